@@ -1,0 +1,126 @@
+"""Contact forces of named pairs, summed from MuJoCo-Warp's contact list."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from dexsim.sim.engine import ContactPair, geoms_of
+
+# Sums are fixed-point integers: integer atomics commute, so results do not depend on the order of threads.
+_SCALE = 65536.0  # 1.5e-5 N resolution, +-32 kN range
+
+
+def pair_table(model: mujoco.MjModel, pairs: Sequence[ContactPair], slots: int = 2) -> np.ndarray:
+    """For geoms (a, b): the pairs they belong to, int32 [ngeom, ngeom, slots]; +p+1 if a is of the pair's first
+    member, -(p+1) if b is, 0 = none."""
+    table = np.zeros((model.ngeom, model.ngeom, slots), dtype=np.int32)
+    for p, pair in enumerate(pairs):
+        for a in geoms_of(model, *pair.first):
+            for b in geoms_of(model, *pair.second):
+                if a == b:
+                    continue
+                for i, j, s in ((a, b, p + 1), (b, a, -(p + 1))):
+                    free = np.flatnonzero(table[i, j] == 0)
+                    if abs(s) in np.abs(table[i, j]):
+                        continue
+                    if len(free) == 0:
+                        raise ValueError(f"geoms {i} and {j} belong to more than {slots} contact pairs")
+                    table[i, j, free[0]] = s
+    return table
+
+
+@wp.kernel(enable_backward=False)
+def add_contacts(
+    nacon: wp.array(dtype=int),
+    geom: wp.array(dtype=wp.vec2i),
+    worldid: wp.array(dtype=int),
+    frame: wp.array(dtype=wp.mat33),
+    dim: wp.array(dtype=int),
+    efc_address: wp.array2d(dtype=int),
+    efc_force: wp.array2d(dtype=float),
+    njmax: int,
+    table: wp.array3d(dtype=int),
+    # out
+    normal_sum: wp.array2d(dtype=int),
+    force_sum: wp.array3d(dtype=int),
+):
+    c = wp.tid()
+    if c >= nacon[0]:
+        return
+    adr = efc_address[c, 0]
+    g = geom[c]
+    if adr < 0 or g[0] < 0 or g[1] < 0:
+        return
+    w = worldid[c]
+    f = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(wp.min(dim[c], 3)):
+        a = efc_address[c, i]
+        if a >= 0 and a < njmax:
+            f[i] = efc_force[w, a]
+    # the frame's first row is the normal, from geom[0] to geom[1]; f acts on geom[1]
+    world = wp.transpose(frame[c]) * f
+    for k in range(table.shape[2]):
+        p = table[g[0], g[1], k]
+        if p != 0:
+            sign = -1.0  # first member is geom[0]: it gets the reaction
+            if p < 0:
+                sign = 1.0
+            col = wp.abs(p) - 1
+            wp.atomic_add(normal_sum, w, col, int(wp.round(f[0] * 65536.0)))
+            for i in range(3):
+                wp.atomic_add(force_sum, w, col, i, int(wp.round(sign * world[i] * 65536.0)))
+
+
+@wp.kernel(enable_backward=False)
+def read_sums(
+    normal_sum: wp.array2d(dtype=int),
+    force_sum: wp.array3d(dtype=int),
+    # out
+    normal: wp.array2d(dtype=float),
+    force: wp.array2d(dtype=wp.vec3),
+):
+    w, p = wp.tid()
+    s = 1.0 / 65536.0
+    normal[w, p] = float(normal_sum[w, p]) * s
+    force[w, p] = wp.vec3(float(force_sum[w, p, 0]) * s, float(force_sum[w, p, 1]) * s, float(force_sum[w, p, 2]) * s)
+    # ready for the next control step
+    normal_sum[w, p] = 0
+    for i in range(3):
+        force_sum[w, p, i] = 0
+
+
+@wp.kernel(enable_backward=False)
+def check_worlds(
+    qpos: wp.array2d(dtype=float),
+    qvel: wp.array2d(dtype=float),
+    solver_overflow: wp.array(dtype=int),
+    nacon: wp.array(dtype=int),
+    nefc: wp.array(dtype=int),
+    nan_bit: int,
+    # out
+    flags: wp.array(dtype=int),
+    overflow: wp.array(dtype=int),
+    peak: wp.array(dtype=int),
+):
+    w = wp.tid()
+    bad = int(0)
+    for i in range(qpos.shape[1]):
+        if not wp.isfinite(qpos[w, i]):
+            bad = 1
+    for i in range(qvel.shape[1]):
+        # 1e4 rad/s or m/s is far beyond anything a hand does: the solver has diverged
+        if not wp.isfinite(qvel[w, i]) or wp.abs(qvel[w, i]) > 1.0e4:
+            bad = 1
+    f = solver_overflow[w]
+    overflow[w] = overflow[w] | f
+    if bad == 1:
+        f = f | nan_bit
+    flags[w] = f
+    solver_overflow[w] = 0
+    if w == 0:
+        wp.atomic_max(peak, 0, nacon[0])
+    wp.atomic_max(peak, 1, nefc[w])

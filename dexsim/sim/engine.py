@@ -1,0 +1,191 @@
+"""The interface of a physics engine, and what both engines share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from dexsim.errors import UserError
+
+FLAG_NAN = 1 << 30
+"""Bit of `Engine.t.flags`: a state of this world is not finite (or its speed is absurd)."""
+OVERFLOW_BITS = (1 << 0) | (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4) | (1 << 8)
+"""Bits of `Engine.t.flags` that mean lost contacts or constraint rows (MuJoCo-Warp's OverflowType)."""
+
+
+@dataclass(frozen=True)
+class ContactPair:
+    """A named pair of geom groups whose contact force is measured.
+
+    first, second: (kind, name) with kind "geom", "body" or "subtree" (a body and all its descendants).
+    """
+
+    name: str
+    first: tuple[str, str]
+    second: tuple[str, str]
+
+
+def geoms_of(model: mujoco.MjModel, kind: str, name: str) -> np.ndarray:
+    """Ids of the geoms that (kind, name) selects; raises UserError when the name is unknown."""
+    if kind == "geom":
+        gid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
+        if gid >= 0:
+            return np.array([gid])
+    elif kind in ("body", "subtree"):
+        bid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        if bid >= 0:
+            bodies = {bid}
+            if kind == "subtree":
+                for b in range(bid + 1, model.nbody):
+                    if model.body_parentid[b] in bodies:
+                        bodies.add(b)
+            return np.flatnonzero(np.isin(model.geom_bodyid, list(bodies)))
+    raise UserError(f"contact pair: no {kind} named '{name}' in the model")
+
+
+class Engine:
+    """N worlds of one `mujoco.MjModel`.
+
+    Attributes:
+      n: number of worlds. device: "cpu" or "cuda:i". dt: physics step [s]. mjm: the compiled model.
+      real: Warp scalar type of states (`wp.float32` on MuJoCo-Warp, `wp.float64` on C MuJoCo).
+      wp: Warp arrays that live as long as the engine, and never move:
+        time [N], qpos [N, nq], qvel [N, nv], qfrc_applied [N, nv] (of `real`);
+        xpos [N, nbody] vec3 and xmat [N, nbody] mat33 (float32): body frames in the world;
+        pair_normal [N, P]: sum of normal contact forces [N]; pair_force [N, P] vec3: net force on the pair's first
+        member, world frame [N]; flags [N] int32.
+      t: the same memory as torch tensors, with xfrc_applied [N, nbody, 6] (world-frame force then torque).
+    """
+
+    kind = ""
+
+    def __init__(self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]):
+        if worlds < 1:
+            raise UserError(f"worlds={worlds}: must be at least 1")
+        self.mjm, self.n, self.device, self.dt = model, worlds, device, float(model.opt.timestep)
+        self.pairs = tuple(pairs)
+        self.field_names = tuple(fields)
+        self.wp = SimpleNamespace()
+        self.t = SimpleNamespace()
+
+    # -- names -------------------------------------------------------------------------------------------------------
+    def body(self, name: str) -> int:
+        return self._id(mujoco.mjtObj.mjOBJ_BODY, "body", name)
+
+    def geom(self, name: str) -> int:
+        return self._id(mujoco.mjtObj.mjOBJ_GEOM, "geom", name)
+
+    def joint(self, name: str) -> int:
+        return self._id(mujoco.mjtObj.mjOBJ_JOINT, "joint", name)
+
+    def qpos_index(self, joints: Sequence[str]) -> np.ndarray:
+        """Index into qpos of each (one-DoF) joint, int array [J]."""
+        return np.array([self.mjm.jnt_qposadr[self.joint(j)] for j in joints], dtype=np.int32)
+
+    def dof_index(self, joints: Sequence[str]) -> np.ndarray:
+        """Index into qvel of each (one-DoF) joint, int array [J]."""
+        return np.array([self.mjm.jnt_dofadr[self.joint(j)] for j in joints], dtype=np.int32)
+
+    def pair(self, name: str) -> int:
+        """Column of a contact pair in pair_normal and pair_force."""
+        for k, p in enumerate(self.pairs):
+            if p.name == name:
+                return k
+        raise UserError(f"no contact pair '{name}'; declared: {', '.join(p.name for p in self.pairs) or 'none'}")
+
+    def _id(self, obj: mujoco.mjtObj, kind: str, name: str) -> int:
+        i = mujoco.mj_name2id(self.mjm, obj, name)
+        if i < 0:
+            count = {"body": self.mjm.nbody, "geom": self.mjm.ngeom, "joint": self.mjm.njnt}[kind]
+            known = [mujoco.mj_id2name(self.mjm, obj, k) or f"#{k}" for k in range(count)]
+            raise UserError(f"model has no {kind} '{name}'; it has: {', '.join(known)}")
+        return i
+
+    # -- the engine's own part -----------------------------------------------------------------------------------------
+    def field(self, name: str) -> torch.Tensor:
+        """Per-world values [N, ...] of a declared model field; written in place, seen by the next step."""
+        raise NotImplementedError
+
+    def wp_field(self, name: str) -> wp.array:
+        """The same memory as `field`, as a Warp array of `real` (dof fields: [N, nv])."""
+        raise NotImplementedError
+
+    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+        """substeps x (before_each, one physics step), then poses, contact forces and flags, then `after`.
+
+        The callbacks only launch Warp kernels on arrays that exist already: MuJoCo-Warp records the sequence once
+        and replays it.
+        """
+        raise NotImplementedError
+
+    def refresh(self) -> None:
+        """Body poses for the present qpos (after `set_state`), nothing else."""
+        raise NotImplementedError
+
+    def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Where mask [N] (bool) holds: state := (qpos [N, nq], qvel [N, nv]), time, warm start, applied and contact
+        forces := 0. Poses follow at the next `refresh` or `step`."""
+        raise NotImplementedError
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """`set_state` to the model's qpos0 at rest."""
+        qpos = torch.as_tensor(self.mjm.qpos0, dtype=self.t.qpos.dtype, device=self.device).expand(self.n, -1)
+        self.set_state(mask, qpos, torch.zeros_like(self.t.qvel))
+
+    def set_const(self) -> None:
+        """Recompute what MuJoCo derives from masses, inertias and sizes (invweight0 and the like) in all worlds."""
+        raise NotImplementedError
+
+    def peaks(self) -> dict[str, float]:
+        """Largest numbers of contacts and constraint rows seen, and the room for them. Reads from the device."""
+        raise NotImplementedError
+
+    def check_overflow(self) -> None:
+        """Fail if contacts or constraint rows were lost since the last call. Reads from the device: call it rarely."""
+        flags = int(torch.bitwise_or(self.t.overflow, 0).max().item())
+        if flags & OVERFLOW_BITS:
+            p = self.peaks()
+            raise UserError(
+                f"contact overflow (flags {flags:#x}): peak {p['contacts']:.1f} contacts a world of sim.nconmax={p['nconmax']} on "
+                f"average, {p['rows']:.0f} constraint rows of sim.njmax={p['njmax']}; raise the one that is full "
+                f"(e.g. sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
+            )
+        self.t.overflow.zero_()
+
+
+def make_engine(
+    spec: mujoco.MjSpec,
+    worlds: int,
+    device: str = "cpu",
+    engine: str = "auto",
+    fields: Sequence[str] = (),
+    pairs: Sequence[ContactPair] = (),
+    deterministic: bool = False,
+    nconmax: int = 40,
+    njmax: int = 160,
+    threads: int = 0,
+) -> Engine:
+    """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a CPU).
+
+    fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
+    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all.
+    """
+    if engine not in ("auto", "warp", "mujoco"):
+        raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
+    if engine == "auto":
+        engine = "warp" if device.startswith("cuda") else "mujoco"
+    if engine == "mujoco" and device != "cpu":
+        raise UserError(f"sim.engine=mujoco runs on the CPU only, not on device={device}; use sim.engine=warp or device=cpu")
+    if engine == "warp":
+        from dexsim.sim.warp_engine import WarpEngine
+
+        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax)
+    from dexsim.sim.mujoco_engine import MujocoEngine, compile_with_sensors
+
+    return MujocoEngine(compile_with_sensors(spec, pairs), worlds, fields, pairs, threads)

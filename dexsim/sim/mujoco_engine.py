@@ -1,0 +1,140 @@
+"""C MuJoCo behind the Engine interface: worlds on a thread pool (`mujoco.batch`), float64, CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+import warp as wp
+
+from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
+
+_SLOTS = 6  # contacts of one pair that are summed
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
+
+
+def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> mujoco.MjModel:
+    """Compile `spec` with one contact sensor a pair (C MuJoCo's batch does not hand out its contact list)."""
+    kinds = {"geom": mujoco.mjtObj.mjOBJ_GEOM, "body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY}
+    spec = spec.copy()
+    data = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)) | (1 << int(mujoco.mjtConDataField.mjCONDATA_NORMAL)) | (
+        1 << int(mujoco.mjtConDataField.mjCONDATA_TANGENT))
+    for p in pairs:
+        spec.add_sensor(
+            name=f"pair_{p.name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds[p.first[0]], objname=p.first[1],
+            reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, _SLOTS])
+    return spec.compile()
+
+
+class MujocoEngine(Engine):
+    """N worlds on C MuJoCo. See `Engine` for the interface; results do not depend on the number of threads."""
+
+    kind = "mujoco"
+
+    def __init__(self, model: mujoco.MjModel, worlds: int, fields: Sequence[str], pairs: Sequence[ContactPair], threads: int,
+                 real: type = wp.float64):
+        super().__init__(model, worlds, "cpu", fields, pairs)
+        self.real = real
+        self.batch = mujoco.batch.Batch(model, worlds, threads)
+        b = self.batch
+        # a diverged world must keep its NaN, to be seen and reset by the environment like on the other engine
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        b.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        b.forward()
+        self._xpos64, self._xmat64 = b.bind("xpos"), b.bind("xmat")
+        self._sensordata = b.bind("sensordata") if self.pairs else None
+        self._nefc, self._ncon = b.bind("nefc"), b.bind("ncon")
+        w, P, N = self.wp, len(self.pairs), worlds
+        for name in ("time", "qpos", "qvel", "qfrc_applied"):
+            setattr(w, name, wp.array(b.bind(name), dtype=wp.float64, device="cpu", copy=False))
+            setattr(self.t, name, torch.from_numpy(b.bind(name)))
+        self.t.xfrc_applied = torch.from_numpy(b.bind("xfrc_applied"))
+        self._warmstart = torch.from_numpy(b.bind("qacc_warmstart"))
+        w.xpos = wp.zeros((N, model.nbody), dtype=wp.vec3, device="cpu")
+        w.xmat = wp.zeros((N, model.nbody), dtype=wp.mat33, device="cpu")
+        w.pair_normal = wp.zeros((N, P), dtype=float, device="cpu")
+        w.pair_force = wp.zeros((N, P), dtype=wp.vec3, device="cpu")
+        w.flags = wp.zeros(N, dtype=int, device="cpu")
+        for name in ("xpos", "xmat", "pair_normal", "pair_force", "flags"):
+            setattr(self.t, name, wp.to_torch(getattr(w, name)))
+        self.t.overflow = torch.zeros(N, dtype=torch.int32)
+        if P:
+            adr = np.array([model.sensor_adr[model.sensor(f"pair_{p.name}").id] for p in self.pairs])
+            self._sensor_cols = adr[:, None] + np.arange(9 * _SLOTS)
+        self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
+        self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
+        self._fields_wp: dict[str, wp.array] = {}
+        self._peak = np.zeros(2)
+        self.refresh()
+
+    def field(self, name: str) -> torch.Tensor:
+        return self._fields_t[name]
+
+    def wp_field(self, name: str) -> wp.array:
+        if name not in self._fields_wp:
+            self._fields_wp[name] = wp.array(self._fields[name], dtype=wp.float64, device="cpu", copy=False)
+        return self._fields_wp[name]
+
+    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+        b = self.batch
+        with wp.ScopedDevice("cpu"):
+            if before_each is None:
+                b.step(nstep=substeps)
+            else:
+                for _ in range(substeps):
+                    before_each()
+                    b.step()
+            self._contacts()
+            b.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
+            self._poses()
+            self._check()
+            if after is not None:
+                after()
+
+    def refresh(self) -> None:
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
+        self._poses()
+
+    def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        m, t = mask[:, None], self.t
+        t.qpos.copy_(torch.where(m, qpos.to(t.qpos.dtype), t.qpos))
+        t.qvel.copy_(torch.where(m, qvel.to(t.qvel.dtype), t.qvel))
+        self._warmstart.masked_fill_(m, 0.0)
+        t.qfrc_applied.masked_fill_(m, 0.0)
+        t.time.masked_fill_(mask, 0.0)
+        t.xfrc_applied.masked_fill_(m[..., None], 0.0)
+        t.pair_normal.masked_fill_(m, 0.0)
+        t.pair_force.masked_fill_(m[..., None], 0.0)
+        t.flags.masked_fill_(mask, 0)
+
+    def set_const(self) -> None:
+        self.batch.set_const()
+
+    def peaks(self) -> dict[str, float]:
+        return {"contacts": float(self._peak[0]), "rows": float(self._peak[1]), "nconmax": 0, "njmax": 0}
+
+    def _poses(self) -> None:
+        n, nb = self.n, self.mjm.nbody
+        self.t.xpos.numpy()[:] = self._xpos64
+        self.t.xmat.numpy()[:] = self._xmat64.reshape(n, nb, 3, 3)
+
+    def _contacts(self) -> None:
+        if not self.pairs:
+            return
+        s = self._sensordata[:, self._sensor_cols].reshape(self.n, len(self.pairs), _SLOTS, 9)
+        force, normal, tangent = s[..., 0:3], s[..., 3:6], s[..., 6:9]
+        other = np.cross(normal, tangent)
+        # force is what the first member exerts on the second, in the frame (normal, tangent, other); on the first: minus
+        world = force[..., :1] * normal + force[..., 1:2] * tangent + force[..., 2:3] * other
+        self.t.pair_normal.copy_(torch.from_numpy(force[..., 0].sum(-1)))
+        self.t.pair_force.copy_(torch.from_numpy(-world.sum(-2)))
+        self._peak[0] = max(self._peak[0], self._ncon.max())
+        self._peak[1] = max(self._peak[1], self._nefc.max())
+
+    def _check(self) -> None:
+        q, v = self.t.qpos, self.t.qvel
+        bad = ~torch.isfinite(q).all(1) | ~(v.abs() < 1.0e4).all(1)  # NaN compares false
+        self.t.flags.copy_(bad.to(torch.int32) * FLAG_NAN)

@@ -1,0 +1,167 @@
+"""MuJoCo-Warp behind the Engine interface: the only place that captures graphs."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Sequence
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+
+from dexsim.sim import contact
+from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
+
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
+
+
+class WarpEngine(Engine):
+    """N worlds on MuJoCo-Warp, float32, CPU or CUDA. See `Engine` for the interface."""
+
+    kind = "warp"
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        worlds: int,
+        device: str,
+        fields: Sequence[str],
+        pairs: Sequence[ContactPair],
+        deterministic: bool,
+        nconmax: int,
+        njmax: int,
+    ):
+        super().__init__(model, worlds, device, fields, pairs)
+        self.real = wp.float32
+        self.nconmax, self.njmax = nconmax, -(-njmax // 16) * 16  # the solver's tiles want multiples of 16
+        wp.config.log_level = wp.LOG_WARNING
+        if device.startswith("cuda"):
+            # torch and Warp share one non-default stream: ordered without synchronisation, and capturable
+            torch.cuda.set_device(device)
+            stream = torch.cuda.current_stream()
+            if stream.cuda_stream == 0:
+                stream = torch.cuda.Stream()
+                torch.cuda.set_stream(stream)
+            wp.set_stream(wp.stream_from_torch(stream), device)
+        with wp.ScopedDevice(device):
+            batched = {f for f in fields if not f.startswith("opt.")} | set(_DERIVED)
+            self.m = mjw.put_model(model, batch_sizes=dict.fromkeys(batched, worlds))
+            self.m.opt.warn_overflow = False  # the device's printf serialises the GPU; flags tell instead
+            if deterministic:
+                self.m.opt.deterministic = int(mjw.DeterminismType.ALL)
+            if "opt.gravity" in fields:
+                self.m.opt.gravity = wp.array(np.tile(model.opt.gravity, (worlds, 1)), dtype=wp.vec3)
+            self.d = mjw.put_data(model, mujoco.MjData(model), nworld=worlds, nconmax=nconmax, njmax=self.njmax)
+            P = len(self.pairs)
+            w = self.wp
+            w.time, w.qpos, w.qvel, w.qfrc_applied = self.d.time, self.d.qpos, self.d.qvel, self.d.qfrc_applied
+            w.xpos, w.xmat = self.d.xpos, self.d.xmat
+            w.pair_normal = wp.zeros((worlds, P), dtype=float)
+            w.pair_force = wp.zeros((worlds, P), dtype=wp.vec3)
+            w.flags = wp.zeros(worlds, dtype=int)
+            self._overflow = wp.zeros(worlds, dtype=int)
+            self._peak = wp.zeros(2, dtype=int)
+            self._normal_sum = wp.zeros((worlds, P), dtype=int)
+            self._force_sum = wp.zeros((worlds, P, 3), dtype=int)
+            self._table = wp.array(contact.pair_table(model, self.pairs), dtype=int) if P else None
+        for name in ("time", "qpos", "qvel", "qfrc_applied", "xpos", "xmat", "pair_normal", "pair_force", "flags"):
+            setattr(self.t, name, wp.to_torch(getattr(w, name)))
+        self.t.overflow = wp.to_torch(self._overflow)
+        self.t.xfrc_applied = wp.to_torch(self.d.xfrc_applied)
+        self._warmstart = wp.to_torch(self.d.qacc_warmstart)
+        self._fields = {}
+        for name in set(fields) | set(_DERIVED):
+            owner, attr = (self.m.opt, name[4:]) if name.startswith("opt.") else (self.m, name)
+            self._fields[name] = getattr(owner, attr)
+        self._fields_t = {k: wp.to_torch(v) for k, v in self._fields.items()}
+        self._graphs: dict = {}
+        self._eager_done: set = set()
+        self.refresh()
+
+    def field(self, name: str) -> torch.Tensor:
+        return self._fields_t[name]
+
+    def wp_field(self, name: str) -> wp.array:
+        return self._fields[name]
+
+    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+        def program():
+            for _ in range(substeps):
+                if before_each is not None:
+                    before_each()
+                mjw.step(self.m, self.d)
+            mjw.kinematics(self.m, self.d)
+            self._outputs()
+            if after is not None:
+                after()
+
+        self._run(("step", substeps, before_each, after), program)
+
+    def refresh(self) -> None:
+        self._run(("refresh",), lambda: mjw.kinematics(self.m, self.d))
+
+    def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        m = mask[:, None]
+        t = self.t
+        torch.where(m, qpos.to(t.qpos.dtype), t.qpos, out=t.qpos)
+        torch.where(m, qvel.to(t.qvel.dtype), t.qvel, out=t.qvel)
+        # masked_fill, not a product: 0 * NaN is NaN
+        self._warmstart.masked_fill_(m, 0.0)
+        t.qfrc_applied.masked_fill_(m, 0.0)
+        t.time.masked_fill_(mask, 0.0)
+        t.xfrc_applied.masked_fill_(m[..., None], 0.0)
+        t.pair_normal.masked_fill_(m, 0.0)
+        t.pair_force.masked_fill_(m[..., None], 0.0)
+        t.flags.masked_fill_(mask, 0)
+
+    def set_const(self) -> None:
+        with wp.ScopedDevice(self.device):
+            mjw.set_const(self.m, self.d)
+
+    def peaks(self) -> dict[str, float]:
+        contacts, rows = self._peak.numpy()
+        return {"contacts": contacts / self.n, "rows": float(rows), "nconmax": self.nconmax, "njmax": self.njmax}
+
+    def _outputs(self) -> None:
+        d = self.d
+        if self.pairs:
+            wp.launch(
+                contact.add_contacts,
+                dim=d.naconmax,
+                inputs=[d.nacon, d.contact.geom, d.contact.worldid, d.contact.frame, d.contact.dim, d.contact.efc_address,
+                        d.efc.force, d.njmax, self._table],
+                outputs=[self._normal_sum, self._force_sum],
+            )
+            wp.launch(
+                contact.read_sums,
+                dim=(self.n, len(self.pairs)),
+                inputs=[self._normal_sum, self._force_sum],
+                outputs=[self.wp.pair_normal, self.wp.pair_force],
+            )
+        wp.launch(
+            contact.check_worlds,
+            dim=self.n,
+            inputs=[d.qpos, d.qvel, d.overflow, d.nacon, d.nefc, FLAG_NAN],
+            outputs=[self.wp.flags, self._overflow, self._peak],
+        )
+
+    def _run(self, key: tuple, program: Callable[[], None]) -> None:
+        """First call: eager (kernels compile). Second: recorded, then replayed; the same path on CPU and CUDA."""
+        with wp.ScopedDevice(self.device):
+            if key not in self._eager_done:
+                program()
+                self._eager_done.add(key)
+                return
+            graph = self._graphs.get(key)
+            if graph is None:
+                gc.collect()
+                gc.disable()  # a graph destroyed during a capture would be recorded into it
+                try:
+                    with wp.ScopedCapture() as capture:
+                        program()
+                finally:
+                    gc.enable()
+                graph = self._graphs[key] = capture.graph
+            wp.capture_launch(graph)
