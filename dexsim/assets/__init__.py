@@ -1,0 +1,1 @@
+"""Hand and object models that ship with dexsim."""
