@@ -1,0 +1,209 @@
+"""Where taxels are: a layout is data, read from files; any count of pads, any count of taxels on each."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.errors import UserError
+
+
+@dataclass(frozen=True)
+class TaxelLayout:
+    """Taxels of F pads, padded to the largest pad's count T (padding has area 0).
+
+    names: pad names [F]. bodies: names of the bodies that carry them [F]. kinds: pad type [F], the key of per-type
+    constants such as the foundation stiffness. count: taxels of each pad [F].
+    point [F, T, 3]: positions [m]; normal, tx, ty [F, T, 3]: unit directions (z, x and y of a taxel's frame; tx and ty
+    lie in the tangent plane). Both in the frame of the carrying body.
+    area [F, T]: area that a taxel stands for [m^2].
+    """
+
+    names: tuple[str, ...]
+    bodies: tuple[str, ...]
+    kinds: tuple[str, ...]
+    count: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+    tx: np.ndarray
+    ty: np.ndarray
+    area: np.ndarray
+
+    @property
+    def pads(self) -> int:
+        return len(self.names)
+
+    @property
+    def taxels(self) -> int:
+        """Taxels of the largest pad, T."""
+        return self.point.shape[1]
+
+    def centre(self) -> np.ndarray:
+        """Area-weighted centre of each pad [F, 3] [m], body frame: the centre reported while the force is zero."""
+        w = self.area / self.area.sum(1, keepdims=True)
+        return np.einsum("ft,ftk->fk", w, self.point)
+
+    def bound(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre [F, 3] and radius [F] of a sphere around each pad's taxels [m], body frame."""
+        centre, radius = np.zeros((self.pads, 3)), np.zeros(self.pads)
+        for f in range(self.pads):
+            p = self.point[f, : self.count[f]]
+            centre[f] = 0.5 * (p.min(0) + p.max(0))
+            radius[f] = np.linalg.norm(p - centre[f], axis=1).max()
+        return centre, radius
+
+    @staticmethod
+    def build(pads: Sequence[dict]) -> TaxelLayout:
+        """Pads as dicts with name, body, kind (default: name), point, normal and optionally tx, ty (default:
+        normal x tx), area (default 1 mm^2 each); lists of any length. Fails with UserError on shapes that do not agree or vectors not of unit length.
+        """
+        if not pads:
+            raise UserError("taxel layout: no pads given; at least one is needed")
+        counts = np.array([len(p["point"]) for p in pads], dtype=np.int32)
+        f, t = len(pads), int(counts.max()) if len(counts) else 0
+        out = {k: np.zeros((f, t, 3)) for k in ("point", "normal", "tx", "ty")}
+        out["normal"][..., 2], out["tx"][..., 0], out["ty"][..., 1] = 1.0, 1.0, 1.0
+        area = np.zeros((f, t))
+        for i, pad in enumerate(pads):
+            n = counts[i]
+            where = f"taxel pad '{pad['name']}'"
+            if n == 0:
+                raise UserError(f"{where}: has no taxels; give at least one or leave the pad out")
+            point, normal = _vectors(pad["point"], n, f"{where}: point"), _vectors(pad["normal"], n, f"{where}: normal")
+            _check_unit(normal, f"{where}: normal")
+            tx, ty = tangents(normal) if pad.get("tx") is None else (pad["tx"], pad.get("ty"))
+            tx = _vectors(tx, n, f"{where}: tx")
+            ty = np.cross(normal, tx) if ty is None else ty
+            tx, ty = _vectors(tx, n, f"{where}: tx"), _vectors(ty, n, f"{where}: ty")
+            for name, v in (("tx", tx), ("ty", ty)):
+                _check_unit(v, f"{where}: {name}")
+                off = np.abs((v * normal).sum(1)).max()
+                if off > 1e-2:
+                    raise UserError(f"{where}: {name} must lie in the tangent plane; its largest component along the normal is {off:.3g}, allowed 0.01")
+            a = np.full(n, 1e-6) if pad.get("area") is None else np.asarray(pad["area"], dtype=float)
+            if a.shape != (n,) or not np.all(np.isfinite(a)) or a.min() <= 0.0:
+                raise UserError(f"{where}: area must be {n} positive numbers [m^2]")
+            for k, v in (("point", point), ("normal", normal), ("tx", tx), ("ty", ty)):
+                out[k][i, :n] = v
+            area[i, :n] = a
+        return TaxelLayout(
+            names=tuple(p["name"] for p in pads),
+            bodies=tuple(p["body"] for p in pads),
+            kinds=tuple(p.get("kind", p["name"]) for p in pads),
+            count=counts,
+            area=area,
+            **out,
+        )
+
+
+def tangents(normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    """The sensor's x and y directions projected on each taxel's tangent plane, unit length, [n, 3] each.
+
+    Where a direction (nearly) is the normal, its projection is replaced by the one that is at right angles to the
+    other's.
+    """
+    normal = np.asarray(normal, dtype=float)
+
+    def project(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        p = v - (normal @ v)[:, None] * normal
+        size = np.linalg.norm(p, axis=1, keepdims=True)
+        return p / np.maximum(size, 1e-12), size[:, 0]
+
+    tx, sx = project(np.asarray(x, dtype=float))
+    ty, sy = project(np.asarray(y, dtype=float))
+    tx = np.where((sx < 1e-2)[:, None], np.cross(ty, normal), tx)
+    ty = np.where((sy < 1e-2)[:, None], np.cross(normal, tx), ty)
+    return tx, ty
+
+
+def load_layout(path: str | Path, body: str, name: str | None = None, kind: str | None = None) -> dict:
+    """One pad from a CSV file: a header naming the columns, one taxel a row in index order.
+
+    Columns: x, y, z [m]; nx, ny, nz; optional tx, ty, tz (the direction `TaxelLayout.tx`) and area [m^2]; others are
+    ignored. Lines that begin with # are comments. Returns a dict for `TaxelLayout.build`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"taxel file {path}: not found")
+    lines = [s for s in path.read_text().splitlines() if s.strip() and not s.startswith("#")]
+    rows = list(csv.DictReader(lines))
+    if not rows:
+        raise UserError(f"taxel file {path}: no taxels in it; expected a header line and one line a taxel")
+    header = set(rows[0])
+
+    def read(names: Sequence[str], needed: bool) -> np.ndarray | None:
+        missing = [n for n in names if n not in header]
+        if missing:
+            if needed:
+                raise UserError(f"taxel file {path}: column '{missing[0]}' is missing; it has: {', '.join(sorted(h for h in header if h))}")
+            return None
+        out = np.zeros((len(rows), len(names)))
+        for i, row in enumerate(rows):
+            for j, n in enumerate(names):
+                try:
+                    out[i, j] = float(row[n])
+                except (TypeError, ValueError):
+                    raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]!r}, not a number") from None
+                if not np.isfinite(out[i, j]):
+                    raise UserError(f"taxel file {path}, taxel {i}: '{n}' is {row[n]}, must be finite")
+        return out
+
+    area = read(["area"], False)
+    return {
+        "name": name or path.stem,
+        "body": body,
+        "kind": kind or name or path.stem,
+        "point": read(["x", "y", "z"], True),
+        "normal": read(["nx", "ny", "nz"], True),
+        "tx": read(["tx", "ty", "tz"], False),
+        "area": None if area is None else area[:, 0],
+    }
+
+
+def xhand_layout() -> TaxelLayout:
+    """The xHand's 5 x 120 taxels (`dexsim/assets/xhand/taxels_*.csv`)."""
+    from dexsim.assets import xhand
+
+    folder = Path(xhand.__file__).parent
+    pads = []
+    for finger, body in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True):
+        kind = "thumb" if finger == "thumb" else "finger"
+        pad = load_layout(folder / f"taxels_{kind}.csv", body, finger, kind)
+        if len(pad["point"]) != xhand.TAXELS_PER_FINGER:
+            raise UserError(f"taxel file {folder}/taxels_{kind}.csv: {len(pad['point'])} taxels, must be {xhand.TAXELS_PER_FINGER}")
+        pads.append(pad)
+    return TaxelLayout.build(pads)
+
+
+def tip_points(model: object, geoms: Sequence[str]) -> list[np.ndarray]:
+    """Corners [V, 3] (m, body frame) of the tips' collision meshes in a `mujoco.MjModel`: what other pads can feel."""
+    import mujoco
+
+    out = []
+    for name in geoms:
+        g = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
+        if g < 0 or model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
+            raise UserError(f"tip geom '{name}': {'not in the model' if g < 0 else 'not a mesh'}; touch between fingers needs a convex mesh")
+        m = model.geom_dataid[g]
+        at = model.mesh_vertadr[m]
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[g])
+        out.append(model.mesh_vert[at : at + model.mesh_vertnum[m]] @ turn.reshape(3, 3).T + model.geom_pos[g])
+    return out
+
+
+def _vectors(v: object, n: int, what: str) -> np.ndarray:
+    v = np.asarray(v, dtype=float)
+    if v.shape != (n, 3) or not np.all(np.isfinite(v)):
+        raise UserError(f"{what}: must be {n} finite vectors of 3 numbers; got shape {v.shape}")
+    return v
+
+
+def _check_unit(v: np.ndarray, what: str) -> None:
+    worst = np.abs(np.linalg.norm(v, axis=1) - 1.0).max()
+    if worst > 1e-3:
+        raise UserError(f"{what}: vectors must have length 1; one is off by {worst:.3g} (allowed 0.001)")

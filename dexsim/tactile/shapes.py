@@ -1,0 +1,125 @@
+"""What touch needs to know of objects: kinds, and baked distance grids, flat on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from dexsim.assets.objects.shape import Grid
+from dexsim.errors import UserError
+from dexsim.tactile.sdf import KINDS, Shapes
+
+
+@dataclass(frozen=True)
+class TouchShape:
+    """name; kind: "box", "sphere", "capsule", "cylinder" or "grid"; grid: for kind "grid" only."""
+
+    name: str
+    kind: str
+    grid: Grid | None = None
+
+
+class ShapeSet:
+    """Shapes by index, in the order given.
+
+    shapes: `TouchShape`s or objects of `dexsim.assets.objects` (anything with name, kind, grid). Fails with UserError
+    on an unknown kind or a grid that does not hold its shape.
+    """
+
+    def __init__(self, shapes: Sequence, device: str = "cpu"):
+        self.names = tuple(s.name for s in shapes)
+        self.kinds = np.array([_kind(s) for s in shapes], dtype=np.int32)
+        self.grids: list[Grid | None] = []
+        dims, origin, spacing, offset, radius = [], [], [], [], []
+        data: list[np.ndarray] = []
+        at = 0
+        for s in shapes:
+            grid = None
+            d, o, h, r = (2, 2, 2), np.zeros(3), 1.0, 0.0
+            if s.kind == "grid":
+                grid = _checked(s)
+                d, o, h = grid.data.shape, grid.origin, grid.spacing
+                r = _surface_radius(grid)
+            self.grids.append(grid)
+            dims.append(d), origin.append(o), spacing.append(h), radius.append(r)
+            offset.append(at if grid is not None else 0)
+            if grid is not None:
+                flat = grid.data.reshape(-1).astype(np.float32)
+                data.append(np.stack([flat, np.append(flat[1:], flat[-1])], axis=1))
+                at += len(flat)
+        if at >= 2**31:
+            raise UserError(f"distance grids hold {at} samples, more than {2**31 - 1}: use fewer shapes or coarser grids")
+        self.samples = at
+        self.device = device
+        out = Shapes()
+        with wp.ScopedDevice(device):
+            out.kind = wp.array(self.kinds, dtype=int)
+            out.dims = wp.array(np.array(dims, dtype=np.int32).reshape(-1, 3), dtype=wp.vec3i)
+            out.origin = wp.array(np.array(origin, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3)
+            out.spacing = wp.array(np.array(spacing, dtype=np.float32), dtype=float)
+            out.offset = wp.array(np.array(offset, dtype=np.int32), dtype=int)
+            out.radius = wp.array(np.array(radius, dtype=np.float32), dtype=float)
+            out.data = wp.array(np.concatenate(data) if data else np.zeros((1, 2), np.float32), dtype=wp.vec2)
+        self.wp = out
+
+    def index(self, name: str) -> int:
+        """Index of the shape of this name."""
+        if name not in self.names:
+            raise UserError(f"no touch shape '{name}'; there are: {', '.join(self.names)}")
+        return self.names.index(name)
+
+
+def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-3) -> Grid:
+    """Distance grid [m] of the convex hull of points [n, 3]: exact inside (largest of the face planes' distances) and
+    on faces; near an edge outside it is a lower bound, which no contact reads."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    planes = np.unique(np.round(hull.equations, 9), axis=0)
+    low, high = points.min(0) - margin, points.max(0) + margin
+    n = np.ceil((high - low) / spacing).astype(int) + 1
+    axes = [low[i] + spacing * np.arange(n[i]) for i in range(3)]
+    x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
+    out = np.full(tuple(n), -np.inf, dtype=np.float32)
+    for a, b, c, d in planes:
+        np.maximum(out, (a * x + b * y + c * z + d).astype(np.float32), out=out)
+    return Grid(low, float(spacing), out)
+
+
+def _kind(shape: object) -> int:
+    if shape.kind not in KINDS:
+        raise UserError(f"touch shape '{shape.name}': kind '{shape.kind}' is unknown; choose one of {', '.join(KINDS)}")
+    return KINDS[shape.kind]
+
+
+def _checked(shape: object) -> Grid:
+    g = shape.grid
+    what = f"touch shape '{shape.name}'"
+    if g is None:
+        raise UserError(f"{what}: kind 'grid' needs a distance grid")
+    data = np.asarray(g.data, dtype=np.float32)
+    if data.ndim != 3 or min(data.shape) < 2:
+        raise UserError(f"{what}: grid has shape {data.shape}; at least 2 samples along each of 3 axes are needed")
+    if not np.all(np.isfinite(data)) or not g.spacing > 0.0:
+        raise UserError(f"{what}: grid must be finite with positive spacing; spacing is {g.spacing}")
+    edge = min(data[0].min(), data[-1].min(), data[:, 0].min(), data[:, -1].min(), data[:, :, 0].min(), data[:, :, -1].min())
+    if edge <= 0.0:
+        raise UserError(f"{what}: grid does not hold the shape (distance {edge:.3g} m on its border, must be > 0): bake it with a wider margin")
+    if data.min() >= 0.0:
+        raise UserError(f"{what}: grid is nowhere negative: no sample lies inside the shape; use a finer grid")
+    return Grid(np.asarray(g.origin, dtype=float), float(g.spacing), data)
+
+
+def _surface_radius(g: Grid) -> float:
+    """Farthest cell that can touch the inside, seen from the frame's origin."""
+    n = g.data.shape
+    r2 = 0.0
+    for ix in range(n[0]):
+        inside = np.argwhere(g.data[ix] <= g.spacing)
+        if len(inside):
+            p = g.origin + g.spacing * np.concatenate([np.full((len(inside), 1), ix), inside], axis=1)
+            r2 = max(r2, float((p * p).sum(1).max()))
+    return float(np.sqrt(r2) + np.sqrt(3.0) * g.spacing)

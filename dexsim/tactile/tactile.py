@@ -1,0 +1,166 @@
+"""Touch of N worlds: what pads feel of the object and of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import warp as wp
+
+from dexsim.errors import UserError
+from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
+from dexsim.tactile.kernel import LAWS, Law, Pads, touch_kernel
+from dexsim.tactile.layout import TaxelLayout
+from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
+
+MAX_BLOCK = 1024
+
+
+class Tactile:
+    """Forces of all taxels, reduced to a force and a centre per pad.
+
+    engine: N worlds; `engine.wp.xpos`, `xmat` are read, and `pair_normal` for sum=solver; `launch` runs in `after` of
+    `engine.step`. layout: F pads of up to T taxels. shapes: what objects can be. object_body: name of the object's body
+    (its frame is the shape's frame), or several names. cfg: see configs/tactile/default.yaml.
+    pairs: for sum=solver, name of the engine's contact pair (pad, object) of each pad, [F] (or [F][O] for O objects).
+    tips: for others=true, points [V, 3] (body frame) of each pad's tip, whose convex hull other pads can feel.
+    other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
+
+    Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform scale
+    first for grids); with O objects [N, O], [N, O, 3].
+    Out: force [N, F] (N) and centre [N, F, 3] (m, world frame; the pad's centre where the force is 0) as the sensor
+    reports them; force_clean and centre_clean of the object alone without imperfections; force_other [N, F] of other
+    fingers; raw [N, F, T] and raw_clean if raw=true; raw3 [N, F, T, 3] with shear=true. The tensors never move.
+    """
+
+    def __init__(
+        self,
+        engine: object,
+        layout: TaxelLayout,
+        shapes: ShapeSet,
+        object_body: str | Sequence[str],
+        cfg: Mapping | TactileConfig | None = None,
+        *,
+        pairs: Sequence | None = None,
+        tips: Sequence[np.ndarray] | None = None,
+        other_pairs: Sequence[Sequence[str]] | None = None,
+        block: bool | None = None,
+    ):
+        self.cfg = cfg = tactile_config(cfg)
+        self.engine, self.layout, self.shapes = engine, layout, shapes
+        self.device, n, f, t = engine.device, engine.n, layout.pads, layout.taxels
+        bodies = [object_body] if isinstance(object_body, str) else list(object_body)
+        o = len(bodies)
+        self.block = (self.device != "cpu" and t <= MAX_BLOCK) if block is None else block
+        others = cfg.others and tips is not None and f > 1
+        if cfg.feel_others and not others:
+            raise UserError("tactile.feel_others=true: this hand gives no tip surfaces to feel")
+        solver = cfg.sum == "solver"
+        columns = np.full((f, o), -1, dtype=np.int32)
+        if solver:
+            if pairs is None or len(pairs) != f:
+                raise UserError(f"tactile.sum=solver needs the contact pair of each of {f} pads; use tactile.sum=spring without contacts")
+            for i, names in enumerate(pairs):
+                names = [names] if isinstance(names, str) else list(names)
+                if len(names) != o:
+                    raise UserError(f"tactile pair names of pad '{layout.names[i]}': {len(names)} given for {o} objects")
+                columns[i] = [engine.pair(name) for name in names]
+        tip_columns = np.full((f, f), -1, dtype=np.int32)
+        if other_pairs is not None:
+            for i in range(f):
+                for j in range(f):
+                    if i != j and other_pairs[i][j]:
+                        tip_columns[i, j] = engine.pair(other_pairs[i][j])
+        measured = cfg.measured
+        store = cfg.raw or measured
+        self.columns = tuple(COLUMNS)
+
+        with wp.ScopedDevice(self.device):
+            self._pads = _pads(engine, layout)
+            self._law = _law(cfg, layout)
+            tip_shapes = [TouchShape(f"tip_{name}", "grid", bake_convex(np.asarray(p, float))) for name, p in zip(layout.names, tips, strict=True)] if others else []
+            self.tips = ShapeSet(tip_shapes, self.device)
+            a = SimpleNamespace(
+                object_body=wp.array([engine.body(b) for b in bodies], dtype=int),
+                shape_id=wp.full((n, o), -1, dtype=int),
+                shape_size=wp.zeros((n, o), dtype=wp.vec3),
+                pair_column=wp.array(columns, dtype=int),
+                tip_column=wp.array(tip_columns, dtype=int),
+                params=wp.zeros((len(COLUMNS), n), dtype=float),
+                scratch=wp.zeros((n, f, t) if solver and not self.block else (1, 1, 1), dtype=float),
+                force=wp.zeros((n, f), dtype=float),
+                centre=wp.zeros((n, f), dtype=wp.vec3),
+                force_other=wp.zeros((n, f), dtype=float),
+                felt=wp.zeros((n, f, t) if store else (1, 1, 1), dtype=float),
+            )
+        self._a = a
+        self.shape_id, self.shape_size = wp.to_torch(a.shape_id), wp.to_torch(a.shape_size)
+        if isinstance(object_body, str):
+            self.shape_id, self.shape_size = self.shape_id[:, 0], self.shape_size[:, 0]
+        self.force_clean, self.centre_clean = wp.to_torch(a.force), wp.to_torch(a.centre)
+        self.force_other = wp.to_torch(a.force_other)
+        self.force, self.centre = self.force_clean, self.centre_clean
+        self.raw_clean = self.raw = wp.to_torch(a.felt) if store else None
+        self.raw3 = None
+        self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
+        self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
+        self._kernel = touch_kernel(self.block, solver, store, others)
+        self._pair_normal = engine.wp.pair_normal if solver or (tip_columns >= 0).any() else wp.zeros((1, 1), dtype=float, device=self.device)
+        self.randomize(torch.ones(n, dtype=torch.bool, device=self.device))
+
+    def column(self, name: str) -> torch.Tensor:
+        """View [N] of one per-world parameter; see `dexsim.tactile.config.COLUMNS`."""
+        if name not in COLUMNS:
+            raise UserError(f"touch has no parameter '{name}'; it has: {', '.join(COLUMNS)}")
+        return self.params[:, self.columns.index(name)]
+
+    def randomize(self, mask: torch.Tensor, generator: torch.Generator | None = None) -> None:
+        """Where mask [N] (bool) holds: draw the per-world parameters anew from their configured ranges."""
+        for name in self.columns:
+            low, high = self.cfg.range(name)
+            col = self.column(name)
+            if low == high:
+                col.masked_fill_(mask, low)
+            else:
+                draw = low + (high - low) * torch.rand(col.shape, generator=generator, device=col.device)
+                col.copy_(torch.where(mask, draw, col))
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Where mask [N] (bool) holds: forget the past (hysteresis, shear anchors, delayed readings)."""
+
+    def launch(self) -> None:
+        """Feel: only launches, so it can be recorded in a graph."""
+        a, n, f = self._a, self.engine.n, self.layout.pads
+        args = [
+            self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp, a.object_body,
+            a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column, int(self.cfg.feel_others),
+            self._row["stiffness_scale"], self._row["threshold"], a.scratch, a.force, a.centre, a.force_other, a.felt,
+        ]  # fmt: skip
+        if self.block:
+            threads = 32 * -(-self.layout.taxels // 32)
+            wp.launch_tiled(self._kernel, dim=[n, f], inputs=args, block_dim=threads, device=self.device)
+        else:
+            wp.launch(self._kernel, dim=[n, f], inputs=args, device=self.device)
+
+
+def _pads(engine: object, layout: TaxelLayout) -> Pads:
+    centre, radius = layout.bound()
+    out = Pads()
+    out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
+    out.count = wp.array(layout.count, dtype=int)
+    out.taxel = wp.array(np.concatenate([layout.point, layout.area[..., None]], axis=-1).astype(np.float32), dtype=wp.vec4)
+    out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
+    out.bound = wp.array(np.concatenate([centre, radius[:, None]], axis=1).astype(np.float32), dtype=wp.vec4)
+    return out
+
+
+def _law(cfg: TactileConfig, layout: TaxelLayout) -> Law:
+    out = Law()
+    out.kind = LAWS[cfg.law]
+    spring = cfg.sum == "spring" or cfg.others
+    out.stiffness = wp.array(np.array(stiffness_of(cfg, layout.kinds) if spring else [1.0] * layout.pads, dtype=np.float32), dtype=float)
+    out.thickness, out.c10, out.c01 = (float(cfg.rubber[k]) for k in ("thickness", "c10", "c01"))
+    out.reach = float(cfg.reach)
+    return out
