@@ -1,16 +1,19 @@
 """Objects to grasp: primitives, irregular shapes made by `shapes.py`, and a user's own meshes.
 
-The irregular shapes are loaded from `library.npz`, which `python -m dexsim.assets.objects.bake` writes; nothing but
-NumPy is needed to load them.
+The irregular shapes are loaded from `library.npz`, which `python -m dexsim.assets.objects.bake` writes; trimesh is
+imported only to read a user's mesh.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import as_file, files
+from pathlib import Path
 
 import numpy as np
 
+from dexsim.assets.objects.baking import unpack
 from dexsim.assets.objects.shape import Grid, Shape, primitive_mass_properties
 
 __all__ = ["Grid", "Shape", "library", "load_mesh", "names", "primitive_mass_properties"]
@@ -33,9 +36,6 @@ def _primitive(kind: str) -> Shape:
 
 @cache
 def _library() -> dict[str, Shape]:
-    # Imported here so that the baking of the library does not need the library.
-    from dexsim.assets.objects.baking import unpack
-
     shapes = {kind: _primitive(kind) for kind in _PRIMITIVES}
     with as_file(files(__name__) / "library.npz") as path, np.load(path, allow_pickle=False) as stored:
         parts: dict[str, dict[str, np.ndarray]] = {}
@@ -64,10 +64,10 @@ def names(held_out: bool | None = None) -> list[str]:
     return [name for name, shape in _library().items() if held_out is None or shape.held_out == held_out]
 
 
-def load_mesh(path, scale: float = 1.0) -> Shape:
-    """A `Shape` from a user's mesh file, or from a list of at most three files with its convex parts.
+def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0) -> Shape:
+    """A `Shape` of kind "grid" from a user's mesh file, or from a list of at most three files of its convex parts.
 
-    See `mesh.load_mesh`, which this calls.
+    See `dexsim.assets.objects.mesh.load_mesh`, which this calls.
     """
     from dexsim.assets.objects.mesh import load_mesh as load
 

@@ -57,14 +57,15 @@ def main() -> None:
     shapes = bake_all()
     stored = {f"{name}/{key}": array for name, shape in shapes.items() for key, array in pack(shape).items()}
     np.savez_compressed(LIBRARY, **stored)
-    print(f"{'name':10} hulls vertices   extents mm           cm3    kept out  grid          error mean/max mm")
+    print("name       hulls vertices   extents mm           cm3    kept out  grid          error mean/max mm")
     for shape in shapes.values():
         sizes = ",".join(str(len(h)) for h in shape.hulls)
         extents = " x ".join(f"{1e3 * e:.1f}" for e in shape.extents)
         dims = "x".join(str(n) for n in shape.grid.data.shape)
+        mean, largest = (1e3 * e for e in shape.grid_error)
         print(
             f"{shape.name:10} {len(shape.hulls)}     {sizes:10} {extents:20} {1e6 * shape.volume:6.1f} "
-            f"{'yes' if shape.held_out else 'no':8}  {dims:12}  {1e3 * shape.grid_error[0]:.3f} / {1e3 * shape.grid_error[1]:.3f}"
+            f"{'yes' if shape.held_out else 'no':8}  {dims:12}  {mean:.3f} / {largest:.3f}"
         )
     print(f"{LIBRARY.name}: {LIBRARY.stat().st_size / 1e6:.2f} MB")
     if arguments.picture:

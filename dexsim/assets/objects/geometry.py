@@ -1,7 +1,7 @@
 """Exact geometry of a union of convex polyhedra: boundary, mass properties, signed distance (NumPy, double precision).
 
-A shape is a list of hulls, each an array of vertices [V, 3] in metres. Everything here works on that list alone, so that
-contact (which gets the hulls) and touch (which gets a grid of these distances) see the same surface.
+A shape is a list of hulls, each an array of vertices [V, 3] in metres. Everything here works on that list alone, so
+that contact (which gets the hulls) and touch (which gets a grid of these distances) see the same surface.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import ConvexHull
 
-# Two planes are one plane when their unit normals and their offsets (relative to the size) agree to this.
-_COPLANAR = 1e-7
+# Corners this close to a plane (relative to the size of the hull) lie in it.
+_FLAT = 2e-6
 
 
 def hull_vertices(points: np.ndarray) -> np.ndarray:
@@ -23,21 +23,25 @@ def hull_vertices(points: np.ndarray) -> np.ndarray:
 
 def hull_planes(vertices: np.ndarray) -> np.ndarray:
     """Planes [F, 4] (outward unit normal n, offset d; inside is n . x + d <= 0), coplanar triangles merged."""
-    equations = ConvexHull(vertices).equations
-    scale = np.ptp(vertices, axis=0).max()
+    hull = ConvexHull(vertices)
+    tol = _FLAT * np.ptp(vertices, axis=0).max()
+    corners = vertices[hull.simplices]  # [T, 3, 3]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     kept: list[np.ndarray] = []
-    for plane in equations:
-        if not any(plane[:3] @ k[:3] > 1 - _COPLANAR and abs(plane[3] - k[3]) < 1e-6 * scale for k in kept):
-            kept.append(plane)
+    # Largest first: a sliver's own normal is uncertain, so it should join a face, not found one.
+    for k in np.argsort(-area, kind="stable"):
+        normal = hull.equations[k, :3]
+        if not any(normal @ p[:3] > 0 and np.abs(corners[k] @ p[:3] + p[3]).max() < tol for p in kept):
+            kept.append(hull.equations[k])
     return np.array(kept)
 
 
 def hull_faces(vertices: np.ndarray) -> list[np.ndarray]:
     """Faces of a convex hull as polygons [K, 3], counter-clockwise seen from outside, in the order of `hull_planes`."""
-    scale = np.ptp(vertices, axis=0).max()
+    tol = _FLAT * np.ptp(vertices, axis=0).max()
     faces = []
     for plane in hull_planes(vertices):
-        on = vertices[np.abs(vertices @ plane[:3] + plane[3]) < 2e-6 * scale]
+        on = vertices[np.abs(vertices @ plane[:3] + plane[3]) < tol]
         centre = on.mean(axis=0)
         u = on[0] - centre
         u /= np.linalg.norm(u)
@@ -109,6 +113,42 @@ def union_boundary(hulls: Sequence[np.ndarray]) -> np.ndarray:
                     if area > tol**2:
                         triangles.append(triangle)
     return np.array(triangles)
+
+
+def simplify_hull(points: np.ndarray, limit: int) -> tuple[np.ndarray, float, float]:
+    """At most `limit` corners [V, 3] of a convex polyhedron near the hull of `points`, and how far (m) its surface
+    lies at most inside and at most outside of that hull's.
+
+    Greedy: starts from the extreme points along the axes and adds the corner farthest outside until `limit`; then
+    grows about its centre to the volume of the full hull, so that the error is shared between inside and outside.
+    Both are convex, so the largest distances are found at corners.
+    """
+    full = ConvexHull(points)
+    corners = points[full.vertices]
+    if len(corners) <= limit:
+        return hull_vertices(points), 0.0, 0.0
+    chosen = sorted({int(i) for axis in range(3) for i in (corners[:, axis].argmin(), corners[:, axis].argmax())})
+    flat = 1e-3 * np.ptp(corners, axis=0).max()
+    while np.linalg.matrix_rank(corners[chosen] - corners[chosen[0]], tol=flat) < 3:
+        # Not a solid yet: add the point farthest from the span of those chosen.
+        offset = corners - corners[chosen[0]]
+        span = np.linalg.svd(offset[chosen])[2][: np.linalg.matrix_rank(offset[chosen], tol=flat)]
+        farthest = int(np.linalg.norm(offset - offset @ span.T @ span, axis=1).argmax())
+        if farthest in chosen:
+            break
+        chosen.append(farthest)
+    while len(chosen) < limit:
+        distance = _triangle_distance(corners, union_boundary([hull_vertices(corners[chosen])]))
+        distance[chosen] = 0
+        chosen.append(int(distance.argmax()))
+    simple = hull_vertices(corners[chosen])
+    volume, centre, _ = mass_properties(union_boundary([simple]))
+    simple = centre + (simple - centre) * (full.volume / volume) ** (1 / 3)
+    beyond = (corners @ (planes := hull_planes(simple))[:, :3].T + planes[:, 3]).max(axis=1) > 0
+    inside = (_triangle_distance(corners, union_boundary([simple])) * beyond).max()
+    beyond = (simple @ full.equations[:, :3].T + full.equations[:, 3]).max(axis=1) > 0
+    outside = (_triangle_distance(simple, points[full.simplices]) * beyond).max()
+    return simple, float(inside), float(outside)
 
 
 def mass_properties(triangles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -78,8 +78,8 @@ def hexprism() -> Hulls:
 
 
 def tetra() -> Hulls:
-    """A tetrahedron with its corners cut off, one of them less than the others."""
-    corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], float) * 30
+    """An uneven tetrahedron with its corners cut off, one of them less than the others."""
+    corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) * [30.0, 24.0, 27.0]
     points = []
     for i, a in enumerate(corners):
         cut = 0.16 if i == 0 else 0.24

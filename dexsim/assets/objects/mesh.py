@@ -1,0 +1,147 @@
+"""A user's own mesh as a `Shape`: reads it with trimesh, names what is wrong with it, and makes hulls and a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from dexsim.assets.objects.baking import MARGIN, shape_from_hulls
+from dexsim.assets.objects.geometry import mass_properties, principal_axes, simplify_hull, union_boundary
+from dexsim.assets.objects.shape import Shape
+from dexsim.assets.objects.shapes import MAX_HULLS, MAX_VERTICES
+from dexsim.errors import UserError
+
+SMALLEST, LARGEST = 0.005, 0.300  # m, largest extent of an object that a hand can be asked to hold
+_CELLS = 62  # along the longest side of the grid, margin included
+_CONVEX = 0.99  # share of its hull that a mesh fills to pass for convex
+
+
+def _scale_hint(extent: float, scale: float) -> str:
+    """The factor that would bring an extent (as scaled, m) into range, in words."""
+    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
+        # Units guess the file as it is, so undo the scale that was passed.
+        if SMALLEST <= extent / scale * factor <= LARGEST:
+            return f"the file is probably in {unit}: pass scale={factor:g}"
+    if SMALLEST <= extent / scale <= LARGEST:
+        return "the file is probably in metres already: pass scale=1"
+    return f"pass a scale that brings it there, e.g. scale={scale * 0.06 / extent:.3g} for 60 mm"
+
+
+def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
+    """Triangles [T, 3, 3] (m) of a closed surface, outward, and notes; `UserError` names what is wrong."""
+    import trimesh
+
+    if not path.is_file():
+        raise UserError(f"mesh {path}: no such file")
+    try:
+        mesh = trimesh.load(path, force="mesh")
+    except Exception as error:  # trimesh raises whatever its reader for the format does
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(
+            f"mesh {path}: cannot be read ({reason[:120]}); formats that work: .stl, .obj, .ply, .off"
+        ) from error
+    vertices = np.asarray(getattr(mesh, "vertices", ()), float)
+    if len(getattr(mesh, "faces", ())) == 0 or len(vertices) == 0:
+        raise UserError(f"mesh {path}: holds no triangles; export the surface as a triangle mesh")
+    if not np.isfinite(vertices).all():
+        raise UserError(f"mesh {path}: {(~np.isfinite(vertices).all(axis=1)).sum()} vertices are not finite numbers")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+
+    extent = scale * np.ptp(vertices, axis=0).max()
+    if not SMALLEST <= extent <= LARGEST:
+        raise UserError(
+            f"mesh {path}: largest extent is {1e3 * extent:.4g} mm at scale={scale:g}, allowed "
+            f"{1e3 * SMALLEST:g} to {1e3 * LARGEST:g} mm; {_scale_hint(extent, scale)}"
+        )
+    faces = np.asarray(mesh.faces)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    # A closed surface may pass an edge more than twice (two bodies touching), but never an odd number of times.
+    if (counts % 2).any():
+        raise UserError(
+            f"mesh {path}: not watertight, {(counts % 2).sum()} of {len(counts)} edges border a hole; "
+            "close the surface (for example Blender: Mesh > Clean Up > Fill Holes)"
+        )
+    # Wound alike, neighbours run along their common edge in opposite directions.
+    order = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    _, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(which.ravel(), weights=order)
+    if (balance != 0).any():
+        raise UserError(
+            f"mesh {path}: inconsistent winding at {(balance != 0).sum()} of {len(counts)} edges (neighbouring faces "
+            "look to opposite sides); recalculate the normals outside (Blender: Mesh > Normals > Recalculate Outside)"
+        )
+    triangles = scale * np.asarray(mesh.vertices, float)[faces]
+    box = np.prod(np.ptp(triangles.reshape(-1, 3), axis=0))
+    volume = mass_properties(triangles - triangles.mean(axis=(0, 1)))[0] if box > 0 else 0.0
+    if abs(volume) <= 1e-4 * extent**3:
+        raise UserError(
+            f"mesh {path}: encloses no volume ({1e6 * volume:.3g} cm3 at {1e3 * extent:.3g} mm extent); "
+            "an object must be solid: give a flat surface a thickness"
+        )
+    if volume < 0:
+        return triangles[:, ::-1], [f"{path.name}: its faces looked inward; turned to look outward"]
+    return triangles, []
+
+
+def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0) -> Shape:
+    """A `Shape` of kind "grid" from a mesh file, or from a list of at most three files with its convex parts.
+
+    path: .stl, .obj, .ply or .off file, or a list of them whose parts share one frame; each part stands for its hull.
+    scale: metres per unit of the file (0.001 for millimetres).
+
+    Contact and touch both use the convex hull of the mesh (of each part), simplified to 32 corners; `Shape.notes`
+    states what that changed. Volume, centre and inertia of a single file are those of the mesh itself, of parts
+    those of the union of the hulls. A few seconds of work: the distance grid is baked here.
+
+    Raises UserError, naming the file, for: a missing or unreadable file, no triangles, a largest extent outside
+    5 to 300 mm, holes, inconsistent winding, no volume, more than three parts, a scale that is not positive.
+    """
+    single = isinstance(path, (str, Path))
+    paths = [Path(path)] if single else [Path(p) for p in path]
+    if not 1 <= len(paths) <= MAX_HULLS:
+        raise UserError(
+            f"mesh parts: {len(paths)} files given, allowed 1 to {MAX_HULLS}; merge convex parts that lie close by"
+        )
+    if not (np.isfinite(scale) and scale > 0):
+        raise UserError(f"mesh {paths[0]}: scale={scale}, must be a positive number; 0.001 for a file in millimetres")
+    notes: list[str] = []
+    hulls = []
+    for file in paths:
+        triangles, said = _read(file, scale)
+        notes += said
+        points = triangles.reshape(-1, 3)
+        try:
+            hull_volume = ConvexHull(points).volume
+            corners, inside, outside = simplify_hull(points, MAX_VERTICES)
+        except QhullError as error:
+            raise UserError(f"mesh {file}: too flat for a convex hull; give it a thickness") from error
+        filled = mass_properties(triangles)[0] / hull_volume
+        if filled < _CONVEX:
+            advice = "; pass a list of up to three files of convex parts to keep its hollows" if single else ""
+            notes.append(f"{file.name}: not convex ({100 * filled:.0f} % of its hull); its convex hull is used{advice}")
+        if inside > 0 or outside > 0:
+            notes.append(
+                f"{file.name}: convex hull simplified to {len(corners)} corners of the same volume, at most "
+                f"{1e3 * inside:.2f} mm inside and {1e3 * outside:.2f} mm outside of it"
+            )
+        hulls.append(corners)
+    solid = triangles if single else union_boundary(hulls)
+    volume, centre, inertia = mass_properties(solid)
+    axes = principal_axes(inertia)
+    hulls = [(h - centre) @ axes for h in hulls]
+    # One to one with the library: about 1.25 mm for an object of 60 mm.
+    spacing = (np.ptp(np.concatenate(hulls), axis=0).max() + 2 * MARGIN) / _CELLS
+    return replace(
+        shape_from_hulls(paths[0].stem, hulls, spacing=spacing),
+        volume=volume,
+        inertia_unit=axes.T @ inertia @ axes,
+        notes=tuple(notes),
+        file_centre=centre,
+        file_axes=axes,
+        file_scale=scale,
+    )
