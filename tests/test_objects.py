@@ -387,3 +387,29 @@ def test_bad_files_and_arguments(tmp_path):
         with pytest.raises(UserError, match=said) as caught:
             load_mesh(path, scale)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["rock", "bracket", "peanut", "cross"])
+def test_contact_sees_the_surface_that_touch_sees(name):
+    """MuJoCo's distance from a small ball to the hulls is the exact distance that the grid is baked from."""
+    shape, radius = library()[name], 0.004
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    for k, hull in enumerate(shape.hulls):
+        spec.add_mesh(name=f"hull{k}", uservert=hull.ravel())
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull{k}", name=f"hull{k}")
+    probe = spec.worldbody.add_body(mocap=True)
+    probe.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], name="ball")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    points = np.random.default_rng(0).uniform(-0.04, 0.04, (150, 3))
+    exact = signed_distance(shape.hulls, points)
+    free = exact > radius + 5e-4
+    assert free.sum() > 30
+    for point, distance in zip(points[free], exact[free], strict=True):
+        data.mocap_pos[0] = point
+        mujoco.mj_forward(model, data)
+        ball = model.geom("ball").id
+        seen = [mujoco.mj_geomDistance(model, data, ball, g, 0.2, None) for g in range(model.ngeom) if g != ball]
+        assert abs(min(seen) - (distance - radius)) < 1e-7
