@@ -1,0 +1,40 @@
+# make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
+# make test    the tests
+# make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
+# Another Python: make train PYTHON=python3.12
+
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && { echo $$p; break; }; done)
+VENV ?= .venv
+PY := $(VENV)/bin/python
+ARGS ?=
+
+.PHONY: help train test play
+
+help:
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -4
+
+train: $(VENV)/.installed
+	$(PY) train.py $(or $(filter task=%,$(ARGS)),task=grasp) $(filter-out task=%,$(ARGS))
+
+play: $(VENV)/.installed
+	$(PY) play.py $(or $(ARGS),checkpoint=checkpoints/grasp.pt)
+
+test: $(VENV)/.installed-test
+	$(PY) -m pytest -q -m "not slow" $(ARGS)
+
+# Installed again only when pyproject.toml changes.
+$(VENV)/.installed: pyproject.toml | $(PY)
+	$(PY) -m pip install --quiet --disable-pip-version-check -e .
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml | $(PY)
+	$(PY) -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@touch $@ $(VENV)/.installed
+
+$(PY):
+	@test -n "$(PYTHON)" || { echo "error: dexsim needs Python 3.11 or newer; none found (PYTHON=/path/to/python names one)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: dexsim needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+		{ rm -rf $(VENV); echo "error: $(PYTHON) cannot make a virtual environment (Debian, Ubuntu: apt-get install python3-venv)"; exit 1; }

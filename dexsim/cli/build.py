@@ -1,0 +1,50 @@
+"""Seeding and building the environment, with the line that says why the first start takes long."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from dexsim.cli import machine
+from dexsim.cli.report import describe_env, versions_line
+
+MakeEnv = Callable[..., Any]
+
+
+def seed_all(seed: int) -> None:
+    """Seed every global random generator."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, Any]) -> Any:
+    """Print versions, machine and ``facts``, seed everything, make the environment.
+
+    ``make_env`` replaces :func:`dexsim.tasks.make_env` (tests).
+    """
+    if make_env is None:
+        from dexsim.tasks import make_env
+    where = cfg["device"]
+    print(versions_line())
+    facts = {"device": f"{machine.describe(where)}, memory {machine.memory(where)}",
+             "task": f"{cfg['choices']['task']}, {cfg['worlds']} worlds, engine {cfg['sim']['engine']},"
+                     f" seed {cfg['seed']}"} | facts
+    for name, value in facts.items():
+        print(f"{name:<8} {value}")
+    seed_all(cfg["seed"])
+    print("compiling kernels (first run only; cached afterwards) ...", flush=True)
+    start = time.perf_counter()
+    env = make_env(cfg, n_worlds=cfg["worlds"], device=where, seed=cfg["seed"], engine=cfg["sim"]["engine"])
+    print(f"ready after {time.perf_counter() - start:.1f} s", flush=True)
+    return env
+
+
+def print_tables(env: Any) -> None:
+    """Observation, action, reward, termination and randomization tables."""
+    print("\n" + describe_env(env.describe()) + "\n", flush=True)

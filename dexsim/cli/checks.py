@@ -1,0 +1,77 @@
+"""Values that no run can work with, refused before anything heavy starts.
+
+Only what every task shares; a task, the servo and the randomization check their own settings where they use them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from dexsim.errors import UserError
+
+INF = math.inf
+# setting: (lowest, highest, whole number?); a missing or null setting is not checked
+LIMITS: dict[str, tuple[float, float, bool]] = {
+    "worlds": (1, 1 << 20, True),
+    "iterations": (1, 10**9, True),
+    "episodes": (1, 10**7, True),
+    "seed": (0, 2**31 - 1, True),
+    "save_interval": (1, 10**9, True),
+    "final_episodes": (0, 10**7, True),
+    "sim.timestep": (1e-5, 0.02, False),
+    "sim.decimation": (1, 1000, True),
+    "sim.nconmax": (1, 10**6, True),
+    "sim.njmax": (1, 10**6, True),
+    "agent.num_steps_per_env": (1, 10**5, True),
+    "agent.algorithm.learning_rate": (1e-12, 1.0, False),
+    "agent.algorithm.desired_kl": (1e-9, 10.0, False),
+    "agent.algorithm.num_learning_epochs": (1, 1000, True),
+    "agent.algorithm.num_mini_batches": (1, 10**6, True),
+    "agent.algorithm.clip_param": (1e-6, 10.0, False),
+    "agent.algorithm.gamma": (0.0, 1.0, False),
+    "agent.algorithm.lam": (0.0, 1.0, False),
+    "agent.algorithm.entropy_coef": (0.0, INF, False),
+    "agent.algorithm.value_loss_coef": (0.0, INF, False),
+    "agent.algorithm.max_grad_norm": (1e-9, INF, False),
+    "agent.actor.distribution_cfg.init_std": (1e-6, 100.0, False),
+}
+
+
+def check(cfg: dict[str, Any]) -> None:
+    """Raise UserError for a setting outside its limits, naming it, its value and the range."""
+    for key, (low, high, whole) in LIMITS.items():
+        value = get(cfg, key)
+        if value is not None:
+            _number(key, value, low, high, whole)
+    for key in ("agent.actor.hidden_dims", "agent.critic.hidden_dims"):
+        sizes = get(cfg, key)
+        if sizes is not None and (not isinstance(sizes, list) or not sizes or not all(_whole(s, 1) for s in sizes)):
+            raise UserError(f"{key}={sizes}: must be a list of whole numbers from 1 up, e.g. [512,256,128]")
+    worlds, steps = cfg.get("worlds"), get(cfg, "agent.num_steps_per_env")
+    batches = get(cfg, "agent.algorithm.num_mini_batches")
+    if worlds and steps and batches and worlds * steps < 2 * batches:
+        raise UserError(f"agent.algorithm.num_mini_batches={batches}: {worlds} worlds x {steps} steps are too few samples;"
+                        " raise worlds or agent.num_steps_per_env")
+
+
+def _number(key: str, value: Any, low: float, high: float, whole: bool) -> None:
+    kind = "a whole number" if whole else "a number"
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if not good or not low <= value <= high or (whole and int(value) != value):
+        above = f"from {low:g} to {high:g}" if high != INF else f"from {low:g} up"
+        raise UserError(f"{key}={value}: must be {kind} {above}")
+
+
+def _whole(value: Any, low: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= low
+
+
+def get(cfg: dict[str, Any], key: str) -> Any:
+    """The value at a dotted key, None where the path breaks off."""
+    node: Any = cfg
+    for part in key.split("."):
+        if not isinstance(node, dict) or part not in node:
+            return None
+        node = node[part]
+    return node

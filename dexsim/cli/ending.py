@@ -1,0 +1,36 @@
+"""How a command ends: 0, 2 with one line for what a user can mend, 130 after Ctrl-C; a traceback only for our bugs."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Callable
+
+from dexsim.errors import UserError
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def guard(main: Callable[[list[str]], int], argv: list[str]) -> int:
+    """Run ``main(argv)`` and turn its errors into a line on stderr and an exit status."""
+    try:
+        return main(argv)
+    except UserError as error:
+        return _say(error, 2)
+    except KeyboardInterrupt:
+        return _say("stopped by Ctrl-C before there was anything to save", 130, "")
+    except BrokenPipeError:  # e.g. `python train.py --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        where = f" at {error.filename}" if error.filename else ""
+        return _say(f"the disk is full{where}; free some space, then continue with resume=<run folder>/last.pt", 2)
+
+
+def _say(message: object, status: int, prefix: str = "error: ") -> int:
+    sys.stdout.flush()
+    print(f"\n{prefix}{message}" if status == 130 else f"{prefix}{message}", file=sys.stderr, flush=True)
+    return status

@@ -1,0 +1,83 @@
+"""A run's folder: resolved config, progress.csv, checkpoints, curves."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dexsim.errors import UserError
+
+
+def make(folder: Path, setting: str, empty: bool = False) -> Path:
+    """Create a folder and make sure that it can be written. Raises UserError naming the setting to change.
+
+    Args:
+        setting: the settings that choose the folder, for the message.
+        empty: refuse one that already holds something.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable.tmp"
+        probe.write_bytes(b"x")
+        probe.unlink()
+        if empty and any(folder.iterdir()):
+            raise UserError(f"{folder} already holds a run: choose another {setting}, or continue it with"
+                            f" resume={folder / 'last.pt'}")
+    except OSError as error:
+        raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
+    return folder
+
+
+def for_run(cfg: dict[str, Any]) -> Path:
+    """The new run's folder: ``out``, else ``runs/<task>/<run>`` with date and time for a nameless run."""
+    if cfg["out"] is not None:
+        return make(Path(str(cfg["out"])).expanduser(), "out=", empty=True)
+    parent = Path("runs") / cfg["choices"]["task"]
+    if cfg["run"] is not None:
+        return make(parent / str(cfg["run"]), "run=", empty=True)
+    name = stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
+    k = 2
+    while (parent / name).exists():
+        name, k = f"{stamp}_{k}", k + 1
+    return make(parent / name, "out=", empty=True)
+
+
+def write_config(folder: Path, cfg: dict[str, Any]) -> None:
+    """Save the resolved config as ``config.yaml``."""
+    (folder / "config.yaml").write_text(yaml.safe_dump(cfg, sort_keys=False))
+
+
+class ProgressFile:
+    """``progress.csv``: one row an iteration; a column may appear later, earlier rows then have it empty."""
+
+    def __init__(self, path: Path, earlier: Path | None = None, until: int = 0) -> None:
+        self._path, self._names, self._rows = path, [], []
+        if earlier is not None and earlier.is_file():  # a resumed run's past
+            with open(earlier, newline="") as file:
+                self._rows = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)
+                              if int(row["iteration"]) <= until]
+            self._names = list(dict.fromkeys(k for row in self._rows for k in row))
+            self._write_all()
+
+    def add(self, row: dict[str, float]) -> None:
+        """Append a row."""
+        text = {k: repr(v) for k, v in row.items() if not (isinstance(v, float) and math.isnan(v))}
+        self._rows.append(text)
+        new = [k for k in text if k not in self._names]
+        if new:
+            self._names += new
+            self._write_all()
+        else:
+            with open(self._path, "a", newline="") as file:
+                csv.DictWriter(file, self._names, restval="").writerow(text)
+
+    def _write_all(self) -> None:
+        with open(self._path, "w", newline="") as file:
+            writer = csv.DictWriter(file, self._names, restval="")
+            writer.writeheader()
+            writer.writerows(self._rows)

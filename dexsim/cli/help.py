@@ -1,0 +1,55 @@
+"""``--help`` of the entry scripts, written from the config files themselves so that it cannot go stale."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from dexsim.cli.settings import groups
+
+TRAIN = """usage: python train.py [key=value ...]
+
+Train a policy in many simulated worlds at once. Ctrl-C stops and saves.
+
+examples:
+  python train.py task=grasp                                the whole job, sized for this machine
+  python train.py worlds=64 iterations=10 device=cpu        a quick look
+  python train.py servo=ideal agent.algorithm.learning_rate=5e-4
+  python train.py resume=runs/grasp/<run>/last.pt iterations=2000
+"""
+PLAY = """usage: python play.py checkpoint=PATH [key=value ...]
+       python play.py policy=random|zero|scripted task=grasp [key=value ...]
+
+Play a policy: a metrics table, metrics.json, plots and, unless video=false, an mp4.
+
+examples:
+  python play.py checkpoint=checkpoints/grasp.pt
+  python play.py checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
+  python play.py checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
+"""
+END = """
+  python {script}.py --cfg      every setting with the value it would have, then stop
+"""
+
+
+def text(script: str, config_dir: Path) -> str:
+    """The help page of ``train`` or ``play``."""
+    files = ["config.yaml"] if script == "train" else ["play.yaml"]
+    lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
+    for file in files:
+        lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in settings(config_dir / file)]
+    lines += ["", "groups (one file of configs/<group>/ each):"]
+    lines += [f"  {name + '=':<14}{' | '.join(options)}" for name, options in groups(config_dir).items()]
+    return "\n".join(lines) + "\n" + END.format(script=script)
+
+
+def settings(path: Path) -> list[tuple[str, str, str]]:
+    """(dotted key, default, comment) of each commented line ``key: value  # comment`` of a config file."""
+    rows, owner = [], ""
+    for line in path.read_text().splitlines():
+        if match := re.match(r"^(\w+):\s*$", line):
+            owner = match[1] + "."
+        elif match := re.match(r"^(\s*)(\w+):\s*(\S+)\s+#\s*(.+)$", line):
+            indent, key, value, comment = match.groups()
+            rows.append(((owner if indent else "") + key, value, comment))
+    return rows

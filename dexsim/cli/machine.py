@@ -1,0 +1,69 @@
+"""What this machine is and has: device, memory, versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+import torch
+
+from dexsim.errors import UserError
+
+PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
+
+
+def device(asked: str | None) -> str:
+    """ "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not here."""
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if asked is None:
+        return "cuda:0" if count else "cpu"
+    name, _, index = str(asked).partition(":")
+    if name == "cpu" and not index:
+        return "cpu"
+    if name == "cuda" and (not index or index.isdigit()):
+        if not count:
+            raise UserError(f"device={asked}: torch {torch.__version__} sees no CUDA device here; use device=cpu"
+                            " (or check nvidia-smi and that torch is a CUDA build)")
+        if int(index or 0) >= count:
+            raise UserError(f"device={asked}: this machine has {count} CUDA device(s), cuda:0 to cuda:{count - 1}")
+        return f"cuda:{int(index or 0)}"
+    raise UserError(f"device={asked}: must be cpu, cuda or cuda:<number>")
+
+
+def refuse_many_ranks() -> None:
+    """Raise UserError under torchrun with more than one process: training on several GPUs is not supported."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UserError("WORLD_SIZE > 1: training on several GPUs is not supported; start one process without torchrun")
+
+
+def versions() -> dict[str, str]:
+    """Versions of dexsim, Python and what it stands on, for the printout and for checkpoints."""
+    from dexsim import __version__
+
+    found = {"dexsim": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def memory(where: str) -> str:
+    """Free and total memory of a device, e.g. "14.2 of 16.0 GiB free"."""
+    if where.startswith("cuda"):
+        free, total = torch.cuda.mem_get_info(where)
+    else:
+        if "SC_AVPHYS_PAGES" not in os.sysconf_names:  # macOS
+            return "memory unknown"
+        page = os.sysconf("SC_PAGE_SIZE")
+        free, total = os.sysconf("SC_AVPHYS_PAGES") * page, os.sysconf("SC_PHYS_PAGES") * page
+    return f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
+
+
+def describe(where: str) -> str:
+    """A device in words, e.g. "cuda:0 (NVIDIA H200)" or "cpu (2 cores)"."""
+    if where.startswith("cuda"):
+        return f"{where} ({torch.cuda.get_device_name(where)})"
+    return f"cpu ({len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()} cores)"

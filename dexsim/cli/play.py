@@ -1,0 +1,42 @@
+"""One replay from resolved settings to metrics and video. Called by play.py in the root folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dexsim.cli import build, folder, machine
+from dexsim.cli.replay import replay
+from dexsim.cli.start import Start
+from dexsim.learning import checkpoint
+from dexsim.learning.ppo import load_policy, plain_policy
+
+
+def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
+    """Play; returns the exit status. Raises UserError."""
+    cfg, play = start.cfg, start.play
+    out = folder.make(_out(start), "out=")
+    what = start.source or f"policy {play['policy']}"
+    env = build.build_env(cfg, make_env, {"policy": what, "results": out})
+    if start.data is not None:
+        checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))
+        policy = load_policy(start.data, env, str(start.source))
+        about = {"checkpoint": str(start.source), "iteration": start.data["iteration"], "git": start.data["git"],
+                 "trained_with": start.data["versions"], "versions": machine.versions()}
+    else:
+        policy = plain_policy(str(play["policy"]), env, cfg["seed"])
+        about = {"policy": play["policy"], "versions": machine.versions()}
+    print(f"playing {play['episodes']} episodes", flush=True)
+    replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
+    return 0
+
+
+def _out(start: Start) -> Path:
+    """``out``; else play/ beside a run's checkpoint, else out/<checkpoint> or out/<task>_<policy>."""
+    if start.play["out"] is not None:
+        return Path(str(start.play["out"])).expanduser()
+    if start.source is None:
+        return Path("out") / f"{start.cfg['choices']['task']}_{start.play['policy']}"
+    source = Path(start.source)
+    if (source.parent / "config.yaml").is_file():
+        return source.parent / ("play" if source.stem in ("policy", "last") else f"play_{source.stem}")
+    return Path("out") / source.stem

@@ -1,0 +1,205 @@
+"""Settings of a run: Hydra's groups and files, then the user's overrides, with names and types checked here.
+
+Hydra composes the group files (``task=grasp servo=ideal``) and parses the command line; the overrides themselves
+(``worlds=64 agent.algorithm.learning_rate=1e-3``) are applied by :func:`override`, because they must work the same on
+a config from the files and on one out of a checkpoint, and because a wrong name must be answered with the valid ones.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dexsim.errors import UserError
+
+WORDS = ("auto", "unknown", "inf", "null")  # strings that a number's place may hold
+
+
+@dataclass
+class Request:
+    """A command line taken apart: group choices (``task=grasp``) and value overrides (``worlds=64``), in order."""
+
+    choices: dict[str, str] = field(default_factory=dict)
+    values: list[Override] = field(default_factory=list)
+
+
+def groups(config_dir: Path) -> dict[str, list[str]]:
+    """The config groups and their options: the folders under ``configs/`` and the YAML files in them."""
+    found = {d.name: sorted(f.stem for f in d.glob("*.yaml")) for d in sorted(config_dir.iterdir()) if d.is_dir()}
+    return {name: options for name, options in found.items() if options}
+
+
+def parse(argv: list[str], config_dir: Path) -> Request:
+    """Take a command line apart. Raises UserError for text that is no ``key=value`` and for an unknown group option."""
+    request, known, parser = Request(), groups(config_dir), OverridesParser.create()
+    for text in argv:
+        if text.startswith("-"):
+            plain = text.lstrip("-")
+            hint = f"write {plain}" if "=" in plain else "settings are written key=value, without dashes"
+            raise UserError(f"unknown option {text!r}: {hint} (--help lists them)")
+        if "=" not in text and not text.startswith("~"):
+            raise UserError(f"{text!r} is not a setting: write it as key=value (--help lists them)")
+        try:
+            item = parser.parse_override(text)
+        except HydraException:
+            key, _, value = text.partition("=")
+            raise UserError(f"cannot read {text!r}: a value with special characters needs quotes, {key}='\"{value}\"'"
+                            " in a shell") from None
+        if item.is_sweep_override():
+            raise UserError(f"{text!r} gives several values: one run takes one value for each setting")
+        if item.key_or_group in known and item.type == OverrideType.CHANGE:
+            request.choices[item.key_or_group] = _option(item, known[item.key_or_group])
+        else:
+            request.values.append(item)
+    return request
+
+
+def _option(item: Override, options: list[str]) -> str:
+    group, name = item.key_or_group, str(item.value())
+    if name in options:
+        return name
+    if name.endswith((".yaml", ".yml")) and group == "servo":
+        raise UserError(f"servo={name}: a file of your own is given as servo_file={name}")
+    raise UserError(f"{group}={name}: no such option; {group} can be {', '.join(options)}{_guess(name, options)}")
+
+
+def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
+    """Compose ``configs/config.yaml`` with these group choices; ``choices`` in the result records all of them."""
+    overrides = [f"{group}={option}" for group, option in choices.items()]
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(config_dir.resolve())):
+            cfg = compose("config", overrides=overrides, return_hydra_config=True)
+            chosen = {k: v for k, v in OmegaConf.to_container(cfg.hydra.runtime.choices).items() if "/" not in k}
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
+        raise UserError(f"config files in {config_dir}: {_first_line(error)}") from None
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    cfg["choices"] = chosen
+    OmegaConf.set_struct(cfg, True)
+    return cfg
+
+
+def choose(cfg: DictConfig, config_dir: Path, choices: dict[str, str]) -> DictConfig:
+    """Exchange whole groups of a config that came out of a checkpoint for options of the config files."""
+    if not choices:
+        return cfg
+    fresh = from_files(config_dir, choices)
+    OmegaConf.set_struct(cfg, False)
+    for group, option in choices.items():
+        cfg[group] = fresh[group]
+        cfg.setdefault("choices", {})[group] = option
+    OmegaConf.set_struct(cfg, True)
+    return cfg
+
+
+def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
+    """Apply value overrides in place. Raises UserError naming the valid settings for an unknown one.
+
+    ``key=value`` needs the key to exist; ``+key=value`` adds one; ``~key`` removes one.
+    """
+    for item in items:
+        key = item.key_or_group
+        if item.type == OverrideType.DEL:
+            _parent(cfg, key)  # raises when it is not there
+            owner, _, last = key.rpartition(".")
+            node = OmegaConf.select(cfg, owner) if owner else cfg
+            OmegaConf.set_struct(node, False)
+            node.pop(last)
+            continue
+        value = item.value()
+        if item.type == OverrideType.CHANGE:
+            _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
+        OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
+    return cfg
+
+
+def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfig:
+    """Merge ``task.presets.<name>`` (a partial config) over cfg, then the user's overrides again over that."""
+    presets = OmegaConf.select(cfg, "task.presets") or {}
+    if name == "none":
+        return cfg
+    if name not in presets:
+        if not presets or name in ("cpu", "cuda"):
+            return cfg  # the task has no wish for this kind of machine
+        raise UserError(f"preset={name}: no such preset; this task has auto, none, {', '.join(presets)}")
+    try:
+        merged = OmegaConf.merge(cfg, presets[name])
+    except OmegaConfBaseException as error:
+        raise UserError(f"task.presets.{name}: {_first_line(error)}") from None
+    return override(merged, items)
+
+
+def resolve(cfg: DictConfig) -> dict[str, Any]:
+    """The plain dict that the library gets: interpolations resolved, nothing missing."""
+    try:
+        return OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise UserError(f"settings: {_first_line(error)}") from None
+
+
+def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
+    """The node that holds ``key``. Raises UserError naming what there is where the path breaks off."""
+    node, parts = cfg, key.split(".")
+    for depth, part in enumerate(parts):
+        inside = isinstance(node, ListConfig) and part.isdigit() and int(part) < len(node)
+        if not inside and not (isinstance(node, DictConfig) and part in node):
+            where = ".".join(parts[:depth])
+            names = [f"{where}.{k}" if where else str(k) for k in node] if isinstance(node, DictConfig) else []
+            valid = f"{where or 'the settings'} {'has' if where else 'are'}: {', '.join(names)}" if names else \
+                f"{where} is a single value"
+            everything = _every_key(cfg)
+            raise UserError(f"unknown setting {key!r}{_guess(key, everything)}; {valid}")
+        if depth == len(parts) - 1:
+            return node
+        node = node[int(part) if isinstance(node, ListConfig) else part]
+        if not isinstance(node, (DictConfig, ListConfig)):
+            raise UserError(f"unknown setting {key!r}: {'.'.join(parts[:depth + 1])} is a single value")
+    raise AssertionError("unreachable")
+
+
+def _every_key(cfg: DictConfig, prefix: str = "") -> list[str]:
+    keys = []
+    for key in cfg:
+        keys.append(f"{prefix}{key}")
+        if not OmegaConf.is_interpolation(cfg, key) and isinstance(cfg[key], DictConfig):
+            keys += _every_key(cfg[key], f"{prefix}{key}.")
+    return keys
+
+
+def _guess(name: str, valid: list[str]) -> str:
+    """ "; did you mean ...?" for the nearest name: by the whole path, else by its last part ('' when none is near)."""
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.75)
+    if not near:
+        last = {v.rpartition(".")[2]: v for v in reversed(valid)}
+        near = [last[n] for n in difflib.get_close_matches(name.rpartition(".")[2], list(last), n=1, cutoff=0.75)]
+    return f" (did you mean {near[0]}?)" if near else ""
+
+
+def _check_type(key: str, old: Any, new: Any) -> None:
+    """Refuse what can only be a slip: text or a truth value for a number, a single value for a group of settings."""
+    if isinstance(old, DictConfig) and not isinstance(new, dict):
+        # a range may be written as a dict {value, low, high}; then a plain number or list may take its place
+        if set(old) <= {"value", "low", "high", "unit"} and not isinstance(new, str):
+            return
+        raise UserError(f"{key} is a group of settings ({', '.join(f'{key}.{k}' for k in old)}), not a single value")
+    if isinstance(old, bool) and not isinstance(new, bool):
+        raise UserError(f"{key}={new}: must be true or false")
+    if isinstance(old, (int, float)) and not isinstance(old, bool):
+        if isinstance(new, bool) or (isinstance(new, str) and new not in WORDS and "${" not in new):
+            raise UserError(f"{key}={str(new).lower() if isinstance(new, bool) else new}: must be a number, like {old}")
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(line.strip() for line in str(error).strip().splitlines()[:3])

@@ -1,0 +1,163 @@
+"""From a command line to the plain config that the library gets, for ``train.py`` and ``play.py``.
+
+Names and types are checked before anything heavy is imported, so that a slip is answered at once.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from dexsim.cli import checks, settings
+from dexsim.cli import help as help_page
+from dexsim.errors import UserError
+
+WORLDS = {"cpu": 64, "cuda": 8192}  # where neither the user nor the task's preset says
+ITERATIONS = {"cpu": 200, "cuda": 1000}
+MAX_PLAY_WORLDS = {"cpu": 64, "cuda": 4096}
+
+
+@dataclass
+class Start:
+    """What a command was asked to do.
+
+    cfg: resolved config. play: play.py's own settings ({} for train.py). source: the checkpoint's path, or None.
+    data: the checkpoint, as :func:`dexsim.learning.checkpoint.load` returns it, or None.
+    """
+
+    cfg: dict[str, Any]
+    play: dict[str, Any]
+    source: str | None = None
+    data: dict[str, Any] | None = None
+
+
+def for_train(argv: list[str], config_dir: Path) -> Start | None:
+    """Settings of a training run; None when the command only asked for help or the settings (printed)."""
+    argv, only_show = _flags(argv, config_dir, "train")
+    if argv is None:
+        return None
+    request = settings.parse(argv, config_dir)
+    source = _last(request, "resume")
+    data = _load(source) if source is not None else None
+    if data is None:
+        cfg = _from_files(config_dir, request)
+    else:
+        cfg = _from_checkpoint(data, config_dir, request, {"run": None, "out": None, "device": None})
+    device = _device(cfg)
+    if data is None:
+        cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
+    plain = _finish(cfg, device)
+    kind = device.partition(":")[0]
+    plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
+    plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
+    checks.check(plain)
+    return None if only_show and _show(plain) else Start(plain, {}, source, data)
+
+
+def for_play(argv: list[str], config_dir: Path) -> Start | None:
+    """Settings of a replay; None when the command only asked for help or the settings (printed)."""
+    argv, only_show = _flags(argv, config_dir, "play")
+    if argv is None:
+        return None
+    request = settings.parse(argv, config_dir)
+    own = OmegaConf.load(config_dir / "play.yaml")
+    OmegaConf.set_struct(own, True)
+    settings.override(own, [item for item in request.values if item.key_or_group in own])
+    request.values = [item for item in request.values if item.key_or_group not in own]
+    play = settings.resolve(own)
+    if (play["checkpoint"] is None) == (play["policy"] is None):
+        raise UserError("say what to play: checkpoint=PATH, or policy=random|zero|scripted with task=<name>")
+    if play["policy"] not in (None, "random", "zero", "scripted"):
+        raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
+    data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
+    if data is not None:
+        cfg = _from_checkpoint(data, config_dir, request, {})
+    else:
+        cfg = _from_files(config_dir, request)
+    OmegaConf.update(cfg, "device", play["device"])
+    device = _device(cfg)
+    if data is None:
+        cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
+    plain = _finish(cfg, device)
+    checks.check(play)
+    play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
+    plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
+    checks.check(plain | {"agent": {}})
+    return None if only_show and _show(plain | play) else Start(plain, play, play["checkpoint"], data)
+
+
+def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | None, bool]:
+    """Take -h/--help and --cfg off; (None, ...) when the help page was printed and that is all."""
+    if any(a in ("-h", "--help", "help") for a in argv):
+        print(help_page.text(script, config_dir), end="")
+        return None, False
+    if script == "play" and not argv:
+        raise UserError("say what to play: checkpoint=PATH, or policy=random|zero|scripted with task=<name> (--help)")
+    return [a for a in argv if a != "--cfg"], "--cfg" in argv
+
+
+def _show(cfg: dict[str, Any]) -> bool:
+    print(yaml.safe_dump(cfg, sort_keys=False), end="")
+    return True
+
+
+def _last(request: settings.Request, key: str) -> str | None:
+    found = [item.value() for item in request.values if item.key_or_group == key]
+    return None if not found or found[-1] is None else str(found[-1])
+
+
+def _load(path: Any) -> dict[str, Any]:
+    from dexsim.learning import checkpoint
+
+    return checkpoint.load(str(path))
+
+
+def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
+    cfg = settings.from_files(config_dir, request.choices)
+    return settings.override(_servo_file(cfg, request), request.values)
+
+
+def _from_checkpoint(data: dict[str, Any], config_dir: Path, request: settings.Request,
+                     fresh: dict[str, Any]) -> DictConfig:
+    """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
+    cfg = OmegaConf.create(copy.deepcopy(data["config"]) | fresh)
+    OmegaConf.set_struct(cfg, True)
+    cfg = _servo_file(settings.choose(cfg, config_dir, request.choices), request)
+    return settings.override(cfg, request.values)
+
+
+def _device(cfg: DictConfig) -> str:
+    from dexsim.cli import machine
+
+    return machine.device(cfg.device)
+
+
+def _preset(cfg: DictConfig, device: str) -> str:
+    name = "none" if cfg.preset is None else str(cfg.preset)
+    return device.partition(":")[0] if name == "auto" else name
+
+
+def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
+    plain = settings.resolve(cfg)
+    plain["device"] = device
+    return plain
+
+
+def _servo_file(cfg: DictConfig, request: settings.Request) -> DictConfig:
+    """Put the user's servo file itself into ``servo``, so that overrides reach it and a checkpoint carries it."""
+    given = _last(request, "servo_file")
+    if given is not None:
+        from dexsim.actuator.table import ServoTable
+
+        path = Path(given).expanduser()
+        ServoTable.load(path)  # raises UserError
+        OmegaConf.set_struct(cfg, False)
+        cfg["servo"] = yaml.safe_load(path.read_text(encoding="utf-8"))
+        cfg["choices"]["servo"] = str(path)
+        OmegaConf.set_struct(cfg, True)
+    return cfg

@@ -1,0 +1,220 @@
+"""Checkpoints: one file that holds all a run needs to go on and all a replay needs to be rebuilt.
+
+A checkpoint is a ``torch.save`` zip of tensors, numbers and text, read with ``weights_only=True``: a file cannot run
+code. It is written beside its place, synced and renamed, so that the previous one survives a full disk or a crash.
+
+Keys (all of them always there in a ``train`` file; a ``policy`` file leaves out those marked t):
+  format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty});
+  layout ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps);
+  actor (state dict, its running normalization included); t critic, t optimizer, t env (the environment's counters,
+  curriculum and random state), t rng (torch, cuda, numpy, python).
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import pickle
+import random
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dexsim.errors import UserError
+
+FORMAT = "dexsim-checkpoint"
+VERSION = 1
+KEYS = ("kind", "config", "versions", "git", "layout", "iteration", "steps", "actor")
+TRAIN_KEYS = ("critic", "optimizer", "env", "rng")
+
+
+def save(path: str | Path, payload: dict[str, Any]) -> Path:
+    """Write a checkpoint so that ``path`` holds either the old file or the whole new one, never a part.
+
+    Raises UserError naming the path when the disk is full or the folder cannot be written.
+    """
+    return write(path, encode(payload))
+
+
+def encode(payload: dict[str, Any]) -> bytes:
+    """A checkpoint's bytes; ``config`` (a dict) becomes JSON text, format and version are added."""
+    payload = {"format": FORMAT, "version": VERSION, **payload, "config": json.dumps(payload["config"])}
+    buffer = io.BytesIO()  # torch reports a failed write as a RuntimeError without its cause, so write it ourselves
+    torch.save(payload, buffer)
+    return buffer.getvalue()
+
+
+def write(path: str | Path, data: bytes) -> Path:
+    """Write, sync, rename. Raises UserError; the file that was at ``path`` before stays whole."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(part, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        kept = "; the previous file there is whole" if path.exists() else ""
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise UserError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None
+        raise UserError(f"cannot save {path}: {error.strerror}{kept}") from None
+    return path
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last through a power cut; some file systems cannot, which loses nothing now."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
+            raise
+    finally:
+        os.close(handle)
+
+
+def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint; ``config`` comes back as a dict, tensors on ``device``.
+
+    Raises UserError, one line each: no such file, truncated or damaged, pickled code (refused), not a dexsim
+    checkpoint, another format version, a missing part.
+    """
+    path = Path(path).expanduser()
+    _check_whole(path)
+    try:
+        data = torch.load(path, map_location=device, weights_only=True)
+    except pickle.UnpicklingError:
+        raise UserError(f"{path}: refused, it holds pickled code; a dexsim checkpoint holds only tensors, numbers and"
+                        " text") from None
+    except (RuntimeError, EOFError, OSError, KeyError, ValueError) as error:
+        raise UserError(f"{path}: damaged or not a checkpoint ({str(error).splitlines()[0][:120]})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise UserError(f"{path}: not a dexsim checkpoint (train.py writes them, as last.pt in the run folder)")
+    if data.get("version") != VERSION:
+        raise UserError(f"{path}: checkpoint format version {data.get('version')}, this dexsim reads version {VERSION};"
+                        f" it was written by dexsim {_writer(data)}, install that one or train again")
+    missing = [k for k in KEYS + (TRAIN_KEYS if data.get("kind") == "train" else ()) if k not in data]
+    if missing:
+        raise UserError(f"{path}: damaged checkpoint, it lacks {', '.join(missing)}")
+    try:
+        data["config"] = json.loads(data["config"])
+    except (TypeError, ValueError):
+        raise UserError(f"{path}: damaged checkpoint, its config is not JSON") from None
+    return data
+
+
+def _check_whole(path: Path) -> None:
+    """Tell a missing, truncated, damaged or pickled file apart before torch gets it."""
+    if not path.exists():
+        raise UserError(f"{path}: no such checkpoint{_nearby(path)}")
+    if path.is_dir():
+        raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
+    try:
+        with open(path, "rb") as file:
+            head = file.read(2)
+        if head[:1] == b"\x80":  # first byte of a raw pickle
+            raise UserError(f"{path}: refused, it is a raw pickle, which can run code; a dexsim checkpoint holds only"
+                            " tensors, numbers and text")
+        with zipfile.ZipFile(path) as archive:
+            bad = archive.testzip()
+    except zipfile.BadZipFile:
+        what = "truncated" if head == b"PK" else "empty" if not head else "not a checkpoint"
+        raise UserError(f"{path}: {what} ({path.stat().st_size} bytes); use another checkpoint of its run folder") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    if bad:
+        raise UserError(f"{path}: damaged, its part {bad} fails its checksum; use another checkpoint of its run folder")
+
+
+def _nearby(path: Path) -> str:
+    """Checkpoints that are there, newest first, for an error message."""
+    try:
+        found = sorted(path.parent.glob("*.pt"), key=lambda p: -p.stat().st_mtime)
+    except OSError:
+        found = []
+    return f"; in {path.parent} there are {', '.join(p.name for p in found[:5])}" if found else ""
+
+
+def _writer(data: dict[str, Any]) -> str:
+    versions = data.get("versions")
+    return str(versions.get("dexsim", "?")) if isinstance(versions, dict) else "?"
+
+
+def policy_only(payload: dict[str, Any]) -> dict[str, Any]:
+    """The small export: what a replay needs and no more (actor with its normalization, config, layout, versions)."""
+    return {k: v for k, v in payload.items() if k in KEYS} | {"kind": "policy"}
+
+
+def check_layout(data: dict[str, Any], layout: dict[str, Any], path: str | Path) -> None:
+    """Raise UserError when the environment's joints or actor observations are not those the policy was trained on."""
+    saved = data["layout"]
+    if list(saved["joints"]) != list(layout["joints"]):
+        raise UserError(f"{path}: trained with joints {', '.join(saved['joints'])}; this environment has"
+                        f" {', '.join(layout['joints'])}")
+    old, new = ([tuple(r) for r in x["observations"]["actor"]] for x in (saved, layout))
+    if old != new:
+        at = next((i for i, (a, b) in enumerate(zip(old, new)) if a != b), min(len(old), len(new)))
+        had, has = (f"{x[at][0]} ({x[at][1]})" if at < len(x) else "nothing" for x in (old, new))
+        raise UserError(f"{path}: trained on other observations: entry {at} of the actor's was {had}, here it is {has};"
+                        " drop the override that changes them")
+
+
+def layout_of(env: Any) -> dict[str, Any]:
+    """Joint and observation layout of an environment, for the checkpoint (plain lists and text)."""
+    tables = env.describe()
+    groups = {g: [[str(row[0]), int(row[1])] for row in rows] for g, rows in tables["observations"].items()}
+    return {"joints": [str(n) for n in env.action_names],
+            "action": [[str(v) if isinstance(v, str) else float(v) for v in row] for row in tables["action"]],
+            "observations": groups}
+
+
+def git_state(folder: Path | None = None) -> dict[str, Any]:
+    """Commit of the dexsim in use and whether its tracked files differ from it; "unknown" outside a git checkout."""
+    folder = folder or Path(__file__).resolve().parent
+
+    def git(*args: str) -> str | None:
+        try:
+            done = subprocess.run(["git", "-C", str(folder), *args], capture_output=True, text=True, timeout=20)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if not git("ls-files", "__init__.py"):  # e.g. installed into a virtual environment inside some other repository
+        return {"commit": "unknown", "dirty": False}
+    return {"commit": git("rev-parse", "HEAD") or "unknown",
+            "dirty": bool(git("status", "--porcelain", "--untracked-files=no"))}
+
+
+def rng_state() -> dict[str, Any]:
+    """State of every global random generator, as tensors and plain numbers."""
+    name, keys, position, has_gauss, cached = np.random.get_state()
+    version, internal, gauss = random.getstate()
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [str(name), torch.from_numpy(keys.astype(np.int64)), int(position), int(has_gauss), float(cached)],
+        "python": [int(version), torch.tensor(internal, dtype=torch.int64), gauss],
+    }
+
+
+def set_rng_state(state: dict[str, Any]) -> None:
+    """Put :func:`rng_state` back. CUDA generators are set as far as this machine has the same devices."""
+    torch.set_rng_state(state["torch"].cpu())
+    for index, value in enumerate(state["cuda"][: torch.cuda.device_count() if torch.cuda.is_available() else 0]):
+        torch.cuda.set_rng_state(value.cpu(), index)
+    name, keys, position, has_gauss, cached = state["numpy"]
+    np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, cached))
+    version, internal, gauss = state["python"]
+    random.setstate((version, tuple(internal.tolist()), gauss))

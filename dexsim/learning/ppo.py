@@ -1,0 +1,80 @@
+"""rsl-rl's PPO from a dexsim config: the agent's settings, and a policy alone for replay."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # rsl-rl imports GitPython, which fails where git is not installed
+
+import torch
+from rsl_rl.utils import resolve_class
+from tensordict import TensorDict
+
+from dexsim.errors import UserError
+
+Policy = Callable[[TensorDict], torch.Tensor]  # observations -> actions [N, A]
+
+
+def agent_config(cfg: dict[str, Any], device: str) -> dict[str, Any]:
+    """The nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep."""
+    agent = copy.deepcopy(cfg["agent"])
+    agent["seed"], agent["save_interval"] = cfg["seed"], cfg["save_interval"]
+    if agent.get("check_for_nan") is None:
+        agent["check_for_nan"] = device == "cpu"
+    return agent
+
+
+@contextlib.contextmanager
+def agent_errors() -> Iterator[None]:
+    """Keep rsl-rl's own printing away and turn its refusals of agent settings into UserError."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    except (TypeError, ImportError, AttributeError) as error:
+        raise UserError(f"agent settings: rsl-rl refuses them: {str(error).splitlines()[0]}") from error
+    except ValueError as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"agent settings: {str(error).splitlines()[0]}") from error
+
+
+def load_policy(data: dict[str, Any], env: Any, path: str) -> Policy:
+    """The trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
+
+    Args:
+        data: what :func:`dexsim.learning.checkpoint.load` returned.
+        env: the environment rebuilt from its config; gives observation sizes.
+        path: the file's name, for messages.
+    """
+    agent = agent_config(data["config"], str(env.device))
+    with agent_errors():
+        kind, settings = resolve_class(agent["actor"])
+        actor = kind(env.get_observations(), agent["obs_groups"], "actor", env.num_actions, **settings).to(env.device)
+    try:
+        actor.load_state_dict(data["actor"])
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: its policy does not fit this environment ({reason})") from None
+    return actor.eval()
+
+
+def plain_policy(name: str, env: Any, seed: int) -> Policy:
+    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform over the action range) or ``scripted``
+    (the task's own, from ``env.scripted_policy()``)."""
+    shape = (env.num_envs, env.num_actions)
+    if name == "zero":
+        return lambda obs: torch.zeros(shape, device=env.device)
+    if name == "random":
+        generator = torch.Generator(device=env.device).manual_seed(seed)
+        low, high = (torch.tensor([float(row[i]) for row in env.describe()["action"]], device=env.device) for i in (1, 2))
+        return lambda obs: low + (high - low) * torch.rand(shape, generator=generator, device=env.device)
+    if name == "scripted":
+        if not hasattr(env, "scripted_policy"):
+            raise UserError("policy=scripted: this task has no scripted policy; use random or zero")
+        return env.scripted_policy()
+    raise UserError(f"policy={name}: must be random, zero or scripted (a trained one is given as checkpoint=PATH)")

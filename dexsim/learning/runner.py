@@ -1,0 +1,147 @@
+"""The training loop: rsl-rl's PPO and writer in a loop of our own.
+
+rsl-rl's ``OnPolicyRunner`` builds the algorithm. Its ``learn``, ``save`` and console are replaced, because they repeat
+an iteration after a resume, stall the GPU at each step for their statistics, and save neither config nor random state.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dexsim.learning import checkpoint
+from dexsim.learning.meter import Meter
+from dexsim.learning.ppo import agent_config, agent_errors
+
+import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
+from rsl_rl.runners import OnPolicyRunner  # isort: skip
+from rsl_rl.utils import check_nan  # isort: skip
+
+from dexsim.errors import UserError
+
+
+class Runner(OnPolicyRunner):
+    """PPO on a dexsim environment.
+
+    Args:
+        env: an rsl-rl ``VecEnv`` with ``describe``, ``state_dict``, ``load_state_dict``, ``action_names``.
+        cfg: the resolved config, kept in every checkpoint.
+        versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
+
+    ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included.
+    """
+
+    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str]) -> None:
+        self.full_cfg, self._versions, self._git = cfg, versions, checkpoint.git_state()
+        device = str(env.device)
+        with agent_errors():
+            super().__init__(env, agent_config(cfg, device), log_dir=None, device=device)
+        self.iteration, self.steps = 0, 0
+        self._meter = Meter(env.num_envs, device)
+        self._layout = checkpoint.layout_of(env)
+        self._fresh = True
+
+    def open_writer(self, folder: Path) -> Any:
+        """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
+        known = self._git["commit"] != "unknown"
+        self.logger.log_dir, self.logger.git_status_repos = str(folder), [__file__] if known else []
+        with agent_errors():
+            self.logger.init_logging_writer()  # writes git/<repository>.diff as well
+        if not known:
+            (folder / "git").rmdir()
+        return self.logger.writer
+
+    def learn(  # type: ignore[override]
+        self,
+        iterations: int,
+        on_iteration: Callable[[dict[str, float]], None] = lambda row: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Learn until ``iterations`` are done in all; False when ``stop()`` ended it early.
+
+        ``on_iteration`` gets the iteration's scalars. A rollout that ``stop`` breaks off is dropped, an update never.
+        Raises UserError when the losses stop being finite.
+        """
+        if self._fresh and self.cfg.get("init_at_random_ep_len"):
+            self.env.episode_length_buf = torch.randint_like(
+                self.env.episode_length_buf, high=max(int(self.env.max_episode_length), 1))
+        self._fresh = False
+        self.alg.train_mode()
+        # The environment may hand out the same buffers at every step; PPO stores them only after the next one.
+        obs = self.env.get_observations().clone()
+        while self.iteration < iterations:
+            start = time.perf_counter()
+            with torch.no_grad():  # not inference_mode: what the environment keeps from here is changed in place later
+                for _ in range(self.cfg["num_steps_per_env"]):
+                    if stop():
+                        self.alg.storage.clear()
+                        self._meter.drop()
+                        return False
+                    obs = self._step(obs)
+                self.alg.compute_returns(obs)
+            collected = time.perf_counter()
+            losses = self.alg.update()
+            self._check(losses)
+            self.iteration += 1
+            self.current_learning_iteration = self.iteration
+            self.steps += self.cfg["num_steps_per_env"] * self.env.num_envs
+            row = self._meter.read()
+            row |= {f"Loss/{k}": float(v) for k, v in losses.items()}
+            row |= {"Loss/learning_rate": self.alg.learning_rate,
+                    "Policy/mean_std": self.alg.get_policy().output_std.mean().item()}
+            row |= {"collect_s": collected - start, "learn_s": time.perf_counter() - collected}
+            on_iteration({"iteration": self.iteration, "steps": self.steps} | row)
+        return True
+
+    def _step(self, obs: Any) -> Any:
+        actions = self.alg.act(obs)
+        obs, rewards, dones, extras = self.env.step(actions)
+        if self.cfg["check_for_nan"]:
+            check_nan(obs, rewards, dones)
+        obs = obs.clone()
+        self.alg.process_env_step(obs, rewards, dones, extras)
+        self._meter.add(rewards, dones, extras.get("log"))
+        return obs
+
+    def _check(self, losses: dict[str, float]) -> None:
+        if not all(math.isfinite(v) for v in losses.values()):
+            bad = ", ".join(f"{k}={v}" for k, v in losses.items() if not math.isfinite(v))
+            raise UserError(f"learning diverged at iteration {self.iteration + 1} ({bad}); continue from the last"
+                            " checkpoint with a lower agent.algorithm.learning_rate or desired_kl")
+
+    def payload(self) -> dict[str, Any]:
+        """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
+        learned = self.alg.save()
+        return {
+            "kind": "train", "config": self.full_cfg, "versions": self._versions, "git": self._git,
+            "layout": self._layout, "iteration": self.iteration, "steps": self.steps,
+            "actor": learned["actor_state_dict"], "critic": learned["critic_state_dict"],
+            "optimizer": learned["optimizer_state_dict"], "env": self.env.state_dict(), "rng": checkpoint.rng_state(),
+        }
+
+    def restore(self, data: dict[str, Any], path: str) -> None:
+        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state.
+
+        Raises UserError when it holds only a policy or does not fit this environment.
+        """
+        if data["kind"] != "train":
+            raise UserError(f"{path}: holds only a policy, nothing to resume; use the last.pt of its run folder")
+        checkpoint.check_layout(data, self._layout, path)
+        try:
+            self.alg.load({"actor_state_dict": data["actor"], "critic_state_dict": data["critic"],
+                           "optimizer_state_dict": data["optimizer"]}, None, True)
+        except (RuntimeError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path}: does not fit the networks of this run ({reason})") from None
+        self.iteration, self.steps = int(data["iteration"]), int(data["steps"])
+        self.env.load_state_dict(data["env"])
+        checkpoint.set_rng_state(data["rng"])
+        self._fresh = False
+
+    def policy(self) -> Any:
+        """The actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
+        self.alg.eval_mode()
+        return self.alg.get_policy()

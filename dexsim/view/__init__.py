@@ -1,0 +1,1 @@
+"""Headless views: plots and videos."""

@@ -1,0 +1,101 @@
+"""Plots as PNG files: learning curves of a run folder, and whatever an evaluation offers to draw.
+
+    python -m dexsim.view.plots runs/grasp/<run>      draws its curves.png again
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
+
+from dexsim.errors import UserError  # noqa: E402
+
+BLUE, LIGHT = "#1f5fa8", "#9dbfe3"
+FIRST = ("reward", "length", "step_reward")
+HIDDEN = ("iteration", "steps", "collect_s", "learn_s", "episodes", "time_s")
+TITLES = {"reward": "reward of an episode", "length": "length of an episode (steps)", "step_reward": "reward of a step"}
+
+
+def read_progress(path: Path) -> dict[str, list[float]]:
+    """Columns of a run's ``progress.csv``; an empty cell is NaN. Raises UserError where there is none."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; train.py writes it into the run folder")
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = list(rows[0]) if rows else []
+    return {n: [float(r[n]) if r[n] else math.nan for r in rows] for n in names}
+
+
+def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path:
+    """Learning curves against environment steps: reward, episode length, then every logged term; saved to ``path``.
+
+    Thin line: each iteration; thick line: mean over a twentieth of the run.
+    """
+    names = [n for n in FIRST if n in columns]
+    names += sorted((n for n in columns if n not in FIRST and n not in HIDDEN), key=_order)
+    names = [n for n in names if any(math.isfinite(v) for v in columns[n])]
+    across = min(4, max(1, len(names)))
+    down = max(1, math.ceil(len(names) / across))
+    figure = Figure(figsize=(3.6 * across, 2.5 * down), layout="constrained")
+    steps = columns.get("steps", [])
+    for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, names):
+        points = [(x, y) for x, y in zip(steps, columns[name]) if math.isfinite(y)]
+        x, y = [p[0] for p in points], [p[1] for p in points]
+        axes.plot(x, y, color=LIGHT, linewidth=0.8, marker="." if len(x) < 3 else None)
+        axes.plot(x, smooth(y, max(1, len(y) // 20)), color=BLUE, linewidth=1.6)
+        axes.set_title(TITLES.get(name, name), fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.25)
+    for axes in figure.axes[len(names):]:
+        axes.set_axis_off()
+    for axes in figure.axes[max(0, len(names) - across): len(names)]:
+        axes.set_xlabel("environment steps", fontsize=8)
+    if title:
+        figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def _order(name: str) -> tuple[int, str]:
+    """Task terms first, then losses and the rest."""
+    return (1 if name.startswith(("Loss/", "Policy/", "Perf/")) else 0, name)
+
+
+def smooth(values: Sequence[float], width: int) -> list[float]:
+    """Mean of each value and up to ``width - 1`` before it."""
+    total, out = 0.0, []
+    for i, value in enumerate(values):
+        total += value - (values[i - width] if i >= width else 0.0)
+        out.append(total / min(i + 1, width))
+    return out
+
+
+def draw(functions: Sequence[Callable[[Any], None]], folder: Path) -> list[Path]:
+    """Each function draws on one axes; saved as ``<function name>.png`` (``plot_<k>.png`` for a nameless one)."""
+    paths = []
+    for k, function in enumerate(functions):
+        name = getattr(function, "__name__", "")
+        figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+        function(figure.subplots())
+        path = folder / f"{name if name.isidentifier() and name != 'function' else f'plot_{k}'}.png"
+        figure.savefig(path, dpi=120)
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    try:
+        for argument in sys.argv[1:]:
+            run = Path(argument)
+            print(curves(read_progress(run / "progress.csv"), run / "curves.png", str(run)))
+    except UserError as problem:
+        sys.exit(f"error: {problem}")

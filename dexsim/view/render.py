@@ -1,0 +1,139 @@
+"""The rendering process of :mod:`dexsim.view.video`; not for direct use.
+
+    MUJOCO_GL=egl python -m dexsim.view.render FOLDER OUT.mp4
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+NO_GL = 3
+LONGEST_S = 60.0
+FASTEST = 60.0  # frames per second that a video needs at most
+# Palm frame = world frame: fingers along +x, palm normal +z. Three-quarter view from the fingers' side, a little above.
+CAMERA = {"lookat": [0.055, 0.0, 0.035], "distance": 0.46, "azimuth": 140.0, "elevation": -28.0}
+
+
+def main(folder: Path, path: Path) -> int:
+    """Render what ``folder`` holds; prints ``frame <k> <n>`` lines."""
+    try:
+        import mujoco
+
+        context = mujoco.GLContext(64, 64)
+        context.make_current()
+        context.free()
+    except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
+        print(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        return NO_GL
+    settings = json.loads((folder / "settings.json").read_text())
+    try:
+        film(folder, path, settings)
+    except OSError as error:
+        print(error.strerror or error)
+        return 1
+    return 0
+
+
+def film(folder: Path, path: Path, settings: dict[str, Any]) -> None:
+    """Render all frames and pipe them to ffmpeg; the file appears under its name only when it is whole."""
+    import imageio_ffmpeg
+
+    tiles = [Tile(folder, k, clip, settings) for k, clip in enumerate(settings["clips"])]
+    every = max(1, math.ceil(1.0 / settings["dt"] / FASTEST - 1e-6))
+    rate = 1.0 / (settings["dt"] * every)
+    longest = max(len(t.qpos) for t in tiles)
+    chosen = range(0, min(longest, int(LONGEST_S / settings["dt"])), every)
+    part = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
+    writer = None
+    try:
+        for n, k in enumerate(chosen):
+            frame = grid([tile.frame(k) for tile in tiles])
+            if writer is None:
+                writer = imageio_ffmpeg.write_frames(
+                    str(part), (frame.shape[1], frame.shape[0]), fps=rate, codec="libx264", pix_fmt_in="rgb24",
+                    pix_fmt_out="yuv420p", quality=7, macro_block_size=2, output_params=["-movflags", "+faststart"])
+                writer.send(None)
+            writer.send(np.ascontiguousarray(frame))
+            if n % 10 == 0 or n == len(chosen) - 1:
+                print("frame", n + 1, len(chosen), flush=True)
+        if writer is not None:
+            writer.close()
+            os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class Tile:
+    """One world: renders its frames with label and bars."""
+
+    def __init__(self, folder: Path, index: int, clip: dict[str, Any], settings: dict[str, Any]) -> None:
+        import mujoco
+
+        self._mujoco, self._clip, self._settings = mujoco, clip, settings
+        arrays = np.load(folder / f"{index}.npz")
+        self.qpos = arrays["qpos"]
+        self._force = arrays["force"] if "force" in arrays else None
+        self._command = arrays["command"] if "command" in arrays else None
+        width, height = settings["size"]
+        model = mujoco.MjModel.from_binary_path(str(folder / f"{index}.mjb"))
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 4
+        model.vis.quality.shadowsize = 2048
+        model.vis.headlight.ambient[:] = 0.35
+        model.vis.headlight.diffuse[:] = 0.45
+        model.vis.headlight.specular[:] = 0.15
+        model.vis.map.znear = 0.02
+        self._sky = any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._renderer = mujoco.Renderer(model, height, width)
+        self._camera = mujoco.MjvCamera()
+        view = CAMERA | settings["camera"]
+        self._camera.lookat[:] = view["lookat"]
+        self._camera.distance, self._camera.azimuth = view["distance"], view["azimuth"]
+        self._camera.elevation = view["elevation"]
+        self._behind = backdrop(height, width)
+
+    def frame(self, k: int) -> np.ndarray:
+        """Frame ``k`` [H, W, 3] uint8; past the end, the last one."""
+        from dexsim.view.overlay import annotate
+
+        k = min(k, len(self.qpos) - 1)
+        self._data.qpos[:] = self.qpos[k]
+        self._mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        image = self._renderer.render()
+        if not self._sky:
+            image = np.where(image.any(axis=2, keepdims=True), image, self._behind)
+        lines = self._clip["text"]
+        text = "   ".join(t for t in (self._clip["label"], lines[min(k, len(lines) - 1)] if lines else "") if t)
+        return annotate(
+            image, text, None if self._force is None else self._force[min(k, len(self._force) - 1)],
+            None if self._command is None else self._command[min(k, len(self._command) - 1)],
+            self._settings["names"], self._settings["full"])
+
+
+def backdrop(height: int, width: int) -> np.ndarray:
+    """A quiet grey-blue gradient [H, W, 3] uint8 where nothing was drawn."""
+    mix = np.linspace(0.0, 1.0, height)[:, None, None]
+    colour = (1 - mix) * np.array([206, 214, 224]) + mix * np.array([120, 132, 148])
+    return np.broadcast_to(colour, (height, width, 3)).astype(np.uint8)
+
+
+def grid(tiles: list[np.ndarray]) -> np.ndarray:
+    """Tiles [H, W, 3] in rows: 1, 1x2, 2x2, 2x3, 3x3 ...; empty places stay dark."""
+    across = math.ceil(math.sqrt(len(tiles)))
+    down = math.ceil(len(tiles) / across)
+    blank = np.full_like(tiles[0], 24)
+    tiles = tiles + [blank] * (across * down - len(tiles))
+    return np.concatenate([np.concatenate(tiles[r * across:(r + 1) * across], axis=1) for r in range(down)], axis=0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))
