@@ -1,0 +1,199 @@
+"""The servo of an engine's joints: its table, its state, and the launch that runs before each physics step."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Sequence
+
+import mujoco
+import torch
+import warp as wp
+
+from dexsim.actuator.columns import INDEX, NAMES, column, did_you_mean
+from dexsim.actuator.kernel import QUEUE, SLOTS, reset_kernel, send_kernel, servo_kernel
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+
+FIELDS = ("dof_damping", "dof_frictionloss")  # per-world model fields that the engine must declare
+
+
+class Servo:
+    """Drives J named hinge or slide joints of an engine with N worlds. The law and its integration: `kernel.py`.
+
+    Arguments:
+        engine: see `dexsim.sim`; the fields in `FIELDS` declared per world; timestep fixed.
+        joints: names of the joints, in the order of every [N, J] array here.
+        table: what is believed of the drives; written to every world.
+        control_period: shortest time between targets [s], so that the queue outlasts the longest delay (else 8).
+        driven, loop, reported: names of the joints that the motor drives, that the loop's encoder reads and that
+            `position()` reports, where a mechanism has separate rotor joints; default `joints`.
+
+    Tensors share memory with the kernel; write them in place:
+        params [N, J, C] columns of `columns.py`, SI; nominal [J, C] as the table states them;
+        state [N, J, S] slots `slots`: motor torque of the last step [N.m], enabled (1 driven, 0 free), then the queue's
+            stamps [s] and targets [rad], oldest first;
+        torque [N, J] motor torque as its current shows it, at the start of the last physics step: after clipping and
+            lag, before efficiency and friction, positive along positive joint position [N.m];
+        base_damping, base_frictionloss [N, J] the model's own joint damping and friction, to which the servo's are
+            added. Randomize these, not the model fields, which the servo overwrites before each physics step.
+    """
+
+    def __init__(
+        self,
+        engine: Any,
+        joints: Sequence[str],
+        table: ServoTable,
+        *,
+        control_period: float | None = None,
+        driven: Sequence[str] | None = None,
+        loop: Sequence[str] | None = None,
+        reported: Sequence[str] | None = None,
+    ):
+        self.engine = engine
+        self.joints = tuple(joints)
+        self.table = table
+        mjm, n, device, real = engine.mjm, engine.n, engine.device, engine.real
+        known = [name for name in (mjm.joint(i).name for i in range(mjm.njnt)) if name]
+        table.check_joints([*known, *self.joints])
+        dof_q, dof = _addresses(mjm, driven or joints, known, len(self.joints))
+        loop_q, loop_dof = _addresses(mjm, loop or joints, known, len(self.joints))
+        reported_q, reported_dof = _addresses(mjm, reported or joints, known, len(self.joints))
+        if len(set(dof)) != len(dof):
+            raise UserError(f"servo: a joint is driven twice in {list(driven or joints)}; each joint has one drive.")
+
+        nominal = table.nominal(self.joints)
+        self.queue = 8
+        if control_period:  # the newest entry, one a period through the longest delay, and one before
+            longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
+            self.queue = max(8, math.ceil(longest / control_period) + 3)
+        self.slots = {name: i for i, name in enumerate(SLOTS)}
+        for k in range(self.queue):
+            self.slots[f"stamp{k}"] = QUEUE + k
+            self.slots[f"target{k}"] = QUEUE + self.queue + k
+
+        j, c, s = len(self.joints), len(NAMES), QUEUE + 2 * self.queue
+        zeros = lambda *shape: wp.zeros(shape, dtype=real, device=device)  # noqa: E731
+        index = lambda values: wp.array(values, dtype=int, device=device)  # noqa: E731
+        self._params, self._state, self._torque = zeros(n, j, c), zeros(n, j, s), zeros(n, j)
+        self._base_damping, self._base_frictionloss = zeros(n, j), zeros(n, j)
+        self._target, self._stamp = zeros(n, j), zeros(n)
+        self._mask = wp.zeros(n, dtype=wp.bool, device=device)
+        self._dof, self._dof_q, self._loop_q, self._loop_dof = index(dof), index(dof_q), index(loop_q), index(loop_dof)
+
+        self.params, self.state, self.torque = (wp.to_torch(a) for a in (self._params, self._state, self._torque))
+        self.base_damping = wp.to_torch(self._base_damping)
+        self.base_frictionloss = wp.to_torch(self._base_frictionloss)
+        self._target_t, self._stamp_t, self._mask_t = (wp.to_torch(a) for a in (self._target, self._stamp, self._mask))
+        as_tensor = lambda x: torch.as_tensor(x, dtype=self.params.dtype, device=self.params.device)  # noqa: E731
+        self._as_tensor = as_tensor
+        self._reported_q = torch.as_tensor(reported_q, device=self.params.device)
+        self._reported_dof = torch.as_tensor(reported_dof, device=self.params.device)
+
+        self.nominal = as_tensor(nominal)
+        self.params[:] = self.nominal
+        self.base_damping[:] = as_tensor(mjm.dof_damping[dof])
+        self.base_frictionloss[:] = as_tensor(mjm.dof_frictionloss[dof])
+        self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
+        self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
+
+        self._servo = servo_kernel(real, table.drive == "voltage")
+        self._send, self._reset = send_kernel(real), reset_kernel(real)
+        self._period = 1.0 / table.control_rate if table.control_rate else 0.0
+        self._shape = (n, j)
+        self._wp = engine.wp
+        self._fields = {name: engine.wp_field(name) for name in FIELDS}
+        self.reset(None, as_tensor(mjm.qpos0[loop_q]).expand(n, j))
+
+    # -- parameters ------------------------------------------------------------
+
+    def column(self, name: str) -> torch.Tensor:
+        """[N, J] view of one column of `params`; UserError with the valid names for another name."""
+        return self.params[:, :, INDEX[column(name).name]]
+
+    # -- targets ------------------------------------------------------------
+
+    def send(
+        self,
+        target: torch.Tensor,
+        mask: torch.Tensor | None = None,
+        stamp: torch.Tensor | float | None = None,
+    ) -> None:
+        """Queues target [N, J] (rad) where mask [N] bool holds (None: all worlds), stamped [s] ([N] or one; None: now).
+
+        Stamps must not decrease. With the table's control_rate a target acts from that bus's next tick. No host sync.
+        """
+        self._target_t.copy_(target)
+        self._set_mask(mask)
+        time = self._wp.time
+        if stamp is not None:
+            self._stamp_t.copy_(self._as_tensor(stamp).expand_as(self._stamp_t))
+            time = self._stamp
+        self._launch(self._send, self.queue, self._period, self._mask, time, self._target, self._state)
+
+    def reset(self, mask: torch.Tensor | None, q: torch.Tensor) -> None:
+        """Puts the drives of the masked worlds [N] bool (None: all) at rest, targets q [N, J] (rad) held since ever."""
+        self._target_t.copy_(q)
+        self._set_mask(mask)
+        self._launch(self._reset, self.queue, self._mask, self._target, self._state, self._torque)
+
+    # -- the step ------------------------------------------------------------
+
+    def before_each(self) -> None:
+        """Launches the servo for one physics step: the engine's `before_each` (one launch, capturable)."""
+        w = self._wp
+        self._launch(
+            self._servo, self.engine.dt, self.queue, self._dof, self._dof_q, self._loop_q, self._loop_dof,
+            self._params, self._base_damping, self._base_frictionloss, w.time, w.qpos, w.qvel,
+            self._state, w.qfrc_applied, self._fields["dof_damping"], self._fields["dof_frictionloss"], self._torque,
+        )  # fmt: skip
+
+    # -- what an observer reads ------------------------------------------------------------
+
+    def position(self) -> torch.Tensor:
+        """[N, J] position that the encoders report: scale * position + offset of the reported joints [rad]."""
+        return self.column("position_scale") * self.engine.t.qpos[:, self._reported_q] + self.column("position_offset")
+
+    def velocity(self) -> torch.Tensor:
+        """[N, J] velocity that the encoders report [rad/s]."""
+        return self.column("position_scale") * self.engine.t.qvel[:, self._reported_dof]
+
+    # -- state ------------------------------------------------------------
+
+    def get_state(self) -> torch.Tensor:
+        """A copy of state [N, J, S]."""
+        return self.state.clone()
+
+    def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None) -> None:
+        """Sets state [N, J, S] in the masked worlds [N] bool (None: all)."""
+        if mask is None:
+            self.state.copy_(state)
+        else:
+            self.state.copy_(torch.where(mask[:, None, None], state, self.state))
+        self.torque.copy_(self.state[:, :, self.slots["motor"]])
+
+    def _set_mask(self, mask: torch.Tensor | None) -> None:
+        if mask is None:
+            self._mask_t.fill_(True)
+        else:
+            self._mask_t.copy_(mask)
+
+    def _launch(self, kernel, *args) -> None:
+        wp.launch(kernel, dim=self._shape, inputs=list(args), device=self.engine.device)
+
+
+def _addresses(mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int):
+    """qpos and dof addresses of the named joints; UserError for an unknown name or a joint not a hinge or slide."""
+    if len(names) != count:
+        raise UserError(f"servo: {len(names)} joints given where {count} are driven: {list(names)}.")
+    qpos, dof = [], []
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise UserError(f"servo: joint '{name}' is not in the model.{hint} Its joints: {', '.join(known)}")
+        joint = mjm.joint(name)
+        joint = mjm.joint(name).id
+        if int(mjm.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            raise UserError(f"servo: joint '{name}' is neither a hinge nor a slide; a servo drives those only.")
+        qpos.append(int(mjm.jnt_qposadr[joint]))
+        dof.append(int(mjm.jnt_dofadr[joint]))
+    return qpos, dof

@@ -1,0 +1,326 @@
+"""What is believed of a mechanism's drives: the `servo.yaml` format, read, checked, resolved per joint, written back.
+
+    drive: torque                  # or voltage
+    joints:
+      "*": {kp: 1.5, kd: 0.03}     # every joint; a joint's own entry wins, column by column
+      index_bend_joint: {kp: 0.8, delay: [0.0, 0.02], kd: {value: 0.02, low: 0.01, high: 0.03}, lag: unknown}
+    current_per_torque: 0.9        # A per N.m; this and the encoder keys may also be mappings by joint name
+    control_rate: 100              # Hz at which targets reach the servo; absent: they act when stamped
+    loop_rate: 1000                # Hz of the servo's own loop (carried along: the simulated loop is continuous)
+    loop_encoder: joint            # joint or motor
+    position_encoder: joint        # joint or motor
+    supply_voltage: 24.0           # V
+
+A value is a number, a range [low, high], a number with its range, or `unknown`; an absent column is ideal (neutral).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Iterable, Sequence
+
+import numpy as np
+import yaml
+
+from dexsim.actuator.columns import COLUMNS, INDEX, NAMES, Column, did_you_mean
+from dexsim.errors import UserError
+
+DRIVES = ("torque", "voltage")
+SIDES = ("joint", "motor")
+KEYS = (
+    "drive",
+    "joints",
+    "current_per_torque",
+    "control_rate",
+    "loop_rate",
+    "loop_encoder",
+    "position_encoder",
+    "supply_voltage",
+)
+ALL = "*"
+
+
+@dataclass(frozen=True)
+class Value:
+    """One entry: `value` (None where unknown) in the range it is believed in (a bare number: low == value == high)."""
+
+    value: float | None
+    low: float
+    high: float
+
+    @property
+    def unknown(self) -> bool:
+        return self.value is None
+
+
+def _number(x: Any) -> float | None:
+    """x as a float, or None if it is not a number (YAML reads 1e-3 as text: accept that)."""
+    if isinstance(x, bool) or x is None:
+        return None
+    if isinstance(x, (int, float)):
+        return float(x)
+    if isinstance(x, str):
+        try:
+            return float(x)
+        except ValueError:
+            return None
+    return None
+
+
+def parse_value(raw: Any, column: Column, where: str) -> Value:
+    """A `servo.yaml` value as a Value inside the column's allowed range; UserError starting with `where`."""
+    allowed = f"allowed: {column.low:g} .. {column.high:g} {column.unit}"
+    if isinstance(raw, str) and raw == "unknown":
+        return Value(None, column.low, column.high)
+    if isinstance(raw, (list, tuple)):
+        numbers = [_number(x) for x in raw]
+        if len(numbers) != 2:
+            raise UserError(f"{where}: a range needs two numbers [low, high], got {list(raw)}; {allowed}.")
+        low, high, value = numbers[0], numbers[1], None
+    elif isinstance(raw, dict):
+        extra = sorted(set(raw) - {"value", "low", "high"})
+        if extra or "value" not in raw:
+            raise UserError(f"{where}: expected {{value: .., low: .., high: ..}}, got {raw}; {allowed}.")
+        value = _number(raw["value"])
+        low, high = _number(raw.get("low", raw["value"])), _number(raw.get("high", raw["value"]))
+        numbers = [value, low, high]
+    else:
+        value = low = high = _number(raw)
+        numbers = [value]
+    if any(n is None or math.isnan(n) for n in numbers):
+        raise UserError(f"{where}: {raw!r} is not a number, [low, high], {{value, low, high}} or 'unknown'; {allowed}.")
+    for n in numbers:
+        if not column.low <= n <= column.high and n != column.neutral:
+            raise UserError(f"{where}: {n:g} {column.unit} is out of range; {allowed}.")
+    if low > high:
+        raise UserError(f"{where}: the range is upside down, low {low:g} > high {high:g}; {allowed}.")
+    if value is None:
+        value = low if low == high else 0.5 * (low + high)
+        if math.isinf(value):
+            raise UserError(f"{where}: [{low:g}, {high:g}] has no middle; give {{value: .., low: .., high: ..}}.")
+    if not low <= value <= high:
+        raise UserError(f"{where}: value {value:g} is outside its own range {low:g} .. {high:g}.")
+    return Value(value, low, high)
+
+
+@dataclass
+class ServoTable:
+    """The drives of a mechanism as `servo.yaml` states them; `entries[joint or "*"][column]` is what it says."""
+
+    drive: str = "torque"
+    entries: dict[str, dict[str, Value]] = field(default_factory=dict)
+    current_per_torque: float | str | dict | None = None  # A per N.m, "unknown", or by joint name
+    control_rate: float | None = None  # Hz
+    loop_rate: float | None = None  # Hz
+    loop_encoder: str | dict = "joint"
+    position_encoder: str | dict = "joint"
+    supply_voltage: float | None = None  # V
+    source: str = "servo"  # named in errors
+
+    # -- reading and writing ------------------------------------------------------------
+
+    @classmethod
+    def load(cls, path: str | Path) -> ServoTable:
+        """The table in a YAML file; UserError if it is missing, not YAML, or states something impossible."""
+        path = Path(path)
+        try:
+            raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UserError(f"servo file '{path}' does not exist; servo_file=PATH must name a servo.yaml.") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"servo file '{path}' cannot be read: {error}.") from None
+        except yaml.YAMLError as error:
+            text = " ".join(str(error).split())
+            raise UserError(f"servo file '{path}' is not valid YAML: {text}.") from None
+        return cls.from_dict(raw, source=str(path))
+
+    @classmethod
+    def from_dict(cls, raw: Any, source: str = "servo") -> ServoTable:
+        """The table in a plain mapping of the file's content (of a resolved Hydra config, say)."""
+        if not isinstance(raw, dict):
+            raise UserError(f"{source}: expected a mapping with the keys {', '.join(KEYS)}; got {type(raw).__name__}.")
+        for key in raw:
+            if key not in KEYS:
+                hint = did_you_mean(key, KEYS)
+                raise UserError(f"{source}: key '{key}' does not exist.{hint} Valid keys: {', '.join(KEYS)}")
+        drive = raw.get("drive", "torque")
+        if drive not in DRIVES:
+            hint = did_you_mean(drive, DRIVES)
+            raise UserError(f"{source}: drive '{drive}' does not exist.{hint} Valid: {', '.join(DRIVES)}")
+        joints = raw.get("joints") or {}
+        if not isinstance(joints, dict):
+            raise UserError(f'{source}: joints must map joint names (or "*") to columns; got {type(joints).__name__}.')
+        entries: dict[str, dict[str, Value]] = {}
+        for joint, columns in joints.items():
+            if columns is None:
+                columns = {}
+            if not isinstance(columns, dict):
+                raise UserError(f"{source}: joints.{joint} must be like {{kp: 1.5}}; got {columns!r}.")
+            entries[str(joint)] = {}
+            for name, value in columns.items():
+                where = f"{source}: joints.{joint}.{name}"
+                if name not in INDEX:
+                    hint = did_you_mean(name, NAMES)
+                    raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
+                entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
+        table = cls(
+            drive=drive,
+            entries=entries,
+            current_per_torque=_scalar_or_map(raw, "current_per_torque", source, unknown=True),
+            control_rate=_positive(raw, "control_rate", "Hz", source),
+            loop_rate=_positive(raw, "loop_rate", "Hz", source),
+            loop_encoder=_side(raw, "loop_encoder", source),
+            position_encoder=_side(raw, "position_encoder", source),
+            supply_voltage=_positive(raw, "supply_voltage", "V", source),
+            source=source,
+        )
+        return table
+
+    def to_dict(self) -> dict:
+        """The file's content again: `from_dict(table.to_dict())` is the same table."""
+        out: dict[str, Any] = {"drive": self.drive, "joints": {}}
+        for joint, columns in self.entries.items():
+            out["joints"][joint] = {name: _plain(value) for name, value in columns.items()}
+        for key in KEYS[2:]:
+            value = getattr(self, key)
+            if value is not None:
+                out[key] = copy.deepcopy(value)
+        return out
+
+    def save(self, path: str | Path) -> None:
+        """Writes the table as a `servo.yaml`, replacing the file only once the new one is complete."""
+        path = Path(path)
+        temporary = path.with_name(path.name + ".part")
+        try:
+            text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=120)
+            temporary.write_text(text, encoding="utf-8")
+            temporary.replace(path)
+        except OSError as error:
+            raise UserError(f"servo file '{path}' cannot be written: {error}.") from None
+
+    # -- what holds for a joint ------------------------------------------------------------
+
+    def check_joints(self, known: Iterable[str]) -> None:
+        """UserError if the table names a joint that is not among `known`."""
+        known = list(known)
+        for mapping in (self.entries, self.current_per_torque, self.loop_encoder, self.position_encoder):
+            for joint in mapping if isinstance(mapping, dict) else ():
+                if joint != ALL and joint not in known:
+                    hint = did_you_mean(joint, known)
+                    raise UserError(
+                        f"{self.source}: joint '{joint}' does not exist.{hint} Valid joints: {', '.join(known)}"
+                    )
+
+    def value(self, joint: str, column: str) -> Value:
+        """What the table says of one joint and column; the neutral value where it says nothing."""
+        for key in (joint, ALL):
+            if column in self.entries.get(key, {}):
+                return self.entries[key][column]
+        neutral = COLUMNS[INDEX[column]].neutral
+        return Value(neutral, neutral, neutral)
+
+    def set(
+        self,
+        joint: str,
+        column: str,
+        value: float | None,
+        low: float | None = None,
+        high: float | None = None,
+    ) -> None:
+        """States one joint's column (a fit, say); checked like a file's entry. value None: unknown."""
+        if column not in INDEX:
+            hint = did_you_mean(column, NAMES)
+            raise UserError(f"{self.source}: no such servo column '{column}'.{hint} Valid: {', '.join(NAMES)}")
+        raw: Any = "unknown"
+        if value is not None:
+            raw = {"value": value, "low": value if low is None else low, "high": value if high is None else high}
+        parsed = parse_value(raw, COLUMNS[INDEX[column]], f"{self.source}: joints.{joint}.{column}")
+        self.entries.setdefault(joint, {})[column] = parsed
+
+    def nominal(self, joints: Sequence[str]) -> np.ndarray:
+        """[J, C] float64: values in the order of `COLUMNS`; unknown ones neutral, except kp, which must be known."""
+        out = np.empty((len(joints), len(COLUMNS)))
+        for j, joint in enumerate(joints):
+            for c, column in enumerate(COLUMNS):
+                value = self.value(joint, column.name)
+                if value.unknown and column.name == "kp":
+                    raise UserError(
+                        f"{self.source}: joints.{joint}.kp is unknown; state a number, or fit it to a recording."
+                    )
+                out[j, c] = column.neutral if value.unknown else value.value
+        if self.drive == "voltage":
+            for j, joint in enumerate(joints):
+                if math.isinf(out[j, INDEX["torque_limit"]]):
+                    raise UserError(
+                        f"{self.source}: drive: voltage needs joints.{joint}.torque_limit, the stall torque [N.m]."
+                    )
+        return out
+
+    def bounds(self, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """low, high [J, C] float64: the range each value is believed in (the column's whole range where unknown)."""
+        values = [[self.value(joint, name) for name in NAMES] for joint in joints]
+        return np.array([[v.low for v in row] for row in values]), np.array([[v.high for v in row] for row in values])
+
+    def unknown(self, joints: Sequence[str]) -> np.ndarray:
+        """[J, C] bool: where the file says `unknown`."""
+        return np.array([[self.value(joint, name).unknown for name in NAMES] for joint in joints])
+
+    def current(self, joints: Sequence[str]) -> np.ndarray:
+        """[J] float64: A per N.m of motor torque; nan where unknown or not stated."""
+        out = np.full(len(joints), np.nan)
+        for j, joint in enumerate(joints):
+            value = _lookup(self.current_per_torque, joint)
+            if isinstance(value, (int, float)):
+                out[j] = value
+        return out
+
+    def encoder(self, which: str, joints: Sequence[str]) -> list[str]:
+        """'joint' or 'motor' for each joint; which: 'loop' or 'position'."""
+        return [_lookup(getattr(self, f"{which}_encoder"), joint) or "joint" for joint in joints]
+
+
+def _lookup(value: Any, joint: str) -> Any:
+    """A plain value, or its entry by joint name, or by "*"."""
+    if isinstance(value, dict):
+        return value.get(joint, value.get(ALL))
+    return value
+
+
+def _plain(value: Value) -> Any:
+    if value.unknown:
+        return "unknown"
+    if value.low == value.high == value.value:
+        return value.value
+    return {"value": value.value, "low": value.low, "high": value.high}
+
+
+def _positive(raw: dict, key: str, unit: str, source: str) -> float | None:
+    if raw.get(key) is None:
+        return None
+    number = _number(raw[key])
+    if number is None or not 0.0 < number < math.inf:
+        raise UserError(f"{source}: {key} is {raw[key]!r}; it must be a number > 0 [{unit}].")
+    return number
+
+
+def _scalar_or_map(raw: dict, key: str, source: str, unknown: bool) -> float | str | dict | None:
+    value = raw.get(key)
+    if isinstance(value, dict):
+        return {str(joint): _scalar_or_map({key: v}, key, f"{source}: {joint}", unknown) for joint, v in value.items()}
+    if value == "unknown" and unknown:
+        return "unknown"
+    return _positive(raw, key, "A per N.m", source)
+
+
+def _side(raw: dict, key: str, source: str) -> str | dict:
+    value = raw.get(key)
+    if value is None:
+        return "joint"
+    if isinstance(value, dict):
+        return {str(joint): _side({key: v}, key, f"{source}: {joint}") for joint, v in value.items()}
+    if value not in SIDES:
+        raise UserError(f"{source}: {key} is {value!r};{did_you_mean(value, SIDES)} valid: {', '.join(SIDES)}.")
+    return value
