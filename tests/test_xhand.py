@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import shutil
+
 import mujoco
 import numpy as np
 import pytest
 import trimesh
 
 from dexsim.assets import xhand
-from dexsim.assets.xhand.surface import PADS, Lattice, to_sensor
+from dexsim.assets.xhand import build
+from dexsim.assets.xhand.surface import PADS, Lattice, to_link, to_sensor
 
 # Measured: mass (kg), com (m), ixx iyy izz ixy ixz iyz (kg m^2) of the moving links alone, link frame.
 LINKS = {
@@ -155,7 +159,8 @@ def test_joint_axes_move_the_tips_the_measured_way(model, data):
     start = {site: data.site(site).xpos.copy() for site in TIPS}
     moves = [(4, "tip_index", 2, 1), (5, "tip_index", 2, 1), (6, "tip_mid", 2, 1), (7, "tip_mid", 2, 1),
              (8, "tip_ring", 2, 1), (9, "tip_ring", 2, 1), (10, "tip_pinky", 2, 1), (11, "tip_pinky", 2, 1),
-             (1, "tip_thumb", 0, 1), (2, "tip_thumb", 0, 1), (3, "tip_index", 1, -1), (0, "tip_thumb", 2, 1)]  # fmt: skip
+             (1, "tip_thumb", 0, 1), (2, "tip_thumb", 0, 1),
+             (3, "tip_index", 1, -1), (0, "tip_thumb", 2, 1)]  # fmt: skip
     for joint, site, axis, sign in moves:
         data.qpos[:] = 0
         data.qpos[joint] = 0.15
@@ -205,7 +210,7 @@ def test_only_capsules_and_one_small_hull_per_tip_collide(model):
 
 
 def test_self_collision_pairs_are_the_meant_ones(model):
-    """32 pairs: tip on tip 10, thumb tip on first links 8 and palm 6, thumb's middle link on finger tips 8."""
+    """40 pairs: tip on tip 10, thumb tip on finger links 12 and palm 6, thumb links on finger tips 12."""
     colliding = [g for g in range(model.ngeom) if model.geom_contype[g]]
     count = 0
     for i, a in enumerate(colliding):
@@ -217,7 +222,7 @@ def test_self_collision_pairs_are_the_meant_ones(model):
                 count += 1
                 names = {model.geom(a).name, model.geom(b).name}
                 assert any(name.startswith("tip_") for name in names), names
-    assert count == 32
+    assert count == 40
 
 
 def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
@@ -241,8 +246,6 @@ def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
 
 def test_capsules_stay_within_the_measured_bounds(model):
     """Every capsule lies inside its link's bounds to 1 mm (they are fitted to them)."""
-    import csv
-
     with open(xhand.FOLDER / "bodies.csv", encoding="ascii") as f:
         bounds = {row["body"]: row for row in csv.DictReader(f)}
     for g in range(model.ngeom):
@@ -319,8 +322,6 @@ def test_collision_hull_follows_the_skin(model, pad):
     hull = geom_mesh(model, f"tip_{FINGER_OF[pad]}")
     skin = surface(pad)
     u, v = skin.grid(41, 49)
-    from dexsim.assets.xhand.surface import to_link
-
     fine = to_link(skin.position(u, v).reshape(-1, 3), PADS[pad])
     assert distance(hull, lattice(pad).reshape(-1, 3)).max() <= 3e-4
     assert distance(hull, fine).max() <= 3e-4
@@ -333,16 +334,13 @@ def test_skin_mesh_is_closed_and_passes_through_the_taxels(finger):
     vertices, faces = xhand.tip_skin_mesh(finger)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_convex and mesh.volume > 4e-6
-    plane = (xhand.taxel_table(finger)["position"] @ mesh.face_normals.T - (mesh.face_normals * mesh.triangles[:, 0]).sum(1))
+    offset = (mesh.face_normals * mesh.triangles[:, 0]).sum(axis=1)
+    plane = xhand.taxel_table(finger)["position"] @ mesh.face_normals.T - offset
     assert abs(plane.max(axis=1)).max() < 1e-4  # signed distance to a convex solid
 
 
 def test_tables_agree_with_the_generator(tmp_path, monkeypatch):
     """The committed files are what build.py writes."""
-    import shutil
-
-    from dexsim.assets.xhand import build
-
     before = {p.name: p.read_text() for p in xhand.FOLDER.glob("*.*") if p.suffix in (".csv", ".xml")}
     for name in before:
         shutil.copy(xhand.FOLDER / name, tmp_path / name)

@@ -107,8 +107,8 @@ def taxel_table(finger: str) -> dict[str, np.ndarray]:
 def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
     """Closed, convex, watertight fingertip (vertices [n, 3] m, outward triangles [m, 3]) in the distal body's frame.
 
-    It passes through the taxels (within 0.04 mm; the lattice is that far from convex); `tip_*` in the MJCF is the
-    same solid with at most 64 vertices.
+    It passes through the taxels (within 0.1 mm; the lattice surface is convex to
+    0.04 mm); `tip_*` in the MJCF is the same solid with at most 64 vertices.
     """
     from dexsim.assets.xhand.shells import hull_mesh
     from dexsim.assets.xhand.surface import PADS, Lattice, tip_points, to_link, to_sensor

@@ -18,12 +18,14 @@ from dexsim.assets.xhand.surface import PADS, Lattice, tangents, tip_hull, tip_p
 # Damping: 8 % and 18 % of the effort at top speed. Dry friction is left to the servo model (0 here).
 ARMATURE = {1.1: 5e-4, 0.4: 2e-4}  # kg m^2, by effort
 DAMPING = {1.1: 0.01, 0.4: 0.005}  # N m s/rad
-SKIN_STIFFNESS_SOLREF = "0.005 1"  # a neutral contact; the scene writes the rubber's own stiffness
+SOLREF = "0.005 1"  # a neutral contact; the scene writes the rubber's own stiffness
 
 # Self collision: (contype, conaffinity) added to the object bits.
 #   bit 4: every tip against every other tip
-#   bit 8: the thumb's tip against the fingers' first links and the palm
-#   bit 16: the thumb's middle link against the fingers' tips
+#   bit 8: the thumb's tip against the fingers' links and the palm
+#   bit 16: the thumb's links against the fingers' tips
+# 40 pairs of geoms. Left out: fingers against fingers other than at the tips (under 3 mm in random postures), thumb
+# links against the palm and the finger links (rare), finger tips against the palm (out of reach).
 TIP_BIT, THUMB_TIP_BIT, THUMB_LINK_BIT = 4, 8, 16
 
 PALM_CENTRE = 0.065  # z of the palm frame on the root link's fingers axis (m)
@@ -54,11 +56,11 @@ for _finger in ("mid", "ring", "pinky"):
     CAPSULES[f"right_hand_{_finger}_link2"] = CAPSULES["right_hand_index_rota_link2"]
 
 MATERIALS = {
-    "shell": ("0.105 0.110 0.120 1", 0.45, 0.55),
-    "cover": ("0.200 0.207 0.220 1", 0.35, 0.45),
-    "metal": ("0.560 0.570 0.590 1", 0.80, 0.70),
-    "skin": ("0.800 0.805 0.810 1", 0.15, 0.15),
-    "pad": ("0.330 0.338 0.350 1", 0.10, 0.10),
+    "shell": ("0.150 0.156 0.168 1", 0.35, 0.45),
+    "cover": ("0.255 0.263 0.278 1", 0.30, 0.40),
+    "metal": ("0.500 0.510 0.530 1", 0.45, 0.60),
+    "skin": ("0.800 0.805 0.810 1", 0.10, 0.15),
+    "pad": ("0.400 0.408 0.420 1", 0.08, 0.10),
 }
 
 
@@ -92,18 +94,18 @@ def tip_meshes(pad_name: str, lattice: Lattice) -> dict[str, shells.Mesh]:
     pad = PADS[pad_name]
     u, v = lattice.grid(28, 34)
     outer, normal = lattice.position(u, v), lattice.normal(u, v)
-    skin, rest = tip_points(lattice, pad, 28, 34)
-    inner = (outer - 0.0005 * normal).reshape(-1, 3)
+    _, rest = tip_points(lattice, pad, 28, 34, under=0.0006)
     return {
         f"tip_{pad_name}": shells.hull_mesh(to_link(tip_hull(lattice, pad), pad)),
         f"skin_{pad_name}": shells.loft(to_link(outer, pad), to_link(normal, pad), 0.0012),
-        f"core_{pad_name}": shells.hull_mesh(to_link(np.concatenate([inner, rest]), pad)),
+        f"core_{pad_name}": shells.hull_mesh(to_link(rest, pad)),
     }
 
 
 def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
     """Visual shells: name -> (body, material, mesh); the fingers' are listed once, for the middle finger."""
     mm = lambda *p: [[0.001 * x for x in q] for q in p]  # noqa: E731
+    box = shells.rounded_box
     palm, thumb1, thumb2 = "right_hand_link", "right_hand_thumb_rota_link1", "right_hand_thumb_rota_link2"
     bend, index = "right_hand_thumb_bend_link", "right_hand_index_bend_link"
     link1, link2 = "right_hand_mid_link1", "right_hand_mid_link2"
@@ -117,19 +119,20 @@ def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
         "palm_body": (palm, "shell", shells.slab(body, -0.018, 0.0225, 0.006)),
         "palm_back": (palm, "cover", shells.slab(back, -0.023, -0.008, 0.005)),
         "palm_pad": (palm, "pad", shells.slab(cushion, 0.012, 0.025, 0.004)),
-        "thumb_base": (bend, "metal", shells.rounded_box((-0.0100, 0.000, -0.0090), (0.0095, 0.036, 0.0098), 0.004)),
-        "thumb_body": (thumb1, "shell", shells.rounded_box((-0.0165, -0.002, -0.0125), (0.0165, 0.049, 0.0118), 0.006)),
-        "thumb_back": (thumb1, "cover", shells.rounded_box((-0.0188, 0.001, -0.0178), (0.0195, 0.050, 0.004), 0.006)),
+        "thumb_base": (bend, "metal", box((-0.0100, 0.000, -0.0090), (0.0095, 0.036, 0.0098), 0.004)),
+        "thumb_body": (thumb1, "shell", box((-0.0165, -0.002, -0.0125), (0.0165, 0.049, 0.0118), 0.006)),
+        "thumb_back": (thumb1, "cover", box((-0.0188, 0.001, -0.0178), (0.0195, 0.050, 0.004), 0.006)),
         "thumb_ear_a": (thumb1, "shell", shells.ear((0.0553, 0), 0.0112, mm((40, -10), (40, 10)), 0.0125, 0.0165, 0)),
         "thumb_ear_b": (thumb1, "shell", shells.ear((0.0553, 0), 0.0112, mm((40, -10), (40, 10)), -0.0165, -0.0125, 0)),
-        "thumb_neck": (thumb2, "shell", shells.rounded_box((-0.0118, -0.002, -0.0115), (0.0118, 0.022, 0.0072), 0.004)),
-        "index_base": (index, "metal", shells.rounded_box((-0.0155, -0.0070, -0.0030), (0.0090, 0.0070, 0.0150), 0.003)),
-        "phalanx": (link1, "shell", shells.rounded_box((-0.0100, -0.0080, 0.0085), (0.0108, 0.0080, 0.0500), 0.004)),
-        "phalanx_back": (link1, "cover", shells.rounded_box((-0.0169, -0.0081, 0.0066), (-0.002, 0.0081, 0.0575), 0.004)),
-        "phalanx_root": (link1, "shell", shells.rounded_box((-0.0070, -0.0058, -0.0020), (0.0072, 0.0058, 0.0140), 0.003)),
+        "thumb_neck": (thumb2, "shell", box((-0.0118, -0.002, -0.0115), (0.0118, 0.022, 0.0072), 0.004)),
+        "index_base": (index, "shell", box((-0.0155, -0.0070, -0.0030), (0.0090, 0.0070, 0.0150), 0.003)),
+        "phalanx": (link1, "shell", box((-0.0100, -0.0080, 0.0085), (0.0108, 0.0080, 0.0500), 0.004)),
+        "phalanx_back": (link1, "cover", box((-0.0169, -0.0081, 0.0066), (-0.002, 0.0081, 0.0575), 0.004)),
+        "phalanx_pad": (link1, "pad", box((0.0070, -0.0062, 0.0130), (0.0111, 0.0062, 0.0465), 0.0018)),
+        "phalanx_root": (link1, "shell", box((-0.0072, -0.0070, 0.0000), (0.0080, 0.0070, 0.0140), 0.003)),
         "phalanx_ear_a": (link1, "shell", shells.ear((0, 0.0558), 0.0098, mm((-9, 44), (10, 44)), 0.0064, 0.0081, 1)),
         "phalanx_ear_b": (link1, "shell", shells.ear((0, 0.0558), 0.0098, mm((-9, 44), (10, 44)), -0.0081, -0.0064, 1)),
-        "tip_neck": (link2, "shell", shells.rounded_box((-0.0072, -0.0058, -0.001), (0.0076, 0.0058, 0.018), 0.003)),
+        "tip_neck": (link2, "shell", box((-0.0072, -0.0058, -0.001), (0.0076, 0.0058, 0.018), 0.003)),
     }
     # Hinge plates of the knuckles, either side of each finger root (z up to the measured 117.6 mm).
     for name, y, z, half in (("mid", 4.0, 108.2, 8.9), ("ring", -16.0, 105.2, 8.9), ("pinky", -36.0, 102.2, 8.9)):
@@ -137,6 +140,8 @@ def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
             low = (y + sign * half) * 1e-3
             mesh = shells.ear((0.0065, z * 1e-3), 0.0093, mm((-10, 84), (20, 84)), low - 0.0007, low + 0.0007, 1)
             out[f"knuckle_{name}_{side}"] = (palm, "shell", mesh)
+        low, high = (-0.0060, (y - 8.2) * 1e-3, 0.080), (0.0190, (y + 8.2) * 1e-3, (z - 8.3) * 1e-3)
+        out[f"knuckle_{name}"] = (palm, "shell", shells.rounded_box(low, high, 0.003))
     return out
 
 
@@ -207,19 +212,20 @@ def build() -> str:
         f'    <material name="xhand_{name}" rgba="{rgba}" specular="{specular}" shininess="{shininess}"/>'
         for name, (rgba, specular, shininess) in MATERIALS.items()
     ]
-    text = _TEMPLATE.format(assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SKIN_STIFFNESS_SOLREF)
+    text = _TEMPLATE.format(assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SOLREF)
     xhand.xml_path().write_text(text, encoding="ascii")
     return text
 
 
 def _sites(body: str) -> list[str]:
     if body == xhand.ROOT_BODY:
-        return [f'<site name="palm" pos="0 0 {PALM_CENTRE}" quat="{_num([0, 0.5**0.5, 0, 0.5**0.5])}"/>']
+        half_turn = _num([0, 0.5**0.5, 0, 0.5**0.5])
+        return [f'<site class="xhand_site" name="palm" pos="0 0 {PALM_CENTRE}" quat="{half_turn}"/>']
     if body not in xhand.TIP_BODIES:
         return []
     finger = xhand.FINGERS[xhand.TIP_BODIES.index(body)]
     offset = {"thumb": "0 0.0502276 0", "mid": "0 0 0.042248"}.get(finger, "0 0 0.0422483")
-    return [f'<site name="tip_{finger}" pos="{offset}"/>']
+    return [f'<site class="xhand_site" name="tip_{finger}" pos="{offset}"/>']
 
 
 def _bits(body: str, tip: bool) -> tuple[int, int]:
@@ -228,9 +234,9 @@ def _bits(body: str, tip: bool) -> tuple[int, int]:
         contype, conaffinity = contype | TIP_BIT | THUMB_TIP_BIT, conaffinity | TIP_BIT | THUMB_TIP_BIT
     elif tip:
         contype, conaffinity = contype | TIP_BIT, conaffinity | TIP_BIT | THUMB_LINK_BIT
-    elif body == "right_hand_thumb_rota_link1":
+    elif "thumb_rota" in body:
         contype |= THUMB_LINK_BIT
-    elif body == xhand.ROOT_BODY or body.endswith("link1"):
+    elif body == xhand.ROOT_BODY or body.endswith(("link1", "link2")):
         contype |= THUMB_TIP_BIT
     return contype, conaffinity
 
@@ -259,15 +265,17 @@ def _visual(body: str, visuals: dict) -> list[str]:
     for finger in ("index_rota", "ring", "pinky"):
         same = same.replace(f"right_hand_{finger}_", "right_hand_mid_")
     out = []
+
+    def add(part: str, mesh: str, material: str) -> None:
+        out.append(f'<geom class="xhand_visual" name="vis_{short}_{part}" mesh="{mesh}" material="xhand_{material}"/>')
+
     for name, (owner, material, _) in visuals.items():
         if owner == same:
-            out.append(f'<geom class="xhand_visual" name="vis_{short}_{name}" mesh="{name}" material="xhand_{material}"/>')
+            add(name, name, material)
     if body in xhand.TIP_BODIES:
         kind = xhand.pad_of(xhand.FINGERS[xhand.TIP_BODIES.index(body)])
         for part, material in (("core", "shell"), ("skin", "skin")):
-            out.append(
-                f'<geom class="xhand_visual" name="vis_{short}_{part}" mesh="{part}_{kind}" material="xhand_{material}"/>'
-            )
+            add(part, f"{part}_{kind}", material)
     key = {"right_hand_mid_link1": "link1", "right_hand_mid_link2": "link2"}.get(same, same)
     for k, (material, centre, axis, radius, half) in enumerate(PINS.get(key, [])):
         ends = [*(np.array(centre) - half * np.array(axis)), *(np.array(centre) + half * np.array(axis))]
@@ -278,12 +286,15 @@ def _visual(body: str, visuals: dict) -> list[str]:
     return out
 
 
-_TEMPLATE = """<!-- Right xHand v1.3. Written by dexsim/assets/xhand/build.py from joints.csv, bodies.csv and taxels_*.csv; do not
-     edit by hand. World frame = palm frame: x along the fingers, y to the little finger, z out of the palm (up). -->
+_TEMPLATE = """<!-- Right xHand v1.3. Written by dexsim/assets/xhand/build.py from joints.csv, bodies.csv and taxels_*.csv;
+     do not edit by hand. World frame = palm frame: x along the fingers, y to the little finger, z out of the palm (up). -->
 <mujoco model="xhand_right">
   <compiler angle="radian" meshdir="meshes" autolimits="true"/>
   <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/>
   <default>
+    <default class="xhand_site">
+      <site group="4" size="0.002" rgba="0.9 0.2 0.2 1"/>
+    </default>
     <default class="xhand_visual">
       <geom type="mesh" contype="0" conaffinity="0" group="2" mass="0"/>
     </default>

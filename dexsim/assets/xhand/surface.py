@@ -136,12 +136,13 @@ def tangents(normals: np.ndarray) -> np.ndarray:
     return np.cross(along, normals)
 
 
-def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45) -> tuple[np.ndarray, np.ndarray]:
+def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
+               under: float = -2e-5) -> tuple[np.ndarray, np.ndarray]:
     """Dense points on the distal fingertip: (skin [n, 3], rest [m, 3]) in sensor axes.
 
     The skin is the lattice surface. The rest (a skirt towards the joint, and the back shell) is ours: as wide and
     deep as the link's bounds, rounded, and kept under the tangent planes of the skin so that the hull of both
-    follows the skin.
+    follows the skin; `under` is how far below those planes (m, slightly negative: roundoff).
     """
     u, v = lattice.grid(nu, nv)
     skin = lattice.position(u, v)
@@ -150,11 +151,16 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45) -> t
     planes = normal.reshape(-1, 3)[regular]
     offset = np.einsum("ij,ij->i", planes, skin.reshape(-1, 3)[regular])
 
+    # Before the first row the solid slopes down to the joint barrel, so that no sharp rim stands there.
+    slope = np.array([0.0, -0.25, 1.0]) / np.hypot(1.0, 0.25)
+    planes = np.concatenate([planes, slope[None]])
+    offset = np.append(offset, (skin.reshape(-1, 3) @ slope).max())
+
     b1, p = pad.round_from, 2.6
     depth = pad.waist - pad.back
 
     def inside(x: np.ndarray) -> np.ndarray:
-        ok = (x @ planes.T <= offset[None, :] + 2e-5).all(axis=1)
+        ok = (x @ planes.T <= offset[None, :] - under).all(axis=1)
         ok &= (x[:, 1] >= pad.start - 1e-9) & (x[:, 1] <= pad.tip)
         low = np.clip(pad.waist - x[:, 2], 0, None) / depth
         end = np.clip(x[:, 1] - b1, 0, None) / (pad.tip + 0.0005 - b1)
