@@ -286,7 +286,8 @@ def _visual(body: str, visuals: dict) -> list[str]:
     return out
 
 
-_TEMPLATE = """<!-- Right xHand v1.3, written by dexsim/assets/xhand/build.py from joints.csv, bodies.csv and taxels_*.csv;
+_TEMPLATE = """\
+<!-- Right xHand v1.3, written by dexsim/assets/xhand/build.py from joints.csv, bodies.csv and taxels_*.csv;
      do not edit by hand. World frame = palm frame: x along the fingers, y to the little finger, z out of the palm. -->
 <mujoco model="xhand_right">
   <compiler angle="radian" meshdir="meshes" autolimits="true"/>
