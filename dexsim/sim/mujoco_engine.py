@@ -38,11 +38,11 @@ class MujocoEngine(Engine):
                  real: type = wp.float64):
         super().__init__(model, worlds, "cpu", fields, pairs)
         self.real = real
+        # A diverged world must keep its NaN, to be seen and reset by the environment like on the other engine. And geoms
+        # that move by world are not where the compiler's bounding volumes have them: test every pair of two bodies.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         self.batch = mujoco.batch.Batch(model, worlds, threads)
         b = self.batch
-        # a diverged world must keep its NaN, to be seen and reset by the environment like on the other engine
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        b.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         b.forward()
         self._xpos64, self._xmat64 = b.bind("xpos"), b.bind("xmat")
         self._sensordata = b.bind("sensordata") if self.pairs else None

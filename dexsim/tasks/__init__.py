@@ -1,0 +1,23 @@
+"""Tasks: what a policy sees, does and is paid for. `make_env` builds one from a resolved configuration."""
+
+from __future__ import annotations
+
+import difflib
+
+from dexsim.errors import UserError
+
+
+def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
+    """The environment of `cfg["task"]["name"]`: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
+
+    cfg: the resolved configuration as a plain dict. engine: "auto", "warp" or "mujoco". Raises UserError for an
+    unknown task and for every impossible value that the task finds.
+    """
+    from dexsim.tasks.grasp import GraspEnv
+
+    tasks = {"grasp": GraspEnv}
+    name = cfg["task"]["name"]
+    if name not in tasks:
+        near = difflib.get_close_matches(name, tasks, 1)
+        raise UserError(f"task.name='{name}': must be one of {', '.join(tasks)}" + (f"; did you mean {near[0]}?" if near else ""))
+    return tasks[name](cfg, n_worlds, device, seed, engine)

@@ -1,0 +1,304 @@
+"""The step loop that every task shares: servo, physics, touch, terminations, rewards, masked reset, observations.
+
+    action --scale, clip--> targets --[ servo | physics ] x K, touch--> terminations -> rewards -> reset -> observations
+
+Nothing here reads from the device: decisions are masks, buffers live as long as the environment.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from dexsim.actuator.servo import Servo
+from dexsim.actuator.table import ServoTable
+from dexsim.assets import xhand
+from dexsim.assets.objects import library
+from dexsim.errors import UserError
+from dexsim.sim import ContactPair, make_engine
+from dexsim.sim.engine import FLAG_NAN
+from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, hand_object_scene
+from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.shapes import ShapeSet
+from dexsim.tactile.tactile import Tactile
+from dexsim.tasks.objects import Objects
+from dexsim.tasks.randomize import Sampler
+
+FINGER_ROOTS = ("right_hand_thumb_bend_link", "right_hand_index_bend_link", "right_hand_mid_link1", "right_hand_ring_link1",
+                "right_hand_pinky_link1")
+PAIRS = (
+    *(ContactPair(f"tip_{f}", ("geom", f"tip_{f}"), ("body", OBJECT)) for f in xhand.FINGERS),
+    *(ContactPair(f"finger_{f}", ("subtree", root), ("body", OBJECT)) for f, root in zip(xhand.FINGERS, FINGER_ROOTS, strict=True)),
+    ContactPair("palm", ("body", "right_hand_link"), ("body", OBJECT)),
+    *(ContactPair(f"self_{f}", ("geom", f"tip_{f}"), ("subtree", "right_hand_link")) for f in xhand.FINGERS),
+)
+"""Contact pairs of the hand scenes: fingertip on object (0-4), whole finger on object (5-9), palm on object (10),
+fingertip on the hand itself (11-15)."""
+
+
+class HandEnv(VecEnv):
+    """N xHands with one object each. A task subclasses it; see `tasks/grasp.py`.
+
+    Shapes: actions [N, 12] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
+    dones [N]. Positions are in the palm frame, which is the world frame (the hand is fixed; gravity turns).
+    """
+
+    def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
+        self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
+        self.num_envs, self.device, self.num_actions = n_worlds, device, len(xhand.JOINTS)
+        self.decimation, self.dt = _periods(sim, self.task)
+        self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
+        shapes = library()
+        self.shape_names = [_known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])]
+        spec = xhand.hand_spec()
+        contact = self.task["contact"]
+        d = contact["impedance"]
+        if not 0.5 <= d < 1.0:
+            raise UserError(f"task.contact.impedance={d}: must lie in [0.5, 1)")
+        scene = hand_object_scene(spec, [shapes[s] for s in self.shape_names], self.task["objects"]["baked_scales"], sim["timestep"])
+        for geom in spec.geoms:
+            if geom.name in xhand.TIP_GEOMS:
+                geom.solimp = [d, d, 1e-3, 0.5, 2.0]
+        _solver_options(spec, sim)
+        self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
+        for geom in list(spec.geoms):
+            if not geom.contype and not geom.conaffinity:
+                spec.delete(geom)
+        self.engine = make_engine(
+            spec, n_worlds, device, engine, fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
+            pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"])
+        self.scene = scene
+        self.rng = torch.Generator(device=device)
+        self.rng.manual_seed(seed)
+        self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt)
+        self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
+        touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
+        self.touch = Tactile(self.engine, xhand_layout(), touch_shapes, OBJECT, cfg["tactile"],
+                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
+        self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
+        self._index()
+        self._buffers()
+        self.setup()
+        self.reset_all()
+
+    # -- for the task to fill in -----------------------------------------------------------------------------------------
+    def setup(self) -> None:
+        """Allocate what the task needs; called once, before the first reset."""
+
+    def begin_episodes(self, mask: torch.Tensor) -> None:
+        """Sample new episodes where mask [N] holds: object, servo, initial state (through `place`)."""
+        raise NotImplementedError
+
+    def before_physics(self) -> None:
+        """Commands, pushes: once a control step, before physics."""
+
+    def terminated(self) -> dict[str, torch.Tensor]:
+        """Named terminations, bool [N] each."""
+        raise NotImplementedError
+
+    def rewards(self) -> dict[str, torch.Tensor]:
+        """Named reward terms, weighted, [N] each."""
+        raise NotImplementedError
+
+    def observe(self) -> dict[str, torch.Tensor]:
+        """Observation groups, [N, D] each."""
+        raise NotImplementedError
+
+    # -- rsl-rl's interface ------------------------------------------------------------------------------------------------
+    def get_observations(self) -> TensorDict:
+        return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor):
+        """One control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are reset, and
+        their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds)."""
+        self.act(actions)
+        self.before_physics()
+        self.engine.step(self.decimation, self.servo.before_each, self.touch.launch)
+        self.episode_length_buf += 1
+        self.read_state()
+        ends = self.terminated()
+        ends["nan"] = self.nan
+        dead = torch.stack(list(ends.values())).any(0)
+        self.time_out = (self.episode_length_buf >= self.max_episode_length) & ~dead
+        terms = self.rewards()
+        reward = torch.stack(list(terms.values()))
+        reward = torch.where(self.nan, torch.zeros_like(reward), reward)
+        self.reward = reward.sum(0)
+        self.done = dead | self.time_out
+        extras = {"time_outs": self.time_out.clone(), "log": self._log(terms, ends, reward)}
+        reward_out, done_out = self.reward.clone(), self.done.clone()
+        self.reset(self.done)
+        return self.get_observations(), reward_out, done_out.to(torch.long), extras
+
+    def act(self, actions: torch.Tensor) -> None:
+        """Turn actions [N, 12] into targets. `relative`: the target moves by action * scale a step, held within the
+        joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
+        the joint's range."""
+        a = torch.nan_to_num(actions.to(torch.float32)).clamp(-1.0, 1.0)
+        self.last_action.copy_(self.action)
+        self.action.copy_(a)
+        act = self.task["action"]
+        if act["mode"] == "relative":
+            target = self.target + a * act["scale"]
+            target = torch.maximum(torch.minimum(target, self.q + act["lead"]), self.q - act["lead"])
+        else:
+            target = self.q_mid + a * self.q_half
+        self.target.copy_(torch.maximum(torch.minimum(target, self.q_high), self.q_low))
+        self.servo.send(self.target)
+
+    def reset_all(self) -> None:
+        """Begin an episode in every world."""
+        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self.reset(mask)
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
+        self.begin_episodes(mask)
+        self.engine.refresh()
+        self.episode_length_buf.masked_fill_(mask, 0)
+        self.action.masked_fill_(mask[:, None], 0.0)
+        self.last_action.masked_fill_(mask[:, None], 0.0)
+        self.read_state()
+        for group, value in self.observe().items():
+            if group not in self.obs:
+                self.obs[group] = torch.zeros_like(value)
+            self.obs[group].copy_(value)
+
+    def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor) -> None:
+        """Where mask holds: hand at rest at hand_q [N, 12]; object at pose [N, 7] (x y z, w x y z) moving at velocity
+        [N, 6] (linear, angular), palm frame."""
+        e = self.engine
+        qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
+        qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
+        qpos[:, self.object_q] = object_pose.to(qpos.dtype)
+        qvel[:, self.object_v] = object_velocity.to(qvel.dtype)
+        e.set_state(mask, qpos, qvel)
+        self.servo.reset(mask, hand_q)
+        self.touch.reset(mask)
+        self.target.copy_(torch.where(mask[:, None], hand_q, self.target))
+
+    # -- state ---------------------------------------------------------------------------------------------------------------
+    def read_state(self) -> None:
+        """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan` [N]."""
+        t = self.engine.t
+        self.nan.copy_((t.flags & FLAG_NAN) != 0)
+        ok = ~self.nan[:, None]
+
+        def clean(x: torch.Tensor) -> torch.Tensor:
+            return torch.where(ok, x, torch.zeros_like(x)).to(torch.float32)
+
+        self.q.copy_(clean(t.qpos[:, self.joint_q]))
+        self.qd.copy_(clean(t.qvel[:, self.joint_v]))
+        self.object_pose.copy_(clean(t.qpos[:, self.object_q]))
+        self.object_velocity.copy_(clean(t.qvel[:, self.object_v]))
+        self.torque.copy_(clean(self.servo.torque))
+        normal = clean(t.pair_normal)
+        self.tip_force.copy_(normal[:, 0:5])
+        self.finger_force.copy_(normal[:, 5:10])
+        self.palm_force.copy_(normal[:, 10])
+        self.self_force.copy_(normal[:, 11:16])
+        pos = t.xpos[:, self.tip_body]
+        rot = t.xmat[:, self.tip_body]
+        tip = pos + (rot @ self.tip_offset[None, :, :, None])[..., 0]
+        self.tips.copy_(clean(tip.reshape(self.num_envs, 15)).reshape(self.num_envs, 5, 3))
+
+    def _index(self) -> None:
+        e, dev = self.engine, self.device
+        mjm = e.mjm
+
+        def long(x):
+            return torch.as_tensor(x, dtype=torch.long, device=dev)
+
+        self.joint_q, self.joint_v = long(e.qpos_index(xhand.JOINTS)), long(e.dof_index(xhand.JOINTS))
+        j = e.joint("object_free")
+        self.object_q = long(range(mjm.jnt_qposadr[j], mjm.jnt_qposadr[j] + 7))
+        self.object_v = long(range(mjm.jnt_dofadr[j], mjm.jnt_dofadr[j] + 6))
+        limits = torch.as_tensor(xhand.joint_limits(), dtype=torch.float32, device=dev)
+        self.q_low, self.q_high = limits[:, 0], limits[:, 1]
+        self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
+        self.effort = torch.as_tensor(xhand.efforts(), dtype=torch.float32, device=dev)
+        self.tip_body = long([e.body(b) for b in xhand.TIP_BODIES])
+        sites = [mjm.site(f"tip_{f}").id for f in xhand.FINGERS]
+        self.tip_offset = torch.as_tensor(mjm.site_pos[sites], dtype=torch.float32, device=dev)
+
+    def _buffers(self) -> None:
+        n, dev, J = self.num_envs, self.device, self.num_actions
+
+        def zeros(*shape, dtype=torch.float32):
+            return torch.zeros(n, *shape, dtype=dtype, device=dev)
+
+        self.episode_length_buf = zeros(dtype=torch.long)
+        self.action, self.last_action, self.target = zeros(J), zeros(J), zeros(J)
+        self.q, self.qd, self.torque = zeros(J), zeros(J), zeros(J)
+        self.object_pose, self.object_velocity = zeros(7), zeros(6)
+        self.tip_force, self.finger_force, self.self_force, self.palm_force = zeros(5), zeros(5), zeros(5), zeros()
+        self.tips = zeros(5, 3)
+        self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
+        self.reward = zeros()
+        self.obs: dict[str, torch.Tensor] = {}
+        self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
+
+    # -- bookkeeping -----------------------------------------------------------------------------------------------------------
+    def _log(self, terms: dict, ends: dict, reward: torch.Tensor) -> dict[str, torch.Tensor]:
+        self.nan_count += self.nan.sum()
+        means = reward.mean(1)
+        log = {f"reward/{name}": means[i] for i, name in enumerate(terms)}
+        rates = torch.stack([*ends.values(), self.time_out]).float().mean(1)
+        log.update({f"end/{name}": rates[i] for i, name in enumerate((*ends, "time_out"))})
+        log.update(self.metrics())
+        return log
+
+    def metrics(self) -> dict[str, torch.Tensor]:
+        """Task metrics for the log, scalars on the device."""
+        return {}
+
+    def check(self) -> None:
+        """Raise UserError if contacts were lost since the last call. Reads from the device: once an iteration."""
+        self.engine.check_overflow()
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return tuple(xhand.JOINTS)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """What a resumed run needs to go on as if it had not stopped: counters and random state (episodes begin anew)."""
+        return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.rng.set_state(state["rng"].cpu())
+        self.nan_count.copy_(state["nan_count"])
+        self.reset_all()
+
+
+def _periods(sim: dict, task: dict) -> tuple[int, float]:
+    dt, control = float(sim["timestep"]), float(sim["control_period"])
+    if not 1e-4 <= dt <= 0.02:
+        raise UserError(f"sim.timestep={dt}: must lie in [0.0001, 0.02] s")
+    k = round(control / dt)
+    if k < 1 or not math.isclose(k * dt, control, rel_tol=1e-6):
+        raise UserError(f"sim.control_period={control} s is not a multiple of sim.timestep={dt} s; e.g. sim.control_period={max(k, 1) * dt:.4g}")
+    if task["episode_s"] < control:
+        raise UserError(f"task.episode_s={task['episode_s']}: must be at least one control period, {control} s")
+    return k, control
+
+
+def _known_shape(name: str, shapes: dict) -> str:
+    if name not in shapes:
+        raise UserError(f"task.objects: no shape '{name}'; shapes: {', '.join(shapes)}")
+    return name
+
+
+def _solver_options(spec, sim: dict) -> None:
+    import mujoco
+
+    o = spec.option
+    o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    o.impratio = sim["impratio"]
+    o.iterations, o.ls_iterations = sim["iterations"], sim["ls_iterations"]
+    o.noslip_iterations = sim["noslip_iterations"]
+    # one contact a convex pair, so that a fingertip's stiffness is that of one contact
+    o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD

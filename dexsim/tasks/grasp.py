@@ -1,0 +1,282 @@
+"""Force-controlled grasp by inverted catching: an object is dropped on a palm-up hand, which must catch it, hold it
+against pushes, and press with a commanded force.
+
+Paper: "Force-Adaptive Grasping" (setup), table "Observation for force-adaptive grasping", equations of R_torque,
+R_force, R_diff, R_outter, R_action, R_vel. Constants the paper does not publish are marked `ours` in
+configs/task/grasp.yaml.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.tasks import terms
+from dexsim.tasks.env import HandEnv
+from dexsim.tasks.press import fingertip_press
+from dexsim.tasks.servos import ServoRandomizer
+
+FINGER_ROOT = [xhand.FLEXION_ROOT[f] for f in xhand.FINGERS]
+"""Joint whose torque closes each finger: thumb 1, index 4, middle 6, ring 8, little 10 (SDK order)."""
+INNER, OUTER = [4, 6, 8, 10], [5, 7, 9, 11]
+"""First and second flexion joints of the four fingers (SDK order)."""
+
+OBSERVATION = (  # table (a): name, width, unit, what it is on hardware
+    ("joint_angle", 12, "rad", "measured"),
+    ("joint_torque", 12, "tau/tau_max", "motor current, as calibrated"),
+    ("object_position", 3, "m", "x, y held at their first value; z from vision: noisy, delayed"),
+    ("object_velocity", 3, "m/s", "finite difference of the measured z; x, y zero"),
+    ("contact_force", 5, "F/F_max", "sum of a pad's normal forces"),
+    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
+    ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
+    ("force_command", 1, "F/F_max", "0..1"),
+)
+ACTOR_SIZE = sum(row[1] for row in OBSERVATION)
+assert ACTOR_SIZE == 66
+
+PRIVILEGED = (
+    ("joint_velocity", 12), ("object_quaternion", 4), ("object_velocity_full", 6), ("object_size", 3), ("object_kind", 4),
+    ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_stiffness", 1), ("contact_damping", 1), ("push", 3),
+    ("finger_force", 5), ("palm_force", 1), ("kp", 12), ("torque_limit", 12), ("target_error", 12), ("command_time", 1),
+)  # fmt: skip
+
+
+class GraspEnv(HandEnv):
+    """The grasp task; see the module."""
+
+    def setup(self) -> None:
+        t, n, dev = self.task, self.num_envs, self.device
+        self.f_max = fingertip_press(self.cfg["servo"], stiffness=t["contact"]["stiffness"])
+        self.tau_max = self.effort[FINGER_ROOT]
+        self.servo_random = ServoRandomizer(self.servo, self.sampler)
+        train, held = t["objects"]["train"], t["objects"]["held_out"]
+        names = [v.shape.name for v in self.scene.variants]
+        self.train_rows = torch.tensor([i for i, s in enumerate(names) if s in train], device=dev)
+        self.held_rows = torch.tensor([i for i, s in enumerate(names) if s in held], device=dev)
+        # every shape is equally likely, whatever the number of its baked sizes
+        self.row_weight = torch.tensor([1.0 / names.count(s) for s in names], device=dev)
+        self.draw_from(self.train_rows)
+        for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.scale", 0.3, 3.0),
+                                ("object.com", -0.25, 0.25), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
+                                ("servo.delay", -0.5, 0.5), ("push.weights", 0.0, 20.0)):
+            self.sampler.check(name, low, high)
+        if not 0 <= t["command"]["low"] <= t["command"]["high"] <= 1:
+            raise UserError(f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high <= 1")
+        self.pose0 = torch.tensor([t["initial"]["pose"][j] for j in xhand.JOINTS], device=dev)
+
+        def zeros(*shape, dtype=torch.float32):
+            return torch.zeros(n, *shape, dtype=dtype, device=dev)
+
+        self.command, self.command_left = zeros(), zeros()
+        self.push, self.push_left, self.push_wait = zeros(3), zeros(), zeros()
+        self.first_xy, self.z_seen = zeros(2), zeros()
+        lag = max(1, int(round(t["sensors"]["vision_delay"][1] / self.dt)) + 1)
+        self.z_history, self.z_delay = zeros(lag + 1), zeros(dtype=torch.long)
+        self.torque_bias = zeros(12)
+        self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
+        self.pushes = True
+        self.metric = {k: torch.zeros((), device=dev) for k in ("hold", "force_error", "thumb_contact", "finger_contact", "object_z")}
+
+    def draw_from(self, rows: torch.Tensor) -> None:
+        """Objects of new episodes are drawn from these rows of the scene's table [R]."""
+        weight = self.row_weight[rows]
+        self._rows, self._cumulative = rows, (weight / weight.sum()).cumsum(0)
+
+    # -- episodes ------------------------------------------------------------------------------------------------------------
+    def begin_episodes(self, mask: torch.Tensor) -> None:
+        s, t, n = self.sampler, self.task, self.num_envs
+        pick = torch.searchsorted(self._cumulative, s.uniform()).clamp(max=len(self._cumulative) - 1)
+        scale = s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
+        self.objects.write(
+            mask, self._rows[pick], scale=scale, mass=s.draw("object.mass"), com=s.draw("object.com", 3), friction=s.draw("object.friction"),
+            stiffness=s.draw("contact.stiffness"), damping_ratio=s.draw("contact.damping_ratio"))
+        self.touch.shape_id.copy_(self.objects.variant.to(torch.int32))
+        self.touch.shape_size.copy_(self.objects.size)
+        self.touch.randomize(mask, self.rng)
+        self.servo_random.draw(mask)
+        self.engine.field("opt.gravity").copy_(torch.where(
+            mask[:, None], torch.tensor([0.0, 0.0, -9.81], device=self.device), self.engine.field("opt.gravity").float()))
+
+        hand = self.pose0 + s.draw("initial.joint", 12)
+        hand = torch.maximum(torch.minimum(hand, self.q_high), self.q_low)
+        # the drop: the lowest point of the object starts `drop` above the palm
+        init = t["initial"]
+        centre = torch.tensor(init["object_xy"], device=self.device)
+        xy = centre + s.draw("initial.object_xy", 2)
+        z = self.objects.radius + s.draw("initial.drop")
+        pose = torch.cat([xy, z[:, None], s.quaternion()], 1)
+        velocity = torch.cat([s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1)
+        self.place(mask, hand, pose, velocity)
+        self.first_xy.copy_(torch.where(mask[:, None], xy + s.draw("sensors.vision_xy", 2), self.first_xy))
+        self.z_history.copy_(torch.where(mask[:, None], z[:, None].expand_as(self.z_history), self.z_history))
+        low, high = (round(x / self.dt) for x in t["sensors"]["vision_delay"])
+        delay = (low + (high - low + 1) * s.uniform()).long().clamp(low, high)
+        self.z_delay.copy_(torch.where(mask, delay, self.z_delay))
+        self.z_seen.copy_(torch.where(mask, z, self.z_seen))
+        self.torque_bias.copy_(torch.where(mask[:, None], s.draw("sensors.torque_bias", 12), self.torque_bias))
+        self._new_command(mask)
+        self._new_push(mask)
+
+    def _new_command(self, mask: torch.Tensor) -> None:
+        c, s = self.task["command"], self.sampler
+        value = c["low"] + (c["high"] - c["low"]) * s.uniform() if self.fixed_command is None else self.fixed_command
+        self.command.copy_(torch.where(mask, value, self.command))
+        hold = c["hold_s"][0] + (c["hold_s"][1] - c["hold_s"][0]) * s.uniform()
+        self.command_left.copy_(torch.where(mask, hold, self.command_left))
+
+    def _new_push(self, mask: torch.Tensor) -> None:
+        """A push in a random direction, of a multiple of the object's weight, after a random wait."""
+        s = self.sampler
+        size = s.draw("push.weights") * self.objects.mass * 9.81
+        self.push.copy_(torch.where(mask[:, None], s.direction() * size[:, None], self.push))
+        self.push_left.copy_(torch.where(mask, s.draw("push.duration"), self.push_left))
+        self.push_wait.copy_(torch.where(mask, s.draw("push.wait"), self.push_wait))
+
+    def before_physics(self) -> None:
+        self.command_left -= self.dt
+        self._new_command(self.command_left <= 0)
+        self.push_wait -= self.dt
+        on = self.push_wait <= 0
+        if not self.pushes:
+            on = torch.zeros_like(on)
+        self.push_left -= self.dt * on
+        over = self.push_left <= 0
+        force = torch.where((on & ~over)[:, None], self.push, torch.zeros_like(self.push))
+        self.engine.t.xfrc_applied[:, self.objects.body, :3] = force.to(self.engine.t.xfrc_applied.dtype)
+        self._new_push(over)
+
+    # -- terminations --------------------------------------------------------------------------------------------------------
+    def terminated(self) -> dict[str, torch.Tensor]:
+        """Dropped: the object's centre is below the palm or far from it."""
+        limit = self.task["termination"]
+        p = self.object_pose[:, :3]
+        away = (p - torch.tensor([0.05, 0.0, 0.0], device=self.device)).norm(dim=1) > limit["distance"]
+        # while a world's gravity is turned, "below" means away from the palm
+        return {"dropped": away | (p[:, 2] < limit["below"])}
+
+    # -- rewards ---------------------------------------------------------------------------------------------------------------
+    def rewards(self) -> dict[str, torch.Tensor]:
+        w, r = self.task["rewards"], self.task["reward"]
+        force, contact = self.tip_force, self.tip_force > r["contact_threshold"]
+        torque = self.torque[:, FINGER_ROOT]
+        out = {
+            # R_force and R_torque: sum over fingers of R_i * contact_i (paper, eqs. for R_force, R_torque)
+            "force": w["force"] * terms.tracking(
+                force, self.command, self.f_max, r["force_sigma"], r["force_low"], r["force_high"], contact),
+            "torque": w["torque"] * terms.tracking(
+                torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact),
+            # R_diff: variance of the four fingers' first joints
+            "diff": w["diff"] * self.q[:, INNER].var(dim=1, unbiased=False),
+            # R_outter: distance of the second joints from their mid-range, not squared
+            "outer": w["outer"] * (self.q[:, OUTER] - self.q_mid[OUTER]).norm(dim=1),
+            "termination": w["termination"] * self._ended(),
+            "action": w["action"] * (self.action - self.last_action).square().sum(1),  # R_action
+            "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
+            # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
+            "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
+            "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
+        }
+        self._measure(contact)
+        return out
+
+    def _ended(self) -> torch.Tensor:
+        return self.terminated()["dropped"].float()
+
+    # -- observations ----------------------------------------------------------------------------------------------------------
+    def observe(self) -> dict[str, torch.Tensor]:
+        s, sense = self.sampler, self.task["sensors"]
+        n = self.num_envs
+        z = self.object_pose[:, 2]
+        if self._stepping:
+            self.z_history.copy_(torch.cat([z[:, None], self.z_history[:, :-1]], 1))
+            seen = self.z_history.gather(1, self.z_delay[:, None])[:, 0] + sense["vision_z_noise"] * s.normal()
+            vz = (seen - self.z_seen) / self.dt
+            self.z_seen.copy_(seen)
+        else:
+            vz = torch.zeros_like(z)
+        fresh = (self.episode_length_buf == 0)
+        vz = torch.where(fresh, torch.zeros_like(vz), vz)
+        zero2 = torch.zeros(n, 2, device=self.device)
+        torque_max = self.effort
+        actor = torch.cat([
+            self.q + sense["joint_noise"] * s.normal(12),
+            self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
+            self.first_xy, self.z_seen[:, None],
+            zero2, vz[:, None],
+            self.touch.force / self.f_max,
+            self.touch.centre.reshape(n, 15),
+            self.tips.reshape(n, 15) + sense["tip_noise"] * s.normal(15),
+            self.command[:, None],
+        ], 1)  # fmt: skip
+        critic = [
+            self.q, self.torque / torque_max, self.object_pose[:, :3], self.object_velocity[:, :3],
+            self.touch.force_clean / self.f_max, self.touch.centre_clean.reshape(n, 15), self.tips.reshape(n, 15), self.command[:, None],
+        ]  # fmt: skip
+        if self.task["critic"] == "privileged":
+            critic += self._privileged()
+        ok = ~self.nan[:, None]
+        return {"actor": torch.where(ok, actor, torch.zeros_like(actor)), "critic": torch.nan_to_num(torch.cat(critic, 1))}
+
+    def _privileged(self) -> list[torch.Tensor]:
+        o = self.objects
+        kind = torch.nn.functional.one_hot(o.kind[o.variant], 4).float()
+        pushing = self.engine.t.xfrc_applied[:, o.body, :3].float()
+        return [
+            self.qd, self.object_pose[:, 3:], self.object_velocity, o.size, kind, o.mass[:, None], o.com, o.friction[:, None],
+            o.stiffness[:, None] / 1e4, o.damping_ratio[:, None], pushing, self.finger_force / self.f_max, self.palm_force[:, None] / self.f_max,
+            self.servo.column("kp").float(), self.servo.column("torque_limit").float(), self.target - self.q, self.command_left[:, None],
+        ]  # fmt: skip
+
+    @property
+    def _stepping(self) -> bool:
+        return hasattr(self, "_ready")
+
+    # -- what the log shows ------------------------------------------------------------------------------------------------------
+    def _measure(self, contact: torch.Tensor) -> None:
+        late = self.episode_length_buf * self.dt > 2.0
+        count = late.sum().clamp(min=1)
+
+        def mean(x):
+            return (x * late).sum() / count
+
+        self._metrics = {
+            "task/held": mean((contact[:, 0] & contact[:, 1:].any(1)).float()),
+            "task/force_error": mean((self.tip_force[:, 1:] - self.command[:, None] * self.f_max).abs().mean(1)),
+            "task/fingers_touching": mean(contact[:, 1:].float().sum(1)),
+            "task/force_other": mean(self.self_force.sum(1)),
+        }
+
+    def metrics(self) -> dict[str, torch.Tensor]:
+        return self._metrics
+
+    def reset_all(self) -> None:
+        super().reset_all()
+        self._ready = True
+
+    def describe(self) -> dict:
+        """Tables for the first screen."""
+        r = self.task["rewards"]
+        notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
+                 "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed"}
+        groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
+        critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
+        if self.task["critic"] == "privileged":
+            critic += [(name, width, "privileged") for name, width in PRIVILEGED]
+        groups["critic"] = critic
+        act = self.task["action"]
+        return {
+            "observations": groups,
+            "action": [(j, float(lo), float(hi), f"rad ({act['mode']})") for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
+            "rewards": [(k, w, notes[k]) for k, w in r.items()],
+            "terminations": [("dropped", f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m away"),
+                             ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
+            "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],
+            "notes": [f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[1].item():.2f} N.m (command 1)"],
+        }
+
+    def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
+        """Play `episodes` episodes; see `tasks/grasp_eval.py`."""
+        from dexsim.tasks.grasp_eval import evaluate
+
+        return evaluate(self, policy, episodes, seed, progress)

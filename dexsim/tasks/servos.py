@@ -1,0 +1,46 @@
+"""Servo randomization: every joint of every world draws new drive parameters at each episode (paper, "Actuator Model
+Randomization"), always from the table's nominal."""
+
+from __future__ import annotations
+
+import torch
+
+from dexsim.actuator.columns import INDEX
+from dexsim.actuator.servo import Servo
+from dexsim.tasks.randomize import Sampler
+
+RELATIVE = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction")
+"""Columns whose range multiplies the nominal; the range of every other column is added to it."""
+
+
+class ServoRandomizer:
+    """Draws servo parameters [N, J, C] where a mask holds.
+
+    A column that the servo's file states with an interval (a fit: {value, low, high}) is drawn from that interval;
+    otherwise `randomize.servo.<column>` says how: a factor for the columns in RELATIVE, an addition for the others.
+    """
+
+    def __init__(self, servo: Servo, sampler: Sampler):
+        self.servo, self.sampler = servo, sampler
+        low, high = servo.table.bounds(servo.joints)
+        unknown = servo.table.unknown(servo.joints)
+        dev, dtype = servo.params.device, servo.params.dtype
+        fitted = torch.as_tensor((low < high) & ~unknown, device=dev)
+        self.low = torch.where(fitted, torch.as_tensor(low, device=dev, dtype=dtype), servo.nominal)
+        self.high = torch.where(fitted, torch.as_tensor(high, device=dev, dtype=dtype), servo.nominal)
+        self.fitted = fitted
+        self.columns = [name.removeprefix("servo.") for name in sampler.ranges if name.startswith("servo.")]
+
+    def draw(self, mask: torch.Tensor) -> None:
+        """New parameters in the worlds that mask [N] selects; others keep theirs."""
+        s, n, J = self.servo, *self.servo.params.shape[:2]
+        new = s.nominal.expand_as(s.params).clone()
+        for name in self.columns:
+            c = INDEX[name]
+            r = self.sampler.draw(f"servo.{name}", J).to(new.dtype)
+            new[..., c] = new[..., c] * r if name in RELATIVE else new[..., c] + r
+        u = self.sampler.uniform(J, new.shape[2]).to(new.dtype)
+        # infinite bounds (an absent limit) have no width: their product with u would be NaN
+        width = torch.where(self.fitted, self.high - self.low, torch.zeros_like(self.low))
+        new = torch.where(self.fitted, self.low + u * width, new)
+        s.params.copy_(torch.where(mask[:, None, None], new, s.params))
