@@ -19,7 +19,10 @@ which implicitfast and discrete integrate implicitly: M (v' - v) = dt (qfrc_appl
     rest T = kp e exactly.
   - At the limits the line goes through (v, T = +-limit) and the velocity at which the law itself is zero: the unlimited
     PD's zero or the no-load speed, whichever comes first. Driving along the torque-speed line D is that line's slope; a
-    drive at its limit never overshoots in one step, whatever the inertia. The difference from the law is O(dt).
+    drive at its limit never overshoots in one step, whatever the inertia. While it brakes, the paper's limit grows as
+    the speed falls, exponentially with rate r = efficiency * tau0 / no_load_speed / inertia; a tiny link does so within one
+    step, so T takes the mean over the step, limit * (exp(r dt) - 1) / (r dt), `inertia` being 1 / dof_invweight0.
+  All differences from the law are O(dt).
 Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking. How hard it sticks is
 the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 does not.
 """
@@ -37,6 +40,8 @@ MOTOR, ENABLED, QUEUE = 0, 1, 2
 SLOTS = ("motor", "enabled")
 
 NEVER = -1.0e9  # the stamp of a target that has always been there
+SEED = 1.0e-6  # of the stall torque: braking from the no-load speed starts from no less
+EDGE = 1.0 + SEED
 SNAP = 1.0e-3  # parts of a step shorter than this are rounding of the clock
 WHOLE = 1.0 - SNAP
 
@@ -66,6 +71,7 @@ def servo_kernel(real, voltage: bool):
         loop_q: wp.array(dtype=int),
         loop_dof: wp.array(dtype=int),
         params: wp.array3d(dtype=real),
+        inertia: wp.array2d(dtype=real),
         base_damping: wp.array2d(dtype=real),
         base_frictionloss: wp.array2d(dtype=real),
         time: wp.array(dtype=real),
@@ -135,13 +141,19 @@ def servo_kernel(real, voltage: bool):
             motor = wp.clamp(pd, -limit, limit)
             damping = slope
             if wp.abs(pd) > limit:
-                chord = slope * limit / wp.abs(pd)  # to the PD's zero
-                line = zero  # to the no-load speed in the direction of the torque
-                if limit > zero:
-                    line = tau0 / (params[w, j, NO_LOAD_SPEED] * supply)
-                    if pd * v < zero:
-                        line = line * (one - x) / (one + x)
-                damping = wp.max(chord, line)
+                line = tau0 / (params[w, j, NO_LOAD_SPEED] * supply)
+                size = limit
+                if pd * v < zero:  # braking: the limit grows as the speed falls, by this factor within the step
+                    growth = wp.min(params[w, j, EFFICIENCY] * line * dt / inertia[w, j], real(60.0))
+                    if growth > real(SNAP) and x < real(EDGE):
+                        size = wp.max(limit, real(SEED) * tau0) * (wp.exp(growth) - one) / growth
+                        size = wp.min(size, wp.min(tau0, wp.abs(pd)))
+                        motor = wp.sign(pd) * size
+                    line = size / (params[w, j, NO_LOAD_SPEED] * supply * (one + x))
+                elif limit == zero:
+                    line = zero
+                # to the PD's zero, or to the no-load speed in the direction of the torque
+                damping = wp.max(slope * size / wp.abs(pd), line)
 
         if state[w, j, ENABLED] == zero:
             motor_now = zero

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexsim.actuator.columns import INDEX
-from dexsim.actuator.kernel import SNAP
+from dexsim.actuator.kernel import EDGE, SEED, SNAP
 
 
 def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
@@ -34,13 +34,15 @@ def servo(
     v_loop=None,
     last=0.0,
     enabled=1.0,
+    inertia=np.inf,
     base_damping=0.0,
     base_frictionloss=0.0,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
     target [rad]; q [rad], v [rad/s] of the driven joint; q_loop, v_loop of the joint that carries the loop's encoder
-    (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; base_*: the model's own friction.
+    (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint
+    [kg.m2]; base_*: the model's own friction.
     Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss` as `kernel.py`
     defines them.
     """
@@ -70,10 +72,17 @@ def servo(
             limit = np.where(x < 1.0, tau0 * (1.0 - x), 0.0)
             motor_now = np.clip(now, -limit, limit)
             motor = np.clip(pd, -limit, limit)
-            chord = slope * limit / np.abs(pd)
-            line = np.where(limit > 0.0, tau0 / (p["no_load_speed"] * supply), 0.0)
-            line = np.where(pd * v < 0.0, line * (1.0 - x) / (1.0 + x), line)
-            damping = np.where(np.abs(pd) > limit, np.maximum(chord, line), slope)
+            line = tau0 / (p["no_load_speed"] * supply)
+            braking = pd * v < 0.0
+            growth = np.minimum(p["efficiency"] * line * dt / inertia, 60.0)
+            grown = np.maximum(limit, SEED * tau0) * (np.exp(growth) - 1.0) / growth
+            grown = np.minimum(grown, np.minimum(tau0, np.abs(pd)))
+            grows = (np.abs(pd) > limit) & braking & (growth > SNAP) & (x < EDGE)
+            size = np.where(grows, grown, limit)
+            motor = np.where(grows, np.sign(pd) * size, motor)
+            line = np.where(limit == 0.0, 0.0, line)
+            line = np.where(braking, size / (p["no_load_speed"] * supply * (1.0 + x)), line)
+            damping = np.where(np.abs(pd) > limit, np.maximum(slope * size / np.abs(pd), line), slope)
 
     on = np.asarray(enabled) != 0.0
     motor_now, motor, damping = np.where(on, motor_now, 0.0), np.where(on, motor, 0.0), np.where(on, damping, 0.0)

@@ -35,7 +35,8 @@ class Servo:
         torque [N, J] motor torque as its current shows it, at the start of the last physics step: after clipping and
             lag, before efficiency and friction, positive along positive joint position [N.m];
         base_damping, base_frictionloss [N, J] the model's own joint damping and friction, to which the servo's are
-            added. Randomize these, not the model fields, which the servo overwrites before each physics step.
+            added. Randomize these, not the model fields, which the servo overwrites before each physics step;
+        inertia [N, J] about the joints [kg.m2], for the integration only: an estimate serves.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Servo:
         zeros = lambda *shape: wp.zeros(shape, dtype=real, device=device)  # noqa: E731
         index = lambda values: wp.array(values, dtype=int, device=device)  # noqa: E731
         self._params, self._state, self._torque = zeros(n, j, c), zeros(n, j, s), zeros(n, j)
-        self._base_damping, self._base_frictionloss = zeros(n, j), zeros(n, j)
+        self._inertia, self._base_damping, self._base_frictionloss = zeros(n, j), zeros(n, j), zeros(n, j)
         self._target, self._stamp = zeros(n, j), zeros(n)
         self._mask = wp.zeros(n, dtype=wp.bool, device=device)
         self._dof, self._dof_q, self._loop_q, self._loop_dof = index(dof), index(dof_q), index(loop_q), index(loop_dof)
@@ -91,6 +92,8 @@ class Servo:
 
         self.nominal = as_tensor(nominal)
         self.params[:] = self.nominal
+        self.inertia = wp.to_torch(self._inertia)
+        self.inertia[:] = as_tensor(1.0 / mjm.dof_invweight0[dof])
         self.base_damping[:] = as_tensor(mjm.dof_damping[dof])
         self.base_frictionloss[:] = as_tensor(mjm.dof_frictionloss[dof])
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
@@ -143,7 +146,7 @@ class Servo:
         w = self._wp
         self._launch(
             self._servo, self.engine.dt, self.queue, self._dof, self._dof_q, self._loop_q, self._loop_dof,
-            self._params, self._base_damping, self._base_frictionloss, w.time, w.qpos, w.qvel,
+            self._params, self._inertia, self._base_damping, self._base_frictionloss, w.time, w.qpos, w.qvel,
             self._state, w.qfrc_applied, self._fields["dof_damping"], self._fields["dof_frictionloss"], self._torque,
         )  # fmt: skip
 
