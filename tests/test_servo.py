@@ -87,8 +87,8 @@ def random_params(rng, shape) -> np.ndarray:
         "kp": 4.0, "kd": 0.1, "deadband": 0.05, "torque_limit": 1.0, "no_load_speed": 10.0, "efficiency": 0.5,
         "delay": 0.02, "lag": 0.02, "supply": 0.3, "coulomb_friction": 0.02, "friction_asymmetry": 0.4,
         "stribeck_peak": 0.02, "stribeck_speed": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
-        "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0, "position_offset": 0.05,
-        "position_scale": 0.1,
+        "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0,
+        "position_offset": 0.05, "position_scale": 0.1,
     }  # fmt: skip
     around = ("efficiency", "supply", "position_scale")
     out = np.empty((*shape, len(COLUMNS)))
