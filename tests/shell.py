@@ -11,7 +11,10 @@ from dexsim.cli.ending import guard
 ROOT = Path(__file__).resolve().parents[1]
 DUMMY = """name: dummy
 steps: 20
-nested: {low: 1.0, high: 2.0}
+nested: {inner: 1.0, high: 2.0}
+sizes: [1.0, 2.0]
+mass: {log: [0.03, 0.3]}
+flag: true
 presets:
   cpu: {worlds: 4, iterations: 2, task: {nested: {high: 3.0}}}
 """

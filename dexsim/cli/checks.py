@@ -20,7 +20,7 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "save_interval": (1, 10**9, True),
     "final_episodes": (0, 10**7, True),
     "sim.timestep": (1e-5, 0.02, False),
-    "sim.decimation": (1, 1000, True),
+    "sim.control_period": (1e-4, 1.0, False),
     "sim.nconmax": (1, 10**6, True),
     "sim.njmax": (1, 10**6, True),
     "agent.num_steps_per_env": (1, 10**5, True),
@@ -44,6 +44,10 @@ def check(cfg: dict[str, Any]) -> None:
         value = get(cfg, key)
         if value is not None:
             _number(key, value, low, high, whole)
+    step, period = get(cfg, "sim.timestep"), get(cfg, "sim.control_period")
+    if step and period and (period < step or abs(period / step - round(period / step)) > 1e-6):
+        raise UserError(f"sim.control_period={period}: must be a multiple of sim.timestep={step}, e.g."
+                        f" {max(round(period / step), 1) * step:g}")
     for key in ("agent.actor.hidden_dims", "agent.critic.hidden_dims"):
         sizes = get(cfg, key)
         if sizes is not None and (not isinstance(sizes, list) or not sizes or not all(_whole(s, 1) for s in sizes)):

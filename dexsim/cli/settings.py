@@ -111,6 +111,8 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
     """
     for item in items:
         key = item.key_or_group
+        if key.partition(".")[0] == "choices":
+            raise UserError(f"{key}: a record of the groups chosen; choose one with task=..., servo=... (--help)")
         if item.type == OverrideType.DEL:
             _parent(cfg, key)  # raises when it is not there
             owner, _, last = key.rpartition(".")
@@ -138,7 +140,8 @@ def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfi
         merged = OmegaConf.merge(cfg, presets[name])
     except OmegaConfBaseException as error:
         raise UserError(f"task.presets.{name}: {_first_line(error)}") from None
-    return override(merged, items)
+    gone = [i for i in items if i.type == OverrideType.DEL and OmegaConf.select(merged, i.key_or_group) is None]
+    return override(merged, [i for i in items if i not in gone])
 
 
 def resolve(cfg: DictConfig) -> dict[str, Any]:
@@ -156,7 +159,7 @@ def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
         inside = isinstance(node, ListConfig) and part.isdigit() and int(part) < len(node)
         if not inside and not (isinstance(node, DictConfig) and part in node):
             where = ".".join(parts[:depth])
-            names = [f"{where}.{k}" if where else str(k) for k in node] if isinstance(node, DictConfig) else []
+            names = [f"{where}.{k}" if where else str(k) for k in node if k != "choices"] if isinstance(node, DictConfig) else []
             valid = f"{where or 'the settings'} {'has' if where else 'are'}: {', '.join(names)}" if names else \
                 f"{where} is a single value"
             everything = _every_key(cfg)
@@ -180,7 +183,7 @@ def _every_key(cfg: DictConfig, prefix: str = "") -> list[str]:
 
 def _guess(name: str, valid: list[str]) -> str:
     """ "; did you mean ...?" for the nearest name: by the whole path, else by its last part ('' when none is near)."""
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.75)
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.8)
     if not near:
         last = {v.rpartition(".")[2]: v for v in reversed(valid)}
         near = [last[n] for n in difflib.get_close_matches(name.rpartition(".")[2], list(last), n=1, cutoff=0.75)]
@@ -190,8 +193,9 @@ def _guess(name: str, valid: list[str]) -> str:
 def _check_type(key: str, old: Any, new: Any) -> None:
     """Refuse what can only be a slip: text or a truth value for a number, a single value for a group of settings."""
     if isinstance(old, DictConfig) and not isinstance(new, dict):
-        # a range may be written as a dict {value, low, high}; then a plain number or list may take its place
-        if set(old) <= {"value", "low", "high", "unit"} and not isinstance(new, str):
+        # a random value may be written as a dict, {value, low, high} or {log: [low, high]}; then a plain number or a
+        # list may take its place
+        if set(old) <= {"value", "low", "high", "unit", "log"} and not isinstance(new, str):
             return
         raise UserError(f"{key} is a group of settings ({', '.join(f'{key}.{k}' for k in old)}), not a single value")
     if isinstance(old, bool) and not isinstance(new, bool):

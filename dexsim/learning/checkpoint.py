@@ -12,6 +12,7 @@ Keys (all of them always there in a ``train`` file; a ``policy`` file leaves out
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import json
@@ -62,7 +63,8 @@ def write(path: str | Path, data: bytes) -> Path:
         os.replace(part, path)
         _sync_folder(path.parent)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
         kept = "; the previous file there is whole" if path.exists() else ""
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise UserError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None

@@ -83,8 +83,7 @@ class Runner(OnPolicyRunner):
                     obs = self._step(obs)
                 self.alg.compute_returns(obs)
             collected = time.perf_counter()
-            losses = self.alg.update()
-            self._check(losses)
+            losses = self._update()
             self.iteration += 1
             self.current_learning_iteration = self.iteration
             self.steps += self.cfg["num_steps_per_env"] * self.env.num_envs
@@ -106,11 +105,25 @@ class Runner(OnPolicyRunner):
         self._meter.add(rewards, dones, extras.get("log"))
         return obs
 
-    def _check(self, losses: dict[str, float]) -> None:
-        if not all(math.isfinite(v) for v in losses.values()):
-            bad = ", ".join(f"{k}={v}" for k, v in losses.items() if not math.isfinite(v))
-            raise UserError(f"learning diverged at iteration {self.iteration + 1} ({bad}); continue from the last"
-                            " checkpoint with a lower agent.algorithm.learning_rate or desired_kl")
+    def _update(self) -> dict[str, float]:
+        """One PPO update. Raises UserError when it left something not finite, before that is saved."""
+        try:
+            losses = self.alg.update()
+        except RuntimeError:
+            if self._finite():
+                raise
+            losses = {}  # a later mini-batch stumbled over the weights
+        bad = [f"{k} loss {v}" for k, v in losses.items() if not math.isfinite(v)]
+        if not bad and not self._finite():
+            bad = ["weights not finite"]
+        if bad:
+            raise UserError(f"learning diverged at iteration {self.iteration + 1} ({', '.join(bad)}); continue from the"
+                            " last checkpoint with a lower agent.algorithm.learning_rate or desired_kl")
+        return losses
+
+    def _finite(self) -> bool:
+        weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
+        return bool(torch.stack([w.isfinite().all() for w in weights]).all())
 
     def payload(self) -> dict[str, Any]:
         """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""

@@ -30,7 +30,8 @@ def main(folder: Path, path: Path) -> int:
         context.make_current()
         context.free()
     except Exception as error:  # whatever a driver or loader raises, the answer is the next backend
-        print(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        missing = isinstance(error, (ImportError, AttributeError))  # PyOpenGL's way to say that a library is not there
+        print("library not found" if missing else str(error).splitlines()[0] if str(error) else type(error).__name__)
         return NO_GL
     settings = json.loads((folder / "settings.json").read_text())
     try:

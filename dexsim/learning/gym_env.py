@@ -1,0 +1,79 @@
+"""A dexsim environment as a ``gymnasium.vector.VectorEnv``: the same object, other conventions.
+
+    from dexsim.tasks import make_env
+    envs = GymVectorEnv(make_env(cfg, n_worlds=64, device="cpu", seed=1, engine="auto"))
+    obs, info = envs.reset(seed=1)
+    obs, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from dexsim.errors import UserError
+
+
+class GymVectorEnv(VectorEnv):
+    """Worlds reset in the step that ends their episode (``AutoresetMode.SAME_STEP``).
+
+    Observations [N, D] float32 are one group of the environment's, by default what the actor sees; the other groups
+    are in ``info``. Where an episode ends, ``info["final_obs"]`` [N, D] holds its last observation for the worlds of
+    ``info["_final_obs"]`` (rows of the others are not meaningful). Time limits are truncations, all else is termination.
+
+    Args:
+        env: the environment (rsl-rl's ``VecEnv``) with ``reset(seed)`` and ``extras["final_obs"]``.
+        group: observation group to return.
+        as_torch: return and take torch tensors on the environment's device instead of NumPy arrays.
+    """
+
+    def __init__(self, env: Any, group: str = "actor", as_torch: bool = False) -> None:
+        first = env.get_observations()
+        if group not in first.keys():
+            raise UserError(f"group={group}: this environment has the observation groups {', '.join(first.keys())}")
+        self.env, self.num_envs, self._group, self._torch = env, int(env.num_envs), group, as_torch
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": [], "render_fps": round(1 / env.dt)}
+        rows = env.describe()["action"]
+        low, high = (np.array([row[i] for row in rows], np.float32) for i in (1, 2))
+        size = first[group].shape[-1]
+        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = Box(low, high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode in every world; a seed makes what follows repeatable."""
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            raise UserError("seed: one whole number for all worlds")
+        with torch.no_grad():
+            obs = self.env.reset(seed)
+        return self._out(obs[self._group]), self._others(obs)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance every world by one control step. ``actions`` [N, A] beyond the action space are the task's to clip."""
+        actions = torch.as_tensor(actions, dtype=torch.float32, device=self.env.device)
+        if actions.shape != self.action_space.shape:
+            raise UserError(f"actions have shape {tuple(actions.shape)}, must be {self.action_space.shape}")
+        with torch.no_grad():
+            obs, reward, done, extras = self.env.step(actions)
+        done = done.bool()
+        truncated = extras["time_outs"].bool() & done
+        info = self._others(obs)
+        if bool(done.any()):
+            if "final_obs" in extras:
+                info["final_obs"] = self._out(extras["final_obs"][self._group])
+            info["_final_obs"] = self._out(done)
+        return self._out(obs[self._group]), self._out(reward), self._out(done & ~truncated), self._out(truncated), info
+
+    def _others(self, obs: Any) -> dict[str, Any]:
+        return {name: self._out(obs[name]) for name in obs.keys() if name != self._group}
+
+    def _out(self, value: torch.Tensor) -> Any:
+        """A copy (the environment changes its buffers in place): torch tensor or NumPy array."""
+        value = value.detach().clone()
+        return value if self._torch else value.cpu().numpy()
