@@ -7,8 +7,10 @@ Nothing here reads from the device: decisions are masks, buffers live as long as
 
 from __future__ import annotations
 
+import copy
 import math
 
+import mujoco
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -20,7 +22,7 @@ from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
-from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, hand_object_scene
+from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import xhand_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
@@ -62,7 +64,12 @@ class HandEnv(VecEnv):
         for geom in spec.geoms:
             if geom.name in xhand.TIP_GEOMS:
                 geom.solimp = [d, d, 1e-3, 0.5, 2.0]
+        for joint in spec.joints:
+            if joint.name in xhand.JOINTS:
+                # dry friction that holds: MuJoCo's default is so soft that a stuck joint creeps
+                joint.solimp_friction, joint.solref_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0], [0.01, 1.0]
         _solver_options(spec, sim)
+        self._drawn = None
         self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
         for geom in list(spec.geoms):
             if not geom.contype and not geom.conaffinity:
@@ -255,6 +262,20 @@ class HandEnv(VecEnv):
         """Task metrics for the log, scalars on the device."""
         return {}
 
+    def drawn_model(self, world: int) -> mujoco.MjModel:
+        """A model of one world as it is now, with the shells and skins, to render its qpos; reads from the device."""
+        if self._drawn is None:
+            self._drawn = self.drawn_spec.compile()
+        model = copy.copy(self._drawn)
+        for slot in SLOTS:
+            g = self._drawn.geom(slot).id
+            e = self.engine.geom(slot)
+            for name in ("geom_pos", "geom_quat", "geom_size", "geom_dataid"):
+                value = self.engine.field(name)[world, e].cpu().numpy()
+                getattr(model, name)[g] = value
+            model.geom_group[g] = 0
+        return model
+
     def check(self) -> None:
         """Raise UserError if contacts were lost since the last call. Reads from the device: once an iteration."""
         self.engine.check_overflow()
@@ -291,9 +312,7 @@ def _known_shape(name: str, shapes: dict) -> str:
     return name
 
 
-def _solver_options(spec, sim: dict) -> None:
-    import mujoco
-
+def _solver_options(spec: mujoco.MjSpec, sim: dict) -> None:
     o = spec.option
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

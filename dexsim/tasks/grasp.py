@@ -74,9 +74,9 @@ class GraspEnv(HandEnv):
         lag = max(1, int(round(t["sensors"]["vision_delay"][1] / self.dt)) + 1)
         self.z_history, self.z_delay = zeros(lag + 1), zeros(dtype=torch.long)
         self.torque_bias = zeros(12)
+        self.outside_force = zeros(3)  # N on the object's body frame, on top of the random pushes (evaluation)
         self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
         self.pushes = True
-        self.metric = {k: torch.zeros((), device=dev) for k in ("hold", "force_error", "thumb_contact", "finger_contact", "object_z")}
 
     def draw_from(self, rows: torch.Tensor) -> None:
         """Objects of new episodes are drawn from these rows of the scene's table [R]."""
@@ -142,7 +142,7 @@ class GraspEnv(HandEnv):
             on = torch.zeros_like(on)
         self.push_left -= self.dt * on
         over = self.push_left <= 0
-        force = torch.where((on & ~over)[:, None], self.push, torch.zeros_like(self.push))
+        force = torch.where((on & ~over)[:, None], self.push, torch.zeros_like(self.push)) + self.outside_force
         self.engine.t.xfrc_applied[:, self.objects.body, :3] = force.to(self.engine.t.xfrc_applied.dtype)
         self._new_push(over)
 

@@ -1,0 +1,260 @@
+"""Evaluation of the grasp task: does the hand hold, under pushes and upside down, and does it press as commanded?
+
+One episode (seconds): the object is dropped at 0; at `SETTLE` its place in the palm frame is noted; for `HOLD` seconds it must
+stay within `RADIUS` of that place, touched at every control step by the thumb and a finger. In every second episode a
+push of twice the object's weight acts for half a second within the hold, in a random direction. Then the hand is
+turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame, slowly enough
+that the turn itself adds nothing.
+
+The command is constant in an episode, uniform in [0, 1] over episodes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m
+PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
+TURN_S, STAY_S = 0.75, 1.0
+BINS = 10
+FINGERS = ("index", "mid", "ring", "pinky")
+_END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
+
+
+@torch.inference_mode()
+def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
+    """Play `episodes` episodes, `env.num_envs` at a time, half as many again on shapes that were never trained on.
+
+    policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
+    """
+    env.rng.manual_seed(seed)
+    torch.manual_seed(seed)
+    trained = _play_all(env, policy, episodes, env.train_rows, progress, "trained shapes")
+    held_out = _play_all(env, policy, max(episodes // 2, 1), env.held_rows, progress, "kept-out shapes")
+    metrics = _metrics(trained, held_out, env.f_max)
+
+    def force_command(ax):
+        _force_plot(ax, trained)
+
+    def hold_by_command(ax):
+        _hold_plot(ax, trained)
+
+    plots = [force_command, hold_by_command]
+    return {
+        "metrics": metrics,
+        "tables": _tables(trained, held_out, env),
+        "frames": trained["frames"],
+        "plots": plots,
+    }
+
+
+def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: str) -> dict:
+    parts = []
+    env.draw_from(rows)
+    done = 0
+    while done < episodes:
+        parts.append(_play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes))
+        done += env.num_envs
+    env.draw_from(env.train_rows)
+    out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
+    out["frames"] = parts[0]["frames"]
+    return out
+
+
+def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episodes: int) -> dict:
+    """One episode in every world."""
+    n, dev, dt = env.num_envs, env.device, env.dt
+    steps = int(round(_END / dt))
+    training_length, env.max_episode_length = env.max_episode_length, steps + 2
+    env.pushes = False
+    env.fixed_command = torch.rand(n, generator=env.rng, device=dev)
+    env.reset_all()
+    obs = env.get_observations()
+    pushed = torch.arange(n, device=dev) % 2 == 0
+    direction = env.sampler.direction()
+    push_at = SETTLE + 0.5 + (HOLD - 1.0 - PUSH_S) * env.sampler.uniform()
+    angle = 2 * torch.pi * env.sampler.uniform()
+    axis = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)  # in the palm plane
+    down = torch.tensor([0.0, 0.0, -1.0], device=dev).expand(n, 3)
+    command, mass, friction, shape = (x.clone() for x in (env.fixed_command, env.objects.mass, env.objects.friction, env.objects.variant))
+    alive = torch.ones(n, dtype=torch.bool, device=dev)
+    held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
+    place = torch.zeros(n, 3, device=dev)
+    force, torque, samples = torch.zeros(n, 5, device=dev), torch.zeros(n, 12, device=dev), torch.zeros(n, device=dev)
+    shown = list(range(min(4, n))) if keep_frames else []
+    models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
+    qpos, shown_force = [], []
+    push_force = (PUSH_WEIGHTS * 9.81 * mass)[:, None] * direction
+    for k in range(steps):
+        t = k * dt
+        pushing = pushed & (t >= push_at) & (t < push_at + PUSH_S)
+        env.outside_force.copy_(torch.where(pushing[:, None], push_force, torch.zeros_like(push_force)))
+        env.engine.field("opt.gravity").copy_(9.81 * _turned(down, axis, _angle(t)))
+        obs, _, dones, _ = env.step(policy(obs))
+        alive &= ~dones.bool()
+        p = env.object_pose[:, :3]
+        if k == int(round(SETTLE / dt)):
+            place.copy_(p)
+            held = alive.clone()
+        if t > SETTLE:
+            touched = (env.finger_force[:, 0] > 0) & (env.finger_force[:, 1:] > 0).any(1)
+            near = (p - place).norm(dim=1) <= RADIUS
+            good = alive & touched & near
+            if t <= SETTLE + HOLD:
+                held &= good
+                calm = (~pushing).float()
+                force += env.tip_force * calm[:, None]
+                torque += env.torque * calm[:, None]
+                samples += calm
+            else:
+                # turned: still near the place it settled in
+                if k == int(round((SETTLE + HOLD) / dt)) + 1:
+                    held90, held180 = held.clone(), held.clone()
+                if t <= SETTLE + HOLD + TURN_S + STAY_S:
+                    held90 &= good
+                held180 &= good
+        if shown:
+            qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
+            shown_force.append(env.tip_force[shown].cpu().numpy())
+        if progress is not None and k % 10 == 0:
+            progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
+    env.outside_force.zero_()
+    env.fixed_command, env.pushes, env.max_episode_length = None, True, training_length
+    samples = samples.clamp(min=1)
+    out = {
+        "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held, "held90": held90,
+        "held180": held180, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive,
+    }  # fmt: skip
+    out = {k: v.cpu().numpy() for k, v in out.items()}
+    out["frames"] = None
+    if shown:
+        force_shown, given = np.stack(shown_force, 1), command[shown].cpu().numpy()
+        names = [env.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
+        out["frames"] = {
+            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": ("thumb", *FINGERS), "full": 1.2 * env.f_max,
+            "label": [f"{name}, {1000 * m:.0f} g, friction {mu:.1f}" for name, m, mu in zip(names, out["mass"][shown], out["friction"][shown], strict=True)],
+            "overlay": [{"force": f, "command": np.full(steps, c * env.f_max)} for f, c in zip(force_shown, given, strict=True)],
+        }  # fmt: skip
+    return out
+
+
+def _angle(t: float) -> float:
+    """Angle [rad] by which the hand is turned at time t."""
+    first = SETTLE + HOLD
+    second = first + TURN_S + STAY_S
+    return np.pi / 2 * (np.clip((t - first) / TURN_S, 0, 1) + np.clip((t - second) / TURN_S, 0, 1))
+
+
+def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
+    """v [N, 3] rotated about unit axes [N, 3] (Rodrigues)."""
+    c, s = float(np.cos(angle)), float(np.sin(angle))
+    return v * c + torch.linalg.cross(axis, v) * s + axis * (axis * v).sum(1, keepdim=True) * (1 - c)
+
+
+def must_hold(r: dict, f_max: float) -> np.ndarray:
+    """Episodes [E] whose commanded forces can carry the pushed object: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, with the
+    push at its worst, along gravity."""
+    load = r["mass"] * 9.81 * (1 + PUSH_WEIGHTS * r["pushed"])
+    return 4 * r["command"] * f_max >= 2 * load / r["friction"]
+
+
+def _rate(ok: np.ndarray, among: np.ndarray) -> float | None:
+    return float(ok[among].mean()) if among.any() else None
+
+
+def _corr(a: np.ndarray, b: np.ndarray) -> float | None:
+    return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 0 and b.std() > 0 else None
+
+
+def _metrics(r: dict, k: dict, f_max: float) -> dict:
+    able, able_k = must_hold(r, f_max), must_hold(k, f_max)
+    pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
+    held = r["held"].astype(bool)
+    total = r["force"][:, 1:].sum(1)
+    out = {
+        "episodes": int(len(held)), "episodes_kept_out": int(len(k["held"])),
+        "hold_rate": _rate(r["held"], ~pushed & firm),
+        "hold_rate_pushed": _rate(r["held"], pushed & able),
+        "hold_rate_kept_out_shapes": _rate(k["held"], k["pushed"].astype(bool) & able_k),
+        "hold_rate_kept_out_shapes_unpushed": _rate(k["held"], ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
+        "hold_rate_all": float(held.mean()),
+        "hold_rate_turned_90": _rate(r["held90"], able), "hold_rate_turned_180": _rate(r["held180"], able),
+        "force_command_correlation": _corr(r["command"][held], total[held]),
+        "force_max_N": float(f_max),
+    }  # fmt: skip
+    for i, name in enumerate(("thumb", *FINGERS)):
+        out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])
+    if held.sum() > 2:
+        slope, offset = np.polyfit(r["command"][held] * 4 * f_max, total[held], 1)
+        out["force_slope"], out["force_offset_N"] = float(slope), float(offset)
+        out["force_error_N"] = float(np.abs(r["force"][held, 1:] - r["command"][held, None] * f_max).mean())
+        out["contact_force_range_N"] = [float(x) for x in np.percentile(r["force"][held].sum(1), [5, 95])]
+        out["joint_torque_range_Nm"] = [float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])]
+        out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
+    return out
+
+
+def _tables(r: dict, k: dict, env) -> list:
+    f_max = env.f_max
+    rows = []
+    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
+    pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
+    for b in range(BINS):
+        m = bins == b
+        if not m.any():
+            continue
+        h = m & held
+        force = r["force"][h, 1:].sum(1).mean() if h.any() else float("nan")
+        error = np.abs(r["force"][h, 1:] - r["command"][h, None] * f_max).mean() if h.any() else float("nan")
+        rows.append((f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}", int(m.sum()), _pct(held, m & ~pushed), _pct(held, m & pushed),
+                     f"{4 * f_max * (b + 0.5) / BINS:.1f}", f"{force:.1f}", f"{error:.2f}"))
+    tables = [("Hold and force by command", ("F_cmd", "episodes", "held %", "held pushed %", "asked N (4 fingers)", "got N", "error N/finger"), rows)]
+    mass_edges, mu_edges = [0.03, 0.065, 0.14, 0.31], [0.4, 0.67, 0.93, 1.21]
+    grid = []
+    able = must_hold(r, f_max)
+    for a, b in zip(mass_edges[:-1], mass_edges[1:], strict=True):
+        line = [f"{1000 * a:.0f}-{1000 * min(b, 0.3):.0f} g"]
+        for c, d in zip(mu_edges[:-1], mu_edges[1:], strict=True):
+            line.append(_pct(held, able & (r["mass"] >= a) & (r["mass"] < b) & (r["friction"] >= c) & (r["friction"] < d)))
+        grid.append(tuple(line))
+    tables.append(("Held % by mass and friction (where the command can carry the load)", ("mass", "mu 0.4-0.67", "mu 0.67-0.93", "mu 0.93-1.2"), grid))
+    by_shape = []
+    for part, label in ((r, ""), (k, " (kept out)")):
+        able = must_hold(part, f_max)
+        names = np.array([env.scene.variants[int(v)].shape.name for v in part["shape"]])
+        for name in dict.fromkeys(names.tolist()):
+            m = names == name
+            p = part["pushed"].astype(bool)
+            by_shape.append((name + label, int(m.sum()), _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able)))
+    tables.append(("Held % by object", ("object", "episodes", "held %", "held pushed %"), by_shape))
+    return tables
+
+
+def _pct(ok: np.ndarray, among: np.ndarray) -> str:
+    return f"{100 * ok[among].mean():.1f}" if among.any() else "-"
+
+
+def _force_plot(ax, r: dict) -> None:
+    held = r["held"].astype(bool)
+    c = r["command"][held]
+    for i, name in enumerate(FINGERS):
+        ax.scatter(c, r["force"][held, i + 1], s=4, alpha=0.4, label=name)
+    ax.set_xlabel("force command")
+    ax.set_ylabel("contact force of a finger [N]")
+    ax.set_title("Measured force over command, held episodes")
+    ax.legend(markerscale=3)
+
+
+def _hold_plot(ax, r: dict) -> None:
+    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
+    pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
+    x = (np.arange(BINS) + 0.5) / BINS
+    for label, sel, shift in (("unpushed", ~pushed, -0.02), ("pushed", pushed, 0.02)):
+        y = [100 * held[sel & (bins == b)].mean() if (sel & (bins == b)).any() else np.nan for b in range(BINS)]
+        ax.bar(x + shift, y, width=0.035, label=label)
+    ax.set_xlabel("force command")
+    ax.set_ylabel("held [%]")
+    ax.set_ylim(0, 100)
+    ax.set_title("Held through 5 s")
+    ax.legend()
