@@ -11,6 +11,8 @@ from dexsim.tactile.kernel import LAWS
 
 Range = tuple[float, float]
 
+STIFFNESS_UNITS = {"linear": "N/m^3", "hertz": "N/m^2.5", "mooney_rivlin": "1"}
+
 # Per-world parameters, resampled at each episode: name -> (unit, lowest, highest allowed, value at which it is absent).
 COLUMNS: dict[str, tuple[str, float, float, float]] = {
     "stiffness_scale": ("1", 1e-3, 1e3, 1.0),
@@ -20,7 +22,7 @@ COLUMNS: dict[str, tuple[str, float, float, float]] = {
     "delay": ("s", 0.0, 1.0, 0.0),
     "hysteresis": ("1", 0.0, 2.0, 0.0),
     "hysteresis_time": ("s", 1e-3, 100.0, 0.1),
-    "shear_stiffness": ("1", 0.0, 100.0, 1.0 / 3.0),
+    "shear_stiffness": ("N/m^3", 0.0, 1e15, 1.0e8),
     "friction": ("1", 0.0, 10.0, 0.8),
     "gain_spread": ("1", 0.0, 1.0, 0.0),
     "dead": ("1", 0.0, 1.0, 0.0),
@@ -32,10 +34,10 @@ class TactileConfig:
     """See configs/tactile/default.yaml for what each key means."""
 
     sum: str = "solver"
-    law: str = "linear"
-    stiffness: Mapping[str, float] = field(default_factory=dict)
-    rubber: Mapping[str, float] = field(default_factory=lambda: {"thickness": 2.0e-3, "c10": 0.1e6, "c01": 0.05e6})
-    reach: float = 0.4e-3
+    law: str = "hertz"
+    stiffness: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    rubber: Mapping[str, float] = field(default_factory=lambda: {"thickness": 2.0e-3, "c10": 4.0e4, "c01": 1.0e4})
+    reach: float = 0.6e-3
     others: bool = True
     feel_others: bool = False
     raw: bool = False
@@ -84,9 +86,7 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
     if "full_scale" in out:
         out["full_scale"] = int(_number("full_scale", out["full_scale"], 1, 2**24))
     if "stiffness" in out:
-        value = out["stiffness"]
-        value = value if isinstance(value, Mapping) else {"": value}
-        out["stiffness"] = {str(k): _number(f"stiffness.{k}", v, 1e3, 1e15) for k, v in value.items()}
+        out["stiffness"] = _stiffness(out["stiffness"])
     if "rubber" in out:
         limits = {"thickness": (1e-5, 0.1), "c10": (0.0, 1e12), "c01": (0.0, 1e12)}
         rubber = dict(TactileConfig().rubber)
@@ -104,16 +104,29 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
 
 
 def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
-    """Foundation stiffness [N/m^3] of each pad by its kind; 1 for the Mooney-Rivlin law, whose constants are Pa."""
-    if cfg.law == "mooney_rivlin":
-        return [1.0] * len(kinds)
+    """Foundation stiffness of each pad by its kind, in the unit of the force law (`STIFFNESS_UNITS`)."""
+    given = cfg.stiffness.get(cfg.law, {})
     out = []
     for kind in kinds:
-        value = cfg.stiffness.get(kind, cfg.stiffness.get(""))
-        if value is None:
-            given = ", ".join(cfg.stiffness) or "none"
-            raise UserError(f"tactile.stiffness: no value [N/m^3] for pads of kind '{kind}'; given for: {given}")
-        out.append(value)
+        if kind not in given and "all" not in given:
+            unit = STIFFNESS_UNITS[cfg.law]
+            raise UserError(
+                f"tactile.stiffness.{cfg.law}: no value [{unit}] for pads of kind '{kind}'; given for: {', '.join(given) or 'none'}"
+                " (key 'all' holds for every kind)"
+            )
+        out.append(given.get(kind, given.get("all")))
+    return out
+
+
+def _stiffness(value: object) -> dict[str, dict[str, float]]:
+    if not isinstance(value, Mapping):
+        raise UserError(f"tactile.stiffness={value}: must map a law ({', '.join(LAWS)}) to a value by kind of pad")
+    out: dict[str, dict[str, float]] = {}
+    for law, by_kind in value.items():
+        if law not in LAWS:
+            raise UserError(f"tactile.stiffness.{law}: unknown law; valid: {', '.join(LAWS)}")
+        by_kind = by_kind if isinstance(by_kind, Mapping) else {"all": by_kind}
+        out[law] = {str(k): _number(f"stiffness.{law}.{k}", v, 1e-9, 1e15) for k, v in by_kind.items()}
     return out
 
 

@@ -14,8 +14,9 @@ import warp as wp
 from dexsim.tactile.sdf import Shapes, bound_radius, distance, in_grid
 
 LINEAR = 0
-MOONEY_RIVLIN = 1
-LAWS = {"linear": LINEAR, "mooney_rivlin": MOONEY_RIVLIN}
+HERTZ = 1
+MOONEY_RIVLIN = 2
+LAWS = {"linear": LINEAR, "hertz": HERTZ, "mooney_rivlin": MOONEY_RIVLIN}
 MAX_STRAIN = 0.8
 """Compression at which the rubber model saturates (stress grows without bound as it goes to 1)."""
 
@@ -36,7 +37,7 @@ class Law:
     """Constants of the force law, the same in all worlds."""
 
     kind: int
-    stiffness: wp.array(dtype=float)  # [F] N/m^3: pressure per depth
+    stiffness: wp.array(dtype=float)  # [F] linear: N/m^3; hertz: N/m^2.5; mooney_rivlin: factor
     thickness: float  # m, of the rubber
     c10: float  # Pa
     c01: float  # Pa
@@ -47,13 +48,18 @@ class Law:
 def taxel_force(law: Law, stiffness: float, depth: float, area: float, threshold: float):
     """Normal force [N] of a taxel pressed in by `depth` > 0 [m].
 
-    Linear: stiffness * area * depth (paper, "Tactile Sensor Simulation": f = k d, weighted by the area a taxel stands
-    for). Mooney-Rivlin: uniaxial compression of the rubber, stretch l = 1 - depth / thickness, pressure
-    2 (l^-2 - l) (c10 + c01 / l); `stiffness` is then a factor (1 nominal). Under `threshold` [N] the taxel is silent.
+    Linear: stiffness * area * depth, an elastic foundation (paper, "Tactile Sensor Simulation": f = k d, weighted by
+    the area a taxel stands for); its sum grows with about the square of the depth. Hertz: stiffness * area *
+    sqrt(depth): the pressure under a smooth body on an elastic solid is proportional to the root of the rigid overlap
+    (Hertz), and the sum grows with its power 1.5. Mooney-Rivlin: uniaxial compression of the rubber, stretch
+    l = 1 - depth / thickness, pressure 2 (l^-2 - l) (c10 + c01 / l), times `stiffness`. At or under `threshold` [N] the
+    taxel is silent.
     """
     f = float(0.0)
     if law.kind == wp.static(LINEAR):
         f = stiffness * area * depth
+    elif law.kind == wp.static(HERTZ):
+        f = stiffness * area * wp.sqrt(depth)
     else:
         l = 1.0 - wp.min(depth / law.thickness, wp.static(MAX_STRAIN))
         f = stiffness * area * 2.0 * (1.0 / (l * l) - l) * (law.c10 + law.c01 / l)

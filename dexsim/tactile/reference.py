@@ -90,6 +90,10 @@ def linear_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.nd
     return stiffness * area * np.maximum(depth, 0.0)
 
 
+def hertz_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.ndarray:
+    return stiffness * area * np.sqrt(np.maximum(depth, 0.0))
+
+
 def mooney_rivlin_force(depth: np.ndarray, area: np.ndarray, thickness: float, c10: float, c01: float) -> np.ndarray:
     """Uniaxial compression, stretch l = 1 - depth / thickness: pressure 2 (l^-2 - l) (c10 + c01 / l)."""
     stretch = 1.0 - np.minimum(np.maximum(depth, 0.0) / thickness, MAX_STRAIN)
@@ -99,6 +103,8 @@ def mooney_rivlin_force(depth: np.ndarray, area: np.ndarray, thickness: float, c
 def taxel_force(law: str, depth: np.ndarray, area: np.ndarray, stiffness: float, rubber: Mapping, threshold: float = 0.0) -> np.ndarray:
     if law == "linear":
         f = linear_force(depth, area, stiffness)
+    elif law == "hertz":
+        f = hertz_force(depth, area, stiffness)
     else:
         f = stiffness * mooney_rivlin_force(depth, area, rubber["thickness"], rubber["c10"], rubber["c01"])
     return np.where(f <= threshold, 0.0, f)

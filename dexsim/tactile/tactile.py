@@ -13,6 +13,7 @@ from dexsim.errors import UserError
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
 from dexsim.tactile.kernel import LAWS, Law, Pads, touch_kernel
 from dexsim.tactile.layout import TaxelLayout
+from dexsim.tactile.measure import Effects, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
 from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
 MAX_BLOCK = 1024
@@ -46,6 +47,7 @@ class Tactile:
         pairs: Sequence | None = None,
         tips: Sequence[np.ndarray] | None = None,
         other_pairs: Sequence[Sequence[str]] | None = None,
+        seed: int = 0,
         block: bool | None = None,
     ):
         self.cfg = cfg = tactile_config(cfg)
@@ -104,11 +106,56 @@ class Tactile:
         self.force, self.centre = self.force_clean, self.centre_clean
         self.raw_clean = self.raw = wp.to_torch(a.felt) if store else None
         self.raw3 = None
+        self._m = None
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         self._kernel = touch_kernel(self.block, solver, store, others)
         self._pair_normal = engine.wp.pair_normal if solver or (tip_columns >= 0).any() else wp.zeros((1, 1), dtype=float, device=self.device)
-        self.randomize(torch.ones(n, dtype=torch.bool, device=self.device))
+        if measured:
+            if cfg.shear and o != 1:
+                raise UserError(f"tactile.shear=true: works with one object, {o} were given")
+            self._measure(seed)
+        everyone = torch.ones(n, dtype=torch.bool, device=self.device)
+        self.randomize(everyone)
+        self.reset(everyone)
+
+    def _measure(self, seed: int) -> None:
+        """Arrays and kernels of the imperfect sensor."""
+        cfg, (n, f, t) = self.cfg, (self.engine.n, self.layout.pads, self.layout.taxels)
+        slots = 1 if not cfg.used("delay") else int(np.ceil(cfg.range("delay")[1] / cfg.period)) + 2
+        hysteresis, noise = cfg.used("hysteresis"), cfg.used("noise")
+        with wp.ScopedDevice(self.device):
+            e = Effects()
+            for name in ("threshold", "noise", "lsb", "delay", "hysteresis", "hysteresis_time", "shear_stiffness", "friction"):
+                setattr(e, name, self._row[name])
+            axes = np.stack([self.layout.tx, self.layout.ty], axis=2).astype(np.float32)
+            self._m = m = SimpleNamespace(
+                effects=e,
+                axes=wp.array(axes, dtype=wp.vec3),
+                gain=wp.ones((n, f, t), dtype=float),
+                episode=wp.zeros(n, dtype=int),
+                now=wp.zeros(n, dtype=float),
+                last=wp.zeros(n, dtype=float),
+                tick=wp.zeros(1, dtype=int),
+                state=wp.zeros((n, f, t) if hysteresis else (1, 1, 1), dtype=float),
+                anchor=wp.zeros((n, f, t) if cfg.shear else (1, 1, 1), dtype=wp.vec3),
+                ring=wp.zeros((slots, n, f, t), dtype=float),
+                ring_shear=wp.zeros((slots, n, f, t) if cfg.shear else (1, 1, 1, 1), dtype=wp.vec2),
+                stamps=wp.zeros((n, slots), dtype=float),
+                chosen=wp.zeros(n, dtype=int),
+                late=wp.zeros(1, dtype=int),
+                force=wp.zeros((n, f), dtype=float),
+                centre=wp.zeros((n, f), dtype=wp.vec3),
+                raw=wp.zeros((n, f, t) if cfg.raw else (1, 1, 1), dtype=float),
+                raw3=wp.zeros((n, f, t) if cfg.raw and cfg.shear else (1, 1, 1), dtype=wp.vec3),
+                seed=int(seed),
+                taxel=taxel_kernel(cfg.shear, hysteresis, noise),
+                report=report_kernel(self.block, cfg.shear, cfg.raw),
+            )
+        self.force, self.centre = wp.to_torch(m.force), wp.to_torch(m.centre)
+        self.gain = wp.to_torch(m.gain)
+        self.raw = wp.to_torch(m.raw) if cfg.raw else None
+        self.raw3 = wp.to_torch(m.raw3) if cfg.raw and cfg.shear else None
 
     def column(self, name: str) -> torch.Tensor:
         """View [N] of one per-world parameter; see `dexsim.tactile.config.COLUMNS`."""
@@ -127,22 +174,57 @@ class Tactile:
                 draw = low + (high - low) * torch.rand(col.shape, generator=generator, device=col.device)
                 col.copy_(torch.where(mask, draw, col))
 
+        m = self._m
+        if m is not None:
+            wp.to_torch(m.episode).add_(mask.to(torch.int32))
+            if self.cfg.used("gain_spread") or self.cfg.used("dead"):
+                args = [wp.from_torch(mask), self._row["gain_spread"], self._row["dead"], m.episode, m.seed, m.gain]
+                wp.launch(draw_gains, dim=m.gain.shape, inputs=args, device=self.device)
+
     def reset(self, mask: torch.Tensor) -> None:
         """Where mask [N] (bool) holds: forget the past (hysteresis, shear anchors, delayed readings)."""
+        m = self._m
+        if m is not None:
+            args = [wp.from_torch(mask), m.state, m.anchor, m.stamps, m.last]
+            wp.launch(forget, dim=self.engine.n, inputs=args, device=self.device)
+
+    def check(self) -> None:
+        """Fail if a delay was longer than the readings kept. Reads from the device: call it rarely."""
+        if self._m is not None and int(self._m.late.numpy()[0]):
+            raise UserError(
+                f"touch delay needs more readings than are kept: `launch` runs more often than tactile.period={self.cfg.period} s;"
+                " set tactile.period to the time between control steps"
+            )
 
     def launch(self) -> None:
         """Feel: only launches, so it can be recorded in a graph."""
-        a, n, f = self._a, self.engine.n, self.layout.pads
+        a, n = self._a, self.engine.n
         args = [
             self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp, a.object_body,
             a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column, int(self.cfg.feel_others),
             self._row["stiffness_scale"], self._row["threshold"], a.scratch, a.force, a.centre, a.force_other, a.felt,
         ]  # fmt: skip
+        self._launch(self._kernel, args)
+        m = self._m
+        if m is None:
+            return
+        xpos, xmat = self.engine.wp.xpos, self.engine.wp.xmat
+        wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
+        args = [
+            a.felt, m.gain, m.effects, self._pads, m.axes, xpos, xmat, a.object_body, m.now, m.last, m.tick, m.seed,
+            float(self.cfg.full_scale), m.state, m.anchor, m.ring, m.ring_shear,
+        ]  # fmt: skip
+        wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
+        wp.launch(stamp, dim=n, inputs=[m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late], device=self.device)
+        self._launch(m.report, [m.ring, m.ring_shear, m.chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3])
+
+    def _launch(self, kernel: wp.Kernel, args: list) -> None:
+        """One thread, or one block of a thread per taxel, for each world and pad."""
+        dim = [self.engine.n, self.layout.pads]
         if self.block:
-            threads = 32 * -(-self.layout.taxels // 32)
-            wp.launch_tiled(self._kernel, dim=[n, f], inputs=args, block_dim=threads, device=self.device)
+            wp.launch_tiled(kernel, dim=dim, inputs=args, block_dim=32 * -(-self.layout.taxels // 32), device=self.device)
         else:
-            wp.launch(self._kernel, dim=[n, f], inputs=args, device=self.device)
+            wp.launch(kernel, dim=dim, inputs=args, device=self.device)
 
 
 def _pads(engine: object, layout: TaxelLayout) -> Pads:
