@@ -21,18 +21,16 @@ class DummyEnv(VecEnv):
         self.max_episode_length = int(cfg["task"]["steps"])
         self.episode_length_buf = torch.zeros(n_worlds, dtype=torch.long, device=device)
         self._x = torch.zeros(n_worlds, 2, device=device)
-        self._generator = torch.Generator(device=device).manual_seed(seed)
+        self.rng = torch.Generator(device=device).manual_seed(seed)
         self._count = torch.zeros((), dtype=torch.long)
-        self.reset(None)
+        self.keep_final_obs = False
+        self.reset_all()
 
-    def reset(self, seed=None):
-        if seed is not None:
-            self._generator.manual_seed(seed)
+    def reset_all(self):
         self._restart(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
-        return self.get_observations()
 
     def _restart(self, mask):
-        fresh = torch.rand(self.num_envs, 2, generator=self._generator, device=self.device) * 2 - 1
+        fresh = torch.rand(self.num_envs, 2, generator=self.rng, device=self.device) * 2 - 1
         self._x.copy_(torch.where(mask[:, None], fresh, self._x))
         self.episode_length_buf[mask] = 0
 
@@ -41,16 +39,20 @@ class DummyEnv(VecEnv):
         return TensorDict({"actor": self._x, "critic": both}, batch_size=[self.num_envs])
 
     def step(self, actions):
-        self._x += 0.1 * actions.clamp(-1, 1)
+        self._x += 0.1 * actions.clamp(-1, 1)  # a graph from a policy would stick to the state, as in a real task
         self.episode_length_buf += 1
         self._count += 1
         reward = 1.0 - self._x.abs().sum(1)
         lost = self._x.abs().amax(1) > 2
         late = (self.episode_length_buf >= self.max_episode_length) & ~lost
-        extras = {"time_outs": late, "log": {"reward/near": reward.mean(), "hold": lost.float().mean()},
-                  "final_obs": self.get_observations().clone()}
+        extras = {"time_outs": late, "log": {"reward/near": reward.mean(), "hold": lost.float().mean()}}
+        if self.keep_final_obs:
+            extras["final_obs"] = self.get_observations().clone()
         self._restart(lost | late)
         return self.get_observations(), reward, lost | late, extras
+
+    def check(self):
+        """Nothing can overflow here."""
 
     def describe(self):
         return {"observations": {"actor": [("x", 2, "m")], "critic": [("x", 2, "m"), ("x clean", 2, "m")]},
@@ -60,23 +62,24 @@ class DummyEnv(VecEnv):
 
     def state_dict(self):
         return {"x": self._x.clone(), "age": self.episode_length_buf.clone(), "count": self._count.clone(),
-                "generator": self._generator.get_state()}
+                "generator": self.rng.get_state()}
 
     def load_state_dict(self, state):
         self._x.copy_(state["x"])
         self.episode_length_buf[:] = state["age"]
         self._count.copy_(state["count"])
-        self._generator.set_state(state["generator"].cpu())
+        self.rng.set_state(state["generator"].cpu())
 
     def scripted_policy(self):
         return lambda obs: -obs["actor"] * 10
 
     def evaluate(self, policy, episodes, seed, progress):
-        obs = self.reset(seed)
+        self.rng.manual_seed(seed)
+        self.reset_all()
+        obs = self.get_observations()
         total = torch.zeros(self.num_envs)
         for step in range(self.max_episode_length - 1):
-            with torch.no_grad():
-                obs, reward, _, _ = self.step(policy(obs))
+            obs, reward, _, _ = self.step(policy(obs))
             total += reward
             progress(step + 1, self.max_episode_length - 1)
         frames = 5
@@ -87,10 +90,10 @@ class DummyEnv(VecEnv):
         def progress_plot(axes):
             axes.plot([0, 1], [0, 1])
 
-        return {"metrics": {"episodes": episodes, "mean_return": float(total.mean()), "nothing": float("nan")},
+        return {"metrics": {"episodes": episodes, "mean_return": float(total.mean()), "graph": self._x.requires_grad, "nothing": float("nan")},
                 "tables": [("by world", ("world", "return"), [(0, float(total[0]))])],
                 "frames": {"model": [mujoco.MjModel.from_xml_string(XML)], "qpos": [qpos], "overlay": [overlay]},
-                "plots": [progress_plot]}
+                "plots": [("second", progress_plot), progress_plot]}
 
 
 def make_env(cfg, n_worlds, device, seed, engine):

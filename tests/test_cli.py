@@ -95,7 +95,7 @@ def test_resume_continues_counters_curves_and_config(configs, place, run_folder,
     data = checkpoint.load("runs/dummy/more/last.pt")
     assert data["iteration"] == 4 and data["steps"] == 4 * 24 * 4
     assert data["config"]["agent"]["actor"]["hidden_dims"] == [8] and data["config"]["worlds"] == 4
-    assert data["env"]["count"] == 4 * 24
+    assert data["env"]["count"] == 1 + 4 * 24  # the first step only compiles
     rows = Path("runs/dummy/more/progress.csv").read_text().splitlines()
     assert [r.split(",")[0] for r in rows] == ["iteration", "1", "2", "3", "4"]
     assert "after 2 iterations" in capfd.readouterr().out
@@ -115,6 +115,7 @@ def test_play_from_a_checkpoint(configs, place, run_folder, capfd):
     assert shell.call("play", configs, f"checkpoint={run_folder / 'policy.pt'}", "episodes=6", "video=false", "out=o",
                       "device=cpu", "task.steps=9") == 0
     metrics = json.loads(Path("o/metrics.json").read_text())
+    assert metrics["graph"] is False  # no autograd graph reached the environment
     assert metrics["episodes"] == 6 and metrics["nothing"] is None  # NaN is no JSON
     assert metrics["about"]["iteration"] == 2 and metrics["about"]["seed"] == 0
     out = capfd.readouterr().out
@@ -305,7 +306,7 @@ def test_ctrl_c_saves_and_says_where(configs, place, capfd, monkeypatch, number,
 
     def interrupted(self, actions):
         count.append(1)
-        if len(count) == 24 + 3:
+        if len(count) == 1 + 24 + 3:
             os.kill(os.getpid(), number)
         return step(self, actions)
 

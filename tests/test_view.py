@@ -153,5 +153,5 @@ def test_drawing_functions_give_one_file_each(tmp_path):
     def force_command(axes):
         axes.plot([0, 1], [0, 1])
 
-    paths = plots.draw([force_command, lambda axes: axes.plot([1])], tmp_path)
-    assert [p.name for p in paths] == ["force_command.png", "plot_1.png"]
+    paths = plots.draw([force_command, ("plain", lambda axes: axes.plot([1]))], tmp_path)
+    assert [p.name for p in paths] == ["force_command.png", "plain.png"]

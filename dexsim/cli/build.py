@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -40,9 +42,31 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
     seed_all(cfg["seed"])
     print("compiling kernels (first run only; cached afterwards) ...", flush=True)
     start = time.perf_counter()
+    quiet_warp(where)
     env = make_env(cfg, n_worlds=cfg["worlds"], device=where, seed=cfg["seed"], engine=cfg["sim"]["engine"])
+    with torch.no_grad():  # one step compiles the rest and captures the graph
+        env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
     print(f"ready after {time.perf_counter() - start:.1f} s", flush=True)
     return env
+
+
+def quiet_warp(device: str) -> None:
+    """Start Warp without its banner and, where only the CPU is wanted, without its warning that there is no GPU driver
+    (printed by its native library, hence the file descriptor)."""
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        if device == "cpu":
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, 2)
+            os.close(nowhere)
+        warp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def print_tables(env: Any) -> None:

@@ -7,6 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dexsim.cli.console import Ticker
 from dexsim.cli.report import table
 from dexsim.learning.ppo import Policy
@@ -19,7 +21,8 @@ def replay(env: Any, policy: Policy, out: Path, episodes: int, seed: int, video:
     Args:
         about: what was played (checkpoint, versions, ...), kept in metrics.json under "about".
     """
-    result = env.evaluate(policy, episodes=episodes, seed=seed, progress=Ticker("episodes"))
+    with torch.no_grad():
+        result = env.evaluate(policy, episodes=episodes, seed=seed, progress=Ticker("episodes"))
     metrics = result["metrics"]
     (out / "metrics.json").write_text(json.dumps(_plain(metrics | {"about": about | {"seed": seed}}), indent=2) + "\n")
     rows = [(name, value) for name, value in metrics.items() if not isinstance(value, (list, dict))]

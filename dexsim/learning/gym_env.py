@@ -23,11 +23,13 @@ class GymVectorEnv(VectorEnv):
     """Worlds reset in the step that ends their episode (``AutoresetMode.SAME_STEP``).
 
     Observations [N, D] float32 are one group of the environment's, by default what the actor sees; the other groups
-    are in ``info``. Where an episode ends, ``info["final_obs"]`` [N, D] holds its last observation for the worlds of
-    ``info["_final_obs"]`` (rows of the others are not meaningful). Time limits are truncations, all else is termination.
+    are in ``info``. Actions [N, A] float32 lie in [-1, 1]. Where an episode ends, ``info["final_obs"]`` [N, D] holds its
+    last observation for the worlds of ``info["_final_obs"]`` (rows of the others are not meaningful). Time limits are
+    truncations, all else is termination.
 
     Args:
-        env: the environment (rsl-rl's ``VecEnv``) with ``reset(seed)`` and ``extras["final_obs"]``.
+        env: the environment (rsl-rl's ``VecEnv``) with its generator ``rng`` and ``reset_all()``; it gives
+            ``extras["final_obs"]`` once ``keep_final_obs`` is set.
         group: observation group to return.
         as_torch: return and take torch tensors on the environment's device instead of NumPy arrays.
     """
@@ -38,11 +40,10 @@ class GymVectorEnv(VectorEnv):
             raise UserError(f"group={group}: this environment has the observation groups {', '.join(first.keys())}")
         self.env, self.num_envs, self._group, self._torch = env, int(env.num_envs), group, as_torch
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": [], "render_fps": round(1 / env.dt)}
-        rows = env.describe()["action"]
-        low, high = (np.array([row[i] for row in rows], np.float32) for i in (1, 2))
+        env.keep_final_obs = True
         size = first[group].shape[-1]
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
-        self.single_action_space = Box(low, high, dtype=np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (int(env.num_actions),), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -50,12 +51,16 @@ class GymVectorEnv(VectorEnv):
         """Start a new episode in every world; a seed makes what follows repeatable."""
         if seed is not None and not isinstance(seed, (int, np.integer)):
             raise UserError("seed: one whole number for all worlds")
+        if seed is not None:
+            self.env.rng.manual_seed(int(seed))
+            torch.manual_seed(int(seed))
         with torch.no_grad():
-            obs = self.env.reset(seed)
+            self.env.reset_all()
+        obs = self.env.get_observations()
         return self._out(obs[self._group]), self._others(obs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Advance every world by one control step. ``actions`` [N, A] beyond the action space are the task's to clip."""
+        """Advance every world by one control step. ``actions`` [N, A] are clipped to [-1, 1]."""
         actions = torch.as_tensor(actions, dtype=torch.float32, device=self.env.device)
         if actions.shape != self.action_space.shape:
             raise UserError(f"actions have shape {tuple(actions.shape)}, must be {self.action_space.shape}")

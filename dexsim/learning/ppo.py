@@ -64,15 +64,14 @@ def load_policy(data: dict[str, Any], env: Any, path: str) -> Policy:
 
 
 def plain_policy(name: str, env: Any, seed: int) -> Policy:
-    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform over the action range) or ``scripted``
-    (the task's own, from ``env.scripted_policy()``)."""
+    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform in [-1, 1], what every task's actions are
+    clipped to) or ``scripted`` (the task's own, from ``env.scripted_policy()``)."""
     shape = (env.num_envs, env.num_actions)
     if name == "zero":
         return lambda obs: torch.zeros(shape, device=env.device)
     if name == "random":
         generator = torch.Generator(device=env.device).manual_seed(seed)
-        low, high = (torch.tensor([float(row[i]) for row in env.describe()["action"]], device=env.device) for i in (1, 2))
-        return lambda obs: low + (high - low) * torch.rand(shape, generator=generator, device=env.device)
+        return lambda obs: 2 * torch.rand(shape, generator=generator, device=env.device) - 1
     if name == "scripted":
         if not hasattr(env, "scripted_policy"):
             raise UserError("policy=scripted: this task has no scripted policy; use random or zero")

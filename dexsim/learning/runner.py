@@ -27,7 +27,7 @@ class Runner(OnPolicyRunner):
     """PPO on a dexsim environment.
 
     Args:
-        env: an rsl-rl ``VecEnv`` with ``describe``, ``state_dict``, ``load_state_dict``, ``action_names``.
+        env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``.
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
 
@@ -63,7 +63,7 @@ class Runner(OnPolicyRunner):
         """Learn until ``iterations`` are done in all; False when ``stop()`` ended it early.
 
         ``on_iteration`` gets the iteration's scalars. A rollout that ``stop`` breaks off is dropped, an update never.
-        Raises UserError when the losses stop being finite.
+        Raises UserError when learning diverges or the environment's ``check()`` finds something lost.
         """
         if self._fresh and self.cfg.get("init_at_random_ep_len"):
             self.env.episode_length_buf = torch.randint_like(
@@ -82,6 +82,7 @@ class Runner(OnPolicyRunner):
                         return False
                     obs = self._step(obs)
                 self.alg.compute_returns(obs)
+            self.env.check()
             collected = time.perf_counter()
             losses = self._update()
             self.iteration += 1

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +79,14 @@ def smooth(values: Sequence[float], width: int) -> list[float]:
     return out
 
 
-def draw(functions: Sequence[Callable[[Any], None]], folder: Path) -> list[Path]:
-    """Each function draws on one axes; saved as ``<function name>.png`` (``plot_<k>.png`` for a nameless one)."""
+def draw(functions: Sequence[Any], folder: Path) -> list[Path]:
+    """Each plot, a function of one axes or a pair (file name, function), saved as ``<name>.png``."""
     paths = []
-    for k, function in enumerate(functions):
-        name = getattr(function, "__name__", "")
+    for item in functions:
+        name, function = item if isinstance(item, tuple) else (item.__name__, item)
         figure = Figure(figsize=(7.0, 4.6), layout="constrained")
         function(figure.subplots())
-        path = folder / f"{name if name.isidentifier() and name != 'function' else f'plot_{k}'}.png"
+        path = folder / f"{name}.png"
         figure.savefig(path, dpi=120)
         paths.append(path)
     return paths
