@@ -37,7 +37,8 @@ class TactileConfig:
     law: str = "hertz"
     stiffness: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     rubber: Mapping[str, float] = field(default_factory=lambda: {"thickness": 2.0e-3, "c10": 4.0e4, "c01": 1.0e4})
-    reach: float = 0.6e-3
+    reach: float = 1.0e-3
+    lift: bool = True
     others: bool = True
     feel_others: bool = False
     raw: bool = False
@@ -77,7 +78,7 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
     for key, options in (("sum", ("solver", "spring")), ("law", tuple(LAWS))):
         if key in out and out[key] not in options:
             raise UserError(f"tactile.{key}={out[key]}: must be one of {', '.join(options)}")
-    for key in ("others", "feel_others", "raw", "shear"):
+    for key in ("lift", "others", "feel_others", "raw", "shear"):
         if key in out and not isinstance(out[key], bool):
             raise UserError(f"tactile.{key}={out[key]}: must be true or false")
     for key, low, high in (("reach", 1e-6, 1e-2), ("period", 1e-4, 1.0)):

@@ -63,8 +63,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="presses of each shape")
     parser.add_argument("--contact", type=float, default=CONTACT_STIFFNESS, help="K of the physics, N/m")
     args = parser.parse_args()
-    layout = xhand_layout()
     tips = tip_points(mujoco.MjModel.from_xml_path(str(xhand.xml_path())), xhand.TIP_GEOMS)
+    layout = xhand_layout().lifted(tips)
     report: dict = {"contact": args.contact}
     for kind in dict.fromkeys(layout.kinds):
         pad = layout.kinds.index(kind)

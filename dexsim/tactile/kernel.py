@@ -76,13 +76,15 @@ def spread_level(nearest: float, reach: float):
 
 @wp.func
 def spread_weight(d: float, area: float, level: float):
-    """A taxel's share of the solver's force, up to a factor: area times depth under the level.
+    """A taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
 
-    Deeper than `reach` the level is 0, the object's surface: by depth alone. A shallower contact, or one that falls
-    between the taxels, is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous
-    in the distances, and the nearest taxel always has a positive share: no force is lost.
+    Deeper than `reach` the level is 0, the object's surface. A shallower contact, or one that falls between the taxels,
+    is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous in the distances, and
+    the nearest taxel always has a positive share: no force is lost. The square, which fades out smoothly at the edge of
+    the patch, halves the lattice's error in the centre of a flat contact against the depth itself (measured).
     """
-    return area * wp.max(level - d, 0.0)
+    depth = wp.max(level - d, 0.0)
+    return area * depth * depth
 
 
 @wp.func

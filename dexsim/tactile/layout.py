@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +56,21 @@ class TaxelLayout:
             radius[f] = np.linalg.norm(p - centre[f], axis=1).max()
         return centre, radius
 
+    def lifted(self, tips: Sequence[np.ndarray], limit: float = 1e-3) -> TaxelLayout:
+        """The taxels moved along their normals onto the convex hulls of `tips` ([F] of [V, 3] m, body frames), the
+        surfaces that the physics presses, so that a taxel is in an object where that surface is. Fails if one would
+        move farther than `limit` [m]: the tip then does not follow the pad.
+        """
+        point = self.point.copy()
+        for f, tip in enumerate(tips):
+            n = self.count[f]
+            move = gap_to_hull(point[f, :n], self.normal[f, :n], tip)
+            if not np.abs(move).max() <= limit:
+                k = int(np.argmax(np.where(np.isfinite(move), np.abs(move), np.inf)))
+                raise UserError(f"pad '{self.names[f]}': taxel {k} lies {move[k] * 1e3:.2f} mm under the tip's surface, allowed {limit * 1e3:g}; mend the tip or set tactile.lift=false")
+            point[f, :n] += self.normal[f, :n] * move[:, None]
+        return replace(self, point=point)
+
     @staticmethod
     def build(pads: Sequence[dict]) -> TaxelLayout:
         """Pads as dicts with name, body, kind (default: name), point, normal and optionally tx, ty (default:
@@ -98,6 +113,16 @@ class TaxelLayout:
             area=area,
             **out,
         )
+
+
+def gap_to_hull(point: np.ndarray, normal: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Distance [n] along each normal from points [n, 3] to the convex hull of corners [V, 3]: negative from outside."""
+    from scipy.spatial import ConvexHull
+
+    planes = ConvexHull(corners).equations
+    along = normal @ planes[:, :3].T
+    gap = -(point @ planes[:, :3].T + planes[:, 3])
+    return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
 
 
 def tangents(normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:

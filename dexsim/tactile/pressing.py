@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexsim.tactile import reference as ref
-from dexsim.tactile.layout import TaxelLayout
+from dexsim.tactile.layout import TaxelLayout, gap_to_hull
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,7 @@ def skin_of(layout: TaxelLayout, pad: int, columns: int, rows: int, tip: np.ndar
     good = size > 0.2 * np.linalg.norm(du, axis=-1) * np.linalg.norm(dv, axis=-1)
     point, n, area = point[good], (n / size[..., None])[good], size[good] / size[good].sum()
     if tip is not None:
-        from scipy.spatial import ConvexHull
-
-        planes = ConvexHull(tip).equations
-        along = n @ planes[:, :3].T
-        gap = -(point @ planes[:, :3].T + planes[:, 3]) / np.where(along > 0.05, along, np.nan)
-        point = point + n * np.nanmin(gap, axis=1)[:, None]
+        point = point + n * gap_to_hull(point, n, tip)[:, None]
     return Skin(point, n, area)
 
 

@@ -26,7 +26,8 @@ class Tactile:
     `engine.step`. layout: F pads of up to T taxels. shapes: what objects can be. object_body: name of the object's body
     (its frame is the shape's frame), or several names. cfg: see configs/tactile/default.yaml.
     pairs: for sum=solver, name of the engine's contact pair (pad, object) of each pad, [F] (or [F][O] for O objects).
-    tips: for others=true, points [V, 3] (body frame) of each pad's tip, whose convex hull other pads can feel.
+    tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
+    other pads feel (others=true).
     other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
 
     Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform scale
@@ -80,8 +81,8 @@ class Tactile:
         self.columns = tuple(COLUMNS)
 
         with wp.ScopedDevice(self.device):
-            self._pads = _pads(engine, layout)
-            self._law = _law(cfg, layout)
+            self._pads = _pads(engine, layout, layout.lifted(tips) if cfg.lift and tips is not None else layout)
+            self._law = _law(cfg, layout, needed=not solver or others)
             tip_shapes = [TouchShape(f"tip_{name}", "grid", bake_convex(np.asarray(p, float))) for name, p in zip(layout.names, tips, strict=True)] if others else []
             self.tips = ShapeSet(tip_shapes, self.device)
             a = SimpleNamespace(
@@ -227,22 +228,24 @@ class Tactile:
             wp.launch(kernel, dim=dim, inputs=args, device=self.device)
 
 
-def _pads(engine: object, layout: TaxelLayout) -> Pads:
-    centre, radius = layout.bound()
+def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
+    """The layout on the device, with its taxels where `felt` has them."""
+    centre, radius = felt.bound()
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
     out.count = wp.array(layout.count, dtype=int)
-    out.taxel = wp.array(np.concatenate([layout.point, layout.area[..., None]], axis=-1).astype(np.float32), dtype=wp.vec4)
+    out.taxel = wp.array(np.concatenate([felt.point, layout.area[..., None]], axis=-1).astype(np.float32), dtype=wp.vec4)
     out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
     out.bound = wp.array(np.concatenate([centre, radius[:, None]], axis=1).astype(np.float32), dtype=wp.vec4)
     return out
 
 
-def _law(cfg: TactileConfig, layout: TaxelLayout) -> Law:
+def _law(cfg: TactileConfig, layout: TaxelLayout, needed: bool) -> Law:
+    """needed: whether any force comes from springs; else no stiffness is asked for."""
     out = Law()
     out.kind = LAWS[cfg.law]
-    spring = cfg.sum == "spring" or cfg.others
-    out.stiffness = wp.array(np.array(stiffness_of(cfg, layout.kinds) if spring else [1.0] * layout.pads, dtype=np.float32), dtype=float)
+    stiffness = stiffness_of(cfg, layout.kinds) if needed else [1.0] * layout.pads
+    out.stiffness = wp.array(np.array(stiffness, dtype=np.float32), dtype=float)
     out.thickness, out.c10, out.c01 = (float(cfg.rubber[k]) for k in ("thickness", "c10", "c01"))
     out.reach = float(cfg.reach)
     return out
