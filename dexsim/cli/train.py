@@ -41,6 +41,8 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         stop.gently = True
         try:
             finished = runner.learn(cfg["iterations"], log.iteration, stop.asked)
+        except checkpoint.SaveError:
+            raise
         except UserError as error:
             saved = f"; saved until then: {where / 'last.pt'}" if (where / "last.pt").exists() else ""
             raise UserError(f"{error}{saved}") from error.__cause__

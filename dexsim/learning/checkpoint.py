@@ -29,6 +29,10 @@ import torch
 
 from dexsim.errors import UserError
 
+class SaveError(UserError):
+    """A checkpoint could not be written; what was there before is whole."""
+
+
 FORMAT = "dexsim-checkpoint"
 VERSION = 1
 KEYS = ("kind", "config", "versions", "git", "layout", "iteration", "steps", "actor")
@@ -38,7 +42,7 @@ TRAIN_KEYS = ("critic", "optimizer", "env", "rng")
 def save(path: str | Path, payload: dict[str, Any]) -> Path:
     """Write a checkpoint so that ``path`` holds either the old file or the whole new one, never a part.
 
-    Raises UserError naming the path when the disk is full or the folder cannot be written.
+    Raises SaveError naming the path when the disk is full or the folder cannot be written.
     """
     return write(path, encode(payload))
 
@@ -52,7 +56,7 @@ def encode(payload: dict[str, Any]) -> bytes:
 
 
 def write(path: str | Path, data: bytes) -> Path:
-    """Write, sync, rename. Raises UserError; the file that was at ``path`` before stays whole."""
+    """Write, sync, rename. Raises SaveError; the file that was at ``path`` before stays whole."""
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -67,8 +71,8 @@ def write(path: str | Path, data: bytes) -> Path:
             part.unlink()
         kept = "; the previous file there is whole" if path.exists() else ""
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise UserError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None
-        raise UserError(f"cannot save {path}: {error.strerror}{kept}") from None
+            raise SaveError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None
+        raise SaveError(f"cannot save {path}: {error.strerror}{kept}") from None
     return path
 
 

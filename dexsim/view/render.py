@@ -18,7 +18,7 @@ NO_GL = 3
 LONGEST_S = 60.0
 FASTEST = 60.0  # frames per second that a video needs at most
 # Palm frame = world frame: fingers along +x, palm normal +z. Three-quarter view from the fingers' side, a little above.
-CAMERA = {"lookat": [0.055, 0.0, 0.035], "distance": 0.46, "azimuth": 140.0, "elevation": -28.0}
+CAMERA = {"lookat": [0.045, -0.01, 0.025], "distance": 0.38, "azimuth": 140.0, "elevation": -28.0}
 
 
 def main(folder: Path, path: Path) -> int:
@@ -87,8 +87,8 @@ class Tile:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4
         model.vis.quality.shadowsize = 2048
-        model.vis.headlight.ambient[:] = 0.35
-        model.vis.headlight.diffuse[:] = 0.45
+        model.vis.headlight.ambient[:] = 0.45
+        model.vis.headlight.diffuse[:] = 0.55
         model.vis.headlight.specular[:] = 0.15
         model.vis.map.znear = 0.02
         self._sky = any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
