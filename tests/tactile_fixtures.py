@@ -1,48 +1,14 @@
-"""A minimal engine that only holds poses and contact forces, and layouts to feel with."""
+"""Touch on given poses, and layouts to feel with."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
-import torch
-import warp as wp
 
-from dexsim.errors import UserError
 from dexsim.tactile import ShapeSet, Tactile, TaxelLayout
+from dexsim.tactile.posed import PosedEngine
 from dexsim.tactile.shapes import TouchShape
 
 SPRING = {"sum": "spring", "law": "linear", "stiffness": {"linear": 2.0e8, "hertz": 5.0e6, "mooney_rivlin": 1.0}}
-
-
-class PosedEngine:
-    """N worlds whose body poses and contact forces are set by hand."""
-
-    def __init__(self, n: int, bodies: list[str], pairs: list[str], device: str = "cpu"):
-        self.n, self.device, self.dt = n, device, 0.005
-        self.bodies, self.pairs = bodies, pairs
-        self.wp = SimpleNamespace(
-            time=wp.zeros(n, dtype=float, device=device),
-            xpos=wp.zeros((n, len(bodies)), dtype=wp.vec3, device=device),
-            xmat=wp.zeros((n, len(bodies)), dtype=wp.mat33, device=device),
-            pair_normal=wp.zeros((n, len(pairs)), dtype=float, device=device),
-        )
-        self.t = SimpleNamespace(**{k: wp.to_torch(v) for k, v in vars(self.wp).items()})
-        self.t.xmat[:] = torch.eye(3)
-
-    def body(self, name: str) -> int:
-        if name not in self.bodies:
-            raise UserError(f"model has no body '{name}'")
-        return self.bodies.index(name)
-
-    def pair(self, name: str) -> int:
-        return self.pairs.index(name)
-
-    def place(self, world: int, body: str, position, rotation=None) -> None:
-        b = self.body(body)
-        self.t.xpos[world, b] = torch.as_tensor(np.asarray(position, np.float32))
-        if rotation is not None:
-            self.t.xmat[world, b] = torch.as_tensor(np.asarray(rotation, np.float32))
 
 
 def touch(n: int, layout: TaxelLayout, shapes: list, cfg: dict, **kw) -> tuple[PosedEngine, Tactile]:

@@ -11,7 +11,7 @@ from functools import cache
 
 import warp as wp
 
-from dexsim.tactile.sdf import Shapes, bound_radius, distance, in_grid
+from dexsim.tactile.sdf import Shapes, bound_radius, distance, in_grid, near_grid
 
 LINEAR = 0
 HERTZ = 1
@@ -96,6 +96,12 @@ def pose_in(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w
 @wp.func
 def turn_in(xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
     return wp.transpose(xmat[w, frame]) * xmat[w, body]
+
+
+@wp.func
+def into(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int, p: wp.vec3):
+    """A point of a body in another body's frame: for one point cheaper than composing the two poses."""
+    return wp.transpose(xmat[w, frame]) * (xmat[w, body] * p + (xpos[w, body] - xpos[w, frame]))
 
 
 @wp.func
@@ -200,6 +206,8 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                 if near and tip_column[f, g] >= 0:
                     near = pair_normal[w, tip_column[f, g]] > 0.0
                 if near:
+                    near = near_grid(tips, g, into(xpos, xmat, w, body, pads.body[g], xyz(bound)), bound[3])
+                if near:
                     a = turn_in(xmat, w, body, pads.body[g])
                     b = pose_in(xpos, xmat, w, body, pads.body[g])
                     for t in range(n):
@@ -256,12 +264,11 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
             if wp.static(solver):
                 pressed = pair_normal[w, pair_column[f, o]]
             if shape >= 0 and (pressed > 0.0 or not wp.static(solver)):
-                a = turn_in(xmat, w, body, object_body[o])
-                b = pose_in(xpos, xmat, w, body, object_body[o])
+                q = into(xpos, xmat, w, body, object_body[o], xyz(p))
                 if wp.static(solver):
                     d = float(1.0e9)
                     if live:
-                        d = distance(shapes, shape, size, a * xyz(p) + b)
+                        d = distance(shapes, shape, size, q)
                     nearest = wp.tile_min(wp.tile(d))
                     c = spread_weight(d, p[3], spread_level(nearest[0], law.reach))
                     sums = wp.tile_sum(wp.tile(wp.vec4(c * p[0], c * p[1], c * p[2], c), preserve_type=True))
@@ -270,10 +277,10 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                     total += wp.vec4(scale * s[0], scale * s[1], scale * s[2], pressed)
                     mine += scale * c
                 else:
-                    if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
+                    if may_touch(shapes, shape, size, into(xpos, xmat, w, body, object_body[o], xyz(bound)), bound[3]):
                         c = float(0.0)
                         if live:
-                            d = distance(shapes, shape, size, a * xyz(p) + b)
+                            d = distance(shapes, shape, size, q)
                             if d < 0.0:
                                 c = taxel_force(law, k, -d, p[3], threshold[w])
                         sums = wp.tile_sum(wp.tile(wp.vec4(c * p[0], c * p[1], c * p[2], c), preserve_type=True))
@@ -293,8 +300,10 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                 if near and tip_column[f, g] >= 0:
                     near = pair_normal[w, tip_column[f, g]] > 0.0
                 if near:
+                    near = near_grid(tips, g, into(xpos, xmat, w, body, pads.body[g], xyz(bound)), bound[3])
+                if near:
                     touched = 1
-                    q = turn_in(xmat, w, body, pads.body[g]) * xyz(p) + pose_in(xpos, xmat, w, body, pads.body[g])
+                    q = into(xpos, xmat, w, body, pads.body[g], xyz(p))
                     if live and in_grid(tips, g, q):
                         d = distance(tips, g, wp.vec3(1.0, 1.0, 1.0), q)
                         if d < 0.0:

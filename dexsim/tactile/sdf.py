@@ -115,6 +115,18 @@ def in_grid(s: Shapes, i: int, q: wp.vec3):
 
 
 @wp.func
+def near_grid(s: Shapes, i: int, middle: wp.vec3, radius: float):
+    """Whether a sphere can reach the grid's box."""
+    n = s.dims[i]
+    g = middle - s.origin[i]
+    e = wp.vec3(float(n[0] - 1), float(n[1] - 1), float(n[2] - 1)) * s.spacing[i]
+    x = wp.max(wp.max(-g[0], g[0] - e[0]), 0.0)
+    y = wp.max(wp.max(-g[1], g[1] - e[1]), 0.0)
+    z = wp.max(wp.max(-g[2], g[2] - e[2]), 0.0)
+    return x * x + y * y + z * z < radius * radius
+
+
+@wp.func
 def distance(s: Shapes, i: int, size: wp.vec3, q: wp.vec3):
     """Signed distance [m] of q to shape i of the set, at this world's size."""
     kind = s.kind[i]
