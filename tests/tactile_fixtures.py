@@ -13,7 +13,8 @@ SPRING = {"sum": "spring", "law": "linear", "stiffness": {"linear": 2.0e8, "hert
 
 def touch(n: int, layout: TaxelLayout, shapes: list, cfg: dict, **kw) -> tuple[PosedEngine, Tactile]:
     """An engine with the layout's bodies and `object`, and touch on it, one pair "pad" a pad."""
-    engine = PosedEngine(n, ["world", *dict.fromkeys(layout.bodies), "object"], list(layout.names), kw.pop("device", "cpu"))
+    bodies = ["world", *dict.fromkeys(layout.bodies), "object"]
+    engine = PosedEngine(n, bodies, layout.names, kw.pop("device", "cpu"))
     tactile = Tactile(engine, layout, ShapeSet(shapes, engine.device), "object", cfg, pairs=list(layout.names), **kw)
     return engine, tactile
 
@@ -28,7 +29,15 @@ def flat_layout(half: float = 8e-3, n: int = 81) -> TaxelLayout:
     x = -half + pitch * (np.arange(n) + 0.5)
     p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((n, n))], -1).reshape(-1, 3)
     return TaxelLayout.build(
-        [{"name": "flat", "body": "pad", "point": p, "normal": np.tile([0, 0, 1.0], (n * n, 1)), "area": np.full(n * n, pitch**2)}]
+        [
+            {
+                "name": "flat",
+                "body": "pad",
+                "point": p,
+                "normal": np.tile([0, 0, 1.0], (n * n, 1)),
+                "area": np.full(n * n, pitch**2),
+            }
+        ]
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -94,9 +95,8 @@ def test_spring_sum_equals_the_numpy_reference(law):
             d = expected_distance(pose, f)
             force = ref.taxel_force(law, -d, hand().area[f], stiffness, tactile.cfg.rubber, 1e-3)
             # float32 poses: 1e-8 m on the depth, so compare with the force of that depth besides 1e-4
-            slack = ref.taxel_force(law, np.maximum(-d, 0) + 3e-8, hand().area[f], stiffness, tactile.cfg.rubber) - ref.taxel_force(
-                law, -d, hand().area[f], stiffness, tactile.cfg.rubber
-            )
+            deeper = ref.taxel_force(law, np.maximum(-d, 0) + 3e-8, hand().area[f], stiffness, tactile.cfg.rubber)
+            slack = deeper - ref.taxel_force(law, -d, hand().area[f], stiffness, tactile.cfg.rubber)
             got = tactile.raw_clean[w, f].numpy()
             near = np.abs(force - 1e-3) > 2e-4
             assert np.all(np.abs(got - force)[near] <= (1e-4 * force + 2 * slack)[near])
@@ -139,7 +139,8 @@ def test_block_kernel_equals_the_serial_one(mode, monkeypatch):
     stiffness = {"hertz": 5e6}
     out = []
     for block in (False, True):
-        engine, tactile = touch(6, hand(), shapes(), {"sum": mode, "raw": True, "stiffness": stiffness}, tips=tips(), block=block)
+        cfg = {"sum": mode, "raw": True, "stiffness": stiffness}
+        engine, tactile = touch(6, hand(), shapes(), cfg, tips=tips(), block=block)
         set_poses(engine, tactile, poses)
         # two fingers into each other
         index, mid = hand().bodies[1], hand().bodies[2]
@@ -173,8 +174,9 @@ def test_no_contact_is_exactly_zero_with_the_centre_on_the_pad(mode):
 
 @pytest.mark.parametrize("depth", [0.3e-3, 1.0e-3])
 def test_sphere_on_a_flat_pad_is_the_closed_form_foundation(depth):
-    """Overlap depth - s^2 / 2R: linear sums to pi k R depth^2, the root to 4/3 pi k R depth^1.5 (both to depth / R); and
-    linear, integrated over the exact sphere, to pi k (R a^2 - 2/3 (R^3 - (R - depth)^3)), a the contact's radius."""
+    """Overlap depth - s^2 / 2R: linear sums to pi k R depth^2, the root to 4/3 pi k R depth^1.5 (both to depth / R);
+    and linear, integrated over the exact sphere, to pi k (R a^2 - 2/3 (R^3 - (R - depth)^3)), a the contact's radius.
+    """
     radius, layout = 30e-3, flat_layout()
     for law, k, want in (
         ("linear", 2e8, np.pi * 2e8 * radius * depth**2),
@@ -218,7 +220,9 @@ def test_mirrored_contact_is_felt_mirrored():
 
 
 @wp.kernel
-def _probe(s: Shapes, i: int, size: wp.vec3, q: wp.array(dtype=wp.vec3), d: wp.array(dtype=float), n: wp.array(dtype=wp.vec3)):
+def _probe(
+    s: Shapes, i: int, size: wp.vec3, q: wp.array(dtype=wp.vec3), d: wp.array(dtype=float), n: wp.array(dtype=wp.vec3)
+):
     t = wp.tid()
     d[t] = distance(s, i, size, q[t])
     n[t] = normal(s, i, size, q[t])
@@ -374,7 +378,8 @@ def _press_errors(mode: str, kind: str, size, depth: float, count: int) -> tuple
 
 
 @pytest.mark.parametrize(
-    ("kind", "size", "allowed"), [("box", (0.2, 0.2, 0.2), 1.0), ("sphere", (0.01, 0, 0), 2.0), ("sphere", (0.03, 0, 0), 2.0)]
+    ("kind", "size", "allowed"),
+    [("box", (0.2, 0.2, 0.2), 1.0), ("sphere", (0.01, 0, 0), 2.0), ("sphere", (0.03, 0, 0), 2.0)],
 )
 def test_centre_of_pressure_lies_where_the_contact_is(kind, size, allowed):
     """At 0.7 mm depth; true centre at least 4 mm (two rows) inside the pad's border. The rest: bounded, 3.5 mm."""
@@ -394,13 +399,14 @@ def test_spring_sum_agrees_with_the_contact_law_in_the_median():
     from dexsim.tactile.config import tactile_config
     from dexsim.tactile.fit_stiffness import CONTACT_STIFFNESS, press_library
 
-    with open("configs/tactile/default.yaml", encoding="utf-8") as f:
-        cfg = tactile_config(yaml.safe_load(f))
+    path = Path(__file__).parents[1] / "configs" / "tactile" / "default.yaml"
+    cfg = tactile_config(yaml.safe_load(path.read_text()))
     for pad in (0, 1):
         pressed = press_library(hand().lifted(tips()), pad, tips()[pad], 20, seed=3)
         k = cfg.stiffness["hertz"][hand().kinds[pad]]
         for depth in (0.7e-3, 1.0e-3):
-            r = [ref.hertz_force(-p.d, hand().area[pad], k).sum() / (CONTACT_STIFFNESS * depth) for p in pressed if p.depth == depth]
+            at = [p for p in pressed if p.depth == depth]
+            r = [ref.hertz_force(-p.d, hand().area[pad], k).sum() / (CONTACT_STIFFNESS * depth) for p in at]
             error = 1.25 * np.std(r) / np.sqrt(len(r))  # of the median of that many presses
             assert np.median(r) == pytest.approx(1.0, abs=0.1 + 2.5 * error)
 
@@ -415,10 +421,15 @@ PLATE = """<mujoco><asset><mesh name="plate" builtin="plate" params="9 9" scale=
 
 @pytest.mark.parametrize(
     ("kind", "size"),
-    [("sphere", (0.02, 0, 0)), ("box", (0.005, 0.006, 0.004)), ("capsule", (0.006, 0.005, 0)), ("cylinder", (0.006, 0.005, 0))],
+    [
+        ("sphere", (0.02, 0, 0)),
+        ("box", (0.005, 0.006, 0.004)),
+        ("capsule", (0.006, 0.005, 0)),
+        ("cylinder", (0.006, 0.005, 0)),
+    ],
 )
 def test_depths_are_those_of_mujocos_tactile_sensor(kind, size):
-    """MuJoCo's `tactile` sensor reports the depth at each vertex of a mesh (in the frame of the geom it is bound to)."""
+    """MuJoCo's `tactile` sensor reports the depth at each vertex of a mesh (in the frame of its geom)."""
     spec = mujoco.MjSpec.from_string(PLATE)
     geom = spec.geom("object")
     geom.type, geom.size = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), np.array(size, float)
@@ -429,7 +440,8 @@ def test_depths_are_those_of_mujocos_tactile_sensor(kind, size):
     layout = TaxelLayout.build(
         [{"name": "p", "body": "pad", "point": points, "normal": np.tile([0, 0, 1.0], (n, 1)), "area": np.ones(n)}]
     )
-    engine, tactile = touch(worlds, layout, [TouchShape(kind, kind)], {**SPRING, "stiffness": {"linear": 1.0}, "raw": True})
+    cfg = {**SPRING, "stiffness": {"linear": 1.0}, "raw": True}
+    engine, tactile = touch(worlds, layout, [TouchShape(kind, kind)], cfg)
     tactile.shape_id[:], tactile.shape_size[:] = 0, torch.tensor(size, dtype=torch.float32)
     rng = np.random.default_rng(3)
     want = np.zeros((worlds, n))
@@ -457,8 +469,8 @@ def test_depths_are_those_of_mujocos_tactile_sensor(kind, size):
 
 
 def test_the_surface_may_be_given_by_samples():
-    """The paper's wording (nearest sample, normal, v . n < 0) tends to the exact depth with the samples' density; blending
-    neighbours smooths it."""
+    """The paper's wording (nearest sample, normal, v . n < 0) tends to the exact depth with the samples' density;
+    blending neighbours smooths it."""
     rng = np.random.default_rng(4)
     normals = rng.normal(size=(40000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -479,6 +491,24 @@ def test_kernels_compile_for_cuda_without_a_gpu(solver, tmp_path):
     kernel.module.options["block_dim"] = 128
     out = wp.compile_aot_module(kernel.module, arch=90, use_ptx=True, module_dir=str(tmp_path))
     assert out and out[0].stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "raw", "full"])
+def test_shipped_settings_are_valid_for_the_hand(name):
+    from hydra import compose, initialize_config_dir
+
+    from dexsim.tactile.config import stiffness_of, tactile_config
+
+    folder = Path(__file__).parents[1] / "configs" / "tactile"
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        cfg = tactile_config(compose(name))
+    assert all(k > 0.0 for k in stiffness_of(cfg, hand().kinds))
+    assert cfg.measured == (name == "full") and cfg.sum == ("spring" if name == "paper" else "solver")
+
+
+def test_variants_of_a_shape_share_their_samples():
+    rock = library()["rock"]
+    assert ShapeSet([rock, rock, library()["box"], rock]).samples == rock.grid.data.size
 
 
 def test_bad_settings_are_one_clear_line(tmp_path):
@@ -516,7 +546,8 @@ def test_bad_settings_are_one_clear_line(tmp_path):
 
 def test_layouts_of_any_size():
     """A ragged layout of two pads, one of them of a single taxel, equals each pad alone."""
-    a = {"name": "a", "body": "x", "point": [[0, 0, 0], [1e-3, 0, 0], [2e-3, 0, 0]], "normal": [[0, 0, 1]] * 3, "area": [1e-6, 2e-6, 3e-6]}
+    a = {"name": "a", "body": "x", "point": [[0, 0, 0], [1e-3, 0, 0], [2e-3, 0, 0]], "normal": [[0, 0, 1]] * 3}
+    a["area"] = [1e-6, 2e-6, 3e-6]
     b = {"name": "b", "body": "y", "point": [[0, 0, 0]], "normal": [[0, 0, 1]], "area": [4e-6]}
     layout = TaxelLayout.build([a, b])
     assert layout.point.shape == (2, 3, 3) and layout.count.tolist() == [3, 1]
@@ -524,5 +555,6 @@ def test_layouts_of_any_size():
     tactile.shape_id[:], tactile.shape_size[:] = 0, 0.01
     engine.place(0, "object", [0, 0, 0.0095])
     tactile.launch()
-    np.testing.assert_allclose(tactile.raw[0].numpy(), 2e8 * 5e-4 * np.array([[1e-6, 2e-6, 3e-6], [4e-6, 0, 0]]), rtol=1e-4)
+    want = 2e8 * 5e-4 * np.array([[1e-6, 2e-6, 3e-6], [4e-6, 0, 0]])
+    np.testing.assert_allclose(tactile.raw[0].numpy(), want, rtol=1e-4)
     assert tactile.centre[0, 0, 0].item() == pytest.approx(8e-3 / 6, rel=1e-4)

@@ -112,8 +112,8 @@ def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
         if kind not in given and "all" not in given:
             unit = STIFFNESS_UNITS[cfg.law]
             raise UserError(
-                f"tactile.stiffness.{cfg.law}: no value [{unit}] for pads of kind '{kind}'; given for: {', '.join(given) or 'none'}"
-                " (key 'all' holds for every kind)"
+                f"tactile.stiffness.{cfg.law}: no value [{unit}] for pads of kind '{kind}'; given for:"
+                f" {', '.join(given) or 'none'} (key 'all' holds for every kind)"
             )
         out.append(given.get(kind, given.get("all")))
     return out
@@ -132,7 +132,8 @@ def _stiffness(value: object) -> dict[str, dict[str, float]]:
 
 
 def _number(key: str, value: object, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or not low <= value <= high:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if not number or not low <= value <= high:
         raise UserError(f"tactile.{key}={value}: must be a number from {low:g} to {high:g}")
     return float(value)
 

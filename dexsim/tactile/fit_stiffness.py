@@ -23,7 +23,7 @@ from dexsim.tactile.pressing import Press, presses, skin_of
 CONTACT_STIFFNESS = 7000.0  # N/m
 DEPTHS = (0.3e-3, 0.7e-3, 1.0e-3)  # m
 RUBBER = TactileConfig().rubber
-SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0.0, 0.0), "capsule": (0.019, 0.011, 0.0), "cylinder": (0.02, 0.03, 0.0)}
+SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0.0, 0.0), "capsule": (0.019, 0.011, 0.0)}
 
 
 def press_library(layout: TaxelLayout, pad: int, tip: np.ndarray, count: int, seed: int = 0) -> list[Press]:
@@ -41,10 +41,15 @@ def press_library(layout: TaxelLayout, pad: int, tip: np.ndarray, count: int, se
 
 
 def calibrate_stiffness(
-    layout: TaxelLayout, pad: int, pressed: Sequence[Press], law: str, contact: float = CONTACT_STIFFNESS, rubber: Mapping = RUBBER
+    layout: TaxelLayout,
+    pad: int,
+    pressed: Sequence[Press],
+    law: str,
+    contact: float = CONTACT_STIFFNESS,
+    rubber: Mapping = RUBBER,
 ) -> tuple[float, dict[float, np.ndarray]]:
-    """Stiffness at which the medians of (spring sum / (contact * depth)) at the depths over 0.5 mm average to 1, and the
-    5, 25, 50, 75 and 95 % points of that ratio by depth [m]."""
+    """Stiffness at which the medians of (spring sum / (contact * depth)) at the depths over 0.5 mm average to 1, and
+    the 5, 25, 50, 75 and 95 % points of that ratio by depth [m]."""
     area = layout.area[pad, : layout.count[pad]]
     ratio: dict[float, list[float]] = {}
     for p in pressed:
@@ -71,7 +76,8 @@ def main() -> None:
         pressed = press_library(layout, pad, tips[pad], args.count)
         for law in LAWS:
             k, spread = calibrate_stiffness(layout, pad, pressed, law, args.contact)
-            report[f"{law}.{kind}"] = {"stiffness": k, **{f"{d * 1e3:.1f} mm": np.round(s, 3).tolist() for d, s in spread.items()}}
+            by_depth = {f"{d * 1e3:.1f} mm": np.round(s, 3).tolist() for d, s in spread.items()}
+            report[f"{law}.{kind}"] = {"stiffness": k, **by_depth}
             print(f"{kind:7s} {law:14s} stiffness {k:.4g}; spring sum / (K depth), 5 25 50 75 95 %:")
             for d, s in spread.items():
                 print(f"    {d * 1e3:.1f} mm   " + "  ".join(f"{v:5.2f}" for v in s))

@@ -79,9 +79,9 @@ def spread_weight(d: float, area: float, level: float):
     """A taxel's share of the solver's force, up to a factor: area times the square of the depth under the level.
 
     Deeper than `reach` the level is 0, the object's surface. A shallower contact, or one that falls between the taxels,
-    is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous in the distances, and
-    the nearest taxel always has a positive share: no force is lost. The square, which fades out smoothly at the edge of
-    the patch, halves the lattice's error in the centre of a flat contact against the depth itself (measured).
+    is shared by those within `reach` of the nearest one, as a skin with thickness does. Continuous in the distances,
+    and the nearest taxel always has a positive share: no force is lost. The square, which fades out smoothly at the
+    edge of the patch, lowers the lattice's error in the centre of a flat contact against the depth itself (measured).
     """
     depth = wp.max(level - d, 0.0)
     return area * depth * depth
@@ -183,7 +183,8 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                     total += wp.vec4(c * s[0], c * s[1], c * s[2], pressed)
                     if wp.static(raw):
                         for t in range(n):
-                            felt[w, f, t] = felt[w, f, t] + c * spread_weight(scratch[w, f, t], pads.taxel[f, t][3], level)
+                            share = spread_weight(scratch[w, f, t], pads.taxel[f, t][3], level)
+                            felt[w, f, t] = felt[w, f, t] + c * share
                 else:
                     if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
                         for t in range(n):

@@ -67,14 +67,18 @@ class TaxelLayout:
             move = gap_to_hull(point[f, :n], self.normal[f, :n], tip)
             if not np.abs(move).max() <= limit:
                 k = int(np.argmax(np.where(np.isfinite(move), np.abs(move), np.inf)))
-                raise UserError(f"pad '{self.names[f]}': taxel {k} lies {move[k] * 1e3:.2f} mm under the tip's surface, allowed {limit * 1e3:g}; mend the tip or set tactile.lift=false")
+                raise UserError(
+                    f"pad '{self.names[f]}': taxel {k} lies {move[k] * 1e3:.2f} mm under the tip's surface, allowed"
+                    f" {limit * 1e3:g}; mend the tip or set tactile.lift=false"
+                )
             point[f, :n] += self.normal[f, :n] * move[:, None]
         return replace(self, point=point)
 
     @staticmethod
     def build(pads: Sequence[dict]) -> TaxelLayout:
         """Pads as dicts with name, body, kind (default: name), point, normal and optionally tx, ty (default:
-        normal x tx), area (default 1 mm^2 each); lists of any length. Fails with UserError on shapes that do not agree or vectors not of unit length.
+        normal x tx), area (default 1 mm^2 each); lists of any length. Fails with UserError on shapes that do not agree
+        or vectors not of unit length.
         """
         if not pads:
             raise UserError("taxel layout: no pads given; at least one is needed")
@@ -98,7 +102,10 @@ class TaxelLayout:
                 _check_unit(v, f"{where}: {name}")
                 off = np.abs((v * normal).sum(1)).max()
                 if off > 1e-2:
-                    raise UserError(f"{where}: {name} must lie in the tangent plane; its largest component along the normal is {off:.3g}, allowed 0.01")
+                    raise UserError(
+                        f"{where}: {name} must lie in the tangent plane; its largest component along the normal is"
+                        f" {off:.3g}, allowed 0.01"
+                    )
             a = np.full(n, 1e-6) if pad.get("area") is None else np.asarray(pad["area"], dtype=float)
             if a.shape != (n,) or not np.all(np.isfinite(a)) or a.min() <= 0.0:
                 raise UserError(f"{where}: area must be {n} positive numbers [m^2]")
@@ -125,7 +132,9 @@ def gap_to_hull(point: np.ndarray, normal: np.ndarray, corners: np.ndarray) -> n
     return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
 
 
-def tangents(normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+def tangents(
+    normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray]:
     """The sensor's x and y directions projected on each taxel's tangent plane, unit length, [n, 3] each.
 
     Where a direction (nearly) is the normal, its projection is replaced by the one that is at right angles to the
@@ -164,7 +173,8 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
         missing = [n for n in names if n not in header]
         if missing:
             if needed:
-                raise UserError(f"taxel file {path}: column '{missing[0]}' is missing; it has: {', '.join(sorted(h for h in header if h))}")
+                has = ", ".join(sorted(h for h in header if h))
+                raise UserError(f"taxel file {path}: column '{missing[0]}' is missing; it has: {has}")
             return None
         out = np.zeros((len(rows), len(names)))
         for i, row in enumerate(rows):
@@ -199,7 +209,8 @@ def xhand_layout() -> TaxelLayout:
         kind = "thumb" if finger == "thumb" else "finger"
         pad = load_layout(folder / f"taxels_{kind}.csv", body, finger, kind)
         if len(pad["point"]) != xhand.TAXELS_PER_FINGER:
-            raise UserError(f"taxel file {folder}/taxels_{kind}.csv: {len(pad['point'])} taxels, must be {xhand.TAXELS_PER_FINGER}")
+            want = xhand.TAXELS_PER_FINGER
+            raise UserError(f"taxel file {folder}/taxels_{kind}.csv: {len(pad['point'])} taxels, must be {want}")
         pads.append(pad)
     return TaxelLayout.build(pads)
 
@@ -212,7 +223,8 @@ def tip_points(model: object, geoms: Sequence[str]) -> list[np.ndarray]:
     for name in geoms:
         g = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         if g < 0 or model.geom_type[g] != mujoco.mjtGeom.mjGEOM_MESH:
-            raise UserError(f"tip geom '{name}': {'not in the model' if g < 0 else 'not a mesh'}; touch between fingers needs a convex mesh")
+            why = "not in the model" if g < 0 else "not a mesh"
+            raise UserError(f"tip geom '{name}': {why}; touch between fingers needs a convex mesh")
         m = model.geom_dataid[g]
         at = model.mesh_vertadr[m]
         turn = np.zeros(9)

@@ -15,11 +15,13 @@ from dexsim.errors import UserError
 class PosedEngine:
     """What `Tactile` reads of an engine, set by hand.
 
-    wp / t: time [N], xpos [N, B] vec3, xmat [N, B] mat33 (unit at first), pair_normal [N, P], as Warp arrays and as torch
-    tensors of the same memory.
+    wp / t: time [N], xpos [N, B] vec3, xmat [N, B] mat33 (unit at first), pair_normal [N, P], as Warp arrays and as
+    torch tensors of the same memory.
     """
 
-    def __init__(self, n: int, bodies: Sequence[str], pairs: Sequence[str] = (), device: str = "cpu", dt: float = 0.005):
+    def __init__(
+        self, n: int, bodies: Sequence[str], pairs: Sequence[str] = (), device: str = "cpu", dt: float = 0.005
+    ):
         self.n, self.device, self.dt = n, device, dt
         self.bodies, self.pairs = tuple(bodies), tuple(pairs)
         self.wp = SimpleNamespace(

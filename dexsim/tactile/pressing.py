@@ -36,7 +36,9 @@ class Skin:
     area: np.ndarray
 
 
-def skin_of(layout: TaxelLayout, pad: int, columns: int, rows: int, tip: np.ndarray | None = None, fine: int = 6) -> Skin:
+def skin_of(
+    layout: TaxelLayout, pad: int, columns: int, rows: int, tip: np.ndarray | None = None, fine: int = 6
+) -> Skin:
     """The pad's skin, interpolated bicubically between its lattice of columns x rows taxels, `fine` times finer; moved
     along its normals onto the convex hull of `tip` [V, 3] (body frame) where given: what the physics presses."""
     from scipy.interpolate import RectBivariateSpline
@@ -56,7 +58,9 @@ def skin_of(layout: TaxelLayout, pad: int, columns: int, rows: int, tip: np.ndar
     return Skin(point, n, area)
 
 
-def surface_points(rng: np.random.Generator, shape: object, size: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def surface_points(
+    rng: np.random.Generator, shape: object, size: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Random points of an object's surface, by area, and the outward normals there (object frame), without end."""
     kind = shape.kind
     if kind == "grid":

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.tactile.kernel import MAX_STRAIN
 
-# -- signed distances (points q [..., 3] in the shape's frame; sizes as MuJoCo's) -----------------------------------------
+# -- signed distances (points q [..., 3] in the shape's frame; sizes as MuJoCo's) ------------------------------------
 
 
 def sd_box(q: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -68,8 +68,8 @@ def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: object = None, eps:
 
 
 def sampled_depth(taxels: np.ndarray, points: np.ndarray, normals: np.ndarray, nearest: int = 1) -> np.ndarray:
-    """Depth [n] (m, 0 without contact) of taxels [n, 3] in a surface given by samples, as the paper words it: v = taxel -
-    sample, contact when v . n < 0; the `nearest` samples are blended with weights 1 / |v|^2 (one: the paper's p_o).
+    """Depth [n] (m, 0 without contact) of taxels [n, 3] in a surface given by samples, as the paper words it: v = taxel
+    - sample, contact when v . n < 0; the `nearest` samples are blended with weights 1 / |v|^2 (one: the paper's p_o).
 
     The depth along the normal, -v . n, is blended rather than |v|, which would add the distance between samples.
     """
@@ -83,7 +83,7 @@ def sampled_depth(taxels: np.ndarray, points: np.ndarray, normals: np.ndarray, n
     return np.maximum((w * d).sum(1) / w.sum(1), 0.0)
 
 
-# -- laws ---------------------------------------------------------------------------------------------------------------
+# -- laws ----------------------------------------------------------------------------------------------------------
 
 
 def linear_force(depth: np.ndarray, area: np.ndarray, stiffness: float) -> np.ndarray:
@@ -100,7 +100,9 @@ def mooney_rivlin_force(depth: np.ndarray, area: np.ndarray, thickness: float, c
     return area * 2.0 * (stretch**-2 - stretch) * (c10 + c01 / stretch)
 
 
-def taxel_force(law: str, depth: np.ndarray, area: np.ndarray, stiffness: float, rubber: Mapping, threshold: float = 0.0) -> np.ndarray:
+def taxel_force(
+    law: str, depth: np.ndarray, area: np.ndarray, stiffness: float, rubber: Mapping, threshold: float = 0.0
+) -> np.ndarray:
     if law == "linear":
         f = linear_force(depth, area, stiffness)
     elif law == "hertz":
@@ -111,7 +113,8 @@ def taxel_force(law: str, depth: np.ndarray, area: np.ndarray, stiffness: float,
 
 
 def spread(force: float, d: np.ndarray, area: np.ndarray, reach: float) -> np.ndarray:
-    """The solver's force over taxels at distances d: by area times squared depth under the level max(min d + reach, 0)."""
+    """The solver's force over taxels at distances d: by area times squared depth under the level
+    max(min d + reach, 0)."""
     w = area * np.maximum(np.maximum(d.min() + reach, 0.0) - d, 0.0) ** 2
     return force * w / w.sum()
 

@@ -36,22 +36,24 @@ class ShapeSet:
         dims, origin, spacing, offset, radius = [], [], [], [], []
         data: list[np.ndarray] = []
         at = 0
+        seen: dict[int, tuple[int, Grid, float]] = {}  # variants of one shape share its samples
         for s in shapes:
             grid = None
             d, o, h, r = (2, 2, 2), np.zeros(3), 1.0, 0.0
             if s.kind == "grid":
-                grid = _checked(s)
+                if id(s.grid) not in seen:
+                    grid = _checked(s)
+                    seen[id(s.grid)] = (at, grid, _surface_radius(grid))
+                    flat = grid.data.reshape(-1)
+                    data.append(np.stack([flat, np.append(flat[1:], flat[-1])], axis=1))
+                    at += len(flat)
+                start, grid, r = seen[id(s.grid)]
                 d, o, h = grid.data.shape, grid.origin, grid.spacing
-                r = _surface_radius(grid)
             self.grids.append(grid)
             dims.append(d), origin.append(o), spacing.append(h), radius.append(r)
-            offset.append(at if grid is not None else 0)
-            if grid is not None:
-                flat = grid.data.reshape(-1).astype(np.float32)
-                data.append(np.stack([flat, np.append(flat[1:], flat[-1])], axis=1))
-                at += len(flat)
+            offset.append(start if grid is not None else 0)
         if at >= 2**31:
-            raise UserError(f"distance grids hold {at} samples, more than {2**31 - 1}: use fewer shapes or coarser grids")
+            raise UserError(f"distance grids hold {at} samples, at most {2**31 - 1} fit: use fewer or coarser ones")
         self.samples = at
         self.device = device
         out = Shapes()
@@ -77,15 +79,20 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     on faces; near an edge outside it is a lower bound, which no contact reads."""
     from scipy.spatial import ConvexHull
 
-    hull = ConvexHull(points)
-    planes = np.unique(np.round(hull.equations, 9), axis=0)
+    planes = ConvexHull(points).equations
     low, high = points.min(0) - margin, points.max(0) + margin
     n = np.ceil((high - low) / spacing).astype(int) + 1
-    axes = [low[i] + spacing * np.arange(n[i]) for i in range(3)]
-    x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
-    out = np.full(tuple(n), -np.inf, dtype=np.float32)
-    for a, b, c, d in planes:
-        np.maximum(out, (a * x + b * y + c * z + d).astype(np.float32), out=out)
+    out = np.empty(tuple(n), dtype=np.float32)
+    # By blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest anywhere in it.
+    size = 8
+    for corner in np.ndindex(*(-(-n // size))):
+        first = np.array(corner) * size
+        last = np.minimum(first + size, n)
+        value = planes[:, :3] @ (low + spacing * (first + last - 1) / 2) + planes[:, 3]
+        near = planes[value >= value.max() - np.sqrt(3.0) * size * spacing]
+        cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1)
+        d = (low + spacing * cells) @ near[:, :3].T + near[:, 3]
+        out[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = d.max(-1)
     return Grid(low, float(spacing), out)
 
 
@@ -105,9 +112,12 @@ def _checked(shape: object) -> Grid:
         raise UserError(f"{what}: grid has shape {data.shape}; at least 2 samples along each of 3 axes are needed")
     if not np.all(np.isfinite(data)) or not g.spacing > 0.0:
         raise UserError(f"{what}: grid must be finite with positive spacing; spacing is {g.spacing}")
-    edge = min(data[0].min(), data[-1].min(), data[:, 0].min(), data[:, -1].min(), data[:, :, 0].min(), data[:, :, -1].min())
+    edge = min(data[[0, -1]].min(), data[:, [0, -1]].min(), data[:, :, [0, -1]].min())
     if edge <= 0.0:
-        raise UserError(f"{what}: grid does not hold the shape (distance {edge:.3g} m on its border, must be > 0): bake it with a wider margin")
+        raise UserError(
+            f"{what}: grid does not hold the shape (distance {edge:.3g} m on its border, must be > 0): bake it with a"
+            " wider margin"
+        )
     if data.min() >= 0.0:
         raise UserError(f"{what}: grid is nowhere negative: no sample lies inside the shape; use a finer grid")
     return Grid(np.asarray(g.origin, dtype=float), float(g.spacing), data)

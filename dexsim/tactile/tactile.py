@@ -30,8 +30,8 @@ class Tactile:
     other pads feel (others=true).
     other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
 
-    Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform scale
-    first for grids); with O objects [N, O], [N, O, 3].
+    Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform
+    scale first for grids); with O objects [N, O], [N, O, 3].
     Out: force [N, F] (N) and centre [N, F, 3] (m, world frame; the pad's centre where the force is 0) as the sensor
     reports them; force_clean and centre_clean of the object alone without imperfections; force_other [N, F] of other
     fingers; raw [N, F, T] and raw_clean if raw=true; raw3 [N, F, T, 3] with shear=true. The tensors never move.
@@ -64,11 +64,11 @@ class Tactile:
         columns = np.full((f, o), -1, dtype=np.int32)
         if solver:
             if pairs is None or len(pairs) != f:
-                raise UserError(f"tactile.sum=solver needs the contact pair of each of {f} pads; use tactile.sum=spring without contacts")
+                raise UserError(f"tactile.sum=solver needs the contact pair of each of {f} pads (else tactile.sum=spring)")
             for i, names in enumerate(pairs):
                 names = [names] if isinstance(names, str) else list(names)
                 if len(names) != o:
-                    raise UserError(f"tactile pair names of pad '{layout.names[i]}': {len(names)} given for {o} objects")
+                    raise UserError(f"contact pairs of pad '{layout.names[i]}': {len(names)} given for {o} objects")
                 columns[i] = [engine.pair(name) for name in names]
         tip_columns = np.full((f, f), -1, dtype=np.int32)
         if other_pairs is not None:
@@ -83,8 +83,7 @@ class Tactile:
         with wp.ScopedDevice(self.device):
             self._pads = _pads(engine, layout, layout.lifted(tips) if cfg.lift and tips is not None else layout)
             self._law = _law(cfg, layout, needed=not solver or others)
-            tip_shapes = [TouchShape(f"tip_{name}", "grid", bake_convex(np.asarray(p, float))) for name, p in zip(layout.names, tips, strict=True)] if others else []
-            self.tips = ShapeSet(tip_shapes, self.device)
+            self.tips = ShapeSet(_tip_shapes(layout, tips) if others else [], self.device)
             a = SimpleNamespace(
                 object_body=wp.array([engine.body(b) for b in bodies], dtype=int),
                 shape_id=wp.full((n, o), -1, dtype=int),
@@ -111,7 +110,8 @@ class Tactile:
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         self._kernel = touch_kernel(self.block, solver, store, others)
-        self._pair_normal = engine.wp.pair_normal if solver or (tip_columns >= 0).any() else wp.zeros((1, 1), dtype=float, device=self.device)
+        contacts = solver or bool((tip_columns >= 0).any())
+        self._pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
         if measured:
             if cfg.shear and o != 1:
                 raise UserError(f"tactile.shear=true: works with one object, {o} were given")
@@ -127,7 +127,7 @@ class Tactile:
         hysteresis, noise = cfg.used("hysteresis"), cfg.used("noise")
         with wp.ScopedDevice(self.device):
             e = Effects()
-            for name in ("threshold", "noise", "lsb", "delay", "hysteresis", "hysteresis_time", "shear_stiffness", "friction"):
+            for name in Effects.vars:
                 setattr(e, name, self._row[name])
             axes = np.stack([self.layout.tx, self.layout.ty], axis=2).astype(np.float32)
             self._m = m = SimpleNamespace(
@@ -193,17 +193,18 @@ class Tactile:
         """Fail if a delay was longer than the readings kept. Reads from the device: call it rarely."""
         if self._m is not None and int(self._m.late.numpy()[0]):
             raise UserError(
-                f"touch delay needs more readings than are kept: `launch` runs more often than tactile.period={self.cfg.period} s;"
-                " set tactile.period to the time between control steps"
+                "touch delay needs more readings than are kept: touch is read more often than every"
+                f" tactile.period={self.cfg.period} s; set it to the time between control steps"
             )
 
     def launch(self) -> None:
         """Feel: only launches, so it can be recorded in a graph."""
         a, n = self._a, self.engine.n
         args = [
-            self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp, a.object_body,
-            a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column, int(self.cfg.feel_others),
-            self._row["stiffness_scale"], self._row["threshold"], a.scratch, a.force, a.centre, a.force_other, a.felt,
+            self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp,
+            a.object_body, a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column,
+            int(self.cfg.feel_others), self._row["stiffness_scale"], self._row["threshold"], a.scratch,
+            a.force, a.centre, a.force_other, a.felt,
         ]  # fmt: skip
         self._launch(self._kernel, args)
         m = self._m
@@ -216,16 +217,32 @@ class Tactile:
             float(self.cfg.full_scale), m.state, m.anchor, m.ring, m.ring_shear,
         ]  # fmt: skip
         wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
-        wp.launch(stamp, dim=n, inputs=[m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late], device=self.device)
-        self._launch(m.report, [m.ring, m.ring_shear, m.chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3])
+        args = [m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late]
+        wp.launch(stamp, dim=n, inputs=args, device=self.device)
+        args = [m.ring, m.ring_shear, m.chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
+        self._launch(m.report, args)
 
     def _launch(self, kernel: wp.Kernel, args: list) -> None:
         """One thread, or one block of a thread per taxel, for each world and pad."""
         dim = [self.engine.n, self.layout.pads]
         if self.block:
-            wp.launch_tiled(kernel, dim=dim, inputs=args, block_dim=32 * -(-self.layout.taxels // 32), device=self.device)
+            lanes = 32 * -(-self.layout.taxels // 32)
+            wp.launch_tiled(kernel, dim=dim, inputs=args, block_dim=lanes, device=self.device)
         else:
             wp.launch(kernel, dim=dim, inputs=args, device=self.device)
+
+
+def _tip_shapes(layout: TaxelLayout, tips: Sequence[np.ndarray]) -> list[TouchShape]:
+    """Distance grids of the tips; equal tips share one."""
+    grids: dict[bytes, object] = {}
+    out = []
+    for name, corners in zip(layout.names, tips, strict=True):
+        corners = np.ascontiguousarray(corners, dtype=float)
+        key = corners.tobytes()
+        if key not in grids:
+            grids[key] = bake_convex(corners)
+        out.append(TouchShape(f"tip_{name}", "grid", grids[key]))
+    return out
 
 
 def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
@@ -234,7 +251,8 @@ def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
     out.count = wp.array(layout.count, dtype=int)
-    out.taxel = wp.array(np.concatenate([felt.point, layout.area[..., None]], axis=-1).astype(np.float32), dtype=wp.vec4)
+    taxel = np.concatenate([felt.point, layout.area[..., None]], axis=-1)
+    out.taxel = wp.array(taxel.astype(np.float32), dtype=wp.vec4)
     out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
     out.bound = wp.array(np.concatenate([centre, radius[:, None]], axis=1).astype(np.float32), dtype=wp.vec4)
     return out
