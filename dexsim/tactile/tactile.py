@@ -64,7 +64,7 @@ class Tactile:
         columns = np.full((f, o), -1, dtype=np.int32)
         if solver:
             if pairs is None or len(pairs) != f:
-                raise UserError(f"tactile.sum=solver needs the contact pair of each of {f} pads (else tactile.sum=spring)")
+                raise UserError(f"tactile.sum=solver needs a contact pair for each of {f} pads (or sum=spring)")
             for i, names in enumerate(pairs):
                 names = [names] if isinstance(names, str) else list(names)
                 if len(names) != o:
