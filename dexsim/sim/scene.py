@@ -22,10 +22,12 @@ HULL_SLOTS = 3
 SLOTS = ("object_box", "object_sphere", "object_capsule", *(f"object_hull{i}" for i in range(HULL_SLOTS)))
 _PRIMITIVE_SLOT = {"box": 0, "sphere": 1, "capsule": 2}
 _PARKED = np.array([0.0, 0.0, 1000.0])
-# Placement of slots at compile time: anything but the body frame, or MuJoCo marks geom or inertia as "same frame" and
-# ignores the per-world values.
+# Placement of slots and of the centre of mass at compile time: three different frames, or MuJoCo marks geoms or inertia
+# as "same frame" and ignores the per-world values.
 _OFFSET = [1e-3, 2e-3, 3e-3]
 _TILT = [0.99995, 0.01, 0.0, 0.0]
+_IPOS = [-2e-3, 1e-3, 1e-3]
+_IQUAT = [0.9998, 0.0, 0.02, 0.0]
 
 OBJECT_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "geom_pos", "geom_quat", "geom_size",
                  "geom_dataid", "geom_rbound", "geom_aabb", "geom_friction", "geom_solref", "opt.gravity")
@@ -86,7 +88,7 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
     body = spec.worldbody.add_body(name=OBJECT, pos=[0.05, 0, 0.1])
     body.add_freejoint(name="object_free")
     body.explicitinertial = True
-    body.mass, body.ipos, body.iquat = 0.1, _OFFSET, _TILT
+    body.mass, body.ipos, body.iquat = 0.1, _IPOS, _IQUAT
     body.inertia = [4e-5, 4.1e-5, 4.2e-5]
     common = dict(pos=_OFFSET, quat=_TILT, contype=1, conaffinity=2, condim=4, group=3, rgba=[0.85, 0.45, 0.2, 1.0],
                   friction=[1e-3, 1e-4, 1e-4])

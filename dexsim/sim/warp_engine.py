@@ -37,6 +37,7 @@ class WarpEngine(Engine):
         self.real = wp.float32
         self.nconmax, self.njmax = nconmax, -(-njmax // 16) * 16  # the solver's tiles want multiples of 16
         wp.config.log_level = wp.LOG_WARNING
+        wp.init()
         if device.startswith("cuda"):
             # torch and Warp share one non-default stream: ordered without synchronisation, and capturable
             torch.cuda.set_device(device)

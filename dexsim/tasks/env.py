@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 
 import mujoco
 import torch
@@ -23,7 +24,7 @@ from dexsim.errors import UserError
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import tip_points, xhand_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
 from dexsim.tasks.objects import Objects
@@ -84,7 +85,7 @@ class HandEnv(VecEnv):
         self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
         touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
         self.touch = Tactile(self.engine, xhand_layout(), touch_shapes, OBJECT, cfg["tactile"],
-                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
+                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=tip_points(self.engine.mjm, xhand.TIP_GEOMS))
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()
@@ -110,8 +111,8 @@ class HandEnv(VecEnv):
         """Named reward terms, weighted, [N] each."""
         raise NotImplementedError
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """Observation groups, [N, D] each."""
+    def observe(self, advance: bool) -> dict[str, torch.Tensor]:
+        """Observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
         raise NotImplementedError
 
     # -- rsl-rl's interface ------------------------------------------------------------------------------------------------
@@ -120,25 +121,61 @@ class HandEnv(VecEnv):
 
     def step(self, actions: torch.Tensor):
         """One control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are reset, and
-        their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds)."""
-        self.act(actions)
-        self.before_physics()
+        their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds), and with
+        `keep_final_obs` also "final_obs", the observations before the reset."""
+        self._action_in.copy_(actions)
+        self._replay("before", self._before)
         self.engine.step(self.decimation, self.servo.before_each, self.touch.launch)
+        self._replay("after", self._after)
+        if self.keep_final_obs:
+            final = {k: v.clone() for k, v in self.observe(advance=False).items()}
+        self._replay("reset", self._reset_done)
+        log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
+        extras = {"time_outs": self.time_out.clone(), "log": log}
+        if self.keep_final_obs:
+            extras["final_obs"] = TensorDict(final, batch_size=[self.num_envs], device=self.device)
+        return self.get_observations(), self.reward.clone(), self.done.to(torch.long), extras
+
+    def _before(self) -> None:
+        self.act(self._action_in)
+        self.before_physics()
+
+    def _after(self) -> None:
         self.episode_length_buf += 1
         self.read_state()
         ends = self.terminated()
         ends["nan"] = self.nan
         dead = torch.stack(list(ends.values())).any(0)
-        self.time_out = (self.episode_length_buf >= self.max_episode_length) & ~dead
+        self.time_out.copy_((self.episode_length_buf >= self.max_episode_length) & ~dead)
         terms = self.rewards()
         reward = torch.stack(list(terms.values()))
         reward = torch.where(self.nan, torch.zeros_like(reward), reward)
-        self.reward = reward.sum(0)
-        self.done = dead | self.time_out
-        extras = {"time_outs": self.time_out.clone(), "log": self._log(terms, ends, reward)}
-        reward_out, done_out = self.reward.clone(), self.done.clone()
+        self.reward.copy_(reward.sum(0))
+        self.done.copy_(dead | self.time_out)
+        self._log(terms, ends, reward)
+
+    def _reset_done(self) -> None:
         self.reset(self.done)
-        return self.get_observations(), reward_out, done_out.to(torch.long), extras
+
+    def _replay(self, name: str, part: Callable[[], None]) -> None:
+        """Run a part of the step. On CUDA it is recorded once (after two plain runs) and replayed: thousands of small
+        kernels a second would otherwise keep the GPU waiting for Python. `graphs = False` runs it plainly, for whoever
+        changes settings that a recording holds (evaluation does)."""
+        if not (self.graphs and self.device.startswith("cuda")):
+            part()
+            return
+        self._runs[name] = self._runs.get(name, 0) + 1
+        if self._runs[name] <= 2:
+            part()
+            return
+        graph = self._recorded.get(name)
+        if graph is None:
+            graph = torch.cuda.CUDAGraph()
+            graph.register_generator_state(self.rng)
+            with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+                part()
+            self._recorded[name] = graph
+        graph.replay()
 
     def act(self, actions: torch.Tensor) -> None:
         """Turn actions [N, 12] into targets. `relative`: the target moves by action * scale a step, held within the
@@ -169,7 +206,7 @@ class HandEnv(VecEnv):
         self.action.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask[:, None], 0.0)
         self.read_state()
-        for group, value in self.observe().items():
+        for group, value in self.observe(advance=True).items():
             if group not in self.obs:
                 self.obs[group] = torch.zeros_like(value)
             self.obs[group].copy_(value)
@@ -245,18 +282,25 @@ class HandEnv(VecEnv):
         self.tips = zeros(5, 3)
         self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.reward = zeros()
+        self._action_in = zeros(J)
+        self._log_names: tuple[str, ...] = ()
+        self._log_values: torch.Tensor | None = None
+        self.graphs, self.keep_final_obs = True, False
+        self._runs: dict[str, int] = {}
+        self._recorded: dict[str, torch.cuda.CUDAGraph] = {}
         self.obs: dict[str, torch.Tensor] = {}
         self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
 
     # -- bookkeeping -----------------------------------------------------------------------------------------------------------
-    def _log(self, terms: dict, ends: dict, reward: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _log(self, terms: dict, ends: dict, reward: torch.Tensor) -> None:
         self.nan_count += self.nan.sum()
-        means = reward.mean(1)
-        log = {f"reward/{name}": means[i] for i, name in enumerate(terms)}
         rates = torch.stack([*ends.values(), self.time_out]).float().mean(1)
-        log.update({f"end/{name}": rates[i] for i, name in enumerate((*ends, "time_out"))})
-        log.update(self.metrics())
-        return log
+        metrics = self.metrics()
+        values = torch.cat([reward.mean(1), rates, torch.stack(list(metrics.values()))]) if metrics else torch.cat([reward.mean(1), rates])
+        if self._log_values is None:
+            self._log_names = (*(f"reward/{k}" for k in terms), *(f"end/{k}" for k in (*ends, "time_out")), *metrics)
+            self._log_values = torch.zeros_like(values)
+        self._log_values.copy_(values)
 
     def metrics(self) -> dict[str, torch.Tensor]:
         """Task metrics for the log, scalars on the device."""

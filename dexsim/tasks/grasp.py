@@ -12,7 +12,7 @@ import torch
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.tasks import terms
+from dexsim.tasks import rotation, terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
 from dexsim.tasks.servos import ServoRandomizer
@@ -47,7 +47,11 @@ class GraspEnv(HandEnv):
 
     def setup(self) -> None:
         t, n, dev = self.task, self.num_envs, self.device
-        self.f_max = fingertip_press(self.cfg["servo"], stiffness=t["contact"]["stiffness"])
+        drive = 1.0
+        for name in ("servo.efficiency", "servo.torque_limit"):
+            low, high, _ = self.sampler.range(name)
+            drive *= (low + high) / 2
+        self.f_max = fingertip_press(self.cfg["servo"], stiffness=t["contact"]["stiffness"], drive=drive)
         self.tau_max = self.effort[FINGER_ROOT]
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
         train, held = t["objects"]["train"], t["objects"]["held_out"]
@@ -63,6 +67,13 @@ class GraspEnv(HandEnv):
             self.sampler.check(name, low, high)
         if not 0 <= t["command"]["low"] <= t["command"]["high"] <= 1:
             raise UserError(f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high <= 1")
+        self.gravity0 = torch.tensor([0.0, 0.0, -9.81], device=dev)
+        self.centre0 = torch.tensor(t["initial"]["object_xy"], device=dev)
+        self.reach = torch.tensor([0.05, 0.0, 0.0], device=dev)  # the middle of the grasp
+        self.across = torch.tensor([0.0, 1.0, 0.0], device=dev)
+        h = 0.5**0.5  # rotations that bring the body's x, y or z axis to palm y
+        to_y = torch.tensor([[h, 0.0, 0.0, h], [1.0, 0.0, 0.0, 0.0], [h, -h, 0.0, 0.0]], device=dev)
+        self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.scene.variants], device=dev)]
         self.pose0 = torch.tensor([t["initial"]["pose"][j] for j in xhand.JOINTS], device=dev)
 
         def zeros(*shape, dtype=torch.float32):
@@ -70,7 +81,7 @@ class GraspEnv(HandEnv):
 
         self.command, self.command_left = zeros(), zeros()
         self.push, self.push_left, self.push_wait = zeros(3), zeros(), zeros()
-        self.first_xy, self.z_seen = zeros(2), zeros()
+        self.first_xy, self.z_seen, self.vz_seen = zeros(2), zeros(), zeros()
         lag = max(1, int(round(t["sensors"]["vision_delay"][1] / self.dt)) + 1)
         self.z_history, self.z_delay = zeros(lag + 1), zeros(dtype=torch.long)
         self.torque_bias = zeros(12)
@@ -95,17 +106,15 @@ class GraspEnv(HandEnv):
         self.touch.shape_size.copy_(self.objects.size)
         self.touch.randomize(mask, self.rng)
         self.servo_random.draw(mask)
-        self.engine.field("opt.gravity").copy_(torch.where(
-            mask[:, None], torch.tensor([0.0, 0.0, -9.81], device=self.device), self.engine.field("opt.gravity").float()))
+        gravity = self.engine.field("opt.gravity")
+        gravity.copy_(torch.where(mask[:, None], self.gravity0.to(gravity.dtype), gravity))
 
         hand = self.pose0 + s.draw("initial.joint", 12)
         hand = torch.maximum(torch.minimum(hand, self.q_high), self.q_low)
         # the drop: the lowest point of the object starts `drop` above the palm
-        init = t["initial"]
-        centre = torch.tensor(init["object_xy"], device=self.device)
-        xy = centre + s.draw("initial.object_xy", 2)
+        xy = self.centre0 + s.draw("initial.object_xy", 2)
         z = self.objects.radius + s.draw("initial.drop")
-        pose = torch.cat([xy, z[:, None], s.quaternion()], 1)
+        pose = torch.cat([xy, z[:, None], self._orientation()], 1)
         velocity = torch.cat([s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1)
         self.place(mask, hand, pose, velocity)
         self.first_xy.copy_(torch.where(mask[:, None], xy + s.draw("sensors.vision_xy", 2), self.first_xy))
@@ -117,6 +126,16 @@ class GraspEnv(HandEnv):
         self.torque_bias.copy_(torch.where(mask[:, None], s.draw("sensors.torque_bias", 12), self.torque_bias))
         self._new_command(mask)
         self._new_push(mask)
+
+    def _orientation(self) -> torch.Tensor:
+        """Random orientations [N, 4]: the object's longest axis lies across the fingers (palm y) up to a tilt of
+        `initial.tilt` rad about a random axis; about its longest axis it is turned at random. A tilt of pi is any
+        orientation."""
+        s = self.sampler
+        lay = self.lay[self.objects.variant]
+        roll = rotation.about(self.across.expand(self.num_envs, 3), 2 * torch.pi * s.uniform())
+        tilt = rotation.about(s.direction(), s.draw("initial.tilt"))
+        return rotation.multiply(tilt, rotation.multiply(roll, lay))
 
     def _new_command(self, mask: torch.Tensor) -> None:
         c, s = self.task["command"], self.sampler
@@ -151,7 +170,7 @@ class GraspEnv(HandEnv):
         """Dropped: the object's centre is below the palm or far from it."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
-        away = (p - torch.tensor([0.05, 0.0, 0.0], device=self.device)).norm(dim=1) > limit["distance"]
+        away = (p - self.reach).norm(dim=1) > limit["distance"]
         # while a world's gravity is turned, "below" means away from the palm
         return {"dropped": away | (p[:, 2] < limit["below"])}
 
@@ -184,19 +203,17 @@ class GraspEnv(HandEnv):
         return self.terminated()["dropped"].float()
 
     # -- observations ----------------------------------------------------------------------------------------------------------
-    def observe(self) -> dict[str, torch.Tensor]:
+    def observe(self, advance: bool) -> dict[str, torch.Tensor]:
         s, sense = self.sampler, self.task["sensors"]
         n = self.num_envs
         z = self.object_pose[:, 2]
-        if self._stepping:
+        if advance:
             self.z_history.copy_(torch.cat([z[:, None], self.z_history[:, :-1]], 1))
             seen = self.z_history.gather(1, self.z_delay[:, None])[:, 0] + sense["vision_z_noise"] * s.normal()
-            vz = (seen - self.z_seen) / self.dt
+            self.vz_seen.copy_((seen - self.z_seen) / self.dt)
             self.z_seen.copy_(seen)
-        else:
-            vz = torch.zeros_like(z)
-        fresh = (self.episode_length_buf == 0)
-        vz = torch.where(fresh, torch.zeros_like(vz), vz)
+        fresh = self.episode_length_buf == 0
+        vz = torch.where(fresh, torch.zeros_like(z), self.vz_seen)
         zero2 = torch.zeros(n, 2, device=self.device)
         torque_max = self.effort
         actor = torch.cat([
@@ -228,10 +245,6 @@ class GraspEnv(HandEnv):
             self.servo.column("kp").float(), self.servo.column("torque_limit").float(), self.target - self.q, self.command_left[:, None],
         ]  # fmt: skip
 
-    @property
-    def _stepping(self) -> bool:
-        return hasattr(self, "_ready")
-
     # -- what the log shows ------------------------------------------------------------------------------------------------------
     def _measure(self, contact: torch.Tensor) -> None:
         late = self.episode_length_buf * self.dt > 2.0
@@ -249,10 +262,6 @@ class GraspEnv(HandEnv):
 
     def metrics(self) -> dict[str, torch.Tensor]:
         return self._metrics
-
-    def reset_all(self) -> None:
-        super().reset_all()
-        self._ready = True
 
     def describe(self) -> dict:
         """Tables for the first screen."""

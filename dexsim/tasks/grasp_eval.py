@@ -28,10 +28,12 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
 
     policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
     """
+    was, env.graphs = env.graphs, False  # commands, pushes and objects are not those that a recording holds
     env.rng.manual_seed(seed)
     torch.manual_seed(seed)
     trained = _play_all(env, policy, episodes, env.train_rows, progress, "trained shapes")
     held_out = _play_all(env, policy, max(episodes // 2, 1), env.held_rows, progress, "kept-out shapes")
+    env.graphs = was
     metrics = _metrics(trained, held_out, env.f_max)
 
     def force_command(ax):
@@ -50,13 +52,13 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
 
 
 def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: str) -> dict:
-    parts = []
+    parts, kept = [], (env._rows, env._cumulative)
     env.draw_from(rows)
     done = 0
     while done < episodes:
         parts.append(_play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes))
         done += env.num_envs
-    env.draw_from(env.train_rows)
+    env._rows, env._cumulative = kept
     out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
     out["frames"] = parts[0]["frames"]
     return out

@@ -46,6 +46,7 @@ class Objects:
         self._extent = table([max(v.shape.extents) * v.scale for v in scene.variants])
         self._bound = table([0.0 if v.shape.kind != "grid" else max(float((h**2).sum(1).max()) for h in v.shape.hulls) ** 0.5 * v.scale
                              for v in scene.variants])
+        self._identity = torch.tensor([1.0, 0, 0, 0], device=dev)
         self.variant = torch.zeros(n, dtype=torch.int64, device=dev)
         self.size = torch.zeros(n, 3, device=dev)
         self.mass, self.friction = torch.full((n,), 0.1, device=dev), torch.ones(n, device=dev)
@@ -113,7 +114,6 @@ class Objects:
 
     def _write_inertia(self, mask, mass, inertia, com) -> None:
         e, b, m1 = self.engine, self.body, mask[:, None]
-        identity = torch.tensor([1.0, 0, 0, 0], device=mass.device)
         # A free body's derived constants in closed form (mj_setConst gives the same; tested): translational inverse
         # weight 1/m, rotational the mean inverse inertia.
         inverse = (1 / inertia).mean(1)
@@ -123,7 +123,7 @@ class Objects:
             f[:, b] = torch.where(mask, value.to(f.dtype), f[:, b])
         world = e.field("body_subtreemass")
         world[:, 0] = world[:, 1:2].sum(1) + world[:, b]  # the world's trees: the hand (body 1) and the object
-        for name, value in (("body_inertia", inertia), ("body_ipos", com), ("body_iquat", identity.expand(len(mass), 4)),
+        for name, value in (("body_inertia", inertia), ("body_ipos", com), ("body_iquat", self._identity.expand(len(mass), 4)),
                             ("body_invweight0", weight)):
             f = e.field(name)
             f[:, b] = torch.where(m1, value.to(f.dtype), f[:, b])

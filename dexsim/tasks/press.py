@@ -11,15 +11,18 @@ from dexsim.assets import xhand
 RADIUS = 0.012  # m, of the ball that is pressed
 
 
-def fingertip_press(servo: dict, finger: str = "mid", stiffness: float = 7000.0, flexion: float = 0.2) -> float:
-    """Normal force [N] of one fingertip on a fixed ball when its first flexion joint pulls at its torque limit.
+def fingertip_press(servo: dict, finger: str = "mid", stiffness: float = 7000.0, flexion: float = 0.2, drive: float = 1.0) -> float:
+    """Normal force [N] of one fingertip on a fixed ball when its first flexion joint pulls at its torque limit, and the
+    second holds with no more than its own.
+
+    drive: share of the torque that reaches the joints (the mean efficiency and strength of randomized servos).
 
     The finger is slightly bent (`flexion` rad in both joints), the ball (12 mm radius) lies against the
     middle of the pad's distal half; the other joints hold. Static: C MuJoCo until at rest. All four fingers share this geometry.
     """
     table = ServoTable.from_dict(servo)
     root = xhand.JOINTS[xhand.FLEXION_ROOT[finger]]
-    limit = table.value(root, "torque_limit").value
+    limit = drive * table.value(root, "torque_limit").value
     spec = xhand.hand_spec()
     spec.option.timestep = 0.001
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_MULTICCD
@@ -57,4 +60,6 @@ def fingertip_press(servo: dict, finger: str = "mid", stiffness: float = 7000.0,
         if tip in data.contact[c].geom:
             mujoco.mj_contactForce(model, data, c, force)
             total += force[0]
-    return float(total)
+    # The locked second joint carried whatever it had to: a static force scales with what that joint can carry.
+    carried = abs(data.qfrc_constraint[model.joint(second).dofadr[0]])
+    return float(total * min(1.0, drive * table.value(second, "torque_limit").value / max(carried, 1e-9)))
