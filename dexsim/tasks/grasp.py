@@ -52,7 +52,9 @@ class GraspEnv(HandEnv):
             low, high, _ = self.sampler.range(name)
             drive *= (low + high) / 2
         self.f_max = fingertip_press(self.cfg["servo"], stiffness=t["contact"]["stiffness"], drive=drive)
-        self.tau_max = self.effort[FINGER_ROOT]
+        # index tensors on the device: a Python list would be copied there at every use
+        self.roots, self.inner, self.outer = (torch.tensor(x, device=dev) for x in (FINGER_ROOT, INNER, OUTER))
+        self.tau_max = self.effort[self.roots]
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
         train, held = t["objects"]["train"], t["objects"]["held_out"]
         names = [v.shape.name for v in self.scene.variants]
@@ -178,7 +180,7 @@ class GraspEnv(HandEnv):
     def rewards(self) -> dict[str, torch.Tensor]:
         w, r = self.task["rewards"], self.task["reward"]
         force, contact = self.tip_force, self.tip_force > r["contact_threshold"]
-        torque = self.torque[:, FINGER_ROOT]
+        torque = self.torque[:, self.roots]
         out = {
             # R_force and R_torque: sum over fingers of R_i * contact_i (paper, eqs. for R_force, R_torque)
             "force": w["force"] * terms.tracking(
@@ -186,9 +188,9 @@ class GraspEnv(HandEnv):
             "torque": w["torque"] * terms.tracking(
                 torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact),
             # R_diff: variance of the four fingers' first joints
-            "diff": w["diff"] * self.q[:, INNER].var(dim=1, unbiased=False),
+            "diff": w["diff"] * self.q[:, self.inner].var(dim=1, unbiased=False),
             # R_outter: distance of the second joints from their mid-range, not squared
-            "outer": w["outer"] * (self.q[:, OUTER] - self.q_mid[OUTER]).norm(dim=1),
+            "outer": w["outer"] * (self.q[:, self.outer] - self.q_mid[self.outer]).norm(dim=1),
             "termination": w["termination"] * self._ended(),
             "action": w["action"] * (self.action - self.last_action).square().sum(1),  # R_action
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
