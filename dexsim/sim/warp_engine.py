@@ -151,7 +151,8 @@ class WarpEngine(Engine):
     def _run(self, key: tuple, program: Callable[[], None]) -> None:
         """First call: eager (kernels compile). Second: recorded, then replayed; the same path on CPU and CUDA."""
         with wp.ScopedDevice(self.device):
-            if key not in self._eager_done:
+            inside = self.device.startswith("cuda") and torch.cuda.is_current_stream_capturing()
+            if inside or key not in self._eager_done:  # inside another recording, be part of it
                 program()
                 self._eager_done.add(key)
                 return
