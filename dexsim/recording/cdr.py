@@ -1,0 +1,173 @@
+"""The few ROS 2 messages of a recording as little-endian CDR, written from NumPy arrays.
+
+The message definitions are in `schema.py`. `mcap-ros2-support` can write them too, one Python call a number: a touch
+message of 1800 numbers then takes milliseconds, too long for a real-time loop. The bytes are the same (tested).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little endian; alignment counts from behind it
+
+
+class Cdr:
+    """A message being written: fields in order, each aligned to its size."""
+
+    def __init__(self) -> None:
+        self._b = bytearray(_ENCAPSULATION)
+
+    def _align(self, size: int) -> None:
+        self._b += b"\0" * (-(len(self._b) - 4) % size)
+
+    def pack(self, code: str, value: float) -> None:
+        """One number; `code` as in `struct`."""
+        self._align(struct.calcsize(code))
+        self._b += struct.pack("<" + code, value)
+
+    def string(self, text: str) -> None:
+        """A string with its length and a closing zero."""
+        data = text.encode()
+        self.pack("I", len(data) + 1)
+        self._b += data + b"\0"
+
+    def strings(self, texts: Sequence[str]) -> None:
+        """A sequence of strings."""
+        self.pack("I", len(texts))
+        for text in texts:
+            self.string(text)
+
+    def sequence(self, values: np.ndarray | Sequence[float] | None, dtype: str) -> None:
+        """A sequence of numbers ("<f8" or "<f4"); None is empty."""
+        array = np.asarray([] if values is None else values, dtype=dtype).ravel()
+        self.pack("I", array.size)
+        self.array(array)
+
+    def array(self, array: np.ndarray) -> None:
+        """Numbers without a length."""
+        if array.size:
+            self._align(array.itemsize)
+            self._b += array.tobytes()
+
+    def header(self, stamp_ns: int, frame: str = "") -> None:
+        """std_msgs/Header."""
+        self.pack("i", stamp_ns // 1_000_000_000)
+        self.pack("I", stamp_ns % 1_000_000_000)
+        self.string(frame)
+
+    def bytes(self) -> bytes:
+        """The message."""
+        return bytes(self._b)
+
+
+def joint_state(stamp_ns: int, names: Sequence[str], position: np.ndarray | None, velocity: np.ndarray | None = None,
+                effort: np.ndarray | None = None) -> bytes:
+    """sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
+    c = Cdr()
+    c.header(stamp_ns)
+    c.strings(names)
+    for values in (position, velocity, effort):
+        c.sequence(values, "<f8")
+    return c.bytes()
+
+
+def multi_array(values: np.ndarray, labels: Sequence[str] = ()) -> bytes:
+    """std_msgs/Float32MultiArray of any shape; one dimension label an axis (none: layout left empty)."""
+    array = np.asarray(values, dtype="<f4")
+    c = Cdr()
+    c.pack("I", len(labels))
+    stride = array.size
+    for label, size in zip(labels, array.shape, strict=False):
+        c.string(label)
+        c.pack("I", size)
+        c.pack("I", stride)
+        stride //= max(size, 1)
+    c.pack("I", 0)  # data_offset
+    c.sequence(array, "<f4")
+    return c.bytes()
+
+
+def wrench(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
+    """geometry_msgs/WrenchStamped: force and torque [6]."""
+    c = Cdr()
+    c.header(stamp_ns, frame)
+    c.array(np.asarray(values, dtype="<f8"))
+    return c.bytes()
+
+
+def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
+    """geometry_msgs/PoseStamped from [7] x y z, w x y z."""
+    x, y, z, qw, qx, qy, qz = np.asarray(values, dtype="<f8")
+    c = Cdr()
+    c.header(stamp_ns, frame)
+    c.array(np.array([x, y, z, qx, qy, qz, qw], dtype="<f8"))
+    return c.bytes()
+
+
+def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
+    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0)."""
+    v, unknown = np.asarray(values, dtype="<f8"), np.zeros(9, dtype="<f8")
+    c = Cdr()
+    c.header(stamp_ns, frame)
+    for part in (v[[1, 2, 3, 0]], unknown, v[4:7], unknown, v[7:10], unknown):
+        c.array(part)
+    return c.bytes()
+
+
+class CdrView:
+    """Reads what `Cdr` writes; raises ValueError or struct.error where the message ends too early."""
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 4 or data[1] not in (0, 1):
+            raise ValueError(f"not plain CDR: {bytes(data[:4]).hex()}")
+        self._data, self._at, self._order = data, 4, "<" if data[1] else ">"
+
+    def unpack(self, code: str) -> float:
+        size = struct.calcsize(code)
+        self._at += -(self._at - 4) % size
+        (value,) = struct.unpack_from(self._order + code, self._data, self._at)
+        self._at += size
+        return value
+
+    def string(self) -> str:
+        size = self.unpack("I")
+        raw = self._data[self._at : self._at + size]
+        if len(raw) < size:
+            raise ValueError("message ends inside a string")
+        self._at += size
+        return bytes(raw).rstrip(b"\0").decode()
+
+    def sequence(self, dtype: str) -> np.ndarray:
+        """float64 copy of a sequence of numbers; dtype "f8" or "f4"."""
+        size = self.unpack("I")
+        if not size:
+            return np.zeros(0)
+        width = int(dtype[1])
+        at = self._at + -(self._at - 4) % width
+        values = np.frombuffer(self._data, self._order + dtype, size, at)
+        self._at = at + size * width
+        return values.astype(float)
+
+
+def read_joint_state(data: bytes) -> tuple[int, list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """stamp [ns], names, position, velocity, effort of a sensor_msgs/JointState."""
+    v = CdrView(data)
+    stamp = v.unpack("i") * 1_000_000_000 + v.unpack("I")
+    v.string()
+    names = [v.string() for _ in range(v.unpack("I"))]
+    return stamp, names, v.sequence("f8"), v.sequence("f8"), v.sequence("f8")
+
+
+def read_multi_array(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
+    """Dimensions (empty where not given) and flat data of a std_msgs/Float32MultiArray."""
+    v = CdrView(data)
+    dims = []
+    for _ in range(v.unpack("I")):
+        v.string()
+        dims.append(int(v.unpack("I")))
+        v.unpack("I")
+    v.unpack("I")
+    return tuple(dims), v.sequence("f4")

@@ -1,0 +1,222 @@
+"""One message of a recording as plain values, whatever its encoding: ROS 2 CDR, JSON or protobuf."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from dexsim.recording import cdr
+from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
+
+
+class Unreadable(Exception):
+    """No way to read this channel; the text says why and what to do."""
+
+
+class JointSample:
+    """names (or []), position, velocity, effort (each an array, empty where not given), stamp [ns] or None."""
+
+    __slots__ = ("names", "position", "velocity", "effort", "stamp")
+
+    def __init__(self, names, position, velocity, effort, stamp):
+        self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
+
+
+def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
+    """A function from bytes to a message (object or dict). Raises Unreadable."""
+    encoding = channel.message_encoding
+    if encoding == "cdr":
+        return _ros2(schema)
+    if encoding == "json":
+        return json.loads
+    if encoding == "protobuf":
+        return _protobuf(schema)
+    raise Unreadable(f"its messages are encoded as '{encoding}', which is not read; cdr (ROS 2), json and protobuf are")
+
+
+def is_standard(channel: Channel, schema: Schema | None, kind: str) -> bool:
+    """Whether the fast readers of `cdr.py` fit: CDR, and the definition is the standard one."""
+    if channel.message_encoding != "cdr" or schema is None or schema.name != kind:
+        return False
+    return schema.encoding != "ros2msg" or _fields(schema.data.decode("utf-8", "replace")) == _fields(DEFINITIONS[kind])
+
+
+def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], JointSample]:
+    """Reads joint states. part: dotted path of the sub-message that holds them ("" the message itself)."""
+    if not part and is_standard(channel, schema, JOINT_STATE):
+        def fast(data: bytes) -> JointSample:
+            stamp, names, *arrays = cdr.read_joint_state(data)
+            return JointSample(names, *arrays, stamp or None)
+        return fast
+    decode = decoder(channel, schema)
+
+    def read(data: bytes) -> JointSample:
+        whole = decode(data)
+        m = walk(whole, part)
+        stamp = stamp_of(whole) or stamp_of(m)
+        if isinstance(m, (list, tuple, np.ndarray)):  # the path leads straight to the positions
+            return JointSample([], floats(m), np.zeros(0), np.zeros(0), stamp)
+        if get(m, "points"):  # trajectory_msgs/JointTrajectory: its first point
+            return JointSample(list(get(m, "joint_names") or []), floats(get(get(m, "points")[0], "positions")),
+                               np.zeros(0), np.zeros(0), stamp)
+        names = first(m, "name", "names", "joint_names") or first(whole, "name", "names", "joint_names") or []
+        position = first(m, "position", "positions", "data")
+        if position is None:
+            raise ValueError("no field 'position'")
+        return JointSample(list(names), floats(position), floats(first(m, "velocity", "velocities")),
+                           floats(first(m, "effort", "efforts", "current")), stamp)
+
+    return read
+
+
+def array_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], tuple[tuple[int, ...], np.ndarray]]:
+    """Reads arrays: (dimensions or (), flat values)."""
+    if not part and is_standard(channel, schema, MULTI_ARRAY):
+        return cdr.read_multi_array
+    decode = decoder(channel, schema)
+
+    def read(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
+        m = walk(decode(data), part)
+        if isinstance(m, (int, float, list, tuple, bytes, np.ndarray)):
+            array = floats(m)
+            return array.shape, array.ravel()
+        values = first(m, "data", "values", "value", "voltage", "temperature")
+        if values is None:
+            raise ValueError("no field 'data'")
+        layout = get(m, "layout")
+        dims = tuple(int(get(d, "size")) for d in (get(layout, "dim") or [])) if layout is not None else ()
+        array = floats(values)
+        return dims or (array.shape if array.ndim > 1 else ()), array.ravel()
+
+    return read
+
+
+def vector_reader(channel: Channel, schema: Schema | None, part: str, kind: str) -> Callable[[bytes], tuple[np.ndarray, int | None, str]]:
+    """Reads a wrench [6], a pose [7] or an IMU [10] (see `schema.Recording`): (values, stamp, frame)."""
+    decode = decoder(channel, schema)
+    pick = {"wrench": _wrench, "pose": _pose, "imu": _imu}[kind]
+
+    def read(data: bytes) -> tuple[np.ndarray, int | None, str]:
+        whole = decode(data)
+        header = get(whole, "header")
+        return pick(walk(whole, part)), stamp_of(whole), str((get(header, "frame_id") if header is not None else "") or "")
+
+    return read
+
+
+def get(m: Any, name: str) -> Any:
+    """A field of a message or dict; None where there is none."""
+    return m.get(name) if isinstance(m, dict) else getattr(m, name, None)
+
+
+def first(m: Any, *names: str) -> Any:
+    """The first of these fields that there is."""
+    return next((v for v in (get(m, n) for n in names) if v is not None), None)
+
+
+def walk(m: Any, path: str) -> Any:
+    """Follow a dotted path of field names and list indices."""
+    for step in filter(None, path.split(".")):
+        m = m[int(step)] if step.lstrip("-").isdigit() else get(m, step)
+        if m is None:
+            raise ValueError(f"no field '{step}' of '{path}'")
+    return m
+
+
+def floats(values: Any) -> np.ndarray:
+    """float64 array; None within it (JSON's null) is NaN, None itself is empty."""
+    if values is None:
+        return np.zeros(0)
+    if isinstance(values, (bytes, bytearray)):
+        return np.frombuffer(values, np.uint8).astype(float)
+    if isinstance(values, list):
+        values = [np.nan if v is None else v for v in values]
+    elif not isinstance(values, (np.ndarray, int, float)):
+        values = list(values)
+    return np.asarray(values, dtype=float)
+
+
+def stamp_of(m: Any) -> int | None:
+    """header.stamp (or `timestamp`) [ns]; None where unset or zero."""
+    header = get(m, "header")
+    stamp = get(header, "stamp") if header is not None else first(m, "timestamp", "stamp")
+    if stamp is None:
+        return None
+    if isinstance(stamp, (int, float)):
+        return None if not stamp else int(stamp if stamp > 1e14 else stamp * 1e9)
+    seconds, nanos = first(stamp, "sec", "seconds", "secs"), first(stamp, "nanosec", "nsec", "nanos", "nsecs")
+    if seconds is None:
+        return None
+    return (int(seconds) * 1_000_000_000 + int(nanos or 0)) or None
+
+
+def _wrench(m: Any) -> np.ndarray:
+    m = get(m, "wrench") or m
+    return np.array([_number(get(get(m, part), axis)) for part in ("force", "torque") for axis in "xyz"])
+
+
+def _pose(m: Any) -> np.ndarray:
+    m = get(m, "pose") or m
+    p, q = get(m, "position"), get(m, "orientation")
+    return np.array([_number(get(p, a)) for a in "xyz"] + [_number(get(q, a)) for a in "wxyz"])
+
+
+def _imu(m: Any) -> np.ndarray:
+    q, w, a = (get(m, n) for n in ("orientation", "angular_velocity", "linear_acceleration"))
+    return np.array([_number(get(q, k)) for k in "wxyz"] + [_number(get(w, k)) for k in "xyz"] + [_number(get(a, k)) for k in "xyz"])
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _fields(definition: str) -> list[str]:
+    """The lines of a message definition that matter, defaults and comments left out."""
+    lines = (" ".join(line.split("#")[0].split()[:2]) for line in definition.splitlines())
+    return [line.replace("/msg/", "/") for line in lines if line and not line.startswith("==")]
+
+
+def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
+    from mcap_ros2._dynamic import generate_dynamic
+
+    if schema is None:
+        raise Unreadable("its message definition is lost")
+    text = schema.data.decode("utf-8", "replace")
+    if schema.encoding != "ros2msg" or not text.strip():  # IDL, or none stored: the standard messages are known anyway
+        text = DEFINITIONS.get(schema.name, "")
+        if not text:
+            raise Unreadable(f"its type {schema.name} is described in '{schema.encoding or 'nothing'}', which is not read;"
+                             " record it with message definitions (ros2msg)")
+    try:
+        return generate_dynamic(schema.name, text)[schema.name]
+    except Exception as error:  # the parser raises whatever it likes
+        raise Unreadable(f"the definition of {schema.name} cannot be parsed: {error}") from None
+
+
+def _protobuf(schema: Schema | None) -> Callable[[bytes], Any]:
+    try:
+        from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    except ImportError:
+        raise Unreadable("its messages are encoded as protobuf; `pip install protobuf` to read them") from None
+    if schema is None:
+        raise Unreadable("its message definition is lost")
+    try:
+        pool = descriptor_pool.DescriptorPool()
+        files = {f.name: f for f in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file}
+
+        def add(name: str) -> None:
+            file = files.pop(name, None)
+            if file is not None:
+                for dependency in file.dependency:
+                    add(dependency)
+                pool.Add(file)
+
+        for name in list(files):
+            add(name)
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString
+    except Exception as error:
+        raise Unreadable(f"the protobuf definition of {schema.name} cannot be read: {error}") from None

@@ -1,0 +1,97 @@
+"""What is known about a recording: from its own metadata record, a file beside it, the command line, or a default."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dexsim.actuator.columns import did_you_mean
+from dexsim.errors import UserError
+from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding
+
+VALID = (*KEYS, *UNIT_KEYS)
+NAN = float("nan")
+
+
+def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tuple[dict[str, str], list[Finding]]:
+    """Stated metadata (no defaults yet): `given` wins over the file beside the recording, that over its own record.
+
+    Each key that one source overrides in another is a finding. Raises UserError for unknown keys or a bad file.
+    """
+    beside_path = path.with_name(path.name + ".yaml")
+    beside = _read(beside_path) if beside_path.is_file() else {}
+    stated = {k: str(v) for k, v in own.items() if k in VALID}
+    findings = [Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
+                for k in own if k not in VALID]
+    for source, values in ((str(beside_path), beside), ("meta.*", given)):
+        for key, value in values.items():
+            if key not in VALID:
+                raise UserError(f"{source}: metadata key '{key}' does not exist.{did_you_mean(key, VALID)} Valid: {', '.join(VALID)}")
+            text = _text(value)
+            if stated.get(key, text) != text:
+                findings.append(Finding("metadata_override", "", NAN, 1,
+                                        f"{key}: '{stated[key]}' as recorded, '{text}' by {source}; the latter is used", "info"))
+            stated[key] = text
+    _check(path, stated)
+    return stated, findings
+
+
+def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> list[Finding]:
+    """Fill in the defaults (in place); one finding for each key that matters and was not stated."""
+    missing: list[tuple[str, str, str]] = []
+
+    def default(key: str, value: str, severity: str) -> None:
+        if key not in stated:
+            stated[key] = value
+            missing.append((key, value, severity))
+
+    default("effort_is", "torque_Nm" if has_effort else "none", "warning" if has_effort else "info")
+    for key, value in DEFAULTS.items():
+        important = (key == "effort_sign" and has_effort) or (key in ("tactile_unit", "tactile_lsb", "tactile_axis_sign") and has_tactile) \
+            or key == "gravity"
+        default(key, value, "warning" if important else "info")
+    return [Finding("missing_metadata", "", NAN, 1, f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)", severity)
+            for key, value, severity in missing if key not in ("servo", "notes")]
+
+
+def own_record(records: list[Any]) -> dict[str, str]:
+    """The `dexsim` record among an MCAP file's metadata records; {} where there is none."""
+    return next((dict(r.metadata) for r in records if r.name == METADATA), {})
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+    if raw is None:
+        return {}
+    if not isinstance(raw, dict):
+        raise UserError(f"{path}: must map metadata keys to values; valid keys: {', '.join(VALID)}")
+    return raw
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return yaml.safe_dump(value, sort_keys=False)
+    if isinstance(value, (list, tuple)):
+        return ",".join(str(v) for v in value)
+    return str(value)
+
+
+def _check(path: Path, stated: Mapping[str, str]) -> None:
+    choices = {"effort_is": EFFORT_IS, "tactile_unit": TACTILE_UNIT, "schema": ("1",), "source": ("real", "sim")}
+    choices |= {key: tuple(units) for key, units in UNIT_KEYS.items()}
+    for key, valid in choices.items():
+        if key in stated and stated[key] not in valid:
+            raise UserError(f"{path}: metadata {key}='{stated[key]}' must be one of {', '.join(valid)}; correct it with meta.{key}=...")
+    if stated.get("servo"):
+        try:
+            raw = yaml.safe_load(stated["servo"])
+        except yaml.YAMLError as error:
+            raise UserError(f"{path}: metadata servo is not YAML: {' '.join(str(error).split())}") from None
+        if not isinstance(raw, dict):
+            raise UserError(f"{path}: metadata servo must map keys of servo.yaml to values")

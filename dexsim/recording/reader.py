@@ -1,0 +1,386 @@
+"""Read a recording: dexsim's own, or a ROS 2 bag with other topics and names; whole, truncated or damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Message
+from mcap.records import Schema as McapSchema
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.recording import decode, metadata, names, schema
+from dexsim.recording.container import Container, open_container
+from dexsim.recording.schema import Finding, Recording, Series, States
+
+NAN = float("nan")
+_VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
+
+
+def read(path: str | Path, remap: Mapping[str, str] | None = None, meta: Mapping[str, Any] | None = None,
+         joints: Sequence[str] | None = None, audit: bool = True) -> Recording:
+    """The recording in an MCAP file, or in a folder that `ros2 bag record -s mcap` wrote.
+
+    Arguments:
+        remap: our topic -> theirs ("/joint_states": "/xhand/state"), "#a.b" behind it for a sub-message; our joint name
+            -> theirs ("index_joint1": "finger2_mcp"). A topic that differs only by a namespace, and joint names that
+            differ only by a prefix, are found without.
+        meta: metadata values that win over what the recording says.
+        joints: names of the model's joints: their order, and others are left out. None: the xHand's where the names
+            fit, else those of the recording.
+        audit: also look for faults of the signals (`audit.py`).
+
+    Everything readable is returned; what is lost, assumed or suspicious is in `findings`. Nothing is repaired but what
+    a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
+    """
+    path = Path(path).expanduser()
+    containers = [open_container(p) for p in _files(path)]
+    reading = _Reading(path, containers, dict(remap or {}))
+    stated, findings = metadata.collect(path, metadata.own_record([m for c in containers for m in c.metadata]), dict(meta or {}))
+    reading.findings += findings
+    recording = reading.build(stated, joints)
+    if audit:
+        from dexsim.recording.audit import audit as find_faults
+
+        recording.findings += find_faults(recording)
+    return recording
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    found = sorted(path.glob("*.mcap"), key=lambda p: (len(p.name), p.name))  # NAME_2 before NAME_10
+    if not found:
+        raise UserError(f"recording {path}: the folder holds no .mcap file (record with `ros2 bag record -s mcap`)")
+    return found
+
+
+@dataclass
+class _Stream:
+    """The messages of one channel of one file."""
+
+    channel: Channel
+    schema: McapSchema | None
+    messages: list[Message]
+
+
+class _Reading:
+    """One file (or bag folder) being turned into a Recording."""
+
+    def __init__(self, path: Path, containers: list[Container], remap: dict[str, str]):
+        self.path, self.findings = path, []
+        self.streams: dict[str, list[_Stream]] = {}
+        for c in containers:
+            self._damage(c)
+            by_channel: dict[int, list[Message]] = {}
+            for m in c.messages:
+                by_channel.setdefault(m.channel_id, []).append(m)
+            for channel_id, channel in c.channels.items():
+                stream = _Stream(channel, c.schemas.get(channel.schema_id), by_channel.get(channel_id, []))
+                self.streams.setdefault(channel.topic, []).append(stream)
+        self.config = next((c.attachments[schema.ATTACHMENT].decode("utf-8", "replace") for c in containers
+                            if schema.ATTACHMENT in c.attachments), None)
+        self.sources = self._topics({_slash(k): v for k, v in remap.items() if _is_topic(k)})
+        self.joint_remap = {k: v for k, v in remap.items() if not _is_topic(k)}
+        used = [m.log_time for theirs, _ in self.sources.values() for s in self.streams[theirs] for m in s.messages]
+        if not used:
+            raise UserError(f"recording {path}: no message that can be read; topics: {self._describe_topics()}"
+                            + "".join(f"; {f.text}" for f in self.findings[:3]))
+        self.start_ns = min(used)
+
+    def _damage(self, c: Container) -> None:
+        where = f"{c.path.name}: " if c.path != self.path else ""
+        for ns, count, text in c.damage:
+            self.findings.append(Finding("damage", "", NAN, max(count, 1), where + text + _at(ns), "error"))
+        orphans: dict[int, int] = {}
+        for m in c.messages:
+            if m.channel_id not in c.channels:
+                orphans[m.channel_id] = orphans.get(m.channel_id, 0) + 1
+        for channel_id, count in orphans.items():
+            self.findings.append(Finding("damage", "", NAN, count, f"{where}{count} messages of channel {channel_id},"
+                                         " whose record (topic and type) is lost", "error"))
+
+    # -- topics ------------------------------------------------------------------------------------------------------------
+    def _topics(self, remap: dict[str, str]) -> dict[str, tuple[str, str]]:
+        """Our topic -> (theirs, part): as stated, else of the same name, else of the same name in a namespace, else (for
+        joint states) the only one of the type."""
+        for ours in remap:
+            if ours not in schema.TOPICS:
+                raise UserError(f"remap.{ours}: no such topic; topics are {', '.join(schema.TOPICS)}")
+        out: dict[str, tuple[str, str]] = {}
+        for ours, target in remap.items():
+            theirs, _, part = target.partition("#")
+            if theirs not in self.streams:
+                raise UserError(f"recording {self.path} has no topic '{theirs}' (remap.{ours}); it has: {self._describe_topics()}")
+            out[ours] = (theirs, part)
+        for ours in schema.TOPICS:
+            if ours not in out and ours in self.streams:
+                out[ours] = (ours, "")
+        for ours, kind in schema.TOPICS.items():
+            taken = {theirs for theirs, _ in out.values()}
+            if ours in out:
+                continue
+            fits = [t for t in self.streams if t not in taken and t.endswith(ours) and self._is_a(t, kind)]
+            if ours == schema.STATES and not fits:
+                fits = [t for t in self.streams if t not in taken and self._is_a(t, kind, strict=True)]
+            if len(fits) == 1:
+                out[ours] = (fits[0], "")
+                self.findings.append(Finding("topic", ours, NAN, 1, f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info"))
+            elif len(fits) > 1:
+                self.findings.append(Finding("topic", ours, NAN, len(fits), f"could be any of {', '.join(fits)};"
+                                             f" none is used (say which with remap.{ours}=TOPIC)", "warning"))
+        if schema.STATES not in out and schema.COMMANDS not in out:
+            raise UserError(f"recording {self.path} has neither {schema.STATES} nor {schema.COMMANDS} (say which they are with"
+                            f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}")
+        for ours in (schema.COMMANDS, schema.STATES):
+            if ours not in out:
+                self.findings.append(Finding("missing_topic", ours, NAN, 0, "not in the recording", "warning"))
+        return out
+
+    def _is_a(self, topic: str, kind: str, strict: bool = False) -> bool:
+        s = self.streams[topic][0]
+        name = s.schema.name if s.schema is not None else ""
+        return name.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) or (not strict and s.channel.message_encoding != "cdr")
+
+    def _describe_topics(self) -> str:
+        rows = [f"{t} ({s[0].schema.name if s[0].schema else '?'}, {s[0].channel.message_encoding})" for t, s in sorted(self.streams.items())]
+        return ", ".join(rows) or "none"
+
+    def _decode(self, ours: str, make: Callable[[Channel, McapSchema | None, str], Callable[[bytes], Any]]) -> tuple[np.ndarray, list[Any]]:
+        """Host times [T] s and decoded messages of one of our topics, in order of time."""
+        if ours not in self.sources:
+            return np.zeros(0), []
+        theirs, part = self.sources[ours]
+        times, out, bad, why, when = [], [], 0, "", NAN
+        for stream in self.streams[theirs]:
+            try:
+                reader = make(stream.channel, stream.schema, part)
+            except decode.Unreadable as error:
+                if ours in (schema.COMMANDS, schema.STATES):
+                    raise UserError(f"recording {self.path}: topic {theirs} cannot be read: {error}") from None
+                self.findings.append(Finding("unreadable", ours, NAN, len(stream.messages), f"{theirs}: {error}", "error"))
+                continue
+            for m in stream.messages:
+                t = (m.log_time - self.start_ns) * 1e-9
+                try:
+                    value = reader(m.data)
+                except Exception as error:  # a damaged message may fail anywhere in a decoder
+                    bad, why, when = bad + 1, why or str(error) or type(error).__name__, min(when, t) if bad else t
+                    continue
+                times.append(t)
+                out.append(value)
+        if bad:
+            self.findings.append(Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error"))
+            if not out and ours == schema.STATES:
+                raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
+        t = np.array(times)
+        back = np.flatnonzero(np.diff(t) < 0)
+        if len(back):
+            self.findings.append(Finding("time_not_monotonic", ours, float(t[back[0] + 1]), len(back),
+                                         f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
+                                         " samples are returned in order of time", "error", end=float(t[back[-1] + 1])))
+            order = np.argsort(t, kind="stable")
+            t, out = t[order], [out[i] for i in order]
+        return t, out
+
+    # -- values ------------------------------------------------------------------------------------------------------------
+    def build(self, stated: dict[str, str], joints: Sequence[str] | None) -> Recording:
+        """The recording, with metadata complete."""
+        t_command, commands = self._decode(schema.COMMANDS, decode.joint_reader)
+        t_state, states = self._decode(schema.STATES, decode.joint_reader)
+        theirs = self._their_joints(stated, commands, states, joints)
+        mapping = self._match(theirs, joints)
+        ours = tuple(dict.fromkeys(mapping[n] for n in theirs if n in mapping))
+        order = joints if joints is not None else xhand.JOINTS if set(ours) <= set(xhand.JOINTS) else ours
+        ours = tuple(j for j in order if j in ours)
+        # where each of their unnamed columns goes
+        column = np.array([ours.index(mapping[n]) if n in mapping else -1 for n in theirs])
+        scale = self._units(stated)
+        has_effort = any(len(s.effort) for s in states)
+        has_tactile = schema.TACTILE in self.sources
+        self.findings += metadata.complete(stated, has_effort, has_tactile)
+        if "joint_names" not in stated:
+            self.findings.append(Finding("missing_metadata", "", NAN, 1, f"joint_names is not stated; the messages' own is used: {', '.join(theirs)}", "info"))
+        sign = schema.per_joint_sign(stated["effort_sign"], tuple(theirs), str(self.path))
+        stated["effort_sign"] = ",".join(f"{int(sign[list(column).index(k)]):+d}" for k in range(len(ours)))
+        stated["joint_names"] = ",".join(ours)
+
+        place = _Placer(theirs, column, len(ours))
+        command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place, scale["position"])
+        out = Recording(
+            path=self.path, meta=stated, joints=ours,
+            commands=command if command is not None else Series.empty(schema.COMMANDS, len(ours)),
+            states=States(
+                self._joint_series(schema.STATES, t_state, states, "position", place, scale["position"])
+                or Series.empty(schema.STATES, len(ours)),
+                self._joint_series(schema.STATES, t_state, states, "velocity", place, scale["position"]),
+                self._joint_series(schema.STATES, t_state, states, "effort", place, scale["effort"])),
+            start_ns=self.start_ns, config=self.config)
+        for topic, name in ((schema.TEMPERATURES, "temperature"), (schema.DUTY, "duty"), (schema.ENABLED, "enabled")):
+            setattr(out, name, self._joint_array(topic, place))
+        out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
+        out.tactile = self._array(schema.TACTILE, _tactile_shape)
+        for topic, name in ((schema.EXTERNAL_FORCE, "external_force"), (schema.OBJECT_POSE, "object_pose"), (schema.IMU, "imu")):
+            setattr(out, name, self._vectors(topic))
+        out.findings = self.findings
+        return out
+
+    def _their_joints(self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None) -> list[str]:
+        """The recording's own joint names: `joint_names` first, then as they appear in messages."""
+        listed = list(schema.joint_names(stated.get("joint_names", "")))
+        seen: dict[str, None] = dict.fromkeys(listed)
+        unnamed = 0
+        for group in (states, commands):
+            last = None
+            for s in group:
+                if s.names != last:
+                    last = s.names
+                    seen.update(dict.fromkeys(s.names))
+                unnamed = max(unnamed, len(s.position) if not s.names else 0)
+        if seen:
+            if unnamed > len(listed or seen):
+                raise UserError(f"recording {self.path}: {unnamed} values a message without names, but joint_names lists {len(listed or seen)};"
+                                " state them all with meta.joint_names=a,b,...")
+            return list(seen)
+        if joints is not None and unnamed == len(joints):
+            names_ = list(joints)
+        else:
+            names_ = list(xhand.JOINTS) if unnamed == len(xhand.JOINTS) and joints is None else [f"joint{i}" for i in range(unnamed)]
+        self.findings.append(Finding("missing_metadata", "", NAN, 1, "neither the messages nor joint_names name the joints; assumed:"
+                                     f" {', '.join(names_)} (state meta.joint_names=...)", "warning"))
+        return names_
+
+    def _match(self, theirs: list[str], joints: Sequence[str] | None) -> dict[str, str]:
+        where = str(self.path)
+        if joints is not None:
+            mapping = names.match(theirs, joints, self.joint_remap, where)
+            if not mapping:
+                raise UserError(f"recording {where}: none of its joints ({', '.join(theirs)}) is one of the model's ({', '.join(joints)});"
+                                " say which they are with remap.OURS=THEIRS")
+        elif self.joint_remap and not set(self.joint_remap) <= set(xhand.JOINTS):
+            mapping = {their: their for their in theirs}
+            for our, their in self.joint_remap.items():
+                names.match(theirs, [our], {our: their}, where)
+                mapping[their] = our
+        else:
+            mapping = names.match(theirs, xhand.JOINTS, self.joint_remap, where)
+            if len(mapping) < len(theirs) and len(mapping) < 8:  # not an xHand
+                mapping = {their: their for their in theirs}
+        renamed = [f"{a} is {b}" for a, b in mapping.items() if a != b]
+        left = [n for n in theirs if n not in mapping]
+        if renamed:
+            self.findings.append(Finding("joint_names", "", NAN, len(renamed), "; ".join(renamed), "info"))
+        if left:
+            self.findings.append(Finding("joint_names", "", NAN, len(left), f"not joints of the model, left out: {', '.join(left)}", "info"))
+        return mapping
+
+    def _units(self, stated: dict[str, str]) -> dict[str, float]:
+        out = {"position": 1.0, "effort": 1.0}
+        for key in schema.UNIT_KEYS:
+            unit = stated.get(key)
+            if unit is not None:
+                out[key.removesuffix("_unit")] = schema.UNIT_KEYS[key][unit]
+                if schema.UNIT_KEYS[key][unit] != 1.0:
+                    self.findings.append(Finding("unit", "", NAN, 1, f"{key}={unit}: converted to SI", "info"))
+                    del stated[key]  # the values returned are SI
+        return out
+
+    def _joint_series(self, topic: str, t: np.ndarray, samples: list, name: str, place: _Placer, scale: float) -> Series | None:
+        if not samples or (name != "position" and not any(len(getattr(s, name)) for s in samples)):
+            return None
+        value = np.full((len(t), place.count), np.nan)
+        bad: list[int] = []
+        for i, s in enumerate(samples):
+            values = getattr(s, name)
+            if not len(values):
+                continue
+            to = place(s.names, len(values))
+            if to is None:
+                bad.append(i)
+            else:
+                keep, columns = to
+                value[i, columns] = values[keep]
+        if bad:
+            self.findings.append(Finding("malformed", topic, float(t[bad[0]]), len(bad), f"{name}: as many values as names are expected; samples left out",
+                                         "error", end=float(t[bad[-1]])))
+        stamp = np.array([np.nan if s.stamp is None else (s.stamp - self.start_ns) * 1e-9 for s in samples])
+        return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp)
+
+    def _joint_array(self, topic: str, place: _Placer) -> Series | None:
+        def fit(dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
+            to = place([], len(values))
+            if to is None:
+                return None
+            row = np.full(place.count, np.nan)
+            row[to[1]] = values[to[0]]
+            return row
+
+        return self._array(topic, fit)
+
+    def _array(self, topic: str, fit: Callable[[tuple[int, ...], np.ndarray], Any]) -> Series | None:
+        t, messages = self._decode(topic, decode.array_reader)
+        rows, keep, shape = [], [], None
+        for i, (dims, values) in enumerate(messages):
+            row = fit(dims, values) if len(values) else None
+            if row is not None and (shape is None or np.shape(row) == shape):
+                shape = np.shape(row)
+                rows.append(row)
+                keep.append(i)
+        if len(keep) < len(messages):
+            first = next(i for i in range(len(messages)) if i not in set(keep))
+            self.findings.append(Finding("malformed", topic, float(t[first]), len(messages) - len(keep),
+                                         f"values of an unexpected number ({len(messages[first][1])}); samples left out", "error"))
+        return Series(t[keep], np.array(rows, dtype=float), topic) if rows else None
+
+    def _vectors(self, topic: str) -> Series | None:
+        kind, size = _VECTORS[topic]
+        t, messages = self._decode(topic, lambda c, s, part: decode.vector_reader(c, s, part, kind))
+        if not messages:
+            return None
+        stamp = np.array([np.nan if s is None else (s - self.start_ns) * 1e-9 for _, s, _ in messages])
+        return Series(t, np.array([v for v, _, _ in messages]).reshape(len(t), size), topic,
+                      None if np.isnan(stamp).all() else stamp, messages[0][2])
+
+
+class _Placer:
+    """Where the values of a message go: by its names, or by the recording's order where it has none."""
+
+    def __init__(self, theirs: Sequence[str], column: np.ndarray, count: int):
+        self.theirs, self.column, self.count = list(theirs), column, count
+        self._known: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
+
+    def __call__(self, names_: Sequence[str], size: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """(which values to take, their columns), or None where names and values do not fit."""
+        key = tuple(names_)
+        if key not in self._known:
+            index = np.array([self.theirs.index(n) for n in key], int) if key else np.arange(len(self.theirs))
+            columns = self.column[index]
+            keep = np.flatnonzero(columns >= 0)
+            self._known[key] = keep, columns[keep]
+        if size != (len(key) if key else len(self.theirs)):
+            return None
+        return self._known[key]
+
+
+def _tactile_shape(dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
+    """[fingers, taxels, 3]: as the message says, else the xHand's."""
+    if len(dims) == 3 and int(np.prod(dims)) == len(values):
+        return values.reshape(dims)
+    fingers = len(xhand.FINGERS)
+    return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
+
+
+def _is_topic(name: str) -> bool:
+    return name.startswith("/") or "/" + name in schema.TOPICS
+
+
+def _slash(name: str) -> str:
+    return name if name.startswith("/") else "/" + name
+
+
+def _at(ns: int | None) -> str:
+    return "" if ns is None else f" (from host time {ns} ns)"

@@ -1,0 +1,282 @@
+"""What a recording holds: topics, message types, metadata, and the classes that the reader returns.
+
+One format for simulated and real hands: MCAP with ROS 2 messages. SI units: rad, rad/s, N.m, A, N (m, m/s, N for slide
+joints). Times are host times, seconds since the recording's start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.errors import UserError
+
+COMMANDS, STATES = "/joint_commands", "/joint_states"
+TEMPERATURES, DUTY, ENABLED = "/joint_temperatures", "/joint_duty", "/joint_enabled"
+SUPPLY, TACTILE = "/supply_voltage", "/tactile"
+EXTERNAL_FORCE, OBJECT_POSE, IMU = "/external_force", "/object_pose", "/imu"
+
+JOINT_STATE, MULTI_ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float32MultiArray"
+WRENCH, POSE, IMU_TYPE = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/Imu"
+TOPICS: dict[str, str] = {
+    COMMANDS: JOINT_STATE, STATES: JOINT_STATE, TEMPERATURES: MULTI_ARRAY, DUTY: MULTI_ARRAY, ENABLED: MULTI_ARRAY,
+    SUPPLY: MULTI_ARRAY, TACTILE: MULTI_ARRAY, EXTERNAL_FORCE: WRENCH, OBJECT_POSE: POSE, IMU: IMU_TYPE,
+}  # fmt: skip
+"""Default topic -> ROS 2 type."""
+
+METADATA = "dexsim"  # name of the MCAP metadata record
+ATTACHMENT = "config.yaml"  # name of the attachment with the resolved config
+EFFORT_IS, TACTILE_UNIT = ("current_A", "torque_Nm", "none"), ("N", "count")
+KEYS: dict[str, str] = {
+    "schema": "version of this format: 1",
+    "source": "real or sim",
+    "robot": "e.g. xhand_right",
+    "joint_names": "comma-separated: the order of unnamed arrays",
+    "effort_is": "current_A, torque_Nm or none",
+    "effort_sign": "per joint: +1 where positive effort drives toward positive position, -1, or 0 where the sign is lost",
+    "tactile_unit": "N or count",
+    "tactile_lsb": "newtons a count, or unknown",
+    "tactile_axis_sign": "three signs that bring the vendor's taxel axes to ours",
+    "tactile_layout": "name of the taxel layout, e.g. xhand_right",
+    "gravity": "in the model's world frame, e.g. 0 0 -9.81",
+    "servo": "YAML over servo.yaml for this recording",
+    "notes": "free text",
+}
+"""Metadata keys and what each means; all values are text."""
+DEFAULTS: dict[str, str] = {
+    "schema": "1", "source": "real", "robot": "unknown", "effort_sign": "+1", "tactile_unit": "count",
+    "tactile_lsb": "unknown", "tactile_axis_sign": "+1,+1,+1", "tactile_layout": "xhand_right", "gravity": "0 0 -9.81",
+    "servo": "", "notes": "",
+}  # fmt: skip
+"""What holds where nothing is stated; joint_names and effort_is follow from the messages."""
+UNIT_KEYS: dict[str, dict[str, float]] = {
+    "position_unit": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3},
+    "effort_unit": {"A": 1.0, "mA": 1e-3, "N.m": 1.0, "N": 1.0, "mN.m": 1e-3},
+}
+"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported."""
+
+_HEADER = """std_msgs/Header header
+"""
+_HEADER_DEFS = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_VECTOR = """================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+_QUATERNION = """================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x 0
+float64 y 0
+float64 z 0
+float64 w 1
+"""
+DEFINITIONS: dict[str, str] = {
+    JOINT_STATE: _HEADER + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort" + _HEADER_DEFS,
+    MULTI_ARRAY: """MultiArrayLayout layout
+float32[] data
+================================================================================
+MSG: std_msgs/MultiArrayLayout
+MultiArrayDimension[] dim
+uint32 data_offset
+================================================================================
+MSG: std_msgs/MultiArrayDimension
+string label
+uint32 size
+uint32 stride
+""",
+    WRENCH: _HEADER + "Wrench wrench" + _HEADER_DEFS + """================================================================================
+MSG: geometry_msgs/Wrench
+Vector3 force
+Vector3 torque
+""" + _VECTOR,
+    POSE: _HEADER + "Pose pose" + _HEADER_DEFS + """================================================================================
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+""" + _QUATERNION,
+    IMU_TYPE: _HEADER + """geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance""" + _HEADER_DEFS + _QUATERNION + _VECTOR,
+}
+"""ROS 2 type -> message definition, as rosbag2 stores it."""
+
+SEVERITIES = ("info", "warning", "error")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something the reader or the audit saw. kind: short id, e.g. "gap"; topic: "" for the whole file.
+
+    time: of the first occurrence [s since start], NaN where it has none; end: of the last; count: samples (or keys)
+    concerned; severity: "info" (stated for completeness), "warning" (look at it), "error" (a channel cannot be used as
+    it is); joint: "" where it is not of one joint.
+    """
+
+    kind: str
+    topic: str
+    time: float
+    count: int
+    text: str
+    severity: str = "warning"
+    joint: str = ""
+    end: float = float("nan")
+
+
+@dataclass
+class Series:
+    """Samples of one quantity. t [T] host time [s since start], never decreasing; value [T, ...] with NaN for absent.
+
+    stamp [T]: `header.stamp` on the same axis as t, NaN where unset (None: the message has no header).
+    """
+
+    t: np.ndarray
+    value: np.ndarray
+    topic: str = ""
+    stamp: np.ndarray | None = None
+    frame: str = ""  # header.frame_id of the first message
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def between(self, start: float, end: float) -> Series:
+        """The samples with start <= t < end [s]."""
+        keep = (self.t >= start) & (self.t < end)
+        return replace(self, t=self.t[keep], value=self.value[keep], stamp=None if self.stamp is None else self.stamp[keep])
+
+    @classmethod
+    def empty(cls, topic: str, *shape: int) -> Series:
+        """No samples of values of this shape."""
+        return cls(np.zeros(0), np.zeros((0, *shape)), topic)
+
+
+@dataclass
+class States:
+    """/joint_states: position [T, J] rad; velocity [T, J] rad/s and effort [T, J] (`Recording.effort_is`) or None."""
+
+    position: Series
+    velocity: Series | None = None
+    effort: Series | None = None
+
+
+@dataclass
+class Recording:
+    """One recording: what was commanded and measured, and what is known about it. J joints in the order of `joints`.
+
+    commands.value [T, J] target [rad]; states see `States`; temperature [T, J] degC; duty [T, J] -1..1; enabled [T, J]
+    1 driven, 0 free (None: always driven); supply_voltage [T] V; tactile [T, fingers, taxels, 3] as sent
+    (`tactile_unit`, vendor axes); external_force [T, 6] N and N.m in `external_force.frame`; object_pose [T, 7] x y z,
+    w x y z, palm frame; imu [T, 10] orientation w x y z, angular velocity, linear acceleration.
+    Effort is as recorded: `effort_sign` is not applied (`signed_effort` does).
+    meta: every key of `KEYS`, defaults filled in. start_ns: host time of t = 0. findings: of reading and audit.
+    """
+
+    path: Path
+    meta: dict[str, str]
+    joints: tuple[str, ...]
+    commands: Series
+    states: States
+    temperature: Series | None = None
+    duty: Series | None = None
+    enabled: Series | None = None
+    supply_voltage: Series | None = None
+    tactile: Series | None = None
+    external_force: Series | None = None
+    object_pose: Series | None = None
+    imu: Series | None = None
+    start_ns: int = 0
+    findings: list[Finding] = field(default_factory=list)
+    config: str | None = None  # the resolved config attached to it, YAML
+
+    @property
+    def duration(self) -> float:
+        """Time of the last command or state [s]."""
+        return max([0.0, *(s.t[-1] for s in (self.commands, self.states.position) if len(s))])
+
+    @property
+    def effort_is(self) -> str:
+        """"current_A", "torque_Nm" or "none"."""
+        return self.meta["effort_is"]
+
+    @property
+    def effort_sign(self) -> np.ndarray:
+        """[J]: +1, -1, or 0 where the sign is lost."""
+        return per_joint_sign(self.meta["effort_sign"], self.joints, str(self.path))
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """[3] m/s2 in the model's world frame."""
+        return numbers(self.meta["gravity"], 3, "gravity", str(self.path))
+
+    @property
+    def tactile_axis_sign(self) -> np.ndarray:
+        """[3] signs that bring the taxels' axes to ours."""
+        return numbers(self.meta["tactile_axis_sign"], 3, "tactile_axis_sign", str(self.path))
+
+    @property
+    def tactile_lsb(self) -> float | None:
+        """Newtons a count: 1 where the unit is N, None where unknown."""
+        if self.meta["tactile_unit"] == "N":
+            return 1.0
+        text = self.meta["tactile_lsb"]
+        return None if text == "unknown" else float(numbers(text, 1, "tactile_lsb", str(self.path))[0])
+
+    def signed_effort(self) -> Series | None:
+        """Effort, positive along positive joint position; NaN where the sign is lost."""
+        effort = self.states.effort
+        if effort is None:
+            return None
+        sign = self.effort_sign
+        return replace(effort, value=effort.value * np.where(sign == 0, np.nan, sign))
+
+    def tactile_newtons(self) -> Series | None:
+        """Touch in N and our axes, [T, fingers, taxels, 3]. Raises UserError where the scale is unknown."""
+        if self.tactile is None:
+            return None
+        if self.tactile_lsb is None:
+            raise UserError(f"{self.path}: tactile_unit is count and tactile_lsb is unknown; state meta.tactile_lsb=<N a count>")
+        return replace(self.tactile, value=self.tactile.value * (self.tactile_lsb * self.tactile_axis_sign))
+
+
+def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
+    """`count` numbers separated by commas or spaces. Raises UserError naming file and key."""
+    try:
+        values = np.array([float(x) for x in text.replace(",", " ").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count:
+        raise UserError(f"{where}: metadata {key}='{text}' must be {count} number{'s' * (count > 1)}; correct it with meta.{key}=...")
+    return values
+
+
+def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray:
+    """effort_sign [J]: one value for all, or one a joint; each -1, 0 or 1."""
+    count = len(text.replace(",", " ").split())
+    values = numbers(text, 1 if count == 1 else len(joints), "effort_sign", where)
+    if not np.isin(values, (-1, 0, 1)).all():
+        raise UserError(f"{where}: metadata effort_sign='{text}' must hold +1, -1 or 0; correct it with meta.effort_sign=...")
+    return np.broadcast_to(values, len(joints)).copy()
+
+
+def joint_names(text: str) -> tuple[str, ...]:
+    """The comma-separated list of `joint_names`."""
+    return tuple(name for name in text.replace(",", " ").split())

@@ -1,0 +1,173 @@
+"""Write a recording: MCAP, ROS 2 profile, zstd chunks that are complete on disk at least once a second."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+
+from dexsim.errors import UserError
+from dexsim.recording import cdr, schema
+from dexsim.recording.schema import Recording
+
+
+class Writer:
+    """A recording being written; a context manager. A killed process leaves every finished chunk readable.
+
+    Arguments:
+        path: the file, replaced if it exists.
+        joints: names [J], the order of every array given to add_*.
+        meta: values by key of `schema.KEYS`; joint_names is filled in, the rest as given.
+        start_ns: host time of t = 0 [ns since the epoch]; None: now.
+        config: the resolved config as YAML, attached.
+        chunk_s: a chunk is finished at least this often, in recorded time [s].
+
+    Every add_* takes t [s since start] and its values; `stamp` [s] is what header.stamp says (None: t itself).
+    Not thread-safe: a real-time loop hands samples to the one thread that owns the writer.
+    """
+
+    def __init__(self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any] | None = None,
+                 start_ns: int | None = None, config: str | None = None, chunk_s: float = 1.0, chunk_bytes: int = 1 << 18):
+        self.path, self.joints = Path(path).expanduser(), tuple(joints)
+        self.start_ns = time.time_ns() if start_ns is None else int(start_ns)
+        self.meta = {"schema": "1", "joint_names": ",".join(joints)} | {k: str(v) for k, v in (meta or {}).items()}
+        unknown = [k for k in self.meta if k not in schema.KEYS and k not in schema.UNIT_KEYS]
+        if unknown:
+            raise UserError(f"{self.path}: metadata key '{unknown[0]}' does not exist; valid: {', '.join(schema.KEYS)}")
+        try:
+            self._file = open(self.path, "wb")  # noqa: SIM115 (lives as long as the writer)
+        except OSError as error:
+            raise UserError(f"cannot write recording {self.path}: {error.strerror}; choose another place") from None
+        self._mcap = McapWriter(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="ros2", library="dexsim")
+        self._mcap.add_metadata(schema.METADATA, self.meta)
+        if config is not None:
+            self._mcap.add_attachment(self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode())
+        self._file.flush()
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._count: dict[str, int] = {}
+        self._chunk_ns, self._last_flush = int(chunk_s * 1e9), None
+        self._open = True
+
+    def add_command(self, t: float, position: np.ndarray, stamp: float | None = None) -> None:
+        """Targets [J] sent to the servos [rad]; NaN: none for this joint."""
+        self._joints(schema.COMMANDS, t, position, None, None, stamp)
+
+    def add_state(self, t: float, position: np.ndarray, velocity: np.ndarray | None = None,
+                  effort: np.ndarray | None = None, stamp: float | None = None) -> None:
+        """Measured position, velocity, effort [J] each."""
+        self._joints(schema.STATES, t, position, velocity, effort, stamp)
+
+    def add_temperature(self, t: float, value: np.ndarray) -> None:
+        """[J] degC."""
+        self._array(schema.TEMPERATURES, t, value, ("joint",))
+
+    def add_duty(self, t: float, value: np.ndarray) -> None:
+        """[J] -1..1."""
+        self._array(schema.DUTY, t, value, ("joint",))
+
+    def add_enabled(self, t: float, value: np.ndarray) -> None:
+        """[J] 1 where the servo drives, 0 where it is free."""
+        self._array(schema.ENABLED, t, value, ("joint",))
+
+    def add_supply_voltage(self, t: float, value: float) -> None:
+        """V."""
+        self._array(schema.SUPPLY, t, np.atleast_1d(value), ("supply",))
+
+    def add_tactile(self, t: float, value: np.ndarray) -> None:
+        """[fingers, taxels, 3] in `tactile_unit`."""
+        self._array(schema.TACTILE, t, value, ("finger", "taxel", "axis"))
+
+    def add_external_force(self, t: float, value: np.ndarray, frame: str = "palm", stamp: float | None = None) -> None:
+        """[6] force [N] and torque [N.m] in `frame`."""
+        self._message(schema.EXTERNAL_FORCE, t, cdr.wrench(self._ns(t if stamp is None else stamp), frame, value))
+
+    def add_object_pose(self, t: float, value: np.ndarray, stamp: float | None = None) -> None:
+        """[7] x y z [m], w x y z, palm frame."""
+        self._message(schema.OBJECT_POSE, t, cdr.pose(self._ns(t if stamp is None else stamp), "palm", value))
+
+    def add_imu(self, t: float, value: np.ndarray, frame: str = "object", stamp: float | None = None) -> None:
+        """[10] orientation w x y z, angular velocity [rad/s], linear acceleration [m/s2]."""
+        self._message(schema.IMU, t, cdr.imu(self._ns(t if stamp is None else stamp), frame, value))
+
+    def flush(self) -> None:
+        """Finish the chunk in progress and hand it to the operating system."""
+        self._mcap.flush()
+
+    def close(self) -> None:
+        """Write the index and close."""
+        if self._open:
+            self._open = False
+            self._mcap.finish()
+            self._file.close()
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _ns(self, t: float) -> int:
+        return self.start_ns + round(t * 1e9)
+
+    def _joints(self, topic: str, t: float, position: np.ndarray, velocity: np.ndarray | None, effort: np.ndarray | None,
+                stamp: float | None) -> None:
+        self._message(topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), self.joints, position, velocity, effort))
+
+    def _array(self, topic: str, t: float, value: np.ndarray, labels: Sequence[str]) -> None:
+        self._message(topic, t, cdr.multi_array(value, labels))
+
+    def _message(self, topic: str, t: float, data: bytes) -> None:
+        if topic not in self._channels:
+            kind = schema.TOPICS[topic]
+            if kind not in self._schemas:
+                self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", schema.DEFINITIONS[kind].encode())
+            self._channels[topic] = self._mcap.register_channel(topic, "cdr", self._schemas[kind])
+        ns = self._ns(t)
+        number = self._count[topic] = self._count.get(topic, 0) + 1
+        self._mcap.add_message(self._channels[topic], log_time=ns, data=data, publish_time=ns, sequence=number)
+        if self._last_flush is None:
+            self._last_flush = ns
+        elif ns - self._last_flush >= self._chunk_ns:
+            self._last_flush = ns
+            self._mcap.flush()
+
+
+def write(path: str | Path, recording: Recording) -> None:
+    """Write a whole `Recording`, all topics in order of time."""
+    r = recording
+    with Writer(path, r.joints, r.meta | {"joint_names": ",".join(r.joints)}, r.start_ns, r.config) as w:
+        for _, _, add, args in sorted(_samples(r, w), key=lambda item: (item[0], item[1])):
+            add(*args)
+
+
+def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]:
+    """(time, order within a time, add function, its arguments) of every sample."""
+    c, s = r.commands, r.states
+    for i, t in enumerate(c.t):
+        yield t, 0, w.add_command, (t, c.value[i], _stamp(c, i))
+    for i, t in enumerate(s.position.t):
+        rest = [None if x is None else x.value[i] for x in (s.velocity, s.effort)]
+        yield t, 1, w.add_state, (t, s.position.value[i], *rest, _stamp(s.position, i))
+    plain = ((r.temperature, w.add_temperature), (r.duty, w.add_duty), (r.enabled, w.add_enabled),
+             (r.supply_voltage, w.add_supply_voltage), (r.tactile, w.add_tactile))
+    for order, (series, add) in enumerate(plain, start=2):
+        for i, t in enumerate([] if series is None else series.t):
+            yield t, order, add, (t, series.value[i])
+    for i, t in enumerate([] if r.object_pose is None else r.object_pose.t):
+        yield t, 7, w.add_object_pose, (t, r.object_pose.value[i], _stamp(r.object_pose, i))
+    for order, (series, add) in enumerate(((r.external_force, w.add_external_force), (r.imu, w.add_imu)), start=8):
+        for i, t in enumerate([] if series is None else series.t):
+            yield t, order, add, (t, series.value[i], series.frame, _stamp(series, i))
+
+
+def _stamp(series: Any, i: int) -> float | None:
+    if series.stamp is None or np.isnan(series.stamp[i]):
+        return None
+    return float(series.stamp[i])
