@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import warp as wp
+from mujoco_warp._src.types import vec5
 
 from dexsim.sim.engine import ContactPair, geoms_of
 
@@ -40,9 +41,11 @@ def add_contacts(
     worldid: wp.array(dtype=int),
     frame: wp.array(dtype=wp.mat33),
     dim: wp.array(dtype=int),
+    friction: wp.array(dtype=vec5),
     efc_address: wp.array2d(dtype=int),
     efc_force: wp.array2d(dtype=float),
     njmax: int,
+    pyramidal: int,
     table: wp.array3d(dtype=int),
     # out
     normal_sum: wp.array2d(dtype=int),
@@ -57,10 +60,19 @@ def add_contacts(
         return
     w = worldid[c]
     f = wp.vec3(0.0, 0.0, 0.0)
-    for i in range(wp.min(dim[c], 3)):
-        a = efc_address[c, i]
-        if a >= 0 and a < njmax:
-            f[i] = efc_force[w, a]
+    if pyramidal == 1 and dim[c] > 1:
+        # rows are the edges n +- mu_i t_i of the pyramid, two a direction
+        for i in range(dim[c] - 1):
+            if adr + 2 * i + 1 < njmax:
+                plus, minus = efc_force[w, adr + 2 * i], efc_force[w, adr + 2 * i + 1]
+                f[0] += plus + minus
+                if i < 2:
+                    f[i + 1] = (plus - minus) * friction[c][i]
+    else:
+        for i in range(wp.min(dim[c], 3)):
+            a = efc_address[c, i]
+            if a >= 0 and a < njmax:
+                f[i] = efc_force[w, a]
     # the frame's first row is the normal, from geom[0] to geom[1]; f acts on geom[1]
     world = wp.transpose(frame[c]) * f
     for k in range(table.shape[2]):

@@ -46,6 +46,8 @@ def geoms_of(model: mujoco.MjModel, kind: str, name: str) -> np.ndarray:
                     if model.body_parentid[b] in bodies:
                         bodies.add(b)
             return np.flatnonzero(np.isin(model.geom_bodyid, list(bodies)))
+    else:
+        raise UserError(f"contact pair: kind '{kind}' of '{name}' must be geom, body or subtree")
     raise UserError(f"contact pair: no {kind} named '{name}' in the model")
 
 
@@ -148,8 +150,9 @@ class Engine:
 
     def check_overflow(self) -> None:
         """Fail if contacts or constraint rows were lost since the last call. Reads from the device: call it rarely."""
-        flags = int(torch.bitwise_or(self.t.overflow, 0).max().item())
-        if flags & OVERFLOW_BITS:
+        # masked before the maximum: another world's harmless, larger bit must not hide a loss
+        flags = int((self.t.overflow & OVERFLOW_BITS).max().item())
+        if flags:
             p = self.peaks()
             raise UserError(
                 f"contact overflow (flags {flags:#x}): peak {p['contacts']:.1f} contacts a world of sim.nconmax={p['nconmax']} on "

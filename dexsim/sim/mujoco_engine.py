@@ -10,9 +10,12 @@ import numpy as np
 import torch
 import warp as wp
 
+from dexsim.errors import UserError
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 
-_SLOTS = 6  # contacts of one pair that are summed
+_SLOTS = 12  # contacts of one pair that are summed; more are counted, and fail in `check_overflow`
+_ROW = 10  # numbers a slot: found, force, normal, tangent
+_LOST = 1 << 6  # bit of `Engine.t.overflow`
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 
 
@@ -20,9 +23,14 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
     """Compile `spec` with one contact sensor a pair (C MuJoCo's batch does not hand out its contact list)."""
     kinds = {"geom": mujoco.mjtObj.mjOBJ_GEOM, "body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY}
     spec = spec.copy()
-    data = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)) | (1 << int(mujoco.mjtConDataField.mjCONDATA_NORMAL)) | (
-        1 << int(mujoco.mjtConDataField.mjCONDATA_TANGENT))
+    field = mujoco.mjtConDataField
+    data = sum(1 << int(f) for f in (field.mjCONDATA_FOUND, field.mjCONDATA_FORCE, field.mjCONDATA_NORMAL, field.mjCONDATA_TANGENT))
     for p in pairs:
+        for kind, name in (p.first, p.second):
+            if kind not in kinds:
+                raise UserError(f"contact pair: kind '{kind}' of '{name}' must be geom, body or subtree")
+            if (spec.geom(name) if kind == "geom" else spec.body(name)) is None:
+                raise UserError(f"contact pair: no {kind} named '{name}' in the model")
         spec.add_sensor(
             name=f"pair_{p.name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds[p.first[0]], objname=p.first[1],
             reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, _SLOTS])
@@ -63,11 +71,11 @@ class MujocoEngine(Engine):
         self.t.overflow = torch.zeros(N, dtype=torch.int32)
         if P:
             adr = np.array([model.sensor_adr[model.sensor(f"pair_{p.name}").id] for p in self.pairs])
-            self._sensor_cols = adr[:, None] + np.arange(9 * _SLOTS)
+            self._sensor_cols = adr[:, None] + np.arange(_ROW * _SLOTS)
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
         self._fields_wp: dict[str, wp.array] = {}
-        self._peak = np.zeros(2)
+        self._peak = np.zeros(3)
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:
@@ -116,6 +124,12 @@ class MujocoEngine(Engine):
     def peaks(self) -> dict[str, float]:
         return {"contacts": float(self._peak[0]), "rows": float(self._peak[1]), "nconmax": 0, "njmax": 0}
 
+    def check_overflow(self) -> None:
+        if bool((self.t.overflow & _LOST).any()):
+            raise UserError(f"contact overflow: a contact pair had {self._peak[2]:.0f} contacts, sim.engine=mujoco sums {_SLOTS}; "
+                            f"use sim.engine=warp, or pairs of fewer geoms")
+        self.t.overflow.zero_()
+
     def _poses(self) -> None:
         n, nb = self.n, self.mjm.nbody
         self.t.xpos.numpy()[:] = self._xpos64
@@ -124,13 +138,15 @@ class MujocoEngine(Engine):
     def _contacts(self) -> None:
         if not self.pairs:
             return
-        s = self._sensordata[:, self._sensor_cols].reshape(self.n, len(self.pairs), _SLOTS, 9)
-        force, normal, tangent = s[..., 0:3], s[..., 3:6], s[..., 6:9]
+        s = self._sensordata[:, self._sensor_cols].reshape(self.n, len(self.pairs), _SLOTS, _ROW)
+        found, force, normal, tangent = s[..., 0, 0], s[..., 1:4], s[..., 4:7], s[..., 7:10]
         other = np.cross(normal, tangent)
         # force is what the first member exerts on the second, in the frame (normal, tangent, other); on the first: minus
         world = force[..., :1] * normal + force[..., 1:2] * tangent + force[..., 2:3] * other
         self.t.pair_normal.copy_(torch.from_numpy(force[..., 0].sum(-1)))
         self.t.pair_force.copy_(torch.from_numpy(-world.sum(-2)))
+        self._peak[2] = max(self._peak[2], found.max())
+        self.t.overflow |= torch.from_numpy((found > _SLOTS).any(1) * np.int32(_LOST))
         self._peak[0] = max(self._peak[0], self._ncon.max())
         self._peak[1] = max(self._peak[1], self._nefc.max())
 

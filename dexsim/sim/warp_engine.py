@@ -131,8 +131,9 @@ class WarpEngine(Engine):
             wp.launch(
                 contact.add_contacts,
                 dim=d.naconmax,
-                inputs=[d.nacon, d.contact.geom, d.contact.worldid, d.contact.frame, d.contact.dim, d.contact.efc_address,
-                        d.efc.force, d.njmax, self._table],
+                inputs=[d.nacon, d.contact.geom, d.contact.worldid, d.contact.frame, d.contact.dim, d.contact.friction,
+                        d.contact.efc_address, d.efc.force, d.njmax, int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
+                        self._table],
                 outputs=[self._normal_sum, self._force_sum],
             )
             wp.launch(
