@@ -53,6 +53,7 @@ class HandEnv(VecEnv):
         self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
         self.num_envs, self.device, self.num_actions = n_worlds, device, len(xhand.JOINTS)
         self.decimation, self.dt = _periods(sim, self.task)
+        self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
         shapes = library()
         self.shape_names = [_known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])]
@@ -115,6 +116,16 @@ class HandEnv(VecEnv):
         """Observation groups, [N, D] each. advance: a control step has passed (sensors with memory move on)."""
         raise NotImplementedError
 
+    @property
+    def max_episode_length(self) -> int:
+        """Control steps after which an episode times out; on the device too, so that a recorded step sees a change."""
+        return self._length
+
+    @max_episode_length.setter
+    def max_episode_length(self, steps: int) -> None:
+        self._length = steps
+        self._length_limit.fill_(steps)
+
     # -- rsl-rl's interface ------------------------------------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
@@ -146,7 +157,7 @@ class HandEnv(VecEnv):
         ends = self.terminated()
         ends["nan"] = self.nan
         dead = torch.stack(list(ends.values())).any(0)
-        self.time_out.copy_((self.episode_length_buf >= self.max_episode_length) & ~dead)
+        self.time_out.copy_((self.episode_length_buf >= self._length_limit) & ~dead)
         terms = self.rewards()
         reward = torch.stack(list(terms.values()))
         reward = torch.where(self.nan, torch.zeros_like(reward), reward)
@@ -211,18 +222,19 @@ class HandEnv(VecEnv):
                 self.obs[group] = torch.zeros_like(value)
             self.obs[group].copy_(value)
 
-    def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor) -> None:
-        """Where mask holds: hand at rest at hand_q [N, 12]; object at pose [N, 7] (x y z, w x y z) moving at velocity
-        [N, 6] (linear, angular), palm frame."""
-        e = self.engine
+    def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor,
+              target: torch.Tensor | None = None) -> None:
+        """Where mask holds: hand at rest at hand_q [N, 12], sent to target [N, 12] (hand_q without one); object at pose
+        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear, angular), palm frame."""
+        e, target = self.engine, hand_q if target is None else target
         qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
         qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
         qpos[:, self.object_q] = object_pose.to(qpos.dtype)
         qvel[:, self.object_v] = object_velocity.to(qvel.dtype)
         e.set_state(mask, qpos, qvel)
-        self.servo.reset(mask, hand_q)
+        self.servo.reset(mask, target)
         self.touch.reset(mask)
-        self.target.copy_(torch.where(mask[:, None], hand_q, self.target))
+        self.target.copy_(torch.where(mask[:, None], target, self.target))
 
     # -- state ---------------------------------------------------------------------------------------------------------------
     def read_state(self) -> None:
