@@ -170,7 +170,7 @@ def test_cfg_prints_the_settings_and_does_nothing(configs, place, capfd):
 # --- bad input
 
 @pytest.mark.parametrize("argument, words", [
-    ("wrlds=4", "unknown setting 'wrlds' (did you mean worlds?); the settings are: task, agent, "),
+    ("wrlds=4", "unknown setting 'wrlds' (did you mean worlds?); the settings are: agent, "),
     ("agent.algorithm.learning_rat=1", "did you mean agent.algorithm.learning_rate?); agent.algorithm has: "),
     ("learning_rate=1", "did you mean agent.algorithm.learning_rate?"),
     ("sim.engin.x=1", "unknown setting 'sim.engin.x'"),
