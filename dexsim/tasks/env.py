@@ -126,6 +126,15 @@ class HandEnv(VecEnv):
         self._length = steps
         self._length_limit.fill_(steps)
 
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps since each episode began, [N]. Assigning copies: a recorded step holds this memory."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._episode_length.copy_(steps)
+
     # -- rsl-rl's interface ------------------------------------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
@@ -213,6 +222,7 @@ class HandEnv(VecEnv):
         """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
         self.begin_episodes(mask)
         self.engine.refresh()
+        self._clear_touch(mask)
         self.episode_length_buf.masked_fill_(mask, 0)
         self.action.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask[:, None], 0.0)
@@ -225,7 +235,7 @@ class HandEnv(VecEnv):
     def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor,
               target: torch.Tensor | None = None) -> None:
         """Where mask holds: hand at rest at hand_q [N, 12], sent to target [N, 12] (hand_q without one); object at pose
-        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear, angular), palm frame."""
+        [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own)."""
         e, target = self.engine, hand_q if target is None else target
         qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
         qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
@@ -235,6 +245,18 @@ class HandEnv(VecEnv):
         self.servo.reset(mask, target)
         self.touch.reset(mask)
         self.target.copy_(torch.where(mask[:, None], target, self.target))
+
+    def _clear_touch(self, mask: torch.Tensor) -> None:
+        """Where mask [N] holds, nothing is touched: no force, centres at the pads' centres (poses are refreshed)."""
+        t, touch = self.engine.t, self.touch
+        centre = t.xpos[:, self.tip_body] + (t.xmat[:, self.tip_body] @ self.pad_centre[None, :, :, None])[..., 0]
+        for force in (touch.force, touch.force_clean, touch.force_other):
+            force.masked_fill_(mask[:, None], 0.0)
+        for known in (touch.centre, touch.centre_clean):
+            known.copy_(torch.where(mask[:, None, None], centre, known))
+        for raw in (touch.raw, touch.raw_clean, touch.raw3):
+            if raw is not None:
+                raw.masked_fill_(mask.view(-1, *(1,) * (raw.dim() - 1)), 0.0)
 
     # -- state ---------------------------------------------------------------------------------------------------------------
     def read_state(self) -> None:
@@ -277,6 +299,7 @@ class HandEnv(VecEnv):
         self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self.effort = torch.as_tensor(xhand.efforts(), dtype=torch.float32, device=dev)
         self.tip_body = long([e.body(b) for b in xhand.TIP_BODIES])
+        self.pad_centre = torch.as_tensor(self.touch.layout.centre(), dtype=torch.float32, device=dev)
         sites = [mjm.site(f"tip_{f}").id for f in xhand.FINGERS]
         self.tip_offset = torch.as_tensor(mjm.site_pos[sites], dtype=torch.float32, device=dev)
 
@@ -286,7 +309,7 @@ class HandEnv(VecEnv):
         def zeros(*shape, dtype=torch.float32):
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
-        self.episode_length_buf = zeros(dtype=torch.long)
+        self._episode_length = zeros(dtype=torch.long)
         self.action, self.last_action, self.target = zeros(J), zeros(J), zeros(J)
         self.q, self.qd, self.torque = zeros(J), zeros(J), zeros(J)
         self.object_pose, self.object_velocity = zeros(7), zeros(6)
@@ -311,7 +334,8 @@ class HandEnv(VecEnv):
         values = torch.cat([reward.mean(1), rates, torch.stack(list(metrics.values()))]) if metrics else torch.cat([reward.mean(1), rates])
         if self._log_values is None:
             self._log_names = (*(f"reward/{k}" for k in terms), *(f"end/{k}" for k in (*ends, "time_out")), *metrics)
-            self._log_values = torch.zeros_like(values)
+            with torch.inference_mode(False):  # it outlives the rollout that happens to come first
+                self._log_values = torch.zeros(values.shape, device=self.device)
         self._log_values.copy_(values)
 
     def metrics(self) -> dict[str, torch.Tensor]:
