@@ -14,8 +14,9 @@ def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "au
     unknown task and for every impossible value that the task finds.
     """
     from dexsim.tasks.grasp import GraspEnv
+    from dexsim.tasks.rotate import RotateEnv
 
-    tasks = {"grasp": GraspEnv}
+    tasks = {"grasp": GraspEnv, "rotate": RotateEnv}
     name = cfg["task"]["name"]
     if name not in tasks:
         near = difflib.get_close_matches(name, tasks, 1)

@@ -24,7 +24,7 @@ from dexsim.errors import UserError
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
-from dexsim.tactile.layout import tip_points, xhand_layout
+from dexsim.tactile.layout import xhand_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
 from dexsim.tasks.objects import Objects
@@ -86,7 +86,7 @@ class HandEnv(VecEnv):
         self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
         touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
         self.touch = Tactile(self.engine, xhand_layout(), touch_shapes, OBJECT, cfg["tactile"],
-                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=tip_points(self.engine.mjm, xhand.TIP_GEOMS))
+                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()

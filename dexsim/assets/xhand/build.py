@@ -11,7 +11,7 @@ import numpy as np
 
 from dexsim.assets import xhand
 from dexsim.assets.xhand import shells
-from dexsim.assets.xhand.surface import PADS, Lattice, tangents, tip_hull, tip_points, to_link, to_sensor
+from dexsim.assets.xhand.surface import PADS, TIP_MARGIN, Lattice, tangents, tip_hull, tip_points, to_link, to_sensor
 
 # Neither is published. Armature: the order of magnitude of a small geared motor's rotor seen at the joint
 # (g cm^2 times a gear ratio of 100 to 200 squared); several times the links' own inertia about the joint.
@@ -31,7 +31,8 @@ TIP_BIT, THUMB_TIP_BIT, THUMB_LINK_BIT = 4, 8, 16
 PALM_CENTRE = 0.065  # z of the palm frame on the root link's fingers axis (m)
 
 # Capsules (from, to, radius) in link frames, m, inside the measured bounds.
-_PHALANX = [((0.003, 0, 0), (0.003, 0, 0.0584), 0.0081), ((-0.0088, 0, 0.0145), (-0.0088, 0, 0.0500), 0.0081)]
+# Only what an object in the palm can reach: the backs of palm and fingers have none.
+_PHALANX = [((0.003, 0, 0), (0.003, 0, 0.0584), 0.0081)]
 _PALM_RADIUS = 0.0115
 _PALM_Y = np.linspace(-0.0502 + _PALM_RADIUS, 0.0437 - _PALM_RADIUS, 6)
 _PALM_TOP = [0.082, 0.087, 0.089, 0.091, 0.083, 0.074]  # below each finger's root joint
@@ -48,7 +49,7 @@ CAPSULES = {
     "right_hand_thumb_rota_link2": [((-0.0095, 0, 0), (0.0095, 0, 0), 0.008)],
     "right_hand_index_bend_link": [((0.0012, 0, 0.0045), (0.0012, 0, 0.0190), 0.008)],
     # The index finger's root barrel belongs to its sideways link.
-    "right_hand_index_rota_link1": [((0.003, 0, 0.0138), (0.003, 0, 0.0584), 0.0081), _PHALANX[1]],
+    "right_hand_index_rota_link1": [((0.003, 0, 0.0138), (0.003, 0, 0.0584), 0.0081)],
     "right_hand_index_rota_link2": [((0, 0, 0), (0.001, 0, 0.0075), 0.0079)],
 }
 for _finger in ("mid", "ring", "pinky"):
@@ -212,7 +213,7 @@ def build() -> str:
         f'    <material name="xhand_{name}" rgba="{rgba}" specular="{specular}" shininess="{shininess}"/>'
         for name, (rgba, specular, shininess) in MATERIALS.items()
     ]
-    text = _TEMPLATE.format(assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SOLREF)
+    text = _TEMPLATE.format(assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SOLREF, margin=TIP_MARGIN)
     xhand.xml_path().write_text(text, encoding="ascii")
     return text
 
@@ -300,11 +301,11 @@ _TEMPLATE = """\
       <geom type="mesh" contype="0" conaffinity="0" group="2" mass="0"/>
     </default>
     <default class="xhand_collision">
-      <geom group="3" condim="4" friction="0.8 0.003 0.0001" solref="{solref}" rgba="0.9 0.5 0.2 0.4"/>
+      <geom group="3" condim="3" friction="0.8 0.003 0.0001" solref="{solref}" rgba="0.9 0.5 0.2 0.4"/>
     </default>
     <default class="xhand_tip">
       <geom type="mesh" group="3" condim="4" priority="1" friction="0.9 0.003 0.0001" solref="{solref}"
-        rgba="0.2 0.7 0.4 0.5"/>
+        margin="{margin}" rgba="0.2 0.7 0.4 0.5"/>
     </default>
   </default>
   <asset>

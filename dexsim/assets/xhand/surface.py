@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, HalfspaceIntersection, cKDTree
 
 COLUMNS, ROWS = 10, 12
 
@@ -191,8 +191,15 @@ def hull_distance(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
     return (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
 
 
+TIP_MARGIN = 0.0015
+"""Rounding of the fingertips [m]: the collision mesh is the tip shrunk by this, and its geom's `margin` adds it back. The
+mesh itself then never overlaps an object (rubber yields about 1 mm), so that the collision of convex shapes stays a
+distance query, several times cheaper than a penetration query, and the edges of its facets are rounded."""
+
+
 def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: float = 1.5e-4) -> np.ndarray:
-    """Vertices [<= vertices, 3] (sensor axes) of the convex fingertip, mirror symmetric about a = 0.
+    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the points
+    at least TIP_MARGIN inside the tip.
 
     Greedy: add the dense point farthest outside the present hull, and its mirror image. Skin points are raised by
     `raise_by` along the normal first, so that the facets' sagging is spread to both sides of the skin; points
@@ -202,8 +209,12 @@ def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: floa
     skin, normal = lattice.position(u, v).reshape(-1, 3), lattice.normal(u, v).reshape(-1, 3)
     _, rest = tip_points(lattice, pad)
     raised = skin + normal * (raise_by * lattice.regular(u, v).reshape(-1, 1))
-    points = np.concatenate([raised, rest])
-    weight = np.concatenate([np.ones(len(raised)), np.full(len(rest), 0.1)])
+    whole = np.concatenate([raised, rest])
+    planes = np.unique(ConvexHull(whole).equations.round(9), axis=0) + [0, 0, 0, TIP_MARGIN]
+    points = HalfspaceIntersection(planes, whole.mean(axis=0)).intersections
+    points = np.unique(points[np.isfinite(points).all(axis=1)].round(8), axis=0)
+    near = cKDTree(whole).query(points)[1]
+    weight = np.where(near < len(raised), 1.0, 0.1)
     half = points[:, 0] >= -1e-6
     points, weight = points[half], weight[half]
     points[:, 0] = np.where(points[:, 0] < 2e-5, 0.0, points[:, 0])
