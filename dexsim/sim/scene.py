@@ -1,7 +1,8 @@
 """A hand with one free object whose shape, size, mass and centre of mass differ by world.
 
 One compiled model serves every shape: the object body carries geom slots (a box, a sphere, a capsule, and three convex
-hulls), of which a world uses those that its shape needs; the others are parked a kilometre away. Per world only
+hulls), of which a world uses those that its shape needs; the others are parked a kilometre away (they turn with the
+object, so such a scene must not have planes, which have no end). Per world only
 `geom_*` and `body_*` fields differ, so that topology, kernels and graphs are shared. Measured against one model a
 shape group, this needs one graph and one compile (see docs/benchmarks.md).
 """

@@ -1,0 +1,92 @@
+"""Scenes with objects, small and still, for tests of what is written by world."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+
+from dexsim.assets import xhand
+from dexsim.assets.objects import library
+from dexsim.sim import ContactPair, make_engine
+from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, hand_object_scene
+from dexsim.tasks.objects import Objects
+
+IMPEDANCE = 0.95
+ALL = ["box", "sphere", "capsule", *(n for n, s in library().items() if s.kind == "grid")]
+
+
+def grasp_cfg(*settings: str, worlds: int = 8) -> dict:
+    """The resolved configuration of `python train.py task=grasp SETTINGS`."""
+    from pathlib import Path
+
+    from dexsim.cli import start
+
+    return start.for_train(["task=grasp", f"worlds={worlds}", "device=cpu", *settings], Path(__file__).parents[1] / "configs").cfg
+
+
+def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int = 0):
+    from dexsim.tasks import make_env
+
+    return make_env(grasp_cfg(*settings, worlds=worlds), worlds, "cpu", seed, engine)
+
+
+def hand_scene(n: int, shapes=ALL, kind: str = "mujoco", scales=(1.25,), timestep: float = 0.002, edit=None, **kw):
+    """(engine, scene, objects): the hand and one object of `shapes` a world; edit(spec) changes the spec first."""
+    names = list(shapes)
+    spec = xhand.hand_spec()
+    lib = library()
+    scene = hand_object_scene(spec, [lib[s] for s in names], scales, timestep)
+    for geom in list(spec.geoms):
+        if not geom.contype and not geom.conaffinity:
+            spec.delete(geom)
+        elif geom.name in xhand.TIP_GEOMS:
+            geom.solimp = [IMPEDANCE, IMPEDANCE, 1e-3, 0.5, 2.0]
+    o = spec.option
+    o.integrator, o.cone, o.impratio = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
+    o.iterations, o.ls_iterations = 30, 30
+    o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    if edit is not None:
+        edit(spec)
+    pairs = [ContactPair(f"tip_{f}", ("geom", f"tip_{f}"), ("body", OBJECT)) for f in xhand.FINGERS]
+    fields = [*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"]
+    e = make_engine(spec, n, "cpu", kind, fields=fields, pairs=pairs, **kw)
+    return e, scene, Objects(e, scene, list(xhand.TIP_GEOMS), IMPEDANCE)
+
+
+def write(objects: Objects, mask=None, **given) -> dict[str, torch.Tensor]:
+    """objects.write with defaults for what is not given; returns what was written."""
+    n = objects.engine.n
+    values = {
+        "variant": torch.arange(n) % len(objects.scene.variants), "scale": torch.ones(n, 3), "mass": torch.full((n,), 0.1),
+        "com": torch.zeros(n, 3), "friction": torch.ones(n), "stiffness": torch.full((n,), 7000.0), "damping_ratio": torch.ones(n),
+    }  # fmt: skip
+    for k, v in given.items():
+        values[k] = torch.as_tensor(v, dtype=values[k].dtype).expand_as(values[k]).clone()
+    objects.write(torch.ones(n, dtype=torch.bool) if mask is None else mask, **values)
+    return values
+
+
+def random_values(n: int, rows: int, seed: int) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+
+    def u(low, high, *shape):
+        return low + (high - low) * torch.rand(n, *shape, generator=g)
+
+    return {
+        "variant": torch.randint(rows, (n,), generator=g), "scale": u(0.9, 1.5, 3), "mass": u(0.03, 0.5), "com": u(-0.1, 0.1, 3),
+        "friction": u(0.4, 1.2), "stiffness": u(5e3, 9e3), "damping_ratio": u(0.3, 1.0),
+    }  # fmt: skip
+
+
+def put_object(engine, position, quat=(1.0, 0, 0, 0), hand=None) -> None:
+    """All worlds: the object at rest at a pose ([3] or [N, 3], [4] or [N, 4]); the hand at `hand` [12] or zero."""
+    q, v = engine.t.qpos.clone(), torch.zeros_like(engine.t.qvel)
+    q[:] = torch.as_tensor(engine.mjm.qpos0)
+    if hand is not None:
+        q[:, engine.qpos_index(xhand.JOINTS)] = torch.as_tensor(np.asarray(hand), dtype=q.dtype)
+    a = engine.mjm.jnt_qposadr[engine.joint("object_free")]
+    q[:, a:a + 3] = torch.as_tensor(np.asarray(position), dtype=q.dtype)
+    q[:, a + 3:a + 7] = torch.as_tensor(np.asarray(quat), dtype=q.dtype)
+    engine.set_state(torch.ones(engine.n, dtype=torch.bool), q, v)
+    engine.refresh()
