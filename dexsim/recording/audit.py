@@ -1,10 +1,114 @@
-"""Faults of a recording's signals, found before any physics is."""
+"""Faults of a recording's signals, found before any physics is: `python -m dexsim.recording.audit FILE`.
+
+A finding names topic, time and count; nothing is repaired. Kinds and severities: `KINDS`.
+"""
 
 from __future__ import annotations
 
-from dexsim.recording.schema import Finding, Recording
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.recording import audit_time, audit_values
+from dexsim.recording.schema import SEVERITIES, Finding, Recording, Series
+
+KINDS: dict[str, str] = {
+    "damage": "bytes, chunks or channels of the file that are lost",
+    "unreadable": "messages or channels that cannot be decoded",
+    "malformed": "messages with an unexpected number of values",
+    "missing_topic": "a topic that most uses need",
+    "missing_metadata": "a key that nothing states, and what is assumed",
+    "metadata_override": "a key whose recorded value is not the one used",
+    "metadata_unknown": "a key that this format does not have",
+    "topic": "a topic found under another name",
+    "joint_names": "joints found under other names, or left out",
+    "unit": "numbers that cannot be of the stated unit, or were converted",
+    "time_not_monotonic": "times that go backwards",
+    "time_repeated": "samples with the host time of the one before",
+    "gap": "more than 3.5 periods without a sample",
+    "dropped": "single samples missing",
+    "burst": "samples read from a buffer, not when measured",
+    "clock_skew": "clocks that disagree or drift",
+    "held": "samples that repeat the one before while the joint moves",
+    "stuck": "a channel that never changes where it must",
+    "spike": "single samples far from both neighbours",
+    "wrap": "a signed number read as unsigned, or an angle that starts again",
+    "saturation": "values that pile up at their largest",
+    "lost_sign": "an effort without its sign",
+    "sign_mismatch": "an effort of the opposite sign to the stated one",
+    "nan": "values that are not finite",
+    "absent": "a joint without any value",
+}
+"""Every kind of finding, of the reader's and the audit's."""
 
 
 def audit(recording: Recording) -> list[Finding]:
-    """Findings about the signals themselves."""
-    return []
+    """Findings about the signals of a recording, in order of topic and time; [] for a clean one."""
+    r = recording
+    series: list[Series] = [s for s in (r.commands, r.states.position, r.temperature, r.duty, r.enabled, r.supply_voltage, r.tactile,
+                                        r.external_force, r.object_pose, r.imu) if s is not None]
+    found: list[Finding] = []
+    with np.errstate(all="ignore"):
+        for s in series:
+            found += audit_time.timing(s)
+        found += audit_time.stamps(series)
+        found += audit_time.between_topics(r)
+        for check in (audit_values.finite, audit_values.wraps, audit_values.spikes, audit_values.held, audit_values.stuck,
+                      audit_values.saturation, audit_values.signs, audit_values.units):
+            found += check(r)
+    return sorted(found, key=lambda f: (f.topic, f.time if np.isfinite(f.time) else -1.0))
+
+
+def table(findings: Sequence[Finding]) -> str:
+    """The findings as text, the worst first."""
+    if not findings:
+        return "no findings"
+    rows = [("severity", "kind", "topic", "from s", "to s", "count", "what")]
+    for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
+        times = ["" if not np.isfinite(x) else f"{x:.3f}" for x in (f.time, f.end)]
+        rows.append((f.severity, f.kind, f.topic, *times, str(f.count), f.text))
+    width = [max(len(r[i]) for r in rows) for i in range(6)]
+    return "\n".join("  ".join([*(r[i].ljust(width[i]) for i in range(6)), r[6]]) for r in rows)
+
+
+def summary(r: Recording) -> str:
+    """One line a topic: samples, rate, span."""
+    lines = [f"{r.path}: {r.meta['source']}, {r.meta['robot']}, {len(r.joints)} joints, {r.duration:.2f} s, effort {r.effort_is}"]
+    parts = (("commands", r.commands), ("states", r.states.position), ("  velocity", r.states.velocity), ("  effort", r.states.effort),
+             ("temperature", r.temperature), ("duty", r.duty), ("enabled", r.enabled), ("supply voltage", r.supply_voltage), ("tactile", r.tactile),
+             ("external force", r.external_force), ("object pose", r.object_pose), ("imu", r.imu))
+    for name, s in parts:
+        if s is not None and len(s):
+            rate = (len(s) - 1) / (s.t[-1] - s.t[0]) if len(s) > 1 and s.t[-1] > s.t[0] else float("nan")
+            lines.append(f"  {name:<15} {len(s):>7} samples  {rate:7.1f} Hz  {s.t[0]:8.3f} .. {s.t[-1]:.3f} s")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print what is in a recording and what is wrong with it; status 1 where a channel cannot be used as it is."""
+    from dexsim.recording.arguments import read_arguments
+    from dexsim.recording.reader import read
+
+    if not argv or argv[0] in ("-h", "--help"):
+        print("usage: python -m dexsim.recording.audit FILE [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]\n\nkinds of findings:")
+        print("\n".join(f"  {kind:<20}{text}" for kind, text in KINDS.items()))
+        return 0 if argv else 2
+    paths, remap, meta = read_arguments(argv)
+    worst = 0
+    for path in paths:
+        recording = read(Path(path), remap, meta)
+        print(summary(recording) + "\n")
+        print(table(recording.findings) + "\n")
+        worst = max(worst, int(any(f.severity == "error" for f in recording.findings)))
+    return worst
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

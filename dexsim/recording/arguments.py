@@ -1,0 +1,25 @@
+"""`remap.OURS=THEIRS` and `meta.KEY=VALUE` of a command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dexsim.errors import UserError
+
+
+def read_arguments(argv: Sequence[str]) -> tuple[list[str], dict[str, str], dict[str, str]]:
+    """(what is neither, remap, meta). Raises UserError for another KEY=VALUE."""
+    rest: list[str] = []
+    maps: dict[str, dict[str, str]] = {"remap": {}, "meta": {}}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        group, dot, name = key.partition(".")
+        if equals and dot and group in maps and name:
+            maps[group][name] = value
+        elif equals and "/" not in key:
+            raise UserError(f"'{argument}': expected FILE, remap.OURS=THEIRS or meta.KEY=VALUE")
+        else:
+            rest.append(argument)
+    if not rest:
+        raise UserError("say which recording: FILE.mcap")
+    return rest, maps["remap"], maps["meta"]

@@ -1,0 +1,161 @@
+"""Faults of time: gaps, bursts, repeated times, clocks that disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexsim.recording.schema import COMMANDS, Finding, Recording, Series
+
+GAP = 3.5  # periods without a sample
+SKEW_S = 0.010  # s between header.stamp and host time that a transport does not explain
+DRIFT_PPM = 200.0
+LEAD_S = 0.005  # s by which a response may seem to come before its command
+SHIFT_S = 0.2  # s by which one topic's whole span may be shifted against another's
+EPOCH_S = 1e6  # s: stamps this far off count from another zero
+
+
+def timing(series: Series) -> Iterator[Finding]:
+    """Gaps, dropped samples, times that repeat, bursts."""
+    topic, t = series.topic, series.t
+    if len(t) < 5:
+        return
+    dt = np.diff(t)
+    period = float(np.median(dt[dt > 0])) if (dt > 0).any() else 0.0
+    same = np.flatnonzero(dt == 0)
+    if len(same):
+        yield Finding("time_repeated", topic, float(t[same[0]]), len(same), f"{len(same)} samples have the host time of the one before",
+                      "error" if len(same) > len(t) / 2 else "warning", end=float(t[same[-1]]))
+    if period == 0.0:
+        return
+    regular = np.percentile(dt, 75) < 1.5 * period and np.percentile(dt, 25) > 0.5 * period
+    gaps = np.flatnonzero(dt > GAP * period)
+    # a command may be sent only when it changes: then its pauses say nothing
+    if len(gaps) and regular and (topic != COMMANDS or len(gaps) < 0.02 * len(t)):
+        longest = gaps[np.argmax(dt[gaps])]
+        yield Finding("gap", topic, float(t[gaps[0]]), len(gaps),
+                      f"{len(gaps)} gaps of more than {GAP:g} periods ({period * 1e3:.3g} ms); the longest is {dt[longest] * 1e3:.4g} ms at {t[longest]:.3f} s",
+                      "info" if topic == COMMANDS else "warning", end=float(t[gaps[-1] + 1]))
+    dropped = np.flatnonzero((dt > 1.6 * period) & (dt <= GAP * period))
+    if len(dropped) and regular and len(dropped) > 0.001 * len(t):
+        yield Finding("dropped", topic, float(t[dropped[0]]), len(dropped),
+                      f"{len(dropped)} samples or so are missing singly ({100 * len(dropped) / len(t):.2g} %)", "info", end=float(t[dropped[-1]]))
+    burst = np.flatnonzero((dt > 0) & (dt < 0.1 * period))
+    if len(burst) > 0.05 * len(t):
+        yield Finding("burst", topic, float(t[burst[0]]), len(burst),
+                      f"{len(burst)} samples came within a tenth of a period of the one before: read from a buffer, not when measured",
+                      "warning", end=float(t[burst[-1]]))
+
+
+def stamps(all_series: list[Series]) -> Iterator[Finding]:
+    """header.stamp against host time, in each topic and between topics."""
+    offsets: dict[str, float] = {}
+    for s in all_series:
+        if s.stamp is None:
+            continue
+        ok = np.isfinite(s.stamp)
+        t, stamp = s.t[ok], s.stamp[ok]
+        if len(t) < 5:
+            continue
+        topic, late = s.topic, t - stamp
+        middle = float(np.median(late))
+        again = np.flatnonzero((np.diff(stamp) == 0) & (np.diff(t) > 0))
+        if len(again):
+            yield Finding("held", topic, float(t[again[0] + 1]), len(again), f"{len(again)} messages carry the header.stamp of the one before: repeated",
+                          "warning", end=float(t[again[-1] + 1]))
+        back = np.flatnonzero(np.diff(stamp) < 0)
+        if len(back):
+            yield Finding("time_not_monotonic", topic, float(t[back[0] + 1]), len(back), f"header.stamp goes backwards {len(back)} times",
+                          "warning", end=float(t[back[-1] + 1]))
+        other_epoch = abs(middle) > EPOCH_S
+        if not other_epoch:
+            offsets[topic] = middle
+            if abs(middle) > SKEW_S:
+                yield Finding("clock_skew", topic, float(t[0]), len(t), f"header.stamp is {abs(middle) * 1e3:.4g} ms {'behind' if middle > 0 else 'ahead of'}"
+                              " host time (median); host time is used", "warning", end=float(t[-1]))
+        rate = _slope(t, late)
+        if len(t) > 50 and abs(rate) * 1e6 > DRIFT_PPM and abs(rate) * (t[-1] - t[0]) > 0.5 * SKEW_S:
+            yield Finding("clock_skew", topic, float(t[0]), len(t), f"header.stamp drifts against host time by {rate * 1e6:+.0f} ppm:"
+                          f" {rate * (t[-1] - t[0]) * 1e3:+.3g} ms over the recording", "error", end=float(t[-1]))
+        jumps = np.flatnonzero(np.abs(np.diff(late)) > 5 * SKEW_S)
+        if len(jumps) and abs(np.median(late[: jumps[0] + 1]) - np.median(late[jumps[-1] + 1 :])) > 5 * SKEW_S:
+            yield Finding("clock_skew", topic, float(t[jumps[0] + 1]), len(jumps), f"header.stamp jumps against host time by {np.diff(late)[jumps[0]] * -1e3:+.4g} ms",
+                          "error", end=float(t[jumps[-1] + 1]))
+    if len(offsets) > 1:
+        low, high = min(offsets, key=offsets.get), max(offsets, key=offsets.get)
+        apart = offsets[high] - offsets[low]
+        if apart > 2 * SKEW_S:
+            yield Finding("clock_skew", high, 0.0, 1, f"the clocks that stamp {high} and {low} are {apart * 1e3:.4g} ms apart", "warning")
+
+
+def between_topics(r: Recording) -> Iterator[Finding]:
+    """Topics whose host times cannot be of one clock: one is shifted as a whole, or answers come before commands."""
+    state = r.states.position
+    if len(state) < 20:
+        return
+    for other in (r.commands, r.tactile, r.external_force, r.object_pose, r.imu, r.temperature, r.duty):
+        if other is None or len(other) < 20:
+            continue
+        first, last = other.t[0] - state.t[0], other.t[-1] - state.t[-1]
+        if min(abs(first), abs(last)) > SHIFT_S and first * last > 0 and abs(first - last) < 0.3 * max(abs(first), abs(last)):
+            yield Finding("clock_skew", other.topic, float(other.t[0]), len(other), f"begins {first:+.3g} s and ends {last:+.3g} s from {state.topic}:"
+                          " shifted as a whole, so their host times may be of two clocks", "warning", end=float(other.t[-1]))
+    lead = command_lead(r)
+    if lead is not None and lead > LEAD_S + 0.5 * float(np.median(np.diff(state.t))):
+        yield Finding("clock_skew", state.topic, 0.0, len(state), f"motion comes {lead * 1e3:.3g} ms before its command (median over joints):"
+                      f" the host times of {state.topic} and {COMMANDS} are not of one clock", "error", end=float(state.t[-1]))
+
+
+def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float | None:
+    """Median time [s] by which measured speed leads commanded speed (negative: it lags, as it should), from their
+    cross-correlation over joints that follow well, in each half of the recording alike (a joint that sticks or hits its
+    torque limit stops early, which looks like a lead); None where nothing can be said."""
+    state, leads = r.states.position, []
+    if len(r.commands) < 20:
+        return None
+    start, end = max(state.t[0], r.commands.t[0]), min(state.t[-1], r.commands.t[-1])
+    if end - start < 4 * reach:
+        return None
+    grid = np.arange(start, end, step)
+    for j in range(len(r.joints)):
+        command, position = _held_at(grid, r.commands.t, r.commands.value[:, j]), _line(grid, state.t, state.value[:, j])
+        if command is None or position is None:
+            continue
+        half = len(grid) // 2
+        parts = [_lead(command[part], position[part], int(reach / step)) for part in (slice(None), slice(0, half), slice(half, None))]
+        if all(p is not None for p in parts) and max(parts) - min(parts) <= 3:
+            leads.append(parts[0] * step)
+    return float(np.median(leads)) if leads else None
+
+
+def _lead(command: np.ndarray, position: np.ndarray, reach: int, width: int = 5) -> int | None:
+    """Grid steps by which the position's change comes before the command's; None where they do not go together."""
+    if np.ptp(command) < 0.05 or np.ptp(position) < 0.05:
+        return None
+    a, b = command[width:] - command[:-width], position[width:] - position[:-width]
+    a, b = a - a.mean(), b - b.mean()
+    size = 1 << (len(a) + reach).bit_length()
+    full = np.fft.irfft(np.fft.rfft(b, size) * np.conj(np.fft.rfft(a, size)), size)
+    corr = np.concatenate([full[-reach:], full[: reach + 1]]) / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12)
+    best = int(np.argmax(corr))
+    return reach - best if corr[best] > 0.8 else None
+
+
+def _held_at(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray | None:
+    ok = np.isfinite(x)
+    if ok.sum() < 5:
+        return None
+    t, x = t[ok], x[ok]
+    return x[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, None)]
+
+
+def _line(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray | None:
+    ok = np.isfinite(x)
+    return np.interp(grid, t[ok], x[ok]) if ok.sum() >= 5 else None
+
+
+def _slope(t: np.ndarray, y: np.ndarray) -> float:
+    """Robust slope: medians of the first and last quarter."""
+    q = max(len(t) // 4, 1)
+    return float((np.median(y[-q:]) - np.median(y[:q])) / max(np.median(t[-q:]) - np.median(t[:q]), 1e-9))

@@ -1,0 +1,384 @@
+"""Faults of values: not finite, wrapped, held, stuck, saturated, of the wrong unit, without their sign."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexsim.assets import xhand
+from dexsim.recording.schema import COMMANDS, STATES, TACTILE, Finding, Recording, Series
+
+NAN = float("nan")
+MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 65536.0, 65.536, 2.0**32)  # angles, 8, 12, 16 (also in thousandths), 32 bit
+RATIOS = {180 / np.pi: "degrees", 4096 / (2 * np.pi): "counts of a 12-bit encoder", 1000.0: "thousandths",
+          65536 / (2 * np.pi): "counts of a 16-bit encoder"}
+SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousandths of rad/s"}
+
+
+def quantum(x: np.ndarray) -> float:
+    """Step of a quantised signal: the smallest difference of its distinct values; 0 where it is not quantised."""
+    values = np.unique(x[np.isfinite(x)])
+    if len(values) < 3:
+        return 0.0
+    gaps = np.diff(values)
+    step = float(gaps.min())
+    near = np.abs(gaps / step - np.round(gaps / step)) < 0.02
+    return step if step > 1e-9 and near.mean() > 0.95 else 0.0
+
+
+def is_integer(x: np.ndarray) -> bool:
+    """Whether every finite value is a whole number, and not all are 0 or 1."""
+    x = x[np.isfinite(x)]
+    return len(x) > 0 and bool((x == np.round(x)).all()) and float(np.abs(x).max()) > 1
+
+
+def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarray]]:
+    """(topic, quantity, joint, t, values [T]) of every per-joint signal."""
+    s = r.states
+    for series, name in ((r.commands, "command"), (s.position, "position"), (s.velocity, "velocity"), (s.effort, "effort"),
+                         (r.temperature, "temperature"), (r.duty, "duty"), (r.enabled, "enabled")):
+        if series is not None and len(series):
+            for j, joint in enumerate(r.joints):
+                yield series.topic, name, joint, series.t, series.value[:, j]
+
+
+def finite(r: Recording) -> Iterator[Finding]:
+    """Values that are missing or infinite."""
+    for topic, name, joint, t, x in channels(r):
+        bad = ~np.isfinite(x)
+        if not bad.any():
+            continue
+        at = np.flatnonzero(bad)
+        if bad.all():
+            severity = "warning" if name == "position" else "info"
+            yield Finding("absent", topic, float(t[0]), len(x), f"no {name} of {joint}", severity, joint, float(t[-1]))
+        elif np.isinf(x).any() or name not in ("command", "enabled"):
+            yield Finding("nan", topic, float(t[at[0]]), len(at), f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples",
+                          "warning", joint, float(t[at[-1]]))
+    for series in (r.tactile, r.supply_voltage, r.external_force, r.object_pose, r.imu):
+        if series is not None:
+            bad = np.flatnonzero(~np.isfinite(series.value.reshape(len(series), -1)).all(1))
+            if len(bad):
+                yield Finding("nan", series.topic, float(series.t[bad[0]]), len(bad), f"{len(bad)} of {len(series)} samples hold values that are not finite",
+                              "warning", end=float(series.t[bad[-1]]))
+
+
+def wraps(r: Recording) -> Iterator[Finding]:
+    """A signed number read as unsigned, or an angle that starts again after a turn."""
+    for topic, name, joint, t, x in channels(r):
+        if name not in ("temperature", "enabled"):
+            found = wrapped(x)
+            if found is not None:
+                m, at = found
+                what = "the angle starts again after a turn" if m in (2 * np.pi, 360.0) else f"a signed number was read as unsigned (modulus {m:g})"
+                yield Finding("wrap", topic, float(t[at[0]]), len(at), f"{name} of {joint} jumps by {m:.6g}: {what}", "error", joint, float(t[at[-1]]))
+    if r.tactile is not None and len(r.tactile) > 5:
+        value = r.tactile.value
+        for axis, label in enumerate(("fx", "fy", "fz")):
+            x = value[..., axis].reshape(len(value), -1)
+            if np.nanmin(x) < 0 or np.nanmax(x) <= 200:
+                continue
+            high, low = x > 160, x < 96
+            jumps = np.abs(np.diff(x, axis=0)) > 192
+            # -1 as 255: large values, with hardly any between them and the small ones, reached in one step
+            if jumps.any() and axis < 2 and (x[~high & ~low].size < 0.2 * high.sum()):
+                at = np.flatnonzero(high.any(1))
+                yield Finding("wrap", TACTILE, float(r.tactile.t[at[0]]), int(high.sum()), f"{label} holds values near 255 beside values near 0 and no negative ones:"
+                              " signed bytes were read as unsigned", "error", end=float(r.tactile.t[at[-1]]))
+
+
+def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
+    """(modulus, indices of the samples beyond half of it) of a wrapped signal; None otherwise."""
+    ok = np.flatnonzero(np.isfinite(x))
+    v = x[ok]
+    if len(v) < 10 or np.ptp(v) == 0:
+        return None
+    steps = np.abs(np.diff(v))
+    step = quantum(v)
+    for m in dict.fromkeys((*(bits * step for bits in (256, 4096, 65536) if step), *MODULI)):
+        angle = m in (2 * np.pi, 360.0)
+        if m <= 0 or np.ptp(v) > m * 1.0001 or steps.max() < 0.6 * m or (not angle and v.min() < 0):
+            continue
+        back = np.unwrap(v, period=m) if angle else np.where(v >= m / 2, v - m, v)
+        jumps = steps > 0.6 * m
+        between = jumps.mean() > 0.3 if angle else ((v > 0.25 * m) & (v < 0.75 * m)).any()
+        if np.abs(np.diff(back)).max() < 0.4 * m and np.abs(np.diff(back)).sum() < 0.5 * steps.sum() and not between:
+            at = np.flatnonzero(np.abs(back - v) > 0.5 * m) if not angle else np.flatnonzero(jumps) + 1
+            return float(m), ok[at]
+    return None
+
+
+def spikes(r: Recording) -> Iterator[Finding]:
+    """Single position samples far from both neighbours."""
+    s = r.states.position
+    if len(s) < 10:
+        return
+    for j, joint in enumerate(r.joints):
+        x = s.value[:, j]
+        if not np.isfinite(x).all() or wrapped(x) is not None:
+            continue
+        away = np.minimum(np.abs(x[1:-1] - x[:-2]), np.abs(x[1:-1] - x[2:]))
+        there = np.sign(x[1:-1] - x[:-2]) == np.sign(x[1:-1] - x[2:])
+        typical = np.percentile(np.abs(np.diff(x)), 99)
+        at = np.flatnonzero(there & (away > 0.1) & (away > 5 * typical) & (np.abs(x[2:] - x[:-2]) < 0.5 * away)) + 1
+        if len(at):
+            yield Finding("spike", s.topic, float(s.t[at[0]]), len(at), f"position of {joint}: {len(at)} single samples far from both neighbours"
+                          f" (by up to {away[at - 1].max():.3g})", "warning", joint, float(s.t[at[-1]]))
+
+
+def held(r: Recording) -> Iterator[Finding]:
+    """Samples that repeat while the joint moves, found by the jump that makes up for them."""
+    s = r.states.position
+    if len(s) < 10:
+        return
+    effort = r.states.effort.value if r.states.effort is not None else None
+    rows = s.value if effort is None else np.concatenate([s.value, effort], 1)
+    same_row = np.append(False, ((np.diff(rows, axis=0) == 0) | np.isnan(np.diff(rows, axis=0))).all(1))
+    stale = np.zeros(len(s), bool)
+    alone: dict[int, np.ndarray] = {}
+    for j in range(len(r.joints)):
+        late = repeats(s.t, s.value[:, j])
+        if effort is not None and np.isfinite(effort[:, j]).any() and np.nanstd(effort[:, j]) > 0:
+            late &= np.append(False, np.diff(effort[:, j]) == 0)  # a current that moves on means a joint that sticks
+        stale |= late & same_row
+        alone[j] = late & ~same_row
+    if stale.sum() >= 3:
+        at = np.flatnonzero(stale)
+        yield Finding("held", s.topic, float(s.t[at[0]]), len(at), f"{len(at)} whole samples repeat the one before while joints move", "warning", end=float(s.t[at[-1]]))
+    for j, late in alone.items():
+        at = np.flatnonzero(late)
+        if len(at) >= (5 if effort is not None else 12):
+            yield Finding("held", s.topic, float(s.t[at[0]]), len(at), f"{r.joints[j]}: {len(at)} samples repeat the one before while it moves and others go on",
+                          "warning", r.joints[j], float(s.t[at[-1]]))
+    if r.tactile is not None and len(r.tactile) > 10:
+        x = r.tactile.value.reshape(len(r.tactile), -1)
+        total = np.nansum(np.abs(x), axis=1)
+        late = repeats(r.tactile.t, total) & np.append(False, (np.diff(x, axis=0) == 0).all(1))
+        if late.sum() >= 3:
+            at = np.flatnonzero(late)
+            yield Finding("held", TACTILE, float(r.tactile.t[at[0]]), len(at), f"{len(at)} samples repeat the one before while the force changes", "warning",
+                          end=float(r.tactile.t[at[-1]]))
+
+
+def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """[T] bool: samples equal to the one before within a steady motion, followed by a jump that makes up for them."""
+    out = np.zeros(len(x), bool)
+    dx = np.diff(x)
+    step = max(quantum(x), 1e-9)
+    starts = np.flatnonzero((dx == 0) & (np.append(1.0, dx[:-1]) != 0))  # x[a] == x[a + 1], and x[a - 1] differs
+    for a in starts:
+        b = a + 1
+        while b < len(dx) and dx[b] == 0:
+            b += 1
+        if a < 2 or b + 3 >= len(x) or not np.isfinite(x[a - 2 : b + 4]).all():
+            continue
+        before = (x[a] - x[a - 2]) / max(t[a] - t[a - 2], 1e-9)
+        after = (x[b + 3] - x[b + 1]) / max(t[b + 3] - t[b + 1], 1e-9)
+        slow = min(abs(before), abs(after))
+        # of neighbours equally fast: the missed way shows as a jump of its size, in one sample
+        if before * after <= 0 or max(abs(before), abs(after)) > 2 * slow or slow * (t[b] - t[a]) < 3 * step:
+            continue
+        jump = (x[b + 1] - x[b]) * np.sign(before)
+        way = 0.5 * (abs(before) + abs(after)) * (t[b + 1] - t[a])
+        if 0.7 * way < jump < 1.4 * way:
+            out[a + 1 : b + 1] = True
+    return out
+
+
+def stuck(r: Recording) -> Iterator[Finding]:
+    """A channel that never changes where it must."""
+    s = r.states.position
+    for j, joint in enumerate(r.joints):
+        x = s.value[:, j]
+        if len(s) > 20 and np.isfinite(x).any() and np.nanmax(x) == np.nanmin(x) and len(r.commands):
+            c = r.commands.value[:, j]
+            if np.isfinite(c).any() and np.nanmax(c) - np.nanmin(c) > 0.1:
+                yield Finding("stuck", STATES, float(s.t[0]), len(s), f"position of {joint} is {x[0]:.4g} throughout while its command spans"
+                              f" {np.nanmax(c) - np.nanmin(c):.3g}", "error", joint, float(s.t[-1]))
+    e = r.states.effort
+    if e is not None and len(e) > 20:
+        for j, joint in enumerate(r.joints):
+            x = e.value[:, j]
+            if np.isfinite(x).any() and np.nanmax(x) == np.nanmin(x) and np.nanmax(s.value[:, j]) - np.nanmin(s.value[:, j]) > 0.05:
+                yield Finding("stuck", STATES, float(e.t[0]), len(e), f"effort of {joint} is {x[np.isfinite(x)][0]:.4g} throughout while it moves",
+                              "error", joint, float(e.t[-1]))
+
+
+def saturation(r: Recording) -> Iterator[Finding]:
+    """Values that pile up at their largest."""
+    for topic, name, joint, t, x in channels(r):
+        if name not in ("effort", "duty"):
+            continue
+        x = np.where(np.isfinite(x), x, 0.0)
+        step = quantum(x)
+        for limit, side in ((x.max(), "highest"), (x.min(), "lowest")):
+            at = np.flatnonzero(x == limit)
+            if abs(limit) <= 10 * step or len(at) < 10 or np.ptp(x) == 0:
+                continue
+            runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+            long = [run for run in runs if len(run) >= 3]
+            near = ((np.abs(x - limit) < 0.05 * np.ptp(x)) & (x != limit)).sum()
+            if len(long) >= 2 and sum(map(len, long)) > near:
+                yield Finding("saturation", topic, float(t[long[0][0]]), len(at), f"{name} of {joint} is at its {side} value, {limit:.4g}, in {len(at)} samples",
+                              "info", joint, float(t[long[-1][-1]]))
+    if r.tactile is not None and r.meta["tactile_unit"] == "count" and is_integer(r.tactile.value):
+        v = r.tactile.value
+        full = np.stack([(v[..., 0] >= 127) | (v[..., 0] <= -128), (v[..., 1] >= 127) | (v[..., 1] <= -128), v[..., 2] >= 255])
+        if full.any():
+            at = np.flatnonzero(full.any((0, 2, 3)))
+            yield Finding("saturation", TACTILE, float(r.tactile.t[at[0]]), int(full.sum()), f"taxels at the end of their 8-bit range ({full.any((0, 1)).sum()} of them)",
+                          "warning", end=float(r.tactile.t[at[-1]]))
+
+
+def signs(r: Recording) -> Iterator[Finding]:
+    """Effort that lost its sign, or whose sign is not the one that is stated."""
+    e = r.states.effort
+    if e is None or len(e) < 50:
+        return
+    stated = r.effort_sign
+    lost: list[int] = []
+    for j, joint in enumerate(r.joints):
+        x = e.value[:, j]
+        drive = _drive(r, j, e.t)
+        ok = np.isfinite(x) & np.isfinite(drive)
+        if ok.sum() < 50 or stated[j] == 0 or np.ptp(x[ok]) == 0 or drive[ok].std() == 0:
+            continue
+        x, d, t = x[ok], drive[ok], e.t[ok]
+        strong = np.abs(d) > 0.25 * np.percentile(np.abs(d), 95)
+        both = min((d[strong] > 0).mean(), (d[strong] < 0).mean()) if strong.any() else 0.0
+        plain, absolute = _corr(x, d), _corr(x, np.abs(d))
+        if both > 0.15 and (x >= 0).all() and absolute > 0.3 and absolute > plain * stated[j] + 0.2:
+            lost.append(j)
+            yield Finding("lost_sign", STATES, float(t[0]), len(x), f"effort of {joint} is never negative and follows the size, not the sign, of what drives it"
+                          f" (correlation {absolute:.2f} against {plain:.2f})", "error", joint, float(t[-1]))
+        elif both > 0.15 and not (x >= 0).all() and plain * stated[j] < -0.5:
+            yield Finding("sign_mismatch", STATES, float(t[0]), len(x), f"effort of {joint} is opposite to what effort_sign={int(stated[j]):+d} says"
+                          f" (correlation {plain * stated[j]:.2f} with target minus position)", "error", joint, float(t[-1]))
+    if lost and not (e.value < 0).any():
+        rest = [r.joints[j] for j in range(len(r.joints)) if j not in lost and np.nanmax(e.value[:, j]) > 0]
+        if rest:
+            yield Finding("lost_sign", STATES, float(e.t[0]), len(e), f"effort of {', '.join(rest)} is never negative either", "warning", "", float(e.t[-1]))
+
+
+def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
+    """What an effort should follow [T]: target minus position; where nothing is commanded, the speed."""
+    s = r.states.position
+    ok = np.isfinite(s.value[:, j])
+    if ok.sum() < 5:
+        return np.full(len(t), np.nan)
+    q = np.interp(t, s.t[ok], s.value[ok, j])
+    c = r.commands
+    if len(c) and np.isfinite(c.value[:, j]).sum() > 5:
+        keep = np.isfinite(c.value[:, j])
+        at = np.searchsorted(c.t[keep], t, side="right") - 1
+        return np.where(at >= 0, c.value[keep, j][np.clip(at, 0, None)] - q, np.nan)
+    return np.gradient(q, t) if len(np.unique(t)) == len(t) else np.full(len(t), np.nan)
+
+
+def units(r: Recording) -> Iterator[Finding]:
+    """Numbers that cannot be of the unit that is stated."""
+    s, c = r.states, r.commands
+    limits = dict(zip(xhand.JOINTS, xhand.joint_limits(), strict=True)) if set(r.joints) <= set(xhand.JOINTS) else {}
+
+    def finding(series: Series, text: str, joint: str = "", severity: str = "error") -> Finding:
+        return Finding("unit", series.topic, float(series.t[0]), len(series), text, severity, joint, float(series.t[-1]))
+
+    for series, name in ((s.position, "position"), (c, "command")):
+        for j, joint in enumerate(r.joints):
+            if not len(series) or not np.isfinite(series.value[:, j]).any():
+                continue
+            x = series.value[:, j]
+            top = float(np.nanmax(np.abs(x)))
+            if joint in limits and top > np.abs(limits[joint]).max() + 0.5:
+                guess = "counts?" if is_integer(x) and top > 200 else "degrees?" if top < 400 else "counts?"
+                yield finding(series, f"{name} of {joint} reaches {top:.4g} rad, its limit is {np.abs(limits[joint]).max():.3g}: {guess}", joint)
+            elif not limits and is_integer(x) and top > 100:
+                yield finding(series, f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts?", joint)
+            elif not limits and 4 * np.pi < top < 400 and _jumpless(x):
+                yield finding(series, f"{name} of {joint} reaches {top:.4g} rad: degrees?", joint, "warning")
+    for j, joint in enumerate(r.joints):  # one against the other
+        if len(c) > 20 and len(s.position) > 20:
+            drive, q = _drive(r, j, s.position.t), s.position.value[:, j]
+            ratio = _ratio(drive + q, q)
+            for known, unit in RATIOS.items():
+                for k, whose in ((known, "position"), (1 / known, "command")):
+                    if ratio is not None and abs(ratio / k - 1) < 0.1:
+                        yield finding(s.position if whose == "position" else c, f"{whose} of {joint} is {known:.4g} times the other: {unit}?", joint)
+        if s.velocity is not None and len(s.velocity) > 20 and np.isfinite(s.velocity.value[:, j]).all():
+            speed = np.gradient(s.position.value[:, j], s.position.t) if (np.diff(s.position.t) > 0).all() else None
+            ratio = None if speed is None else _ratio(_smooth(speed), _smooth(s.velocity.value[:, j]))
+            if ratio is not None and ratio < -0.5:
+                yield finding(s.velocity, f"velocity of {joint} has the opposite sign of its position's change", joint)
+            for known, unit in SPEED_RATIOS.items():
+                if ratio is not None and abs(ratio / known - 1) < 0.15:
+                    yield finding(s.velocity, f"velocity of {joint} is {ratio:.4g} times its position's change: {unit}?", joint)
+    yield from _effort_units(r, finding)
+    plain = ((r.temperature, "temperature", -40.0, 150.0, "degC"), (r.duty, "duty", -1.02, 1.02, "full drive"), (r.supply_voltage, "supply voltage", 0.0, 100.0, "V"),
+             (r.enabled, "enabled", 0.0, 1.0, "0 or 1"))
+    for series, name, low, high, unit in plain:
+        if series is None:
+            continue
+        bad = (series.value < low) | (series.value > high)
+        if name == "duty":  # a wrapped one is found as such
+            bad[:, [wrapped(x) is not None for x in series.value.T]] = False
+        if bad.any():
+            t = series.t[bad.reshape(len(series), -1).any(1)]
+            yield Finding("unit", series.topic, float(t[0]), int(bad.sum()), f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
+                          f" {low:g} .. {high:g} is possible", "error", end=float(t[-1]))
+    if r.tactile is not None and r.meta["tactile_unit"] == "N" and is_integer(r.tactile.value) and np.nanmax(np.abs(r.tactile.value)) > 20:
+        yield finding(r.tactile, f"tactile_unit is N, yet all values are whole and reach {np.nanmax(np.abs(r.tactile.value)):.0f}: counts?")
+    if r.tactile is not None and r.meta["tactile_unit"] == "count" and not is_integer(r.tactile.value) and np.nanmax(np.abs(r.tactile.value)) > 0:
+        yield finding(r.tactile, "tactile_unit is count, yet values are not whole: newtons?")
+    if r.object_pose is not None:
+        p = r.object_pose.value
+        if np.nanmedian(np.abs(p[:, :3]).max(1)) > 10:
+            yield finding(r.object_pose, f"the object is {np.nanmedian(np.abs(p[:, :3]).max(1)):.4g} m away: millimetres?")
+        if np.nanmax(np.abs(np.linalg.norm(p[:, 3:], axis=1) - 1)) > 0.02:
+            yield finding(r.object_pose, "the orientation is not a unit quaternion")
+    if r.imu is not None:
+        g = float(np.nanmedian(np.linalg.norm(r.imu.value[:, 7:], axis=1)))
+        if 0.8 < g < 1.25:
+            yield finding(r.imu, f"the acceleration at rest is {g:.3g}: in g, not m/s2?")
+
+
+def _effort_units(r: Recording, finding) -> Iterator[Finding]:
+    e = r.states.effort
+    if e is None:
+        return
+    limit = dict(zip(xhand.JOINTS, xhand.efforts(), strict=True)) if set(r.joints) <= set(xhand.JOINTS) else {}
+    for j, joint in enumerate(r.joints):
+        x = e.value[:, j]
+        if not np.isfinite(x).any():
+            continue
+        top = float(np.nanmax(np.abs(x)))
+        if r.effort_is == "current_A" and top > 20 and (is_integer(x) or joint in limit):
+            yield finding(e, f"effort of {joint} reaches {top:.4g} A: milliamperes?", joint)
+        elif r.effort_is == "torque_Nm" and (top > 20 * limit.get(joint, np.inf) or (is_integer(x) and top > 50)):
+            yield finding(e, f"effort of {joint} reaches {top:.4g} N.m: a current in mA, or counts?", joint)
+
+
+def _smooth(x: np.ndarray, width: int = 5) -> np.ndarray:
+    return np.convolve(x, np.ones(width) / width, mode="same")
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> float | None:
+    """b / a where they go together; None where they do not."""
+    ok = np.isfinite(a) & np.isfinite(b)
+    if ok.sum() < 20 or a[ok].std() == 0 or b[ok].std() == 0:
+        return None
+    corr = _corr(a[ok], b[ok])
+    return float(np.sign(corr) * b[ok].std() / a[ok].std()) if abs(corr) > 0.7 else None
+
+
+def _corr(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    size = np.linalg.norm(a) * np.linalg.norm(b)
+    return float(a @ b / size) if size > 0 else 0.0
+
+
+def _jumpless(x: np.ndarray) -> bool:
+    x = x[np.isfinite(x)]
+    return len(x) > 1 and float(np.abs(np.diff(x)).max()) < 0.5 * np.ptp(x)
+
+

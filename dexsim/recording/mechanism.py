@@ -1,0 +1,235 @@
+"""A mechanism on servos, driven by time-stamped commands: the simulated half of a recording.
+
+Any MuJoCo model serves: the xHand alone in the air, a one-joint test bench, another robot.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import yaml
+
+from dexsim.actuator.servo import FIELDS, Servo
+from dexsim.actuator.table import ServoTable
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
+from dexsim.sim import make_engine
+
+MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
+
+
+@dataclass
+class Mechanism:
+    """A model and what is believed of its drives. joints: the driven ones, in the order of every [J] array."""
+
+    spec: mujoco.MjSpec
+    joints: tuple[str, ...]
+    table: ServoTable
+    robot: str
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Position limits [J, 2], infinite where the model has none."""
+        model = self.spec.compile()
+        rows = [model.joint(j) for j in self.joints]
+        return np.array([model.jnt_range[j.id] if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in rows])
+
+    def column(self, name: str) -> np.ndarray:
+        """A servo column's nominal value [J]."""
+        from dexsim.actuator.columns import INDEX
+
+        return self.table.nominal(self.joints)[:, INDEX[name]]
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Largest speeds [J]: the no-load speeds, MAX_SPEED where infinite."""
+        speed = self.column("no_load_speed")
+        return np.where(np.isfinite(speed), speed, MAX_SPEED)
+
+
+def xhand_servo_dict() -> dict[str, Any]:
+    """The xHand's nominal servo table: configs/servo/xhand.yaml beside the package, else what its URDF states."""
+    path = Path(__file__).resolve().parents[2] / "configs" / "servo" / "xhand.yaml"
+    if path.is_file():
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    rows = zip(xhand.JOINTS, xhand.efforts(), xhand.speeds(), strict=True)
+    return {"joints": {"*": {"kp": 4.0, "kd": 0.1}} | {j: {"torque_limit": float(e), "no_load_speed": float(v)} for j, e, v in rows}}
+
+
+def mechanism(model: str | Path | None = None, servo: str | Path | dict | None = None, joints: Sequence[str] | None = None,
+              gravity: Sequence[float] | None = None) -> Mechanism:
+    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping); by default the xHand and its own.
+
+    joints: the driven ones; by default those of the xHand, else every hinge and slide of the model. gravity: [3] m/s2,
+    world frame. Raises UserError for a model or servo that does not serve.
+    """
+    if model is None:
+        spec, robot = xhand.hand_spec(), "xhand_right"
+        _hold_friction(spec)
+        table = _table(servo if servo is not None else xhand_servo_dict())
+    else:
+        path = Path(model).expanduser()
+        if not path.is_file():
+            raise UserError(f"model={model}: no such file")
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.compile()
+        except (ValueError, RuntimeError) as error:
+            raise UserError(f"model={model}: {' '.join(str(error).split())}") from None
+        robot = path.stem
+        if servo is None:
+            raise UserError(f"model={model}: say which servo drives it with servo=FILE (a servo.yaml)")
+        table = _table(servo)
+    if gravity is not None:
+        spec.option.gravity = [float(g) for g in gravity]
+    hinges = [j.name for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and j.name]
+    chosen = tuple(joints) if joints is not None else (xhand.JOINTS if model is None else tuple(hinges))
+    for joint in chosen:
+        if joint not in hinges:
+            raise UserError(f"joint '{joint}' is not in {model or 'the xHand'}; its joints: {', '.join(hinges)}")
+    if not chosen:
+        raise UserError(f"model={model}: has no named hinge or slide joint to drive")
+    return Mechanism(spec, chosen, table, robot)
+
+
+def for_recording(recording: Recording, model: str | Path | None = None, servo: str | Path | dict | None = None) -> Mechanism:
+    """The mechanism that a recording was made with: its gravity, its `servo` over the believed table, its joints driven
+    (the model's others stay where they are, driven to their initial position)."""
+    out = mechanism(model, servo, None, recording.gravity)
+    missing = [j for j in recording.joints if j not in out.joints]
+    if missing:
+        raise UserError(f"recording {recording.path} has joints that the model has not: {', '.join(missing)}; its joints: {', '.join(out.joints)}")
+    if recording.meta.get("servo"):
+        over = yaml.safe_load(recording.meta["servo"])
+        out.table = ServoTable.from_dict(merged(out.table.to_dict(), over), source=f"servo of {recording.path}")
+    return out
+
+
+def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`over` laid over `base`, mapping by mapping; the servo file's value mappings {value, low, high} are replaced whole."""
+    out = copy.deepcopy(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(out.get(key), dict) and "value" not in value:
+            out[key] = merged(out[key], value)
+        else:
+            out[key] = copy.deepcopy(value)
+    return out
+
+
+@dataclass
+class Run:
+    """What the simulation did, one row a physics step. t [T] s; position, velocity, torque, target [T, J] (as the encoders and
+    the current report; target: the last one sent); qpos [F, nq] every `frame_s`; tip_force [T, P] N where asked for."""
+
+    t: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    torque: np.ndarray
+    target: np.ndarray
+    qpos: np.ndarray
+    frame_s: float
+    model: mujoco.MjModel
+
+
+def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: float, initial: np.ndarray | None = None,
+          timestep: float = 0.002, enabled: Series | None = None, frame_s: float = 0.02) -> Run:
+    """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
+
+    commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]: start and
+    first target of the mechanism's joints (NaN or None: the model's own). Deterministic. Engine: C MuJoCo.
+    """
+    spec = m.spec.copy()
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    engine = make_engine(spec, 1, "cpu", "mujoco", fields=FIELDS, threads=1)
+    steps = max(1, round(duration / timestep))
+    stamps = np.asarray(commands.t, float)
+    spacing = float(np.percentile(np.diff(stamps), 5)) if len(stamps) > 2 else None
+    servo = Servo(engine, m.joints, m.table, control_period=max(spacing, 1e-3) if spacing else None)
+    qpos = torch.as_tensor(engine.mjm.qpos0)[None].clone()
+    address = engine.qpos_index(m.joints)
+    start = qpos[0, address].numpy().copy()
+    if initial is not None:
+        scale, offset = servo.column("position_scale")[0].double().numpy(), servo.column("position_offset")[0].double().numpy()
+        start = np.where(np.isfinite(initial), (initial - offset) / scale, start)
+    qpos[0, address] = torch.as_tensor(start)
+    engine.set_state(torch.ones(1, dtype=torch.bool), qpos, torch.zeros_like(engine.t.qvel))
+    now = np.where(np.isfinite(initial), initial, start) if initial is not None else start.copy()
+    servo.reset(None, torch.as_tensor(now)[None])
+    place = np.array([m.joints.index(c) for c in columns])
+    J = len(m.joints)
+    out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
+    every = max(1, round(frame_s / timestep))
+    frames: list[np.ndarray] = []
+    on = None if enabled is None else np.nan_to_num(enabled.value, nan=1.0) > 0.5
+    state = {"k": 0, "command": 0, "enabled": 0}
+
+    def before_each() -> None:
+        k, t = state["k"], state["k"] * timestep
+        # stamps within this step are known to it: the servo lets each act from its own time on
+        while state["command"] < len(stamps) and stamps[state["command"]] < t + timestep:
+            row = commands.value[state["command"]]
+            now[place] = np.where(np.isfinite(row), row, now[place])
+            servo.send(torch.as_tensor(now)[None], stamp=float(stamps[state["command"]]))
+            state["command"] += 1
+        while on is not None and state["enabled"] < len(on) and enabled.t[state["enabled"]] <= t:
+            servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(servo.state.dtype)
+            state["enabled"] += 1
+        out["position"][k] = servo.position()[0].numpy()
+        out["velocity"][k] = servo.velocity()[0].numpy()
+        out["target"][k] = now
+        if k % every == 0:
+            frames.append(engine.t.qpos[0].numpy().copy())
+        servo.before_each()
+        out["torque"][k] = servo.torque[0].numpy()
+        state["k"] = k + 1
+
+    engine.step(steps, before_each)
+    return Run(np.arange(steps) * timestep, **out, qpos=np.array(frames), frame_s=every * timestep, model=engine.mjm)
+
+
+def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0, start_ns: int = 0) -> Recording:
+    """The run as a simulated recording: commands as sent, states `rate` times a second (Hz; at most the physics rate),
+    torque in N.m. `realistic` makes of it what the hardware would have delivered."""
+    every = max(1, round(1.0 / rate / (run.t[1] - run.t[0]))) if len(run.t) > 1 else 1
+    t = run.t[::every]
+    value = np.full((len(commands), len(m.joints)), np.nan)
+    value[:, [m.joints.index(c) for c in columns]] = commands.value
+    gravity = " ".join(f"{g:g}" for g in m.spec.option.gravity)
+    meta = {"schema": "1", "source": "sim", "robot": m.robot, "joint_names": ",".join(m.joints), "effort_is": "torque_Nm", "effort_sign": "+1",
+            "gravity": gravity, "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False)}
+    series = lambda x, topic: Series(t, x[::every], topic, t.copy())  # noqa: E731
+    return Recording(Path("simulated.mcap"), DEFAULTS | meta, m.joints, Series(commands.t, value, COMMANDS, commands.t.copy()),
+                     States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)), start_ns=start_ns)
+
+
+def replay(recording: Recording, m: Mechanism, timestep: float = 0.002) -> Run:
+    """Drive the mechanism with a recording's commands from the recorded first position (free run, no correction)."""
+    if not len(recording.commands):
+        raise UserError(f"recording {recording.path} has no /joint_commands: nothing to replay")
+    initial = np.full(len(m.joints), np.nan)
+    state = recording.states.position
+    for j, joint in enumerate(recording.joints):
+        seen = np.flatnonzero(np.isfinite(state.value[:, j])) if len(state) else []
+        if len(seen):
+            initial[m.joints.index(joint)] = state.value[seen[0], j]
+    end = max(recording.duration, float(recording.commands.t[-1])) + timestep
+    return drive(m, recording.commands, recording.joints, end, initial, timestep, recording.enabled)
+
+
+def _table(servo: str | Path | dict) -> ServoTable:
+    return ServoTable.from_dict(servo) if isinstance(servo, dict) else ServoTable.load(Path(servo).expanduser())
+
+
+def _hold_friction(spec: mujoco.MjSpec) -> None:
+    """Dry friction that holds, as in the hand's tasks: MuJoCo's default lets a stuck joint creep."""
+    for joint in spec.joints:
+        joint.solimp_friction, joint.solref_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0], [0.01, 1.0]
