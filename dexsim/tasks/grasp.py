@@ -196,6 +196,8 @@ class GraspEnv(HandEnv):
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
+            "force_error": w["force_error"] * ((force[:, 1:] - self.command[:, None] * self.f_max).abs().mean(1) / self.f_max),
+            "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
         self._measure(contact)
@@ -269,7 +271,8 @@ class GraspEnv(HandEnv):
         """Tables for the first screen."""
         r = self.task["rewards"]
         notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
-                 "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed"}
+                 "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed",
+                 "force_error": "ours: |F_i - F_cmd F_max| / F_max, mean of the fingers", "self": "ours: tips pressing on the hand"}
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
         if self.task["critic"] == "privileged":
