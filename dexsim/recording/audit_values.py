@@ -17,14 +17,16 @@ SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousand
 
 
 def quantum(x: np.ndarray) -> float:
-    """Step of a quantised signal: the smallest difference of its distinct values; 0 where it is not quantised."""
+    """Step of a quantised signal: the largest that divides (nearly) all differences of its values; 0 where there is none."""
     values = np.unique(x[np.isfinite(x)])
     if len(values) < 3:
         return 0.0
     gaps = np.diff(values)
-    step = float(gaps.min())
-    near = np.abs(gaps / step - np.round(gaps / step)) < 0.02
-    return step if step > 1e-9 and near.mean() > 0.95 else 0.0
+    for part in range(1, 11):
+        step = float(gaps.min()) / part
+        if step > 1e-9 and (np.abs(gaps / step - np.round(gaps / step)) < 0.02).mean() > 0.97:
+            return step
+    return 0.0
 
 
 def is_integer(x: np.ndarray) -> bool:

@@ -1,0 +1,99 @@
+"""Safe command trajectories for a real hand: python -m dexsim.excite out=DIR."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+from dexsim.errors import UserError
+
+USAGE = """usage: python -m dexsim.excite out=DIR [key=value ...]
+
+Write commands that show what a hand's drives do: slow triangles, a speed ladder, a chirp, steps, holds, random motion and
+repeats, in shuffled order. Every motion is simulated with the servo and made smaller until it keeps the limits of position,
+speed and torque and no two bodies come near each other.
+
+  out/excite.mcap            the commands (/joint_commands)
+  out/excite.csv             the same: time [s], one column a joint [rad]
+  out/excite_simulated.mcap  what the simulation makes of them
+  out/excite.yaml            what moves when, the peaks, what was left out
+
+settings (key=default):
+  joints=all        comma-separated names of the joints to move
+  kinds=all         comma-separated: triangles, ladder, chirp, steps, holds, random
+  model=            MuJoCo or URDF file of another mechanism (default: the xHand)
+  servo=            servo.yaml believed of its drives (default: the xHand's)
+  seed=0            of the order and the random motion
+  rate=100          commands a second
+  repeats=1         motions of each group of joints that come twice
+  speed=0.6         largest joint speed, over the no-load speed
+  torque=0.8        largest motor torque, over the stall torque: what limits the current
+  margin=0.05       share of each joint's range kept free at both ends
+  clearance=0.002   m between bodies that are not neighbours
+  gravity=          in the model's frame, e.g. gravity="0 0 -9.81": how the hand is mounted (default: the model's)
+"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Make and write a plan; returns the exit status. Raises UserError."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(USAGE, end="")
+        return 0 if argv else 2
+    given = _settings(argv)
+    from dexsim.cli.build import quiet_warp
+    from dexsim.recording.excitation import Limits, plan, write_plan
+    from dexsim.recording.mechanism import mechanism
+    from dexsim.recording.schema import numbers
+
+    if "out" not in given:
+        raise UserError("say where to write: out=DIR")
+    quiet_warp("cpu")
+    gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
+    m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity)
+    limits = Limits(**{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance") if k in given})
+    start = time.perf_counter()
+    p = plan(m, _list(given, "joints"), _list(given, "kinds"), int(_number(given, "seed", 0)), _number(given, "rate", 100.0), limits,
+             int(_number(given, "repeats", 1)), say=lambda text: print(f"  {text}", flush=True))
+    print(f"\n{'start s':>9}{'end s':>9}  {'kind':<11}{'scale':>6}  joints")
+    for s in p.segments:
+        again = "" if s.repeats is None else f"  (repeats the one at {p.segments[s.repeats].start:.1f} s)"
+        print(f"{s.start:>9.2f}{s.end:>9.2f}  {s.kind:<11}{s.scale:>6.2f}  {', '.join(s.joints)}{again}")
+    for text in p.left_out:
+        print(f"left out: {text}")
+    print(f"\nsimulated: speed at most {100 * p.peaks.speed.max():.0f} % of no-load, torque at most {100 * p.peaks.torque.max():.0f} % of stall,"
+          f" no contact; {p.t[-1]:.0f} s of commands, made in {time.perf_counter() - start:.0f} s")
+    for path in write_plan(p, given["out"]):
+        print(path)
+    return 0
+
+
+KEYS = ("out", "joints", "kinds", "model", "servo", "seed", "rate", "repeats", "speed", "torque", "margin", "clearance", "gravity")
+
+
+def _settings(argv: Sequence[str]) -> dict[str, str]:
+    out = {}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if not equals or key not in KEYS:
+            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
+        out[key] = value
+    return out
+
+
+def _list(given: dict[str, str], key: str) -> list[str] | None:
+    value = given.get(key, "all")
+    return None if value in ("all", "") else [v.strip() for v in value.split(",") if v.strip()]
+
+
+def _number(given: dict[str, str], key: str, default: float = 0.0) -> float:
+    try:
+        return float(given.get(key, default))
+    except ValueError:
+        raise UserError(f"{key}={given[key]}: must be a number") from None
+
+
+if __name__ == "__main__":
+    from dexsim.cli.ending import guard
+
+    sys.exit(guard(main, sys.argv[1:]))

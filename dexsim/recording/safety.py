@@ -1,0 +1,78 @@
+"""Whether a motion is safe on a real mechanism: limits of position, speed and torque, and no self-contact; in simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from dexsim.recording.mechanism import Mechanism, Run
+
+
+@dataclass
+class Peaks:
+    """What a motion reached. speed, torque [J]: largest, over the limit (a fraction); below: largest excess over the position
+    limits [rad]; contacts: pairs of bodies that came nearer than the clearance, with the time of the first."""
+
+    speed: np.ndarray
+    torque: np.ndarray
+    excess: float
+    contacts: dict[tuple[str, str], float] = field(default_factory=dict)
+
+
+class ContactCheck:
+    """Finds bodies of a mechanism that touch, its own collision filter set aside: every pair of two bodies counts but
+    neighbours (parent and child) and pairs that are nearer than the clearance at `home` already (`exempt`)."""
+
+    def __init__(self, m: Mechanism, home: np.ndarray, clearance: float):
+        spec = m.spec.copy()
+        for geom in spec.geoms:
+            if geom.contype or geom.conaffinity:
+                geom.contype, geom.conaffinity, geom.margin = 1, 1, clearance
+        for exclude in list(spec.excludes):
+            spec.delete(exclude)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.clearance = clearance
+        self.address = np.array([self.model.jnt_qposadr[self.model.joint(j).id] for j in m.joints])
+        self.exempt: set[tuple[str, str]] = set()
+        self.exempt = set(self.near(home))
+
+    def near(self, q: np.ndarray) -> list[tuple[str, str]]:
+        """Pairs of bodies nearer than the clearance at joint positions q [J] (the other joints at rest)."""
+        qpos = self.model.qpos0.copy()
+        qpos[self.address] = q
+        return self.near_qpos(qpos)
+
+    def near_qpos(self, qpos: np.ndarray) -> list[tuple[str, str]]:
+        """The same for a whole qpos [nq]."""
+        m, d = self.model, self.data
+        d.qpos[:] = qpos
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_collision(m, d)
+        out = []
+        for k in range(d.ncon):
+            contact = d.contact[k]
+            if contact.dist < self.clearance:
+                a, b = (m.body(m.geom_bodyid[g]).name or f"body {m.geom_bodyid[g]}" for g in contact.geom)
+                pair = (min(a, b), max(a, b))
+                if pair not in self.exempt:
+                    out.append(pair)
+        return out
+
+    def along(self, run: Run) -> dict[tuple[str, str], float]:
+        """Pairs that came near, with the time of the first."""
+        out: dict[tuple[str, str], float] = {}
+        for k, qpos in enumerate(run.qpos):
+            for pair in self.near_qpos(qpos):
+                out.setdefault(pair, k * run.frame_s)
+        return out
+
+
+def peaks(m: Mechanism, run: Run, check: ContactCheck) -> Peaks:
+    """What a simulated run reached, over what is allowed."""
+    torque_limit, limits = m.column("torque_limit"), m.limits
+    torque = np.abs(run.torque).max(0)
+    excess = np.maximum(run.position - limits[:, 1], limits[:, 0] - run.position).max()
+    return Peaks(np.abs(run.velocity).max(0) / m.speeds, torque / torque_limit, float(excess), check.along(run))
