@@ -63,7 +63,7 @@ class Servo:
             raise UserError(f"servo: a joint is driven twice in {list(driven or joints)}; each joint has one drive.")
 
         nominal = table.nominal(self.joints)
-        self.queue = 8
+        self.queue, self.control_period = 8, control_period
         if control_period:  # the newest entry, one a period through the longest delay, and one before
             longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
             self.queue = max(8, math.ceil(longest / control_period) + 3)

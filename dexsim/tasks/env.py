@@ -53,6 +53,8 @@ class HandEnv(VecEnv):
         self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
         self.num_envs, self.device, self.num_actions = n_worlds, device, len(xhand.JOINTS)
         self.decimation, self.dt = _periods(sim, self.task)
+        if self.task["action"]["mode"] not in ("relative", "absolute"):
+            raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
         self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
         shapes = library()

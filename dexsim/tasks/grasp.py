@@ -69,6 +69,8 @@ class GraspEnv(HandEnv):
             self.sampler.check(name, low, high)
         if not 0 <= t["command"]["low"] <= t["command"]["high"] <= 1:
             raise UserError(f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high <= 1")
+        if t["critic"] not in ("paper", "privileged"):
+            raise UserError(f"task.critic={t['critic']}: must be paper or privileged")
         self.gravity0 = torch.tensor([0.0, 0.0, -9.81], device=dev)
         self.centre0 = torch.tensor(t["initial"]["object_xy"], device=dev)
         self.reach = torch.tensor([0.05, 0.0, 0.0], device=dev)  # the middle of the grasp

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import torch
 
-from dexsim.actuator.columns import INDEX
+from dexsim.actuator.columns import INDEX, column
 from dexsim.actuator.servo import Servo
+from dexsim.errors import UserError
 from dexsim.tasks.randomize import Sampler
 
 RELATIVE = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction")
@@ -30,6 +31,24 @@ class ServoRandomizer:
         self.high = torch.where(fitted, torch.as_tensor(high, device=dev, dtype=dtype), servo.nominal)
         self.fitted = fitted
         self.columns = [name.removeprefix("servo.") for name in sampler.ranges if name.startswith("servo.")]
+        for name in self.columns:
+            self._check(name)
+
+    def _check(self, name: str) -> None:
+        """Raise UserError unless every value that a range can give is one that the servo can have."""
+        col, (low, high, _) = column(name), self.sampler.range(f"servo.{name}")
+        value = self.servo.nominal[:, INDEX[name]]
+        value = value[torch.isfinite(value)].double()
+        if len(value) == 0:
+            return
+        ends = torch.stack([value * low, value * high] if name in RELATIVE else [value + low, value + high])
+        least, most, top = float(ends.min()), float(ends.max()), col.high
+        how = "times" if name in RELATIVE else "added to"
+        if name == "delay" and self.servo.control_period:
+            top = min(top, (self.servo.queue - 3) * self.servo.control_period)  # targets older than that are forgotten
+        if least < col.low - 1e-9 or most > top + 1e-9:
+            raise UserError(f"randomize.servo.{name}=[{low:g}, {high:g}] {how} the nominal gives {least:g} to {most:g} {col.unit}: "
+                            f"must lie in [{col.low:g}, {top:g}]")
 
     def draw(self, mask: torch.Tensor) -> None:
         """New parameters in the worlds that mask [N] selects; others keep theirs."""

@@ -1,0 +1,501 @@
+"""The grasp task: what the policy sees, what it is paid for, when episodes end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from worlds import grasp_cfg, grasp_env
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.sim.engine import FLAG_NAN
+from dexsim.tasks import make_env, terms
+from dexsim.tasks.grasp import ACTOR_SIZE, OBSERVATION, PRIVILEGED
+
+N = 8
+QUIET = ("task.sensors.joint_noise=0", "task.sensors.torque_noise=0", "task.sensors.tip_noise=0", "task.sensors.vision_z_noise=0")
+NO_BIAS = ("randomize.sensors.vision_xy=0", "randomize.sensors.torque_bias=0")
+SLICES = {}
+_at = 0
+for _name, _width, *_ in OBSERVATION:
+    SLICES[_name] = slice(_at, _at + _width)
+    _at += _width
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """Sensors without noise or bias, so that every slice has one right value."""
+    return grasp_env(*QUIET, *NO_BIAS, worlds=N)
+
+
+@pytest.fixture
+def env(quiet):
+    quiet.rng.manual_seed(11)
+    quiet.reset_all()
+    return quiet
+
+
+def act(env, value: float = 0.0) -> torch.Tensor:
+    a = torch.zeros(env.num_envs, 12)
+    a[:, 3:] = value
+    return a
+
+
+# -- observations ------------------------------------------------------------------------------------------------------------
+
+
+def test_sizes_and_layout(env):
+    rows = [(name, width) for name, width, *_ in OBSERVATION]
+    assert rows == [("joint_angle", 12), ("joint_torque", 12), ("object_position", 3), ("object_velocity", 3), ("contact_force", 5),
+                    ("contact_centre", 15), ("fingertip_position", 15), ("force_command", 1)]
+    obs = env.get_observations()
+    assert obs["actor"].shape == (N, 66) and ACTOR_SIZE == 66
+    assert obs["critic"].shape == (N, 66 + sum(w for _, w in PRIVILEGED)) == (N, 148)
+    groups = env.describe()["observations"]
+    for group in ("actor", "critic"):
+        assert sum(row[1] for row in groups[group]) == obs[group].shape[1]
+
+
+def test_critic_paper_has_the_actors_rows():
+    env = grasp_env("task.critic=paper", "tactile.others=false", worlds=2)
+    obs, *_ = env.step(torch.zeros(2, 12))
+    assert obs["critic"].shape == (2, 66)
+    s = SLICES["joint_angle"]
+    assert torch.equal(obs["critic"][:, s], env.q) and not torch.equal(obs["actor"][:, s], env.q)
+
+
+def test_every_slice_holds_what_its_name_says(env):
+    for _ in range(30):
+        obs, *_ = env.step(act(env, 0.5))
+    e = env.engine
+    assert float(env.tip_force.max()) > 0.5, "the hand holds something, or the test says little"
+    for group in ("actor", "critic"):
+        o = {name: obs[group][:, s].double() for name, s in SLICES.items()}
+        q = e.t.qpos[:, e.qpos_index(xhand.JOINTS)]
+        torch.testing.assert_close(o["joint_angle"], q, rtol=0, atol=1e-6)
+        torch.testing.assert_close(o["joint_torque"], env.servo.torque / torch.as_tensor(xhand.efforts()), rtol=0, atol=1e-6)
+        torch.testing.assert_close(o["contact_force"], e.t.pair_normal[:, :5].double() / env.f_max, rtol=1e-4, atol=1e-4)
+        sites = torch.stack([_site(env, w) for w in range(N)])
+        torch.testing.assert_close(o["fingertip_position"], sites.reshape(N, 15), rtol=0, atol=1e-5)
+        torch.testing.assert_close(o["force_command"][:, 0], env.command.double(), rtol=0, atol=0)
+        centre = o["contact_centre"].reshape(N, 5, 3)
+        assert float((centre - sites).norm(dim=-1).max()) < 0.03, "on the pad, in the tips' order"
+    assert torch.equal(obs["critic"][:, SLICES["object_position"]], env.object_pose[:, :3])
+    assert torch.equal(obs["critic"][:, SLICES["object_velocity"]], env.object_velocity[:, :3])
+
+
+def _site(env, w: int) -> torch.Tensor:
+    """Fingertip sites [5, 3] by C MuJoCo's kinematics of world w."""
+    import mujoco
+
+    m = env.engine.batch.get_model(w)
+    d = mujoco.MjData(m)
+    d.qpos[:] = env.engine.t.qpos[w]
+    mujoco.mj_kinematics(m, d)
+    return torch.as_tensor(np.stack([d.site(f"tip_{f}").xpos for f in xhand.FINGERS]))
+
+
+def test_the_actor_sees_the_object_as_on_hardware(env):
+    """x and y held at their first values, vx = vy = 0, z some control steps old, vz its finite difference."""
+    first = env.get_observations()["actor"]
+    z = [env.object_pose[:, 2].clone()]
+    seen = [first[:, SLICES["object_position"]][:, 2].clone()]
+    start_xy = env.object_pose[:, :2].clone()
+    torch.testing.assert_close(first[:, SLICES["object_position"]][:, :2], start_xy, rtol=0, atol=1e-6)
+    assert not first[:, SLICES["object_velocity"]].any()
+    delay = env.z_delay.clone()
+    for k in range(1, 12):
+        obs, _, done, _ = env.step(act(env))
+        assert not done.any()
+        o, v = obs["actor"][:, SLICES["object_position"]], obs["actor"][:, SLICES["object_velocity"]]
+        z.append(env.object_pose[:, 2].clone())
+        expect = torch.stack([z[max(k - int(delay[w]), 0)][w] for w in range(N)])
+        torch.testing.assert_close(o[:, 2], expect, rtol=0, atol=1e-6)
+        assert torch.equal(o[:, :2], first[:, SLICES["object_position"]][:, :2]) and not v[:, :2].any()
+        torch.testing.assert_close(v[:, 2], (o[:, 2] - seen[-1]) / env.dt, rtol=0, atol=1e-4)
+        seen.append(o[:, 2].clone())
+    assert 1 <= int(delay.min()) and int(delay.max()) <= 4
+    assert float((env.object_pose[:, :2] - start_xy).abs().max()) > 1e-4, "it did move"
+
+
+def test_noise_is_the_actors_alone_and_as_large_as_stated():
+    env = grasp_env("tactile.others=false", worlds=64)
+    d = []
+    for _ in range(6):
+        obs, *_ = env.step(torch.zeros(64, 12))
+        d.append((obs["actor"][:, SLICES["joint_angle"]] - obs["critic"][:, SLICES["joint_angle"]]))
+    d = torch.stack(d)
+    assert float(d.std()) == pytest.approx(0.003, rel=0.05) and abs(float(d.mean())) < 3e-4
+    assert float(torch.corrcoef(torch.stack([d[0].ravel(), d[1].ravel()]))[0, 1]) < 0.15, "fresh each step"
+    tau = obs["actor"][:, SLICES["joint_torque"]] - obs["critic"][:, SLICES["joint_torque"]] - env.torque_bias
+    assert float(tau.std()) == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_new_episode_has_felt_nothing(env):
+    """No reading of the episode before is seen in the first observation of the next; centres are the pads' own."""
+    for _ in range(30):
+        obs, *_ = env.step(act(env, 0.5))
+    before = obs["actor"].clone()
+    assert before[:, SLICES["contact_force"]].any()
+    mask = torch.arange(N) % 2 == 0
+    env.reset(mask)
+    obs = env.get_observations()["actor"]
+    assert not obs[mask][:, SLICES["contact_force"]].any() and not obs[mask][:, SLICES["joint_torque"]].any()
+    e = env.engine
+    b = [e.body(x) for x in xhand.TIP_BODIES]
+    pad = torch.as_tensor(env.touch.layout.centre(), dtype=torch.float32)
+    centre = e.t.xpos[:, b] + (e.t.xmat[:, b] @ pad[None, :, :, None])[..., 0]
+    torch.testing.assert_close(obs[mask][:, SLICES["contact_centre"]], centre.reshape(N, 15)[mask], rtol=0, atol=1e-6)
+    assert torch.equal(obs[~mask][:, SLICES["contact_force"]], before[~mask][:, SLICES["contact_force"]])
+
+
+# -- rewards ---------------------------------------------------------------------------------------------------------------
+
+
+def test_tracking_against_hand_computed_values():
+    x = torch.tensor([[2.0, 4.0, 6.0, 4.0, 11.0], [0.1, 4.0, 0.1, 4.0, 4.0]])
+    contact = torch.tensor([[True, True, True, False, True], [True, True, True, True, False]])
+    got = terms.tracking(x, torch.tensor([0.5, 0.5]), x_max=8.0, sigma=0.25, low=0.02, high=1.3, contact=contact)
+    # command 4 N, sigma 2 N, band [0.16, 10.4] N; thumb: band only
+    first = 1.0 + 1.0 + math.exp(-0.5 * (2 / 2) ** 2) + 0.0 + 0.0  # on target; 1 sigma off; no contact; over the band
+    second = 0.0 + 1.0 + 0.0 + 1.0 + 0.0  # thumb under its band; exact; under the band; exact; no contact
+    torch.testing.assert_close(got, torch.tensor([first, second]))
+
+
+def test_low_commands_can_earn():
+    r = grasp_cfg()["task"]["reward"]
+    assert r["force_low"] < 0.1 and r["torque_low"] < 0.1
+
+
+@pytest.fixture
+def posed(env):
+    """An environment whose measured signals are set by hand, for `rewards` alone."""
+    env.tip_force.zero_(), env.torque.zero_(), env.qd.zero_(), env.self_force.zero_(), env.object_velocity.zero_()
+    env.object_pose[:, :3] = env.reach
+    env.q.copy_(env.q_mid.expand(N, 12))
+    env.action.zero_(), env.last_action.zero_()
+    env.command.fill_(0.5)
+    yield env
+    env.reset_all()
+
+
+def terms_of(env) -> dict[str, float]:
+    w = env.task["rewards"]
+    return {k: float(v[0] / w[k]) for k, v in env.rewards().items()}
+
+
+def test_reward_terms_by_hand(posed):
+    env = posed
+    zero = terms_of(env)
+    assert zero["force"] == zero["torque"] == zero["outer"] == zero["action"] == zero["velocity"] == zero["termination"] == 0
+    mid = env.q_mid[[4, 6, 8, 10]].double()
+    assert zero["diff"] == pytest.approx(float(((mid - mid.mean()) ** 2).mean()), abs=1e-7)
+
+    env.q[:, [4, 6, 8, 10]] = torch.tensor([0.2, 0.4, 0.6, 1.0])
+    assert terms_of(env)["diff"] == pytest.approx(np.var([0.2, 0.4, 0.6, 1.0]), rel=1e-5)
+    env.q[:, 0] += 1.0  # the thumb is not in it
+    assert terms_of(env)["diff"] == pytest.approx(np.var([0.2, 0.4, 0.6, 1.0]), rel=1e-5)
+
+    env.q[:, [5, 7, 9, 11]] = env.q_mid[[5, 7, 9, 11]] + torch.tensor([0.3, 0.0, -0.4, 0.0])
+    assert terms_of(env)["outer"] == pytest.approx(0.5, rel=1e-5)  # the norm (0.25 were its square)
+
+    env.action[:, 0], env.last_action[:, 0], env.action[:, 5] = 0.5, -0.5, 0.2
+    assert terms_of(env)["action"] == pytest.approx(1.0 + 0.04, rel=1e-5)
+
+    env.qd[:, 3], env.qd[:, 7] = 2.0, -1.0
+    assert terms_of(env)["velocity"] == pytest.approx(5.0, rel=1e-5)
+
+    env.object_pose[:, 2] = -1.0
+    assert terms_of(env)["termination"] == 1.0
+
+
+def test_force_and_torque_rewards_need_contact_with_the_object(posed):
+    env = posed
+    r = env.task["reward"]
+    env.tip_force[:] = torch.tensor([1.0, 0.5, 0.5, 0.5, 0.05]) * env.f_max
+    env.tip_force[:, 4] = r["contact_threshold"] / 2  # a touch under the threshold is none
+    env.torque[:, [1, 4, 6, 8, 10]] = 0.5 * env.tau_max
+    got = terms_of(env)
+    assert got["force"] == pytest.approx(4.0, rel=1e-4) and got["torque"] == pytest.approx(4.0, rel=1e-4)
+    env.torque[:, 4] = (0.5 + r["torque_sigma"]) * env.tau_max[1]
+    assert terms_of(env)["torque"] == pytest.approx(3.0 + math.exp(-0.5), rel=1e-4)
+    env.tip_force.zero_()
+    env.self_force[:] = 0.5 * env.f_max  # squeezing two fingers does not pay
+    got = terms_of(env)
+    assert got["force"] == got["torque"] == got["grip"] == 0
+
+
+def test_fingers_on_fingers_are_no_contact_with_the_object(env):
+    """A fist with the object far away: fingers press each other, yet no force counts."""
+    far = torch.zeros(N, 7)
+    far[:, 0], far[:, 2], far[:, 3] = 0.05, 0.9, 1.0
+    env.task["termination"]["distance"], kept = 10.0, env.task["termination"]["distance"]
+    try:
+        env.place(torch.ones(N, dtype=torch.bool), env.pose0.expand(N, 12), far, torch.zeros(N, 6))
+        env.engine.field("opt.gravity").zero_()
+        pressed = torch.zeros(N)
+        for k in range(40):
+            a = torch.ones(N, 12)
+            a[:, 0] = 1.0 if k < 15 else 0.0
+            env.step(a)
+            pressed = torch.maximum(pressed, env.self_force.sum(1))
+            assert not env.tip_force.any() and not env.finger_force.any()
+            assert not env.touch.force_clean.any()
+        reward = env.rewards()
+        assert float(pressed.median()) > 0.5, "no finger touched another: the test says nothing"
+        assert not reward["force"].any() and not reward["torque"].any() and not reward["grip"].any()
+    finally:
+        env.task["termination"]["distance"] = kept
+
+
+def test_weights_scale_their_terms_and_the_sum_is_the_reward(env):
+    for _ in range(25):
+        _, reward, done, extras = env.step(act(env, 0.4))
+    total = torch.stack(list(env.rewards().values())).sum(0)
+    kept = ~done.bool()
+    assert kept.any()
+    torch.testing.assert_close(reward[kept], total[kept], rtol=1e-5, atol=1e-6)
+    assert set(env.rewards()) == set(env.task["rewards"])
+
+
+# -- the force scale -----------------------------------------------------------------------------------------------------------
+
+
+def test_f_max_is_a_static_press_of_about_ten_newtons(env):
+    from dexsim.tasks.press import fingertip_press
+
+    assert 5.0 < env.f_max < 20.0
+    servo = grasp_cfg()["servo"]
+    full, half = fingertip_press(servo), fingertip_press(servo, drive=0.5)
+    assert half == pytest.approx(full / 2, rel=0.05)  # static: proportional to torque
+    assert fingertip_press(servo, stiffness=20000.0) == pytest.approx(full, rel=0.05)  # and hardly of the rubber
+
+
+# -- ends ------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_dropped_object_ends_the_episode_and_the_others_go_on(env):
+    env.step(act(env))
+    q = env.engine.t.qpos.clone()
+    q[3, env.object_q[2]] = -0.2
+    q[5, env.object_q[0]] = 1.0
+    env.engine.t.qpos.copy_(q)
+    _, reward, done, extras = env.step(act(env))
+    assert done.tolist() == [0, 0, 0, 1, 0, 1, 0, 0] and not extras["time_outs"].any()
+    assert reward[[3, 5]].max() < -2  # the penalty
+    assert env.episode_length_buf.tolist() == [2, 2, 2, 0, 2, 0, 2, 2]
+    assert bool((env.object_pose[[3, 5], 2] > 0).all()) and extras["log"]["end/dropped"] == pytest.approx(2 / N)
+    assert not env.engine.t.xfrc_applied[[3, 5]].any()
+
+
+def test_time_out_is_flagged_apart_from_termination(env):
+    env.episode_length_buf = torch.tensor([0, env.max_episode_length - 1, 0, 0, env.max_episode_length - 1, 0, 0, 0])
+    env.engine.t.qpos[4, env.object_q[2]] = -0.3  # dropped in its last step: not a time-out
+    _, _, done, extras = env.step(act(env))
+    assert done.tolist() == [0, 1, 0, 0, 1, 0, 0, 0]
+    assert extras["time_outs"].bool().tolist() == [False, True] + [False] * 6
+
+
+def test_assigning_the_episode_length_keeps_its_memory(env):
+    """The runner assigns random lengths; a recorded step must go on with them."""
+    memory = env.episode_length_buf.data_ptr()
+    env.episode_length_buf = torch.arange(N)
+    assert env.episode_length_buf.data_ptr() == memory
+    env.step(act(env))
+    assert env.episode_length_buf.tolist() == list(range(1, N + 1))
+
+
+@pytest.mark.parametrize("where", ["qpos", "qvel"])
+def test_a_nan_world_is_ended_counted_and_replaced(env, where):
+    env.step(act(env))
+    count = int(env.nan_count)
+    getattr(env.engine.t, where)[2, 14] = float("nan")
+    obs, reward, done, extras = env.step(act(env))
+    assert done.tolist() == [0, 0, 1, 0, 0, 0, 0, 0] and not extras["time_outs"].any()
+    assert int(env.nan_count) == count + 1 and extras["log"]["end/nan"] == pytest.approx(1 / N)
+    for _ in range(3):
+        for group in obs.values():
+            assert bool(torch.isfinite(group).all())
+        assert bool(torch.isfinite(reward).all()) and all(bool(torch.isfinite(torch.as_tensor(v)).all()) for v in extras["log"].values())
+        assert not (env.engine.t.flags & FLAG_NAN).any()
+        obs, reward, done, extras = env.step(act(env))
+    assert not done.any()
+
+
+def test_nan_actions_are_harmless(env):
+    a = torch.full((N, 12), float("nan"))
+    a[0] = float("inf")
+    obs, reward, *_ = env.step(a)
+    assert bool(torch.isfinite(obs["actor"]).all()) and bool(torch.isfinite(reward).all())
+    assert bool((env.target <= env.q_high).all() and (env.target >= env.q_low).all())
+
+
+# -- actions -----------------------------------------------------------------------------------------------------------------------
+
+
+def test_relative_actions_move_the_target_within_limits_and_lead(env):
+    scale, lead = env.task["action"]["scale"], env.task["action"]["lead"]
+    start, q = env.target.clone(), env.q.clone()
+    a = torch.linspace(-2, 2, 12).expand(N, 12)
+    env.step(a)
+    expect = torch.minimum(torch.maximum(start + a.clamp(-1, 1) * scale, env.q_low), env.q_high)
+    torch.testing.assert_close(env.target, torch.minimum(torch.maximum(expect, q - lead), q + lead))
+    for _ in range(60):
+        q = env.q.clone()
+        env.step(torch.ones(N, 12))
+        assert bool((env.target <= env.q_high + 1e-6).all()) and bool((env.target - q <= lead + 1e-5).all())
+
+
+def test_absolute_actions_span_each_joints_range():
+    env = grasp_env("task.action.mode=absolute", "tactile.others=false", worlds=2)
+    limits = torch.as_tensor(xhand.joint_limits(), dtype=torch.float32)
+    for value, column in ((-1.0, limits[:, 0]), (1.0, limits[:, 1]), (0.0, limits.mean(1)), (5.0, limits[:, 1])):
+        env.step(torch.full((2, 12), value))
+        torch.testing.assert_close(env.target, column.expand(2, 12), rtol=0, atol=1e-6)
+
+
+def test_an_unknown_action_mode_is_a_user_error():
+    cfg = grasp_cfg(worlds=1)
+    cfg["task"]["action"]["mode"] = "velocity"
+    with pytest.raises(UserError, match="task.action.mode"):
+        make_env(cfg, 1, "cpu", 0, "mujoco")
+
+
+# -- commands and pushes --------------------------------------------------------------------------------------------------------------
+
+
+def test_commands_change_within_an_episode(env):
+    hold = env.task["command"]["hold_s"]
+    values, since, gaps = [], torch.zeros(N), []
+    last = env.command.clone()
+    for _ in range(300):
+        env.before_physics()
+        changed = env.command != last
+        since += env.dt
+        gaps += since[changed].tolist()
+        since[changed] = 0
+        values.append(env.command.clone())
+        last = env.command.clone()
+    values = torch.stack(values)
+    assert 0 <= float(values.min()) and float(values.max()) <= 1 and float(values.std()) > 0.2
+    assert min(gaps) > hold[0] - 2 * env.dt and max(gaps) < hold[1] + 2 * env.dt and len(gaps) > N
+
+
+def test_pushes_have_no_favoured_direction_and_the_stated_size(env):
+    """Force on the object while pushed: |F| / weight within the range, directions and duty as drawn."""
+    forces, length = [], torch.zeros(N)
+    weight = env.objects.mass * 9.81
+    lengths = []
+    for _ in range(6000):
+        env.before_physics()
+        f = env.engine.t.xfrc_applied[:, env.objects.body].clone()
+        assert not f[:, 3:].any()
+        f = f[:, :3].float()
+        on = f.norm(dim=1) > 0
+        lengths += length[(~on) & (length > 0)].tolist()
+        length = torch.where(on, length + env.dt, torch.zeros_like(length))
+        forces.append((f / weight[:, None])[on])
+    low, high, _ = env.sampler.range("push.weights")
+    f = torch.cat(forces)
+    size = f.norm(dim=1)
+    assert low <= float(size.min()) and float(size.max()) <= high + 1e-4 and float(size.max()) > 0.9 * high
+    unique = torch.unique((f / size[:, None] * 1e4).round(), dim=0) / 1e4
+    assert len(unique) > 200
+    assert float(unique.mean(0).norm()) < 4 * (1 / len(unique)) ** 0.5, "zero mean"
+    assert torch.allclose((unique.T @ unique) / len(unique), torch.eye(3) / 3, atol=0.1), "no favoured axis"
+    d = env.sampler.range("push.duration")
+    assert d[0] - 2 * env.dt < min(lengths) and max(lengths) < d[1] + 2 * env.dt
+
+
+def test_pushes_can_be_turned_off(env):
+    env.pushes = False
+    try:
+        for _ in range(200):
+            env.before_physics()
+            assert not env.engine.t.xfrc_applied.any()
+    finally:
+        env.pushes = True
+
+
+# -- the same again ---------------------------------------------------------------------------------------------------------------------
+
+
+def rollout(env, steps: int = 40, seed: int = 5) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    out = []
+    for _ in range(steps):
+        obs, reward, done, _ = env.step(torch.rand(env.num_envs, 12, generator=g) * 2 - 1)
+        out.append(torch.cat([obs["actor"], obs["critic"], reward[:, None], done[:, None]], 1))
+    return torch.stack(out)
+
+
+def test_the_same_seed_gives_the_same_rollout():
+    a, b = (rollout(grasp_env("tactile.others=false", worlds=4, seed=3)) for _ in range(2))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, rollout(grasp_env("sim.threads=1", "tactile.others=false", worlds=4, seed=4)))
+
+
+def test_state_dict_round_trip(env):
+    env.step(act(env, 0.3))
+    env.nan_count += 2
+    state = {k: v.clone() for k, v in env.state_dict().items()}
+    env.load_state_dict(state)
+    first = rollout(env, 10)
+    assert int(env.nan_count) == int(state["nan_count"])
+    env.load_state_dict(state)
+    assert torch.equal(first, rollout(env, 10))
+    env.nan_count.zero_()
+
+
+def test_a_rollout_under_inference_mode_comes_first():
+    """Training collects under inference mode; whoever steps later must not be stopped by tensors made there."""
+    env = grasp_env("tactile.others=false", worlds=2)
+    with torch.inference_mode():
+        env.step(torch.zeros(2, 12))
+    env.step(torch.zeros(2, 12))
+
+
+def test_final_observations_are_those_before_the_reset(env):
+    env.keep_final_obs = True
+    try:
+        env.step(act(env))
+        env.episode_length_buf = torch.full((N,), env.max_episode_length - 1)
+        obs, _, done, extras = env.step(act(env))
+        assert done.all()
+        z = SLICES["object_position"].start + 2
+        assert not torch.equal(extras["final_obs"]["critic"][:, z], obs["critic"][:, z])
+        assert torch.equal(obs["critic"][:, z], env.object_pose[:, 2])
+    finally:
+        env.keep_final_obs = False
+
+
+# -- bad settings -------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change, word", [
+    (("randomize", "object", "mass", [-0.1, 0.3]), "object.mass"),
+    (("randomize", "servo", "delay", [0.0, 0.4]), "delay"),
+    (("randomize", "servo", "kp", [-1.0, 1.0]), "kp"),
+    (("randomize", "servo", "backlash", [0.0, 0.1]), "backlash"),
+    (("sim", "control_period", 0.0123), "control_period"),
+    (("task", "command", "low", 0.9), None),
+    (("task", "command", "high", 1.5), "command"),
+    (("task", "contact", "impedance", 1.0), "impedance"),
+    (("task", "critic", "oracle"), "task.critic"),
+    (("task", "objects", "train", ["cube"]), "cube"),
+])  # fmt: skip
+def test_impossible_settings_are_user_errors(change, word):
+    cfg = grasp_cfg("tactile.others=false", worlds=1)
+    *path, value = change
+    node = cfg
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = value
+    if word is None:
+        make_env(cfg, 1, "cpu", 0, "mujoco")
+        return
+    with pytest.raises(UserError, match=word):
+        make_env(cfg, 1, "cpu", 0, "mujoco")
