@@ -63,6 +63,7 @@ class GraspEnv(HandEnv):
         # every shape is equally likely, whatever the number of its baked sizes
         self.row_weight = torch.tensor([1.0 / names.count(s) for s in names], device=dev)
         self.draw_from(self.train_rows)
+        self.kinds = torch.nn.functional.one_hot(self.objects.kind, 4).float()
         for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.scale", 0.3, 3.0),
                                 ("object.com", -0.25, 0.25), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
                                 ("servo.delay", -0.5, 0.5), ("push.weights", 0.0, 20.0)):
@@ -243,7 +244,7 @@ class GraspEnv(HandEnv):
 
     def _privileged(self) -> list[torch.Tensor]:
         o = self.objects
-        kind = torch.nn.functional.one_hot(o.kind[o.variant], 4).float()
+        kind = self.kinds[o.variant]
         pushing = self.engine.t.xfrc_applied[:, o.body, :3].float()
         return [
             self.qd, self.object_pose[:, 3:], self.object_velocity, o.size, kind, o.mass[:, None], o.com, o.friction[:, None],
