@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from dexsim.errors import UserError
@@ -32,6 +34,8 @@ class Sampler:
             if not (isinstance(pair, (list, tuple)) and len(pair) == 2 and all(isinstance(v, (int, float)) for v in pair)):
                 raise UserError(f"{here}={value}: must be a number, [low, high], or {{log: [low, high]}}")
             low, high = float(pair[0]), float(pair[1])
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise UserError(f"{here}=[{low}, {high}]: both ends must be finite")
             if not low <= high:
                 raise UserError(f"{here}=[{low}, {high}]: low must not exceed high")
             if log and low <= 0:

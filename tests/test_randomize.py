@@ -1,0 +1,123 @@
+"""Sampling: ranges, logs, independence of worlds, bad ranges; servo parameters relative to the nominal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dexsim.actuator.columns import INDEX, NAMES
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.tasks.randomize import Sampler
+from dexsim.tasks.servos import RELATIVE, ServoRandomizer
+
+N = 4096
+
+
+def sampler(cfg: dict, n: int = N, seed: int = 0) -> Sampler:
+    return Sampler(cfg, torch.Generator().manual_seed(seed), n, "cpu")
+
+
+def test_uniform_log_and_fixed():
+    s = sampler({"a": {"u": [1.0, 3.0], "log": {"log": [0.01, 1.0]}, "fixed": 2.5}})
+    u, log, fixed = s.draw("a.u").double(), s.draw("a.log").double(), s.draw("a.fixed")
+    tol = 4 / N**0.5
+    assert 1 <= float(u.min()) and float(u.max()) <= 3 and abs(float(u.mean()) - 2) < 2 * tol * 0.29
+    assert float(log.min()) >= 0.01 * (1 - 1e-6) and float(log.max()) <= 1.0 + 1e-6
+    assert abs(float(log.log10().mean()) + 1) < 2 * tol * 0.29, "uniform in the logarithm"
+    assert torch.equal(fixed, torch.full((N,), 2.5))
+
+
+def test_draws_are_independent_by_world_and_column():
+    s = sampler({"x": [0.0, 1.0]})
+    a, b = s.draw("x", 3), s.draw("x", 3)
+    assert a.shape == (N, 3)
+    c = torch.corrcoef(torch.cat([a, b], 1).T) - torch.eye(6)
+    assert float(c.abs().max()) < 5 / N**0.5
+    assert abs(float(torch.corrcoef(torch.stack([a[:-1, 0], a[1:, 0]]))[0, 1])) < 5 / N**0.5
+
+
+def test_directions_and_quaternions_are_uniform():
+    s = sampler({})
+    d, q = s.direction().double(), s.quaternion().double()
+    assert torch.allclose(d.norm(dim=1), torch.ones(N, dtype=d.dtype), atol=1e-6)
+    assert torch.allclose(q.norm(dim=1), torch.ones(N, dtype=q.dtype), atol=1e-6)
+    assert float(d.mean(0).norm()) < 5 / N**0.5
+    assert torch.allclose(d.T @ d / N, torch.eye(3, dtype=d.dtype) / 3, atol=0.03)
+    assert torch.allclose(q.T @ q / N, torch.eye(4, dtype=d.dtype) / 4, atol=0.03)
+
+
+@pytest.mark.parametrize("value", [[1.0], [2.0, 1.0], "wide", [None, 1.0], {"log": [0.0, 1.0]}, {"log": [-1.0, 1.0]}, [float("nan"), 1.0], [0.0, float("inf")]])
+def test_a_bad_range_is_named(value):
+    with pytest.raises(UserError, match="randomize.object.mass"):
+        sampler({"object": {"mass": value}})
+
+
+def test_unknown_and_forbidden_ranges_are_named():
+    s = sampler({"object": {"mass": [-0.1, 0.3]}})
+    with pytest.raises(UserError, match="randomize.object.mas is missing.*object.mass"):
+        s.range("object.mas")
+    with pytest.raises(UserError, match=r"randomize.object.mass=\[-0.1, 0.3\]: must lie in"):
+        s.check("object.mass", 0.001, 5)
+
+
+# -- servo ---------------------------------------------------------------------------------------------------------------
+
+JOINTS = ("a", "b")
+
+
+class FakeServo:
+    """What a ServoRandomizer needs of a servo."""
+
+    def __init__(self, table: dict, n: int = N):
+        self.table, self.joints = ServoTable.from_dict(table), JOINTS
+        self.nominal = torch.as_tensor(self.table.nominal(JOINTS), dtype=torch.float32)
+        self.params = self.nominal.expand(n, *self.nominal.shape).clone()
+        self.queue, self.control_period = 8, 0.025
+
+
+TABLE = {"joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit": 1.1, "delay": 0.01}, "b": {"kp": {"value": 2.0, "low": 1.8, "high": 2.6}}}}
+
+
+def test_factors_and_additions_are_of_the_nominal():
+    servo = FakeServo(TABLE)
+    r = ServoRandomizer(servo, sampler({"servo": {"kp": [0.5, 1.5], "delay": [0.0, 0.02], "deadband": [0.0, 0.01]}}))
+    everyone = torch.ones(N, dtype=torch.bool)
+    for _ in range(20):  # never compounds
+        r.draw(everyone)
+    p = servo.params
+    for name, joint, low, high in (("kp", 0, 2.0, 6.0), ("delay", 0, 0.01, 0.03), ("delay", 1, 0.01, 0.03), ("deadband", 0, 0.0, 0.01),
+                                   ("kp", 1, 1.8, 2.6)):  # b's kp was fitted: its own interval counts
+        x = p[:, joint, INDEX[name]]
+        width = high - low
+        assert low - 1e-6 <= float(x.min()) < low + 0.02 * width and high - 0.02 * width < float(x.max()) <= high + 1e-6, (name, joint)
+    others = [INDEX[n] for n in NAMES if n not in ("kp", "delay", "deadband")]
+    assert torch.equal(p[..., others], servo.nominal[:, others].expand(N, 2, len(others))), "absent limits stay infinite, no NaN"
+    assert {"kp", "torque_limit"} <= set(RELATIVE) and "delay" not in RELATIVE
+
+
+def test_only_masked_worlds_get_new_drives():
+    servo = FakeServo(TABLE)
+    r = ServoRandomizer(servo, sampler({"servo": {"kp": [0.5, 1.5]}}))
+    r.draw(torch.ones(N, dtype=torch.bool))
+    before = servo.params.clone()
+    mask = torch.arange(N) % 2 == 0
+    r.draw(mask)
+    assert torch.equal(servo.params[~mask], before[~mask])
+    assert bool((servo.params[mask][:, 0, INDEX["kp"]] != before[mask][:, 0, INDEX["kp"]]).double().mean() > 0.99)
+
+
+@pytest.mark.parametrize("cfg, word", [
+    ({"kp": [-0.5, 1.0]}, "servo.kp"), ({"delay": [-0.05, 0.0]}, "servo.delay"), ({"delay": [0.0, 0.2]}, "servo.delay"),
+    ({"deadband": [0.0, 2.0]}, "servo.deadband"), ({"backlash": [0.0, 0.1]}, "backlash"), ({"efficiency": [0.5, 3.0]}, "efficiency"),
+])  # fmt: skip
+def test_values_that_a_servo_cannot_have_are_refused(cfg, word):
+    with pytest.raises(UserError, match=word):
+        ServoRandomizer(FakeServo(TABLE), sampler({"servo": cfg}))
+
+
+def test_a_given_seed_gives_the_same_numbers():
+    a, b, c = (sampler({"x": [0.0, 1.0]}, seed=s).draw("x", 2) for s in (1, 1, 2))
+    assert torch.equal(a, b) and not torch.equal(a, c)
+    assert np.isfinite(a.numpy()).all()
