@@ -16,7 +16,7 @@ import torch
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.tactile.layout import tip_points, xhand_layout
+from dexsim.tactile.layout import xhand_layout
 from dexsim.tasks import rotation
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
@@ -95,7 +95,7 @@ class RotateEnv(HandEnv):
         self.goal[:, 0] = 1.0
         self.successes, self.since = zeros(dtype=torch.long), zeros(dtype=torch.long)
         self.last_done = zeros(dtype=torch.long)  # successes of each world's last ended episode
-        self.reached = zeros(dtype=torch.bool)
+        self.reached, self.dropped, self.tipped, self.nan_end = (zeros(dtype=torch.bool) for _ in range(4))
         self.d_rot, self.d_pos = zeros(), zeros()
         self.tip_rot, self.tip_last, self.tip_rot_last = zeros(5, 3, 3), zeros(5, 3), zeros(5, 3, 3)
         self.tip_velocity = zeros(5, 6)
@@ -112,7 +112,7 @@ class RotateEnv(HandEnv):
         self.taxel_point = None
         if not observe["force_weighted"]:
             layout = xhand_layout()
-            felt = layout.lifted(tip_points(self.engine.mjm, xhand.TIP_GEOMS)) if self.touch.cfg.lift else layout
+            felt = layout.lifted([xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]) if self.touch.cfg.lift else layout
             self.taxel_point = torch.as_tensor(felt.point, dtype=torch.float32, device=dev)  # [5, T, 3], link frame
             self.pad_centre = torch.as_tensor(layout.centre(), dtype=torch.float32, device=dev)
 
@@ -189,12 +189,14 @@ class RotateEnv(HandEnv):
 
     # -- terminations --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
-        """Dropped: the centre is too low or too far from where it began. Tipped: no face looks along the axis any more
-        and the goal's own face is more than `tilt` away from it."""
+        """Dropped: the centre is too low or too far from where it began. Tipped: the goal's upper face looks more than
+        `tilt` away from the axis."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
-        away = ((p - self.home).norm(dim=1) > limit["distance"]) | (p[:, 2] < limit["below"])
-        return {"dropped": away, "tipped": self._tilt_from_goal() > limit["tilt"]}
+        self.dropped.copy_(((p - self.home).norm(dim=1) > limit["distance"]) | (p[:, 2] < limit["below"]))
+        self.tipped.copy_(self._tilt_from_goal() > limit["tilt"])
+        self.nan_end.copy_(self.nan)
+        return {"dropped": self.dropped, "tipped": self.tipped}
 
     def _tilt_from_goal(self) -> torch.Tensor:
         """Angle between the palm axis as the goal's and as the present orientation have it in the object's frame."""
@@ -210,7 +212,7 @@ class RotateEnv(HandEnv):
         self.d_pos.copy_((self.object_pose[:, :3] - self.home).norm(dim=1))
         # goal: 1 / (|d_rot| + eps) * 1 / (1 + exp(alpha (d_goal - delta_dist))), table "Reward for in-hand object rotation"
         close = 1 / (self.d_rot.abs() + r["epsilon"]) * torch.sigmoid(-r["alpha"] * (self.d_pos - r["delta_dist"]))
-        lost = self._tilt_from_goal() > self.task["termination"]["tilt"]
+        lost = self.dropped | self.tipped  # `terminated` comes first
         self.reached.copy_((self.d_rot < r["delta_rot"]) & (self.d_pos < r["delta_pos"]) & ~self.nan & ~lost)
         out = {
             "goal": w["goal"] * close,
@@ -222,7 +224,7 @@ class RotateEnv(HandEnv):
             spin = (self._spin() * self.axis).sum(1) * math.copysign(1.0, self.task["goal"]["angle"])
             out["spin"] = w["spin"] * spin.clamp(-r["spin_max"], r["spin_max"])
         if w["lost"]:
-            out["lost"] = w["lost"] * torch.stack(list(self.terminated().values())).any(0).float()
+            out["lost"] = w["lost"] * lost.float()
         if w["velocity"]:
             out["velocity"] = w["velocity"] * self.qd.square().sum(1)
         if w["torque"]:

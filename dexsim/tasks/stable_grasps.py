@@ -79,16 +79,17 @@ class GraspSet:
 # close (ours). The fingers curl around the face away from the wrist, the thumb lies at the side of the index finger.
 OPEN = (0.3, 0.3, 0.2, 0.0, 0.2, 0.3, 0.2, 0.3, 0.2, 0.3, 0.2, 0.3)
 CLOSED = (
-    (0.3, 1.2), (0.7, 1.5), (0.2, 1.4),
-    (-0.15, 0.15), (0.2, 1.0), (1.2, 1.9),
-    (0.2, 1.0), (1.2, 1.9), (0.2, 1.0), (1.2, 1.9), (0.2, 1.0), (1.2, 1.9),
+    (0.2, 1.0), (0.7, 1.5), (0.2, 1.4),
+    (-0.15, 0.15), (0.0, 0.5), (1.6, 1.9),
+    (0.0, 0.5), (1.6, 1.9), (0.0, 0.5), (1.6, 1.9), (0.0, 0.5), (1.6, 1.9),
 )  # fmt: skip
 FINGER_OF = [k for k, f in enumerate(xhand.FINGERS) for _ in xhand.JOINTS_OF_FINGER[f]]  # of each joint
+BASE = [4, 6, 8, 10]  # first flexion joints of the four fingers
 SPREAD = 0.15  # rad, by which the four fingers differ from a common bend
-CENTRE_X, CENTRE_Y = (0.025, 0.075), (-0.012, 0.018)  # m, where the cube is let go
+CENTRE_X, CENTRE_Y = (0.035, 0.06), (-0.012, 0.018)  # m, where the cube is let go
 CLEARANCE = 0.01  # m, of its lowest point over the palm
 LAND, CLOSE, SPEED, LEAD = 0.4, 2.0, 1.5, 0.08  # s, s, rad/s, rad: the fingers close until their tips touch
-TOUCH, PRESS = 0.03, 0.01  # N that stops a finger; rad by which it then presses on
+TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses on
 
 
 def candidates(n: int, sizes: tuple[float, float], rng: torch.Generator) -> GraspSet:
@@ -96,14 +97,17 @@ def candidates(n: int, sizes: tuple[float, float], rng: torch.Generator) -> Gras
     u = torch.rand(n, 12, generator=rng)
     low, high = torch.tensor(CLOSED).unbind(1)
     target = low + (high - low) * u
-    for joints in ([4, 6, 8, 10], [5, 7, 9, 11]):
+    for joints in (BASE, [5, 7, 9, 11]):
         target[:, joints] = target[:, joints[:1]] + SPREAD * (2 * u[:, joints] - 1)
     edge = sizes[0] + (sizes[1] - sizes[0]) * torch.rand(n, generator=rng)
     xy = torch.stack([lo + (hi - lo) * torch.rand(n, generator=rng) for lo, hi in (CENTRE_X, CENTRE_Y)], 1)
     yaw = 2 * torch.pi * torch.rand(n, generator=rng)
     zero = torch.zeros(n)
     quat = torch.stack([(yaw / 2).cos(), zero, zero, (yaw / 2).sin()], 1)
-    return GraspSet(edge, torch.tensor(OPEN).repeat(n, 1), target, torch.cat([xy, (0.025 + CLEARANCE + edge / 2)[:, None], quat], 1))
+    hand = torch.tensor(OPEN).repeat(n, 1)
+    hand[:, BASE] = target[:, BASE]  # the fingers' first links stay: the cube may lie on them
+    pose = torch.cat([xy, (0.025 + CLEARANCE + edge / 2)[:, None], quat], 1)
+    return GraspSet(edge, hand, target, pose)
 
 
 def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:

@@ -1,0 +1,179 @@
+"""Evaluation of the rotation task in the paper's words: consecutive successes of each trial, time per success, time to fall.
+
+A trial begins in a held pose and ends when the cube is dropped or tips over, or at the cap (`task.evaluation.cap_s`);
+nothing else ends it. The paper's table divides: its seconds per success are the mean time to fall over the mean
+successes (84.3 / 25.1 = 3.36 in its first row, and so in every row), and so are ours. A capped trial counts with the
+cap as its time, so the mean time to fall is a restricted mean. Intervals: bootstrap over trials, 95 %.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
+HEADER = ("Contact center", "Contact force", "Force weighted", "Orientation", "Cons. success trials (sorted)", "Average", "Median",
+          "Succ. time (Ave.) s", "Time to fall (Ave.) s")
+"""Columns of the paper's rotation table."""
+ENDS = ("dropped", "tipped", "nan", "capped")
+
+
+@torch.inference_mode()
+def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
+    """Play `episodes` trials, `env.num_envs` at a time.
+
+    policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
+    """
+    env.rng.manual_seed(seed)
+    torch.manual_seed(seed)
+    cap = float(env.task["evaluation"]["cap_s"])
+    training_length, env.max_episode_length = env.max_episode_length, int(round(cap / env.dt)) + 2
+    parts, done = [], 0
+    try:
+        while done < episodes:
+            parts.append(_play(env, policy, cap, not parts, progress, done, episodes))
+            done += env.num_envs
+    finally:
+        env.max_episode_length = training_length
+    frames = parts[0].pop("frames")
+    r = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
+    metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, env.task["evaluation"]["resamples"], seed)
+    last = r["last"][r["successes"] > 0].sum()
+    metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
+    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in ENDS}
+
+    def successes(ax):
+        _successes_plot(ax, r["successes"])
+
+    def survival(ax):
+        _survival_plot(ax, r["time"], cap)
+
+    return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": [successes, survival]}
+
+
+def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: float, resamples: int, seed: int) -> dict:
+    """Metrics of E trials: successes [E], time [E] s until the fall or the cap, capped [E] bool."""
+    successes, time = np.asarray(successes), np.asarray(time, float)
+    rng = np.random.default_rng(seed)
+    pick = rng.integers(len(successes), size=(max(int(resamples), 1), len(successes)))
+    s, t = successes[pick], time[pick]
+    with np.errstate(divide="ignore"):
+        per = t.sum(1) / s.sum(1)  # infinite where a resample has no success
+    total = successes.sum()
+    return {
+        "episodes": len(successes),
+        "consecutive_successes": {
+            "average": float(successes.mean()), "median": float(np.median(successes)), "all": sorted(int(x) for x in successes),
+            "average_interval": _interval(s.mean(1)), "median_interval": _interval(np.median(s, axis=1)),
+        },
+        "seconds_per_success": float(time.sum() / total) if total else None,
+        "seconds_per_success_interval": _interval(per),
+        "seconds_to_fall": float(time.mean()), "seconds_to_fall_interval": _interval(t.mean(1)),
+        "capped": int(np.asarray(capped).sum()), "cap_s": cap,
+    }  # fmt: skip
+
+
+def _interval(x: np.ndarray) -> list[float | None]:
+    """2.5 and 97.5 percentiles; None where infinite."""
+    low, high = np.percentile(x, [2.5, 97.5], method="nearest")
+    return [float(v) if np.isfinite(v) else None for v in (low, high)]
+
+
+def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episodes: int) -> dict:
+    """One trial in every world."""
+    n, dev, dt = env.num_envs, env.device, env.dt
+    steps = int(round(cap / dt))
+    env.reset_all()
+    obs = env.get_observations()
+    alive = torch.ones(n, dtype=torch.bool, device=dev)
+    count, last_step = torch.zeros(n, dtype=torch.long, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
+    end_step = torch.full((n,), steps, dtype=torch.long, device=dev)
+    how = torch.full((n,), len(ENDS) - 1, dtype=torch.long, device=dev)
+    shown = list(range(min(SHOWN, n))) if keep_frames else []
+    models = [env.drawn_model(w) for w in shown]
+    edge, mass = (2000 * env.objects.size[:, 0]).cpu().numpy(), (1000 * env.objects.mass).cpu().numpy()
+    qpos, force, score = [], [], []
+    for k in range(steps):
+        obs, _, dones, _ = env.step(policy(obs))
+        hit = env.reached & alive
+        count += hit
+        last_step = torch.where(hit, k + 1, last_step)
+        ended = dones.bool() & alive
+        end_step = torch.where(ended, k + 1, end_step)
+        kind = torch.where(env.nan_end, 2, torch.where(env.dropped, 0, 1))
+        how = torch.where(ended, kind, how)
+        alive = alive & ~ended
+        if shown and k * dt < SHOWN_S:
+            qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
+            force.append(env.touch.force_clean[shown].cpu().numpy())
+            score.append(count[shown].cpu().numpy())
+        if k % 40 == 39:
+            if progress is not None:
+                progress(done + min(n, episodes - done) * (k + 1) // steps, episodes, f"{(k + 1) * dt:.0f} s, {int(alive.sum())} still turning")
+            if not bool(alive.any()):
+                break
+    out = {
+        "successes": count.cpu().numpy(), "time": end_step.cpu().numpy() * dt, "last": last_step.cpu().numpy() * dt,
+        "end": np.array(ENDS)[how.cpu().numpy()], "frames": None,
+    }  # fmt: skip
+    if shown:
+        stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in shown]  # the end's own frame is the next trial's
+        out["frames"] = {
+            "model": models, "dt": dt, "names": ("thumb", "index", "mid", "ring", "pinky"), "full": 5.0,
+            "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
+            "label": [f"{edge[w]:.0f} mm, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s" for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
+            "overlay": [{"force": np.stack([f[i] for f in force[:s]])} for i, s in enumerate(stop)],
+            "camera": {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0},
+        }  # fmt: skip
+    return out
+
+
+def row_of(env) -> tuple[str, ...]:
+    """The four settings of a row of the paper's table."""
+    o = env.task["observe"]
+    none = env.task["perception"] == "proprioception"
+    return (*("yes" if o[k] else "-" for k in ("contact_centre", "contact_force")),
+            "yes" if o["contact_centre"] and o["force_weighted"] else "-",
+            {"6d": "6D", "quaternion": "Quaternion", "none": "-"}["none" if none else o["orientation"]])
+
+
+def _tables(env, m: dict, r: dict) -> list:
+    c = m["consecutive_successes"]
+    spread = c["all"] if len(c["all"]) <= 12 else np.percentile(c["all"], np.linspace(5, 95, 10), method="nearest").tolist()
+    seconds = "-" if m["seconds_per_success"] is None else f"{m['seconds_per_success']:.2f}"
+    listed = ",".join(str(int(x)) for x in spread) + ("" if len(c["all"]) <= 12 else " (5, 15 .. 95 %)")
+    line = (*row_of(env), listed, f"{c['average']:.1f}", f"{c['median']:.1f}", seconds, f"{m['seconds_to_fall']:.1f}")
+    intervals = [
+        ("average", f"{c['average']:.2f}", _range(c["average_interval"])), ("median", f"{c['median']:.1f}", _range(c["median_interval"])),
+        ("seconds per success", seconds, _range(m["seconds_per_success_interval"])),
+        ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
+    ]  # fmt: skip
+    ends = [(name, count, f"{100 * count / m['episodes']:.1f}") for name, count in m["ends"].items()]
+    return [
+        ("In-hand rotation (the paper's columns)", HEADER, [line]),
+        ("95 % intervals (bootstrap over trials)", ("quantity", "value", "interval"), intervals),
+        (f"How {m['episodes']} trials ended (cap {m['cap_s']:g} s)", ("end", "trials", "%"), ends),
+    ]
+
+
+def _range(pair: list) -> str:
+    return " .. ".join("inf" if v is None else f"{v:.2f}" for v in pair)
+
+
+def _successes_plot(ax, successes: np.ndarray) -> None:
+    ax.plot(np.linspace(0, 100, len(successes)), np.sort(successes), drawstyle="steps-mid")
+    ax.axhline(successes.mean(), linestyle="--", linewidth=1, color="0.4", label=f"average {successes.mean():.1f}")
+    ax.set_xlabel("trials, sorted [%]")
+    ax.set_ylabel("consecutive successes")
+    ax.set_title("Successes of each trial")
+    ax.legend()
+
+
+def _survival_plot(ax, time: np.ndarray, cap: float) -> None:
+    t = np.sort(time)
+    fallen = t < cap
+    ax.step(np.concatenate([[0], t[fallen], [cap]]), np.concatenate([[100], 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t)), [100 * (~fallen).mean()]]), where="post")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("trials still turning [%]")
+    ax.set_ylim(0, 102)
+    ax.set_title("Time to fall")
