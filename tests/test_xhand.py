@@ -203,14 +203,16 @@ def test_only_capsules_and_one_small_hull_per_tip_collide(model):
             assert model.geom_priority[g] == 1 and model.geom_condim[g] == 4
         else:
             assert model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE
-            assert model.geom(g).name.startswith("col_")
-        assert model.geom_contype[g] & xhand.HAND_BIT and model.geom_conaffinity[g] & xhand.OBJECT_BIT
+            assert model.geom(g).name.startswith(("col_", "self_"))
+        proxy = model.geom(g).name.startswith("self_")  # meets the hand, not the object
+        assert bool(model.geom_contype[g] & xhand.HAND_BIT) != proxy
+        assert bool(model.geom_conaffinity[g] & xhand.OBJECT_BIT) != proxy
     bodies = [model.body(model.geom_bodyid[model.geom(name).id]).name for name in xhand.TIP_GEOMS]
     assert bodies == list(xhand.TIP_BODIES)
 
 
 def test_self_collision_pairs_are_the_meant_ones(model):
-    """36 pairs: tip on tip 10, thumb tip on finger links 8 and palm 6, thumb links on finger tips 12."""
+    """54 pairs: finger tips 6, thumb tip (2 proxies) on finger tips 8, on finger links 16 and palm 12, thumb links on tips 12."""
     colliding = [g for g in range(model.ngeom) if model.geom_contype[g]]
     count = 0
     for i, a in enumerate(colliding):
@@ -221,8 +223,8 @@ def test_self_collision_pairs_are_the_meant_ones(model):
             if model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]:
                 count += 1
                 names = {model.geom(a).name, model.geom(b).name}
-                assert any(name.startswith("tip_") for name in names), names
-    assert count == 36
+                assert any(name.startswith("self_") for name in names), names
+    assert count == 54
 
 
 def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
@@ -233,7 +235,7 @@ def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
                   conaffinity=xhand.HAND_BIT)  # fmt: skip
     with_ball = spec.compile()
     data = mujoco.MjData(with_ball)
-    targets = [g for g in range(with_ball.ngeom) if with_ball.geom_contype[g] and with_ball.geom_bodyid[g] < 14]
+    targets = [g for g in range(with_ball.ngeom) if with_ball.geom_contype[g] & xhand.HAND_BIT and with_ball.geom_bodyid[g] < 14]
     for g in targets:
         data.qpos[:] = 0
         mujoco.mj_forward(with_ball, data)

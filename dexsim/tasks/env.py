@@ -36,10 +36,10 @@ PAIRS = (
     *(ContactPair(f"tip_{f}", ("geom", f"tip_{f}"), ("body", OBJECT)) for f in xhand.FINGERS),
     *(ContactPair(f"finger_{f}", ("subtree", root), ("body", OBJECT)) for f, root in zip(xhand.FINGERS, FINGER_ROOTS, strict=True)),
     ContactPair("palm", ("body", "right_hand_link"), ("body", OBJECT)),
-    *(ContactPair(f"self_{f}", ("geom", f"tip_{f}"), ("subtree", "right_hand_link")) for f in xhand.FINGERS),
+    *(ContactPair(f"self_{f}", ("body", b), ("subtree", "right_hand_link")) for f, b in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)),
 )
 """Contact pairs of the hand scenes: fingertip on object (0-4), whole finger on object (5-9), palm on object (10),
-fingertip on the hand itself (11-15)."""
+distal link on the hand itself (11-15)."""
 
 
 class HandEnv(VecEnv):

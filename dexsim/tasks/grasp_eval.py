@@ -83,6 +83,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
     place = torch.zeros(n, 3, device=dev)
+    moved, untouched = torch.zeros_like(alive), torch.zeros_like(alive)  # what went wrong within the hold
     force, torque, samples = torch.zeros(n, 5, device=dev), torch.zeros(n, 12, device=dev), torch.zeros(n, device=dev)
     shown = list(range(min(4, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
@@ -105,6 +106,8 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
             good = alive & touched & near
             if t <= SETTLE + HOLD:
                 held &= good
+                moved |= alive & ~near
+                untouched |= alive & ~touched
                 calm = (~pushing).float()
                 force += env.tip_force * calm[:, None]
                 torque += env.torque * calm[:, None]
@@ -126,7 +129,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     samples = samples.clamp(min=1)
     out = {
         "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held, "held90": held90,
-        "held180": held180, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive,
+        "held180": held180, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive, "moved": moved, "untouched": untouched,
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
     out["frames"] = None
@@ -184,6 +187,8 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         "hold_rate_turned_90": _rate(r["held90"], able), "hold_rate_turned_180": _rate(r["held180"], able),
         "force_command_correlation": _corr(r["command"][held], total[held]),
         "force_max_N": float(f_max),
+        # why episodes were not held: they overlap; dropped includes the turned part
+        "share_moved": float(r["moved"].mean()), "share_untouched": float(r["untouched"].mean()), "share_dropped": float(1 - r["alive"].mean()),
     }  # fmt: skip
     for i, name in enumerate(("thumb", *FINGERS)):
         out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])

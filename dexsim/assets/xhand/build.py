@@ -229,21 +229,26 @@ def _sites(body: str) -> list[str]:
     return [f'<site class="xhand_site" name="tip_{finger}" pos="{offset}"/>']
 
 
-def _bits(body: str, tip: bool) -> tuple[int, int]:
+def _bits(body: str) -> tuple[int, int]:
+    """Filter bits of a link's capsules: all meet the object; some meet the fingertips' proxies."""
     contype, conaffinity = xhand.HAND_BIT, xhand.OBJECT_BIT
-    if tip and "thumb" in body:
-        contype, conaffinity = contype | TIP_BIT | THUMB_TIP_BIT, conaffinity | TIP_BIT | THUMB_TIP_BIT
-    elif tip:
-        contype, conaffinity = contype | TIP_BIT, conaffinity | TIP_BIT | THUMB_LINK_BIT
-    elif "thumb_rota" in body:
+    if "thumb_rota" in body:
         contype |= THUMB_LINK_BIT
     elif body == xhand.ROOT_BODY or body.endswith(("link1", "link2")):
         contype |= THUMB_TIP_BIT
     return contype, conaffinity
 
 
+# Fingertips meet the hand itself through capsules inside them (within 2 mm of the skin): convex meshes against each other
+# cost more than everything else in a closed grasp. They meet the object through the mesh alone.
+PROXIES = {
+    "thumb": [((x, 0.017, 0.0015), (x, 0.0415, -0.001), 0.0085) for x in (-0.006, 0.006)],
+    "finger": [((0.002, 0, 0.013), (0.0005, 0, 0.0335), 0.008)],
+}
+
+
 def _collision(body: str) -> list[str]:
-    contype, conaffinity = _bits(body, tip=False)
+    contype, conaffinity = _bits(body)
     bits = f'contype="{contype}" conaffinity="{conaffinity}"'
     out = [
         f'<geom class="xhand_collision" name="col_{body.removeprefix("right_hand_")}_{k}" type="capsule"'
@@ -252,11 +257,16 @@ def _collision(body: str) -> list[str]:
     ]
     if body in xhand.TIP_BODIES:
         finger = xhand.FINGERS[xhand.TIP_BODIES.index(body)]
-        contype, conaffinity = _bits(body, tip=True)
         out.append(
             f'<geom class="xhand_tip" name="tip_{finger}" mesh="tip_{xhand.pad_of(finger)}"'
-            f' contype="{contype}" conaffinity="{conaffinity}"/>'
+            f' contype="{xhand.HAND_BIT}" conaffinity="{xhand.OBJECT_BIT}"/>'
         )
+        own, meets = (TIP_BIT | THUMB_TIP_BIT,) * 2 if finger == "thumb" else (TIP_BIT, TIP_BIT | THUMB_LINK_BIT)
+        out += [
+            f'<geom class="xhand_collision" name="self_{finger}_{k}" type="capsule" fromto="{_num([*a, *b])}"'
+            f' size="{radius:.9g}" contype="{own}" conaffinity="{meets}"/>'
+            for k, (a, b, radius) in enumerate(PROXIES[xhand.pad_of(finger)])
+        ]
     return out
 
 
