@@ -1,13 +1,14 @@
-"""Time of the touch kernel: `python -m benchmarks.touch`.
+"""Time of the touch kernel: `python -m benchmarks.touch [device=cuda:0] [worlds=4096,16384] [variants=true]`.
 
-The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, other fingers felt too; the launches
-are captured in a graph and replayed, as in training. Prints a table, then one JSON line.
+The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, configs/tactile/default.yaml; the
+launches are captured in a graph and replayed, as in training. Prints a table of microseconds, then one JSON line.
+variants=true times the kernel's launch choices (threads a block, registers a thread) instead.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import sys
 from pathlib import Path
 
 import mujoco
@@ -18,7 +19,8 @@ import yaml
 
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
-from dexsim.tactile import ShapeSet, Tactile, tip_points, xhand_layout
+from dexsim.errors import UserError
+from dexsim.tactile import ShapeSet, Tactile, xhand_layout
 from dexsim.tactile.posed import PosedEngine
 
 SHAPES = {
@@ -26,8 +28,34 @@ SHAPES = {
     "sphere": ("sphere", (0.03, 0.0, 0.0)),
     "grid": ("rock", (1.0, 0.0, 0.0)),
 }
-TARGET_MS = {4096: 0.1, 16384: 0.4}  # one H200, raw taxels written
+TARGET_US = {4096: 100.0, 16384: 400.0}  # one H200, raw taxels written
 UNIQUE = 64
+VARIANTS = [(128, 0), (32, 0), (64, 0), (256, 0), (128, 80), (128, 64), (128, 48), (256, 64)]
+
+
+class Scene:
+    """Worlds whose hands hold one shape; the solver has a contact wherever the springs would."""
+
+    def __init__(self, worlds: int, shape: str, cfg: dict, device: str, shapes: ShapeSet, poses: tuple):
+        self.layout, self.shapes = xhand_layout(), shapes
+        self.tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
+        name, size = SHAPES[shape]
+        self.shape, self.size = shapes.index(name), torch.tensor(size)
+        self.engine = PosedEngine(worlds, [*self.layout.bodies, "object"], self.layout.names, device)
+        pick = torch.arange(worlds) % UNIQUE
+        self.engine.t.xpos[:] = torch.as_tensor(poses[0], dtype=torch.float32)[pick].to(device)
+        self.engine.t.xmat[:] = torch.as_tensor(poses[1], dtype=torch.float32)[pick].to(device)
+        spring = self.touch({**cfg, "sum": "spring", "raw": True})
+        spring.launch()
+        self.engine.t.pair_normal[:] = spring.force_clean
+        self.lit = float((spring.raw_clean > 0).float().mean())
+
+    def touch(self, cfg: dict, **kw: object) -> Tactile:
+        touch = Tactile(
+            self.engine, self.layout, self.shapes, "object", cfg, pairs=self.layout.names, tips=self.tips, **kw
+        )
+        touch.shape_id[:], touch.shape_size[:] = self.shape, self.size
+        return touch
 
 
 def grasp_poses(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -48,27 +76,6 @@ def grasp_poses(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return pos, rot
 
 
-def build(worlds: int, shape: str, cfg: dict, device: str) -> Tactile:
-    layout = xhand_layout()
-    tips = tip_points(mujoco.MjModel.from_xml_path(str(xhand.xml_path())), xhand.TIP_GEOMS)
-    name, size = SHAPES[shape]
-    shapes = ShapeSet(list(library().values()), device)
-    engine = PosedEngine(worlds, [*layout.bodies, "object"], layout.names, device)
-    pos, rot = grasp_poses(np.random.default_rng(0))
-    pick = torch.arange(worlds) % UNIQUE
-    engine.t.xpos[:] = torch.as_tensor(pos, dtype=torch.float32)[pick].to(device)
-    engine.t.xmat[:] = torch.as_tensor(rot, dtype=torch.float32)[pick].to(device)
-    touch = Tactile(engine, layout, shapes, "object", cfg, pairs=layout.names, tips=tips)
-    touch.shape_id[:] = shapes.index(name)
-    touch.shape_size[:] = torch.tensor(size)
-    # the solver has a contact wherever the springs would
-    spring = Tactile(engine, layout, shapes, "object", {**cfg, "sum": "spring"}, tips=tips)
-    spring.shape_id[:], spring.shape_size[:] = touch.shape_id, touch.shape_size
-    spring.launch()
-    engine.t.pair_normal[:] = spring.force_clean
-    return touch
-
-
 def time_us(touch: Tactile, repeats: int) -> float:
     """Median time of one launch sequence [us], replayed from a graph."""
     device = touch.device
@@ -86,41 +93,82 @@ def time_us(touch: Tactile, repeats: int) -> float:
     return float(np.median(times))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--worlds", type=int, nargs="+")
-    parser.add_argument("--sums", nargs="+", default=["solver", "spring"])
-    args = parser.parse_args()
+def cases(default: dict, full: dict, variants: bool) -> dict[str, tuple[str, dict, dict]]:
+    """Rows: name -> shape, settings, choices of the launch."""
+    rows = {}
+    if variants:
+        for shape, mode in (("grid", "solver"), ("box", "solver"), ("grid", "spring")):
+            for block, registers in VARIANTS:
+                name = f"{shape} {mode} raw, block {block}, registers {registers or 'free'}"
+                rows[name] = shape, {**default, "sum": mode, "raw": True}, {"block_dim": block, "registers": registers}
+        return rows
+    for shape in SHAPES:
+        for mode in ("solver", "spring"):
+            rows[f"{shape} {mode}"] = shape, {**default, "sum": mode}, {}
+            rows[f"{shape} {mode} raw"] = shape, {**default, "sum": mode, "raw": True}, {}
+    for mode in ("solver", "spring"):
+        rows[f"grid {mode} raw others=false"] = "grid", {**default, "sum": mode, "raw": True, "others": False}, {}
+    rows["grid solver raw imperfect"] = "grid", {**full, "raw": True}, {}
+    return rows
+
+
+def arguments(argv: list[str]) -> dict[str, str]:
+    out = {"device": "cuda:0" if torch.cuda.is_available() else "cpu", "worlds": "", "variants": "false"}
+    for a in argv:
+        key, _, value = a.partition("=")
+        if key not in out or not value:
+            raise UserError(f"benchmarks.touch: '{a}' is not one of {', '.join(k + '=' for k in out)}")
+        out[key] = value
+    return out
+
+
+def main(argv: list[str]) -> dict:
+    args = arguments(argv)
     wp.config.log_level = wp.LOG_WARNING
-    cpu = args.device == "cpu"
-    worlds = args.worlds or ([16, 128] if cpu else [1024, 4096, 8192, 16384])
+    device = args["device"]
+    cpu, variants = device == "cpu", args["variants"] == "true"
+    if cpu and variants:
+        raise UserError("benchmarks.touch: variants=true needs a CUDA device; the CPU has one kernel")
+    worlds = args["worlds"] or ("16,128" if cpu else "4096,16384" if variants else "1024,4096,8192,16384")
+    worlds = [int(n) for n in worlds.split(",")]
     folder = Path(__file__).parents[1] / "configs" / "tactile"
     default = yaml.safe_load((folder / "default.yaml").read_text())
     full = {**default, **yaml.safe_load((folder / "full.yaml").read_text())}
     del full["defaults"]
-    rows = []
-    print(" worlds   shape     sum   raw imperfect        us   taxels/s  bytes out   lit")
+    rows = cases(default, full, variants)
+    shapes, poses = ShapeSet(list(library().values()), device), grasp_poses(np.random.default_rng(0))
+    us: dict[str, list[float]] = {name: [] for name in rows}
+    lit = {}
     for n in worlds:
-        cases = [(s, m, raw, False) for s in SHAPES for m in args.sums for raw in (False, True)]
-        for shape, mode, raw, imperfect in [*cases, ("grid", args.sums[0], True, True)]:
-            touch = build(n, shape, {**(full if imperfect else default), "sum": mode, "raw": raw}, args.device)
-            us = time_us(touch, 3 if cpu else 50)
-            taxels = int(touch.layout.count.sum())
-            lit = float((touch.raw_clean > 0).float().mean()) if touch.raw_clean is not None else None
-            size = n * touch.layout.pads * (4 + 12 + 4) + (4 * n * taxels if raw else 0)
-            rate = n * taxels / us * 1e6
-            rows.append({"worlds": n, "shape": shape, "sum": mode, "raw": raw, "imperfect": imperfect,
-                         "us": round(us, 2), "taxels_per_s": round(rate), "bytes_out": size, "lit": lit})  # fmt: skip
-            print(f"{n:7d} {shape:>7} {mode:>7} {raw!s:>5} {imperfect!s:>9} {us:9.1f} {rate:10.3g} {size:10d}"
-                  f" {'' if lit is None else f'{lit:5.2f}'}", flush=True)  # fmt: skip
-    judged = [r for r in rows if r["raw"] and not r["imperfect"]]
-    worst = {n: max(r["us"] for r in judged if r["worlds"] == n) / 1e3 for n in worlds}
-    ratio = {n: round(worst[n] / TARGET_MS[n], 3) for n in worlds if n in TARGET_MS}
-    name = torch.cuda.get_device_name(args.device) if not cpu else "cpu"
-    out = {"benchmark": "touch", "device": name, "rows": rows, "worst_ms_raw": worst, "ratio_to_target": ratio}
+        for shape in SHAPES:
+            mine = {name: row for name, row in rows.items() if row[0] == shape}
+            if not mine:
+                continue
+            scene = Scene(n, shape, default, device, shapes, poses)
+            lit[shape] = round(scene.lit, 2)
+            for name, (_, cfg, choices) in mine.items():
+                us[name].append(round(time_us(scene.touch(cfg, **choices), 3 if cpu else 50), 1))
+    print(f"{'touch [us], worlds:':48s}" + "".join(f"{n:>9d}" for n in worlds))
+    for name, times in us.items():
+        print(f"{name:48s}" + "".join(f"{t:9.1f}" for t in times))
+    judged = [t for name, t in us.items() if "raw" in name and "imperfect" not in name]
+    if variants:
+        best = min((name for name in us if name.startswith("grid solver")), key=lambda name: us[name][-1])
+        out = {"best": best, "us": us[best]}
+    else:
+        worst = {n: max(t[i] for t in judged) for i, n in enumerate(worlds)}
+        out = {"lit": lit, "worst_us_raw": worst,
+               "taxels_per_s": {n: round(600 * n / t * 1e6) for n, t in worst.items()},
+               "ratio_to_target": {n: round(t / TARGET_US[n], 3) for n, t in worst.items() if n in TARGET_US}}  # fmt: skip
+    name = "cpu" if cpu else torch.cuda.get_device_name(device)
+    out = {"benchmark": "touch", "device": name, "worlds": worlds, **out}
     print(json.dumps(out))
+    return out
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main(sys.argv[1:])
+    except UserError as e:
+        print(e, file=sys.stderr)
+        sys.exit(2)

@@ -15,8 +15,9 @@ import warp as wp
 from dexsim.assets import xhand
 from dexsim.assets.objects import Grid, library
 from dexsim.errors import UserError
-from dexsim.tactile import ShapeSet, TaxelLayout, load_layout, tip_points, xhand_layout
+from dexsim.tactile import ShapeSet, TaxelLayout, load_layout, xhand_layout
 from dexsim.tactile import reference as ref
+from dexsim.tactile.lanes import lane_ballot, lane_from, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.pressing import presses, skin_of
 from dexsim.tactile.sdf import Shapes, distance, normal
 from dexsim.tactile.shapes import TouchShape, bake_convex
@@ -32,7 +33,7 @@ def hand() -> TaxelLayout:
 
 @cache
 def tips() -> list[np.ndarray]:
-    return tip_points(mujoco.MjModel.from_xml_path(str(xhand.xml_path())), xhand.TIP_GEOMS)
+    return [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
 
 
 @cache
@@ -133,14 +134,14 @@ def test_solver_sum_is_the_solvers_force_spread_as_in_the_reference_and_never_lo
 
 
 @pytest.mark.parametrize("mode", ["spring", "solver"])
-def test_block_kernel_equals_the_serial_one(mode, monkeypatch):
+def test_a_warp_a_pad_equals_the_serial_kernel(mode, monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     poses = contact_poses(6, 3)
     stiffness = {"hertz": 5e6}
     out = []
-    for block in (False, True):
+    for lanes in (False, True):
         cfg = {"sum": mode, "raw": True, "stiffness": stiffness}
-        engine, tactile = touch(6, hand(), shapes(), cfg, tips=tips(), block=block)
+        engine, tactile = touch(6, hand(), shapes(), cfg, tips=tips(), lanes=lanes)
         set_poses(engine, tactile, poses)
         # two fingers into each other
         index, mid = hand().bodies[1], hand().bodies[2]
@@ -153,6 +154,88 @@ def test_block_kernel_equals_the_serial_one(mode, monkeypatch):
         # poses are composed in another order: 1e-7 m of rounding in the depth, under a root
         np.testing.assert_allclose(a, b, rtol=3e-4, atol=3e-5)
     assert out[0][2][0, 1] > 0.0 and out[0][2][0, 2] > 0.0
+
+
+def test_a_warp_a_pad_takes_ragged_pads_several_objects_and_other_fingers(monkeypatch):
+    """Pads of 70, 1 and 33 taxels (whole and broken rounds of 32 lanes), two objects, other tips in the readings."""
+    from dexsim.tactile import Tactile
+    from dexsim.tactile.posed import PosedEngine
+
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    rng = np.random.default_rng(6)
+    corners = np.array(np.meshgrid([-5e-3, 5e-3], [-5e-3, 5e-3], [-6e-3, 0.0])).reshape(3, -1).T
+    pads = []
+    for name, n in (("a", 70), ("b", 1), ("c", 33)):
+        p = np.c_[rng.uniform(-4e-3, 4e-3, (n, 2)), np.zeros(n)]
+        area = rng.uniform(1e-6, 3e-6, n)
+        pads.append({"name": name, "body": name, "point": p, "normal": np.tile([0, 0, 1.0], (n, 1)), "area": area})
+    layout = TaxelLayout.build(pads)
+    engine = PosedEngine(3, ["x", "a", "b", "c", "one", "two"], [f"{p}{o}" for p in "abc" for o in "12"])
+    flip = np.diag([1.0, -1.0, -1.0])
+    for w in range(3):
+        engine.place(w, "a", [0, 0, 0], np.eye(3))
+        engine.place(w, "b", [0.03, 0, 0], random_rotation(rng))
+        engine.place(w, "c", [1e-3, 5e-4, -4e-4 * (w - 1)], flip)  # apart, touching, pressed
+        engine.place(w, "one", [1e-3, 0, 0.02 - 6e-4], random_rotation(rng))
+        engine.place(w, "two", [0.03 - 2e-3, 1e-3, 0.02 - 6e-4], random_rotation(rng))
+    engine.t.pair_normal[:] = torch.as_tensor(rng.uniform(0, 5, (3, 6)), dtype=torch.float32)
+    for cfg in (
+        {"sum": "spring", "law": "mooney_rivlin", "threshold": 1e-3, "stiffness": {"mooney_rivlin": 1.0}},
+        {"sum": "solver", "stiffness": {"hertz": 5e6}},
+    ):
+        out = []
+        for lanes in (False, True):
+            tactile = Tactile(
+                engine, layout, ShapeSet(primitives()), ["one", "two"], {**cfg, "raw": True, "feel_others": True},
+                pairs=[["a1", "a2"], ["b1", "b2"], ["c1", "c2"]], tips=[corners] * 3, lanes=lanes,
+            )  # fmt: skip
+            tactile.shape_id[:] = torch.tensor([[1, 0], [2, 1], [3, -1]])
+            tactile.shape_size[:] = 0.02
+            for x in (tactile.force_clean, tactile.force_other, tactile.raw_clean):
+                x.fill_(7.0)
+            tactile.launch()
+            x = (tactile.force_clean, tactile.centre_clean, tactile.force_other, tactile.raw_clean)
+            out.append([y.clone().numpy() for y in x])
+        for a, b in zip(*out, strict=True):
+            np.testing.assert_allclose(a, b, rtol=3e-4, atol=3e-6)
+        force, _, other, raw = out[1]
+        assert force[:, 0].min() > 0.1 and other[2, 0] > 0.1 and other[0, 0] == 0.0
+        np.testing.assert_allclose(raw.sum(-1), force + other, rtol=1e-4, atol=1e-6)
+        assert (raw[:, 1, 1:] == 0.0).all() and (raw[:, 2, 33:] == 0.0).all()
+
+
+@wp.kernel(enable_backward=False)
+def _exchanges(
+    v: wp.array(dtype=wp.vec4), low: wp.array(dtype=float), total: wp.array(dtype=float), sums: wp.array(dtype=wp.vec4),
+    seventh: wp.array(dtype=float), bits: wp.array(dtype=int), first: wp.array(dtype=int),
+):  # fmt: skip
+    i = wp.tid()
+    lane = i & 31
+    x = v[i]
+    low[i] = lanes_min(x[0])
+    total[i] = lanes_sum(x[1])
+    sums[i] = lanes_sum4(x, lane)
+    seventh[i] = lane_from(x[2], 7)
+    said = lane_ballot(x[3] > 0.5)
+    bits[i] = said
+    first[i] = lowest_bit(said)
+
+
+def test_lanes_exchange_within_their_warp(monkeypatch):
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    n = 128  # two blocks of two warps
+    v = np.random.default_rng(3).uniform(-1, 1, (n, 4)).astype(np.float32)
+    out = [wp.zeros(n, dtype=t, device="cpu") for t in (float, float, wp.vec4, float, int, int)]
+    wp.launch(_exchanges, dim=n, inputs=[wp.array(v, dtype=wp.vec4, device="cpu"), *out], block_dim=64, device="cpu")
+    low, total, sums, seventh, bits, first = (x.numpy().reshape(4, 32, -1) for x in out)
+    warps = v.reshape(4, 32, 4)
+    assert np.array_equal(low[..., 0], np.repeat(warps[..., 0].min(1), 32).reshape(4, 32))
+    np.testing.assert_allclose(total[..., 0], np.repeat(warps[..., 1].sum(1), 32).reshape(4, 32), atol=1e-5)
+    np.testing.assert_allclose(sums, np.repeat(warps.sum(1), 32, axis=0).reshape(4, 32, 4), atol=1e-5)
+    assert np.array_equal(seventh[..., 0], np.repeat(warps[:, 7, 2], 32).reshape(4, 32))
+    said = (warps[..., 3] > 0.5).astype(np.int64) @ (1 << np.arange(32, dtype=np.int64))
+    assert np.array_equal(bits[..., 0].astype(np.int64) & 0xFFFFFFFF, np.repeat(said, 32).reshape(4, 32))
+    assert np.array_equal(first[..., 0], np.repeat(np.argmax(warps[..., 3] > 0.5, axis=1), 32).reshape(4, 32))
 
 
 @pytest.mark.parametrize("mode", ["spring", "solver"])
@@ -485,12 +568,17 @@ def test_the_surface_may_be_given_by_samples():
 
 @pytest.mark.parametrize("solver", [True, False])
 def test_kernels_compile_for_cuda_without_a_gpu(solver, tmp_path):
+    """And exchange by shuffles of the whole warp, without a barrier, without local memory."""
     from dexsim.tactile.kernel import touch_kernel
 
     kernel = touch_kernel(True, solver, True, True)
     kernel.module.options["block_dim"] = 128
     out = wp.compile_aot_module(kernel.module, arch=90, use_ptx=True, module_dir=str(tmp_path))
-    assert out and out[0].stat().st_size > 1000
+    ptx = out[0].read_text()
+    # nearest 5 (solver), four sums at once 6 + 4, other fingers 5; which lanes: the tests above
+    assert ptx.count("shfl.sync.bfly.b32") == (16 if solver else 11) and ptx.count("shfl.sync.idx.b32") == 4
+    assert "vote.sync.ballot.b32" in ptx and "ld.global.nc.v4" in ptx
+    assert "bar.sync" not in ptx and ".local" not in ptx
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "raw", "full"])
@@ -508,7 +596,7 @@ def test_shipped_settings_are_valid_for_the_hand(name):
 
 def test_variants_of_a_shape_share_their_samples():
     rock = library()["rock"]
-    assert ShapeSet([rock, rock, library()["box"], rock]).samples == rock.grid.data.size
+    assert ShapeSet([rock, rock, library()["box"], rock]).cells == np.prod(np.array(rock.grid.data.shape) - 1)
 
 
 def test_bad_settings_are_one_clear_line(tmp_path):

@@ -233,13 +233,13 @@ def test_measured_force_may_include_other_fingers():
         np.testing.assert_allclose(tactile.force[0].numpy(), want if feel else 0.0, rtol=0.02)
 
 
-def test_block_and_serial_report_the_same_and_replay_from_a_graph(monkeypatch):
+def test_lanes_and_serial_report_the_same_and_replay_from_a_graph(monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     cfg = {"noise": 0.02, "gain_spread": 0.1, "lsb": 0.01, "threshold": 0.01}
     cfg |= {"hysteresis": 0.2, "shear": True, "delay": 0.01}
     out = []
-    for block in (False, True):
-        engine, tactile, press = pressed_box(4, cfg, block=block)
+    for lanes in (False, True):
+        engine, tactile, press = pressed_box(4, cfg, lanes=lanes)
         press(1e-3)
         with wp.ScopedCapture(device="cpu") as capture:
             tactile.launch()

@@ -17,7 +17,7 @@ import numpy as np
 from dexsim.tactile import reference as ref
 from dexsim.tactile.config import TactileConfig
 from dexsim.tactile.kernel import LAWS
-from dexsim.tactile.layout import TaxelLayout, tip_points, xhand_layout
+from dexsim.tactile.layout import TaxelLayout, xhand_layout
 from dexsim.tactile.pressing import Press, presses, skin_of
 
 CONTACT_STIFFNESS = 7000.0  # N/m
@@ -60,15 +60,13 @@ def calibrate_stiffness(
 
 
 def main() -> None:
-    import mujoco
-
     from dexsim.assets import xhand
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=30, help="presses of each shape")
     parser.add_argument("--contact", type=float, default=CONTACT_STIFFNESS, help="K of the physics, N/m")
     args = parser.parse_args()
-    tips = tip_points(mujoco.MjModel.from_xml_path(str(xhand.xml_path())), xhand.TIP_GEOMS)
+    tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
     layout = xhand_layout().lifted(tips)
     report: dict = {"contact": args.contact}
     for kind in dict.fromkeys(layout.kinds):

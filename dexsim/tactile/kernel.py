@@ -1,18 +1,40 @@
 """The touch kernel: transform, distance, force and reduction of all taxels in one launch.
 
-Two variants share every line of the law (`taxel_force`, `spread_weight`, `distance`): `serial`, one thread per (world,
-pad), for the CPU and for pads of more than 1024 taxels; `block`, one thread per taxel and one block per (world, pad),
-for CUDA. Both reduce in the frame of the pad's body and transform once.
+Two variants share every line of the law (`taxel_force`, `spread_weight`, the distances): `serial`, one thread per
+(world, pad), for the CPU and for pads of more than 512 taxels; `lanes`, one warp per (world, pad), for CUDA: each lane
+keeps every 32nd taxel in registers, sums are shuffles, and there is no barrier and no shared memory. Both compose the
+two poses once a pad and reduce in the frame of the pad's body.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import warp as wp
 
-from dexsim.tactile.sdf import Shapes, bound_radius, distance, in_grid, near_grid
+from dexsim.tactile.lanes import LANES, lane_ballot, lanes_min, lanes_sum, lanes_sum4, lowest_bit
+from dexsim.tactile.sdf import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    SPHERE,
+    Shapes,
+    bound_radius,
+    boxes_apart,
+    distance,
+    in_box,
+    load4,
+    sd_box,
+    sd_capsule,
+    sd_cells,
+    sd_cylinder,
+    sd_grid,
+    sd_sphere,
+)
 
+MAX_ROUNDS = 16
+"""Taxels a lane may keep, in steps of 32 lanes."""
 LINEAR = 0
 HERTZ = 1
 MOONEY_RIVLIN = 2
@@ -23,20 +45,23 @@ MAX_STRAIN = 0.8
 
 @wp.struct
 class Pads:
-    """A layout on the device: F pads of up to T taxels."""
+    """A layout on the device: F pads of up to T taxels, in rows of W (T made a multiple of 32)."""
 
     body: wp.array(dtype=int)  # [F]
     count: wp.array(dtype=int)  # [F]
-    taxel: wp.array2d(dtype=wp.vec4)  # [F, T] point [m] in the body frame, and area [m^2]: one 16-byte load
+    # [F, W] point [m] in the body frame, and area [m^2]: one 16-byte load. Behind a pad's last taxel stand copies of
+    # its first one with no area: they feel nothing and are never the only nearest.
+    taxel: wp.array2d(dtype=wp.vec4)
     centre: wp.array(dtype=wp.vec3)  # [F] pad centre, body frame
     bound: wp.array(dtype=wp.vec4)  # [F] bounding sphere: centre, radius
+    middle: wp.array(dtype=wp.vec3)  # [F] bounding box, body frame
+    half: wp.array(dtype=wp.vec3)  # [F]
 
 
 @wp.struct
 class Law:
     """Constants of the force law, the same in all worlds."""
 
-    kind: int
     stiffness: wp.array(dtype=float)  # [F] linear: N/m^3; hertz: N/m^2.5; mooney_rivlin: factor
     thickness: float  # m, of the rubber
     c10: float  # Pa
@@ -45,7 +70,7 @@ class Law:
 
 
 @wp.func
-def taxel_force(law: Law, stiffness: float, depth: float, area: float, threshold: float):
+def taxel_force(kind: int, law: Law, stiffness: float, depth: float, area: float, threshold: float):
     """Normal force [N] of a taxel pressed in by `depth` > 0 [m].
 
     Linear: stiffness * area * depth, an elastic foundation (paper, "Tactile Sensor Simulation": f = k d, weighted by
@@ -56,9 +81,9 @@ def taxel_force(law: Law, stiffness: float, depth: float, area: float, threshold
     taxel is silent.
     """
     f = float(0.0)
-    if law.kind == wp.static(LINEAR):
+    if kind == wp.static(LINEAR):
         f = stiffness * area * depth
-    elif law.kind == wp.static(HERTZ):
+    elif kind == wp.static(HERTZ):
         f = stiffness * area * wp.sqrt(depth)
     else:
         l = 1.0 - wp.min(depth / law.thickness, wp.static(MAX_STRAIN))
@@ -99,12 +124,6 @@ def turn_in(xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int):
 
 
 @wp.func
-def into(xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), w: int, body: int, frame: int, p: wp.vec3):
-    """A point of a body in another body's frame: for one point cheaper than composing the two poses."""
-    return wp.transpose(xmat[w, frame]) * (xmat[w, body] * p + (xpos[w, body] - xpos[w, frame]))
-
-
-@wp.func
 def may_touch(shapes: Shapes, shape: int, size: wp.vec3, middle: wp.vec3, radius: float):
     """Whether a pad inside a sphere can reach the shape: first by bounding spheres, then by the distance itself."""
     near = wp.length(middle) < radius + bound_radius(shapes, shape, size)
@@ -119,13 +138,50 @@ def xyz(v: wp.vec4):
     return wp.vec3(v[0], v[1], v[2])
 
 
+@wp.func
+def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3):
+    """Whether pad f, whose body has rotation a and origin b in that of pad g, surely does not touch g's tip."""
+    return boxes_apart(a, b, pads.middle[f], pads.half[f], tips.middle[g], tips.half[g])
+
+
 @cache
-def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kernel:
-    """The kernel for one choice of options; dimensions: [N, F] threads (serial) or tiles (block).
+def touch_kernel(
+    lanes: bool,
+    solver: bool,
+    raw: bool,
+    others: bool,
+    *,
+    law: str = "hertz",
+    pads: int = 5,
+    taxels: int = 120,
+    objects: int = 1,
+    feel_others: bool = False,
+    registers: int = 0,
+) -> wp.Kernel:
+    """The kernel for one choice of options; dimensions: [N, F] threads (serial) or N * F * 32 (lanes).
 
     solver: spread the solver's normal forces; else the plain spring sum. raw: write every taxel's force. others: feel
-    other pads' tips as well.
+    other pads' tips as well; feel_others: and write them into the taxels' forces. pads, taxels, objects: the layout's
+    sizes F and T, and the objects in each world. registers: CUDA, at most so many a thread (0: as the compiler likes).
     """
+    rounds = -(-taxels // LANES)
+    make = _lanes if lanes else _serial
+    kernel = make(solver, raw, others, LAWS[law], pads, taxels, objects, feel_others, rounds)
+    # Approximate roots and reciprocals are wrong in the last bits only: 1e-7 of a distance
+    return wp.kernel(
+        kernel,
+        enable_backward=False,
+        module="unique",
+        grid_stride=False,
+        cuda_max_registers=registers or None,
+        module_options={"fast_math": lanes},
+    )
+
+
+def _serial(
+    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
+    rounds: int,
+) -> Callable:  # fmt: skip
     def serial(
         xpos: wp.array2d(dtype=wp.vec3),
         xmat: wp.array2d(dtype=wp.mat33),
@@ -139,7 +195,6 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
         pair_column: wp.array2d(dtype=int),
         tips: Shapes,
         tip_column: wp.array2d(dtype=int),
-        feel_others: int,
         stiffness: wp.array(dtype=float),
         threshold: wp.array(dtype=float),
         scratch: wp.array3d(dtype=float),
@@ -191,7 +246,7 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                             p = pads.taxel[f, t]
                             d = distance(shapes, shape, size, a * xyz(p) + b)
                             if d < 0.0:
-                                c = taxel_force(law, k, -d, p[3], threshold[w])
+                                c = taxel_force(wp.static(kind), law, k, -d, p[3], threshold[w])
                                 total += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                                 if wp.static(raw):
                                     felt[w, f, t] = felt[w, f, t] + c
@@ -207,24 +262,58 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
                 if near and tip_column[f, g] >= 0:
                     near = pair_normal[w, tip_column[f, g]] > 0.0
                 if near:
-                    near = near_grid(tips, g, into(xpos, xmat, w, body, pads.body[g], xyz(bound)), bound[3])
-                if near:
                     a = turn_in(xmat, w, body, pads.body[g])
                     b = pose_in(xpos, xmat, w, body, pads.body[g])
-                    for t in range(n):
-                        p = pads.taxel[f, t]
-                        q = a * xyz(p) + b
-                        if in_grid(tips, g, q):
-                            d = distance(tips, g, wp.vec3(1.0, 1.0, 1.0), q)
-                            if d < 0.0:
-                                c = taxel_force(law, k, -d, p[3], threshold[w])
-                                other += c
-                                if wp.static(raw):
-                                    if feel_others != 0:
+                    if not tips_apart(pads, tips, f, g, a, b):
+                        for t in range(n):
+                            p = pads.taxel[f, t]
+                            q = a * xyz(p) + b
+                            if in_box(q, tips.middle[g], tips.half[g]):
+                                d = sd_grid(tips, g, 1.0, q)
+                                if d < 0.0:
+                                    c = taxel_force(wp.static(kind), law, k, -d, p[3], threshold[w])
+                                    other += c
+                                    if wp.static(raw and feel_others):
                                         felt[w, f, t] = felt[w, f, t] + c
             force_other[w, f] = other
 
-    def tiled(
+    return serial
+
+
+def _lanes(
+    solver: bool, raw: bool, others: bool, kind: int, pad_count: int, taxels: int, objects: int, feel_others: bool,
+    rounds: int,
+) -> Callable:  # fmt: skip
+    Reals = wp.types.vector(length=rounds, dtype=float)
+    width = rounds * LANES
+
+    @wp.func
+    def distances(s: Shapes, i: int, size: wp.vec3, a: wp.mat33, b: wp.vec3, px: Reals, py: Reals, pz: Reals):
+        # The kind is asked once for all, so that a lane's loads are all under way before the first is used.
+        kind = s.kind[i]
+        d = Reals()
+        if kind == wp.static(BOX):
+            for r in range(wp.static(rounds)):
+                d[r] = sd_box(a * wp.vec3(px[r], py[r], pz[r]) + b, size)
+        elif kind == wp.static(SPHERE):
+            for r in range(wp.static(rounds)):
+                d[r] = sd_sphere(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0])
+        elif kind == wp.static(CAPSULE):
+            for r in range(wp.static(rounds)):
+                d[r] = sd_capsule(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0], size[1])
+        elif kind == wp.static(CYLINDER):
+            for r in range(wp.static(rounds)):
+                d[r] = sd_cylinder(a * wp.vec3(px[r], py[r], pz[r]) + b, size[0], size[1])
+        else:
+            offset = s.offset[i]
+            n = s.dims[i]
+            origin = s.origin[i]
+            h = s.spacing[i]
+            for r in range(wp.static(rounds)):
+                d[r] = sd_cells(s.data, offset, n, origin, h, size[0], a * wp.vec3(px[r], py[r], pz[r]) + b)
+        return d
+
+    def lanes(
         xpos: wp.array2d(dtype=wp.vec3),
         xmat: wp.array2d(dtype=wp.mat33),
         pair_normal: wp.array2d(dtype=float),
@@ -237,87 +326,123 @@ def touch_kernel(block: bool, solver: bool, raw: bool, others: bool) -> wp.Kerne
         pair_column: wp.array2d(dtype=int),
         tips: Shapes,
         tip_column: wp.array2d(dtype=int),
-        feel_others: int,
         stiffness: wp.array(dtype=float),
         threshold: wp.array(dtype=float),
         scratch: wp.array3d(dtype=float),
         # out
-        force: wp.array2d(dtype=float),
-        centre: wp.array2d(dtype=wp.vec3),
-        force_other: wp.array2d(dtype=float),
-        felt: wp.array3d(dtype=float),
+        force: wp.array(dtype=float),
+        centre: wp.array(dtype=wp.vec3),
+        force_other: wp.array(dtype=float),
+        felt: wp.array(dtype=float),
     ):
-        # Every branch around a tile operation is the same for the whole block.
-        w, f, t = wp.tid()
+        # Every branch around an exchange of lanes is the same for the whole warp.
+        i = wp.tid()
+        lane = i & 31
+        pad = i >> 5
+        w = pad // wp.static(pad_count)
+        f = pad - w * wp.static(pad_count)
         body = pads.body[f]
-        live = t < pads.count[f]
-        p = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        if live:
-            p = pads.taxel[f, t]
-        bound = pads.bound[f]
-        k = stiffness[w] * law.stiffness[f]
+        rot = xmat[w, body]
+        pos = xpos[w, body]
+        px = Reals()
+        py = Reals()
+        pz = Reals()
+        area = Reals()
+        for r in range(wp.static(rounds)):
+            v = load4(pads.taxel, f * wp.static(width) + 32 * r + lane)
+            px[r] = v[0]
+            py[r] = v[1]
+            pz[r] = v[2]
+            area[r] = v[3]
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)  # moment of force, force; the same in all lanes
-        mine = float(0.0)  # this taxel's force
-        for o in range(object_body.shape[0]):
+        mine = Reals()  # forces of this lane's taxels
+        for o in range(wp.static(objects)):
             shape = shape_id[w, o]
             size = shape_size[w, o]
-            pressed = float(0.0)
+            turn = wp.transpose(xmat[w, object_body[o]])
+            a = turn * rot
+            b = turn * (pos - xpos[w, object_body[o]])
             if wp.static(solver):
                 pressed = pair_normal[w, pair_column[f, o]]
-            if shape >= 0 and (pressed > 0.0 or not wp.static(solver)):
-                q = into(xpos, xmat, w, body, object_body[o], xyz(p))
-                if wp.static(solver):
-                    d = float(1.0e9)
-                    if live:
-                        d = distance(shapes, shape, size, q)
-                    nearest = wp.tile_min(wp.tile(d))
-                    c = spread_weight(d, p[3], spread_level(nearest[0], law.reach))
-                    sums = wp.tile_sum(wp.tile(wp.vec4(c * p[0], c * p[1], c * p[2], c), preserve_type=True))
-                    s = sums[0]
+                if shape >= 0 and pressed > 0.0:
+                    d = distances(shapes, shape, size, a, b, px, py, pz)
+                    nearest = d[0]
+                    for r in range(1, wp.static(rounds)):
+                        nearest = wp.min(nearest, d[r])
+                    level = spread_level(lanes_min(nearest), law.reach)
+                    s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                    for r in range(wp.static(rounds)):
+                        c = spread_weight(d[r], area[r], level)
+                        s += wp.vec4(c * px[r], c * py[r], c * pz[r], c)
+                        d[r] = c
+                    s = lanes_sum4(s, lane)
                     scale = pressed / s[3]
                     total += wp.vec4(scale * s[0], scale * s[1], scale * s[2], pressed)
-                    mine += scale * c
-                else:
-                    if may_touch(shapes, shape, size, into(xpos, xmat, w, body, object_body[o], xyz(bound)), bound[3]):
-                        c = float(0.0)
-                        if live:
-                            d = distance(shapes, shape, size, q)
-                            if d < 0.0:
-                                c = taxel_force(law, k, -d, p[3], threshold[w])
-                        sums = wp.tile_sum(wp.tile(wp.vec4(c * p[0], c * p[1], c * p[2], c), preserve_type=True))
-                        total += sums[0]
-                        mine += c
-        if t == 0:
+                    mine += scale * d
+            else:
+                if shape >= 0:
+                    bound = pads.bound[f]
+                    if may_touch(shapes, shape, size, a * xyz(bound) + b, bound[3]):
+                        k = stiffness[w] * law.stiffness[f]
+                        quiet = threshold[w]
+                        d = distances(shapes, shape, size, a, b, px, py, pz)
+                        s = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                        for r in range(wp.static(rounds)):
+                            c = float(0.0)
+                            if d[r] < 0.0:
+                                c = taxel_force(wp.static(kind), law, k, -d[r], area[r], quiet)
+                            s += wp.vec4(c * px[r], c * py[r], c * pz[r], c)
+                            d[r] = c
+                        total += lanes_sum4(s, lane)
+                        mine += d
+        if lane == 0:
             at = pads.centre[f]
             if total[3] > 0.0:
                 at = xyz(total) / total[3]
-            force[w, f] = total[3]
-            centre[w, f] = xmat[w, body] * at + xpos[w, body]
+            force[pad] = total[3]
+            centre[pad] = rot * at + pos
         if wp.static(others):
+            # Lane j asks whether tip j is near, all at once; then the warp feels the tips that are.
             other = float(0.0)
-            touched = int(0)
-            for g in range(pads.body.shape[0]):
-                near = g != f
-                if near and tip_column[f, g] >= 0:
-                    near = pair_normal[w, tip_column[f, g]] > 0.0
+            for block in range(wp.static(-(-pad_count // LANES))):
+                j = wp.static(32) * block + lane
+                near = j < wp.static(pad_count) and j != f
+                if near and tip_column[f, j] >= 0:
+                    near = pair_normal[w, tip_column[f, j]] > 0.0
                 if near:
-                    near = near_grid(tips, g, into(xpos, xmat, w, body, pads.body[g], xyz(bound)), bound[3])
-                if near:
-                    touched = 1
-                    q = into(xpos, xmat, w, body, pads.body[g], xyz(p))
-                    if live and in_grid(tips, g, q):
-                        d = distance(tips, g, wp.vec3(1.0, 1.0, 1.0), q)
-                        if d < 0.0:
-                            other += taxel_force(law, k, -d, p[3], threshold[w])
-            if feel_others != 0:
-                mine += other
-            if touched != 0:
-                both = wp.tile_sum(wp.tile(other))
-                other = both[0]
-            if t == 0:
-                force_other[w, f] = other
+                    turn = wp.transpose(xmat[w, pads.body[j]])
+                    near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - xpos[w, pads.body[j]]))
+                left = lane_ballot(near)
+                while left != 0:
+                    g = 32 * block + lowest_bit(left)
+                    left = left & (left - 1)
+                    turn = wp.transpose(xmat[w, pads.body[g]])
+                    a = turn * rot
+                    b = turn * (pos - xpos[w, pads.body[g]])
+                    middle = tips.middle[g]
+                    half = tips.half[g]
+                    offset = tips.offset[g]
+                    n = tips.dims[g]
+                    origin = tips.origin[g]
+                    h = tips.spacing[g]
+                    k = stiffness[w] * law.stiffness[f]
+                    quiet = threshold[w]
+                    for r in range(wp.static(rounds)):
+                        q = a * wp.vec3(px[r], py[r], pz[r]) + b
+                        if in_box(q, middle, half):
+                            gap = sd_cells(tips.data, offset, n, origin, h, 1.0, q)
+                            if gap < 0.0:
+                                c = taxel_force(wp.static(kind), law, k, -gap, area[r], quiet)
+                                other += c
+                                if wp.static(raw and feel_others):
+                                    mine[r] += c
+            other = lanes_sum(other)
+            if lane == 0:
+                force_other[pad] = other
         if wp.static(raw):
-            if t < felt.shape[2]:
-                felt[w, f, t] = mine
+            for r in range(wp.static(rounds)):
+                t = 32 * r + lane
+                if t < wp.static(taxels):
+                    felt[pad * wp.static(taxels) + t] = mine[r]
 
-    return wp.kernel(tiled if block else serial, enable_backward=False, module="unique")
+    return lanes

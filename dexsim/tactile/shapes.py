@@ -33,28 +33,29 @@ class ShapeSet:
         self.names = tuple(s.name for s in shapes)
         self.kinds = np.array([_kind(s) for s in shapes], dtype=np.int32)
         self.grids: list[Grid | None] = []
-        dims, origin, spacing, offset, radius = [], [], [], [], []
+        dims, origin, spacing, offset, radius, middle, half = [], [], [], [], [], [], []
         data: list[np.ndarray] = []
         at = 0
-        seen: dict[int, tuple[int, Grid, float]] = {}  # variants of one shape share its samples
+        seen: dict[int, tuple[int, Grid, tuple]] = {}  # variants of one shape share its cells
         for s in shapes:
             grid = None
-            d, o, h, r = (2, 2, 2), np.zeros(3), 1.0, 0.0
+            d, o, h = (2, 2, 2), np.zeros(3), 1.0
+            bound = (0.0, np.zeros(3), np.zeros(3))
             if s.kind == "grid":
                 if id(s.grid) not in seen:
                     grid = _checked(s)
-                    seen[id(s.grid)] = (at, grid, _surface_radius(grid))
-                    flat = grid.data.reshape(-1)
-                    data.append(np.stack([flat, np.append(flat[1:], flat[-1])], axis=1))
-                    at += len(flat)
-                start, grid, r = seen[id(s.grid)]
+                    seen[id(s.grid)] = (at, grid, _surface_bound(grid))
+                    data.append(_cells(grid.data))
+                    at += len(data[-1]) // 2
+                start, grid, bound = seen[id(s.grid)]
                 d, o, h = grid.data.shape, grid.origin, grid.spacing
             self.grids.append(grid)
-            dims.append(d), origin.append(o), spacing.append(h), radius.append(r)
+            dims.append(d), origin.append(o), spacing.append(h)
+            radius.append(bound[0]), middle.append(bound[1]), half.append(bound[2])
             offset.append(start if grid is not None else 0)
-        if at >= 2**31:
-            raise UserError(f"distance grids hold {at} samples, at most {2**31 - 1} fit: use fewer or coarser ones")
-        self.samples = at
+        if at >= 2**30:
+            raise UserError(f"distance grids hold {at} cells, at most {2**30 - 1} fit: use fewer or coarser ones")
+        self.cells = at
         self.device = device
         out = Shapes()
         with wp.ScopedDevice(device):
@@ -64,7 +65,9 @@ class ShapeSet:
             out.spacing = wp.array(np.array(spacing, dtype=np.float32), dtype=float)
             out.offset = wp.array(np.array(offset, dtype=np.int32), dtype=int)
             out.radius = wp.array(np.array(radius, dtype=np.float32), dtype=float)
-            out.data = wp.array(np.concatenate(data) if data else np.zeros((1, 2), np.float32), dtype=wp.vec2)
+            out.middle = wp.array(np.array(middle, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3)
+            out.half = wp.array(np.array(half, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3)
+            out.data = wp.array(np.concatenate(data) if data else np.zeros((2, 4), np.float32), dtype=wp.vec4)
         self.wp = out
 
     def index(self, name: str) -> int:
@@ -123,13 +126,18 @@ def _checked(shape: object) -> Grid:
     return Grid(np.asarray(g.origin, dtype=float), float(g.spacing), data)
 
 
-def _surface_radius(g: Grid) -> float:
-    """Farthest cell that can touch the inside, seen from the frame's origin."""
-    n = g.data.shape
-    r2 = 0.0
-    for ix in range(n[0]):
-        inside = np.argwhere(g.data[ix] <= g.spacing)
-        if len(inside):
-            p = g.origin + g.spacing * np.concatenate([np.full((len(inside), 1), ix), inside], axis=1)
-            r2 = max(r2, float((p * p).sum(1).max()))
-    return float(np.sqrt(r2) + np.sqrt(3.0) * g.spacing)
+def _cells(d: np.ndarray) -> np.ndarray:
+    """The corners of each cell [2 C, 4], as `dexsim.tactile.sdf.Shapes.data` has them."""
+    n = tuple(k - 1 for k in d.shape)
+    out = np.empty((*n, 2, 2, 2), dtype=np.float32)
+    for x, y, z in np.ndindex(2, 2, 2):
+        out[..., x, y, z] = d[x : x + n[0], y : y + n[1], z : z + n[2]]
+    return out.reshape(-1, 4)
+
+
+def _surface_bound(g: Grid) -> tuple[float, np.ndarray, np.ndarray]:
+    """Radius about the frame's origin, and middle and half sizes of a box, that hold every cell with a corner inside."""
+    points = [np.argwhere(g.data <= limit) * g.spacing + g.origin for limit in (g.spacing, 0.0)]
+    radius = np.sqrt((points[0] ** 2).sum(1).max()) + np.sqrt(3.0) * g.spacing
+    low, high = points[1].min(0) - g.spacing, points[1].max(0) + g.spacing
+    return float(radius), 0.5 * (low + high), 0.5 * (high - low)

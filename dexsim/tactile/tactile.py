@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 import warp as wp
 
+from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
-from dexsim.tactile.kernel import LAWS, Law, Pads, touch_kernel
+from dexsim.tactile.kernel import MAX_ROUNDS, Law, Pads, touch_kernel
+from dexsim.tactile.lanes import LANES
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import Effects, clock, draw_gains, forget, report_kernel, stamp, taxel_kernel
 from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 
-MAX_BLOCK = 1024
+BLOCK_DIM = 128
+"""Threads a block of the touch kernel on CUDA: 4 warps, each a pad of its own."""
 
 
 class Tactile:
@@ -29,6 +33,8 @@ class Tactile:
     tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
     other pads feel (others=true).
     other_pairs: names [F][F] of contact pairs between tips, "" where not declared: spares the work while apart.
+    lanes: a warp for each pad, on CUDA with at most 512 taxels a pad (default), else a thread; block_dim, registers:
+    threads of its blocks and most registers of a thread (0: free), for CUDA only.
 
     Set per world: shape_id [N] int32 (-1: no object), shape_size [N, 3] (`dexsim.tactile.sdf`: half sizes; uniform
     scale first for grids); with O objects [N, O], [N, O, 3].
@@ -49,14 +55,18 @@ class Tactile:
         tips: Sequence[np.ndarray] | None = None,
         other_pairs: Sequence[Sequence[str]] | None = None,
         seed: int = 0,
-        block: bool | None = None,
+        lanes: bool | None = None,
+        registers: int = 0,
+        block_dim: int = BLOCK_DIM,
     ):
         self.cfg = cfg = tactile_config(cfg)
         self.engine, self.layout, self.shapes = engine, layout, shapes
         self.device, n, f, t = engine.device, engine.n, layout.pads, layout.taxels
         bodies = [object_body] if isinstance(object_body, str) else list(object_body)
         o = len(bodies)
-        self.block = (self.device != "cpu" and t <= MAX_BLOCK) if block is None else block
+        fits = t <= MAX_ROUNDS * LANES
+        self.lanes = (self.device != "cpu" and fits) if lanes is None else lanes and fits
+        self.block_dim = block_dim if self.device != "cpu" else LANES
         others = cfg.others and tips is not None and f > 1
         if cfg.feel_others and not others:
             raise UserError("tactile.feel_others=true: this hand gives no tip surfaces to feel")
@@ -91,7 +101,7 @@ class Tactile:
                 pair_column=wp.array(columns, dtype=int),
                 tip_column=wp.array(tip_columns, dtype=int),
                 params=wp.zeros((len(COLUMNS), n), dtype=float),
-                scratch=wp.zeros((n, f, t) if solver and not self.block else (1, 1, 1), dtype=float),
+                scratch=wp.zeros((n, f, t) if solver and not self.lanes else (1, 1, 1), dtype=float),
                 force=wp.zeros((n, f), dtype=float),
                 centre=wp.zeros((n, f), dtype=wp.vec3),
                 force_other=wp.zeros((n, f), dtype=float),
@@ -109,7 +119,12 @@ class Tactile:
         self._m = None
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
-        self._kernel = touch_kernel(self.block, solver, store, others)
+        options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
+        self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
+        # a warp a pad finds its place by one number: flat outputs
+        self._out = [a.force, a.centre, a.force_other, a.felt]
+        if self.lanes:
+            self._out = [x.flatten() for x in self._out]
         contacts = solver or bool((tip_columns >= 0).any())
         self._pair_normal = engine.wp.pair_normal if contacts else wp.zeros((1, 1), dtype=float, device=self.device)
         if measured:
@@ -151,7 +166,7 @@ class Tactile:
                 raw3=wp.zeros((n, f, t) if cfg.raw and cfg.shear else (1, 1, 1), dtype=wp.vec3),
                 seed=int(seed),
                 taxel=taxel_kernel(cfg.shear, hysteresis, noise),
-                report=report_kernel(self.block, cfg.shear, cfg.raw),
+                report=report_kernel(self.lanes, cfg.shear, cfg.raw),
             )
         self.force, self.centre = wp.to_torch(m.force), wp.to_torch(m.centre)
         self.gain = wp.to_torch(m.gain)
@@ -203,10 +218,13 @@ class Tactile:
         args = [
             self.engine.wp.xpos, self.engine.wp.xmat, self._pair_normal, self._pads, self._law, self.shapes.wp,
             a.object_body, a.shape_id, a.shape_size, a.pair_column, self.tips.wp, a.tip_column,
-            int(self.cfg.feel_others), self._row["stiffness_scale"], self._row["threshold"], a.scratch,
-            a.force, a.centre, a.force_other, a.felt,
+            self._row["stiffness_scale"], self._row["threshold"], a.scratch, *self._out,
         ]  # fmt: skip
-        self._launch(self._kernel, args)
+        if self.lanes:
+            dim = n * self.layout.pads * LANES
+            wp.launch(self._kernel, dim=dim, inputs=args, block_dim=self.block_dim, device=self.device)
+        else:
+            wp.launch(self._kernel, dim=(n, self.layout.pads), inputs=args, device=self.device)
         m = self._m
         if m is None:
             return
@@ -220,29 +238,23 @@ class Tactile:
         args = [m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late]
         wp.launch(stamp, dim=n, inputs=args, device=self.device)
         args = [m.ring, m.ring_shear, m.chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
-        self._launch(m.report, args)
-
-    def _launch(self, kernel: wp.Kernel, args: list) -> None:
-        """One thread, or one block of a thread per taxel, for each world and pad."""
-        dim = [self.engine.n, self.layout.pads]
-        if self.block:
-            lanes = 32 * -(-self.layout.taxels // 32)
-            wp.launch_tiled(kernel, dim=dim, inputs=args, block_dim=lanes, device=self.device)
+        dim = [n, self.layout.pads]
+        if self.lanes:  # a block of one thread per taxel for each world and pad
+            width = self._pads.taxel.shape[1]
+            wp.launch_tiled(m.report, dim=dim, inputs=args, block_dim=width, device=self.device)
         else:
-            wp.launch(kernel, dim=dim, inputs=args, device=self.device)
+            wp.launch(m.report, dim=dim, inputs=args, device=self.device)
+
+
+@lru_cache(maxsize=8)
+def _baked(corners: bytes) -> Grid:
+    return bake_convex(np.frombuffer(corners).reshape(-1, 3))
 
 
 def _tip_shapes(layout: TaxelLayout, tips: Sequence[np.ndarray]) -> list[TouchShape]:
-    """Distance grids of the tips; equal tips share one."""
-    grids: dict[bytes, object] = {}
-    out = []
-    for name, corners in zip(layout.names, tips, strict=True):
-        corners = np.ascontiguousarray(corners, dtype=float)
-        key = corners.tobytes()
-        if key not in grids:
-            grids[key] = bake_convex(corners)
-        out.append(TouchShape(f"tip_{name}", "grid", grids[key]))
-    return out
+    """Distance grids of the tips; equal tips share one, whoever asks."""
+    grids = [_baked(np.ascontiguousarray(corners, dtype=float).tobytes()) for corners in tips]
+    return [TouchShape(f"tip_{name}", "grid", grid) for name, grid in zip(layout.names, grids, strict=True)]
 
 
 def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
@@ -251,8 +263,17 @@ def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
     out = Pads()
     out.body = wp.array([engine.body(b) for b in layout.bodies], dtype=int)
     out.count = wp.array(layout.count, dtype=int)
-    taxel = np.concatenate([felt.point, layout.area[..., None]], axis=-1)
+    width = LANES * -(-layout.taxels // LANES)
+    taxel = np.zeros((layout.pads, width, 4))
+    box = np.zeros((layout.pads, 2, 3))
+    for f, n in enumerate(layout.count):
+        taxel[f, :, :3] = felt.point[f, 0]
+        taxel[f, :n, :3], taxel[f, :n, 3] = felt.point[f, :n], layout.area[f, :n]
+        box[f] = felt.point[f, :n].min(0), felt.point[f, :n].max(0)
     out.taxel = wp.array(taxel.astype(np.float32), dtype=wp.vec4)
+    # a micrometre for rounding
+    out.middle = wp.array(box.mean(1).astype(np.float32), dtype=wp.vec3)
+    out.half = wp.array((0.5 * (box[:, 1] - box[:, 0]) + 1e-6).astype(np.float32), dtype=wp.vec3)
     out.centre = wp.array(layout.centre().astype(np.float32), dtype=wp.vec3)
     out.bound = wp.array(np.concatenate([centre, radius[:, None]], axis=1).astype(np.float32), dtype=wp.vec4)
     return out
@@ -261,7 +282,6 @@ def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
 def _law(cfg: TactileConfig, layout: TaxelLayout, needed: bool) -> Law:
     """needed: whether any force comes from springs; else no stiffness is asked for."""
     out = Law()
-    out.kind = LAWS[cfg.law]
     stiffness = stiffness_of(cfg, layout.kinds) if needed else [1.0] * layout.pads
     out.stiffness = wp.array(np.array(stiffness, dtype=np.float32), dtype=float)
     out.thickness, out.c10, out.c01 = (float(cfg.rubber[k]) for k in ("thickness", "c10", "c01"))
