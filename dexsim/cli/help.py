@@ -26,6 +26,9 @@ examples:
   python play.py checkpoint=checkpoints/grasp.pt
   python play.py checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
   python play.py checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
+  python play.py policy=random task=grasp tactile=raw record=a.mcap realistic=true
+  python play.py replay=a.mcap                                        recorded against simulated: plots, video
+  python play.py replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
 """
 END = """
   python {script}.py --cfg      every setting with the value it would have, then stop

@@ -14,6 +14,10 @@ from dexsim.learning.ppo import load_policy, plain_policy
 def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     """Play; returns the exit status. Raises UserError."""
     cfg, play = start.cfg, start.play
+    if play.get("replay"):
+        from dexsim.cli import recorded
+
+        return recorded.run(play)
     out = folder.make(_out(start), "out=")
     what = start.source or f"policy {play['policy']}"
     env = build.build_env(cfg, make_env, {"policy": what, "results": out})
@@ -26,7 +30,17 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         policy = plain_policy(str(play["policy"]), env, cfg["seed"])
         about = {"policy": play["policy"], "versions": machine.versions()}
     print(f"playing {play['episodes']} episodes", flush=True)
-    replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
+    recorder = None
+    if play["record"] is not None:
+        from dexsim.recording.tap import PlayRecorder
+
+        recorder = PlayRecorder(env, int(play["record_worlds"]), cfg)
+    try:
+        replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
+    finally:  # what was recorded until a Ctrl-C is kept
+        if recorder is not None:
+            for path in recorder.save(play["record"], bool(play["realistic"]), play["seed"]):
+                print(f"mcap     {path}")
     return 0
 
 

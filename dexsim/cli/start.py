@@ -64,6 +64,11 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     argv, only_show = _flags(argv, config_dir, "play")
     if argv is None:
         return None
+    if any(a.startswith("replay=") and a != "replay=null" for a in argv):  # a recording's commands instead of a policy
+        from dexsim.cli import recorded
+
+        play = recorded.settings(argv, config_dir)
+        return None if only_show and _show(play) else Start({}, play, play["replay"])
     request = settings.parse(argv, config_dir)
     own = OmegaConf.load(config_dir / "play.yaml")
     OmegaConf.set_struct(own, True)
@@ -71,7 +76,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     request.values = [item for item in request.values if item.key_or_group not in own]
     play = settings.resolve(own)
     if (play["checkpoint"] is None) == (play["policy"] is None):
-        raise UserError("say what to play: checkpoint=PATH, or policy=random|zero|scripted with task=<name>")
+        raise UserError("say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE")
     if play["policy"] not in (None, "random", "zero", "scripted"):
         raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
@@ -97,7 +102,7 @@ def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | 
         print(help_page.text(script, config_dir), end="")
         return None, False
     if script == "play" and not argv:
-        raise UserError("say what to play: checkpoint=PATH, or policy=random|zero|scripted with task=<name> (--help)")
+        raise UserError("say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE (--help)")
     return [a for a in argv if a != "--cfg"], "--cfg" in argv
 
 

@@ -165,7 +165,7 @@ def write_commands(p: Plan, path: str | Path) -> None:
     notes = yaml.safe_dump([[s.kind, list(s.joints), round(s.start, 3), round(s.end, 3)] for s in p.segments], default_flow_style=True, width=10**6)
     meta = {"source": "sim", "robot": m.robot, "effort_is": "none", "effort_sign": "+1", "gravity": " ".join(f"{g:g}" for g in m.spec.option.gravity),
             "notes": "commands to send, not a measurement; kind, joints, start, end: " + notes.strip()}
-    with Writer(path, m.joints, meta, start_ns=0) as w:
+    with Writer(path, m.joints, meta, start_ns=1_000_000_000) as w:
         for t, row in zip(p.t, p.value, strict=True):
             w.add_command(float(t), row)
 

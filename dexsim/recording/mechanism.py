@@ -21,7 +21,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
-from dexsim.sim import make_engine
+from dexsim.sim import ContactPair, make_engine
 
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
@@ -127,7 +127,8 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 @dataclass
 class Run:
     """What the simulation did, one row a physics step. t [T] s; position, velocity, torque, target [T, J] (as the encoders and
-    the current report; target: the last one sent); qpos [F, nq] every `frame_s`; tip_force [T, P] N where asked for."""
+    the current report; target: the last one sent); qpos [F, nq] and pair_normal [F, P] (N, of each contact pair) every
+    `frame_s`."""
 
     t: np.ndarray
     position: np.ndarray
@@ -137,19 +138,23 @@ class Run:
     qpos: np.ndarray
     frame_s: float
     model: mujoco.MjModel
+    pair_normal: np.ndarray
 
 
 def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: float, initial: np.ndarray | None = None,
-          timestep: float = 0.002, enabled: Series | None = None, frame_s: float = 0.02) -> Run:
+          timestep: float = 0.002, enabled: Series | None = None, frame_s: float = 0.02, pairs: Sequence[ContactPair] = (),
+          follow: tuple[str, Series] | None = None) -> Run:
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
     commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]: start and
-    first target of the mechanism's joints (NaN or None: the model's own). Deterministic. Engine: C MuJoCo.
+    first target of the mechanism's joints (NaN or None: the model's own). enabled: like commands, 0 frees a joint.
+    pairs: contact pairs to measure. follow: (name of a free joint, poses [T, 7]): a body that is led along a recorded
+    path. Deterministic. Engine: C MuJoCo.
     """
     spec = m.spec.copy()
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    engine = make_engine(spec, 1, "cpu", "mujoco", fields=FIELDS, threads=1)
+    engine = make_engine(spec, 1, "cpu", "mujoco", fields=FIELDS, pairs=pairs, threads=1)
     steps = max(1, round(duration / timestep))
     stamps = np.asarray(commands.t, float)
     spacing = float(np.percentile(np.diff(stamps), 5)) if len(stamps) > 2 else None
@@ -161,14 +166,18 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
         scale, offset = servo.column("position_scale")[0].double().numpy(), servo.column("position_offset")[0].double().numpy()
         start = np.where(np.isfinite(initial), (initial - offset) / scale, start)
     qpos[0, address] = torch.as_tensor(start)
+    lead = None
+    if follow is not None:
+        joint = engine.joint(follow[0])
+        q, v = int(engine.mjm.jnt_qposadr[joint]), int(engine.mjm.jnt_dofadr[joint])
+        lead, lead_speed = _path(follow[1], steps, timestep)
+        qpos[0, q : q + 7] = torch.as_tensor(lead[0])
     engine.set_state(torch.ones(1, dtype=torch.bool), qpos, torch.zeros_like(engine.t.qvel))
     now = np.where(np.isfinite(initial), initial, start) if initial is not None else start.copy()
     servo.reset(None, torch.as_tensor(now)[None])
     place = np.array([m.joints.index(c) for c in columns])
     J = len(m.joints)
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
-    every = max(1, round(frame_s / timestep))
-    frames: list[np.ndarray] = []
     on = None if enabled is None else np.nan_to_num(enabled.value, nan=1.0) > 0.5
     state = {"k": 0, "command": 0, "enabled": 0}
 
@@ -183,20 +192,28 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
         while on is not None and state["enabled"] < len(on) and enabled.t[state["enabled"]] <= t:
             servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(servo.state.dtype)
             state["enabled"] += 1
+        if lead is not None:
+            engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
+            engine.t.qvel[0, v : v + 6] = torch.as_tensor(lead_speed[k])
         out["position"][k] = servo.position()[0].numpy()
         out["velocity"][k] = servo.velocity()[0].numpy()
         out["target"][k] = now
-        if k % every == 0:
-            frames.append(engine.t.qpos[0].numpy().copy())
         servo.before_each()
         out["torque"][k] = servo.torque[0].numpy()
         state["k"] = k + 1
 
-    engine.step(steps, before_each)
-    return Run(np.arange(steps) * timestep, **out, qpos=np.array(frames), frame_s=every * timestep, model=engine.mjm)
+    every = max(1, round(frame_s / timestep))
+    frames, forces = [], []
+    for first in range(0, steps, every):
+        frames.append(engine.t.qpos[0].numpy().copy())
+        engine.step(min(every, steps - first), before_each)
+        forces.append(engine.t.pair_normal[0].numpy().copy())
+    return Run(np.arange(steps) * timestep, **out, qpos=np.array(frames), frame_s=every * timestep, model=engine.mjm,
+               pair_normal=np.array(forces).reshape(len(frames), len(pairs)))
 
 
-def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0, start_ns: int = 0) -> Recording:
+def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0,
+             start_ns: int = 1_000_000_000) -> Recording:
     """The run as a simulated recording: commands as sent, states `rate` times a second (Hz; at most the physics rate),
     torque in N.m. `realistic` makes of it what the hardware would have delivered."""
     every = max(1, round(1.0 / rate / (run.t[1] - run.t[0]))) if len(run.t) > 1 else 1
@@ -211,8 +228,11 @@ def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], r
                      States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)), start_ns=start_ns)
 
 
-def replay(recording: Recording, m: Mechanism, timestep: float = 0.002) -> Run:
-    """Drive the mechanism with a recording's commands from the recorded first position (free run, no correction)."""
+def replay(recording: Recording, m: Mechanism, timestep: float = 0.002, pairs: Sequence[ContactPair] = (), follow: str | None = None) -> Run:
+    """Drive the mechanism with a recording's commands from the recorded first position (free run, no correction).
+
+    pairs: contact pairs to measure. follow: name of the free joint that is led along the recorded object's path.
+    """
     if not len(recording.commands):
         raise UserError(f"recording {recording.path} has no /joint_commands: nothing to replay")
     initial = np.full(len(m.joints), np.nan)
@@ -222,7 +242,23 @@ def replay(recording: Recording, m: Mechanism, timestep: float = 0.002) -> Run:
         if len(seen):
             initial[m.joints.index(joint)] = state.value[seen[0], j]
     end = max(recording.duration, float(recording.commands.t[-1])) + timestep
-    return drive(m, recording.commands, recording.joints, end, initial, timestep, recording.enabled)
+    led = None if follow is None or recording.object_pose is None else (follow, recording.object_pose)
+    return drive(m, recording.commands, recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led)
+
+
+def _path(poses: Series, steps: int, timestep: float) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [K, 7] at each physics step, and the speeds [K, 6] (linear in the world, angular in the body) that led there."""
+    value = poses.value.copy()
+    turned = np.cumprod(np.where((value[1:, 3:] * value[:-1, 3:]).sum(1) < 0, -1.0, 1.0))
+    value[1:, 3:] *= turned[:, None]  # q and -q are one orientation: take the near one
+    at = np.stack([np.interp(np.arange(steps) * timestep, poses.t, x) for x in value.T], 1)
+    at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
+    speed = np.zeros((steps, 6))
+    speed[1:, :3] = np.diff(at[:, :3], axis=0) / timestep
+    for k in range(1, steps):
+        mujoco.mju_subQuat(speed[k, 3:], at[k, 3:], at[k - 1, 3:])
+    speed[:, 3:] /= timestep
+    return at, speed
 
 
 def _table(servo: str | Path | dict) -> ServoTable:

@@ -1,0 +1,135 @@
+"""``play.py replay=FILE``: the simulated mechanism driven by a recording's commands, beside what was recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from dexsim.cli import folder
+from dexsim.cli.report import table
+from dexsim.errors import UserError
+
+KEYS = ("replay", "model", "servo", "servo_file", "out", "video", "timestep")
+USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
+
+
+def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
+    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "remap", "meta"}."""
+    from dexsim.recording.arguments import read_arguments
+
+    own: dict[str, str] = {}
+    rest: list[str] = []
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if equals and key in KEYS:
+            own[key] = value
+        elif equals and key.partition(".")[0] in ("remap", "meta"):
+            rest.append(argument)
+        else:
+            raise UserError(f"'{argument}' does not go with replay=FILE; {USAGE}")
+    _, remap, meta = read_arguments([own["replay"], *rest])
+    if own.get("video", "true") not in ("true", "false"):
+        raise UserError(f"video={own['video']}: must be true or false")
+    try:
+        timestep = float(own["timestep"]) if "timestep" in own else None
+    except ValueError:
+        timestep = -1.0
+    if timestep is not None and not 1e-4 <= timestep <= 0.02:
+        raise UserError(f"timestep={own['timestep']}: must be a number from 0.0001 to 0.02 s")
+    servo = own.get("servo_file") or own.get("servo")
+    if servo is not None and not servo.endswith((".yaml", ".yml")):
+        path = config_dir / "servo" / f"{servo}.yaml"
+        if not path.is_file():
+            options = sorted(p.stem for p in (config_dir / "servo").glob("*.yaml"))
+            raise UserError(f"servo={servo}: must be a servo.yaml file, or one of {', '.join(options)}")
+        servo = str(path)
+    return {"replay": own["replay"], "model": own.get("model") or None, "servo": servo, "out": own.get("out") or None,
+            "video": own.get("video", "true") == "true", "timestep": timestep, "remap": remap, "meta": meta}
+
+
+def run(play: dict[str, Any]) -> int:
+    """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and video.mp4."""
+    import yaml
+
+    from dexsim.cli.build import quiet_warp
+    from dexsim.recording import audit, compare, led_object, mechanism
+    from dexsim.recording.reader import read
+    from dexsim.recording.writer import write
+
+    quiet_warp("cpu")
+    path = Path(play["replay"]).expanduser()
+    model = play["model"]
+    hand = None if model is None else mechanism.mechanism(model, play["servo"] or {}).joints
+    recording = read(path, play["remap"], play["meta"], joints=hand)
+    print(audit.summary(recording))
+    if recording.findings:
+        print(audit.table(recording.findings))
+    m = mechanism.for_recording(recording, model, play["servo"])
+    config = yaml.safe_load(recording.config) if recording.config else {}
+    timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
+    led = led_object.add_object(m, recording)
+    out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
+    print(f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
+          + (", the object led along its recorded path" if led else ""), flush=True)
+    result = mechanism.replay(recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if led else None)
+    c = compare.compare(recording, result, m, forces=led)
+    position, effort = c.position_rmse(), c.effort_rmse()
+    rows = [(j, f"{1e3 * p:.2f}", f"{e:.4f}" if e == e else "-") for j, p, e in zip(c.joints, position, effort, strict=True)]
+    print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")
+    about = {"replay": str(path), "model": model or "xhand_right", "timestep_s": timestep, "object": "led" if led else "none",
+             "position_rmse_rad": _plain(c.joints, position), "torque_rmse_Nm": _plain(c.joints, effort),
+             "current_per_torque": _plain(c.joints, c.effort_scale), "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
+             "findings": [f"{f.severity}: {f.kind} {f.topic} {f.text}".strip() for f in recording.findings]}
+    (out / "metrics.json").write_text(json.dumps(about, indent=2) + "\n")
+    print(f"metrics  {out / 'metrics.json'}")
+    write(out / "simulated.mcap", mechanism.recorded(result, m, recording.commands, recording.joints))
+    print(f"mcap     {out / 'simulated.mcap'}")
+    for drawn in compare.plots(c, out, path.name):
+        print(f"plot     {drawn}")
+    if play["video"]:
+        _video(recording, result, m, c, out / "video.mp4")
+    return 0
+
+
+def _plain(joints: tuple[str, ...], values: Any) -> dict[str, float | None]:
+    return {j: float(v) if v == v else None for j, v in zip(joints, values, strict=True)}
+
+
+def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
+    """The recorded posture beside the simulated one."""
+    import mujoco
+    import numpy as np
+
+    from dexsim.cli.console import Ticker
+    from dexsim.view.video import Clip, NoRenderer, render
+
+    model = m.spec.compile()
+    frames = np.arange(len(result.qpos)) * result.frame_s
+    clips = []
+    address = [model.jnt_qposadr[model.joint(j).id] for j in recording.joints]
+    state = recording.states.position
+    force, names = (None, None), ()
+    if c.force_unit == "N" and (c.finger_force is not None or c.finger_force_simulated is not None):
+        from dexsim.assets import xhand
+
+        names = xhand.FINGERS
+        force = tuple(None if s is None else np.stack([np.interp(frames, s[0], x) for x in s[1].T], 1) for s in (c.finger_force, c.finger_force_simulated))
+    if len(state):
+        seen = result.qpos.copy()
+        for a, column in zip(address, state.value.T, strict=True):
+            ok = np.isfinite(column)
+            if ok.any():
+                seen[:, a] = np.interp(frames, state.t[ok], column[ok])
+        clips.append(Clip(model, seen, "recorded", force[0]))
+    clips.append(Clip(model, result.qpos, "simulated", force[1]))
+    camera = None
+    if m.robot != "xhand_right":
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        camera = {"lookat": [float(x) for x in model.stat.center], "distance": 2.2 * float(model.stat.extent), "azimuth": 120.0, "elevation": -20.0}
+    try:
+        render(clips, path, result.frame_s, names, camera=camera, progress=Ticker("frames"))
+        print(f"video    {path}")
+    except NoRenderer as error:  # the numbers stand without it
+        print(error)

@@ -1,0 +1,143 @@
+"""Recorded against simulated: errors joint by joint, and plots side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
+
+from dexsim.assets import xhand  # noqa: E402
+from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
+from dexsim.recording.schema import Recording  # noqa: E402
+
+RECORDED, SIMULATED, COMMANDED = "#1f5fa8", "#d1641b", "#9a9a9a"
+
+
+@dataclass
+class Comparison:
+    """A recording beside its simulation at the recording's own times. Arrays [T, J], NaN where not recorded.
+
+    effort is in N.m: a recorded current is divided by the A per N.m that is known (`effort_scale` [J]) or, where none is
+    (`fitted` [J] bool), by the one that fits best here. finger_force, finger_force_simulated: (t, [T, F]) or None;
+    force_unit: N or count.
+    """
+
+    joints: tuple[str, ...]
+    t: np.ndarray
+    target: np.ndarray
+    position: np.ndarray
+    position_simulated: np.ndarray
+    effort: np.ndarray | None
+    effort_simulated: np.ndarray
+    effort_scale: np.ndarray
+    fitted: np.ndarray
+    finger_force: tuple[np.ndarray, np.ndarray] | None = None
+    finger_force_simulated: tuple[np.ndarray, np.ndarray] | None = None
+    force_unit: str = "N"
+    notes: list[str] = field(default_factory=list)
+
+    def position_rmse(self) -> np.ndarray:
+        """[J] rad."""
+        return np.sqrt(np.nanmean((self.position - self.position_simulated) ** 2, axis=0)) if len(self.t) else np.full(len(self.joints), np.nan)
+
+    def effort_rmse(self) -> np.ndarray:
+        """[J] N.m; NaN where no effort was recorded."""
+        if self.effort is None:
+            return np.full(len(self.joints), np.nan)
+        d = self.effort - self.effort_simulated
+        count = np.isfinite(d).sum(0)
+        return np.where(count > 0, np.sqrt(np.nansum(d**2, axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) -> Comparison:
+    """Lay the run beside the recording. forces: run.pair_normal holds one fingertip a column."""
+    columns = [m.joints.index(j) for j in recording.joints]
+    state, J = recording.states.position, len(recording.joints)
+    t = state.t if len(state) else run.t
+
+    def at(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(t, run.t, values[:, c]) for c in columns], 1)
+
+    held = np.clip(np.searchsorted(run.t, t, side="right") - 1, 0, None)
+    position = state.value if len(state) else np.full((len(t), J), np.nan)
+    simulated = at(run.torque)
+    signed = recording.signed_effort()
+    effort, scale, fitted = None, np.ones(J), np.zeros(J, bool)
+    if signed is not None and recording.effort_is != "none":
+        effort = signed.value
+        if recording.effort_is == "current_A":
+            scale = m.table.current(recording.joints)
+            fitted = np.isnan(scale)
+            for j in np.flatnonzero(fitted):
+                ok = np.isfinite(effort[:, j])
+                power = float((simulated[ok, j] ** 2).sum())
+                scale[j] = float((effort[ok, j] * simulated[ok, j]).sum()) / power if power > 0 else np.nan
+            effort = effort / np.where(scale == 0, np.nan, scale)
+    out = Comparison(recording.joints, t, run.target[held][:, columns], position, at(run.position), effort, simulated, scale, fitted)
+    if recording.tactile is not None:
+        known = recording.tactile_lsb is not None
+        touch = recording.tactile_newtons() if known else recording.tactile
+        out.finger_force = (touch.t, touch.value[..., 2].sum(2))
+        out.force_unit = "N" if known else "count"
+    if forces:
+        out.finger_force_simulated = (np.arange(len(run.pair_normal)) * run.frame_s + run.frame_s, run.pair_normal)
+    return out
+
+
+def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
+    """position.png, effort.png and, where touch was recorded or simulated, force.png: one panel a joint or finger."""
+    paths = [_panels(folder / "position.png", f"{title}: position [rad]", c.joints, c.t,
+                     [("command", COMMANDED, c.target), ("recorded", RECORDED, c.position), ("simulated", SIMULATED, c.position_simulated)],
+                     [f"RMSE {1e3 * x:.2f} mrad" for x in c.position_rmse()])]
+    notes = [f"{s:.2f} A per N.m{' (fitted)' if f else ''}" if s != 1 else "" for s, f in zip(c.effort_scale, c.fitted, strict=True)]
+    lines = [("simulated", SIMULATED, c.effort_simulated)]
+    if c.effort is not None:
+        lines.insert(0, ("recorded", RECORDED, c.effort))
+    paths.append(_panels(folder / "effort.png", f"{title}: motor torque [N.m]", c.joints, c.t, lines, notes))
+    if c.finger_force is not None or c.finger_force_simulated is not None:
+        series = [(n, col, s) for n, col, s in (("recorded", RECORDED, c.finger_force), ("simulated", SIMULATED, c.finger_force_simulated)) if s is not None]
+        count = max(s[1].shape[1] for _, _, s in series)
+        names = xhand.FINGERS if count == len(xhand.FINGERS) else tuple(f"pad {k}" for k in range(count))
+        figure, axes = _grid(count)
+        for k, (ax, name) in enumerate(zip(axes, names, strict=False)):
+            for label, colour, (t, value) in series:
+                ax.plot(t, value[:, k], color=colour, linewidth=0.9, label=label)
+            ax.set_title(name, fontsize=9)
+        _finish(figure, axes, count, f"{title}: normal force of each finger [{c.force_unit}]", folder / "force.png")
+        paths.append(folder / "force.png")
+    return paths
+
+
+def _panels(path: Path, title: str, names: tuple[str, ...], t: np.ndarray, lines: list, notes: list[str]) -> Path:
+    figure, axes = _grid(len(names))
+    for j, (ax, name) in enumerate(zip(axes, names, strict=False)):
+        for label, colour, value in lines:
+            ax.plot(t, value[:, j], color=colour, linewidth=0.9, label=label)
+        ax.set_title(f"{name}  {notes[j]}", fontsize=8)
+    _finish(figure, axes, len(names), title, path)
+    return path
+
+
+def _grid(count: int) -> tuple[Figure, list]:
+    across = min(3, count)
+    down = -(-count // across)
+    figure = Figure(figsize=(4.6 * across, 2.3 * down + 0.6), layout="constrained")
+    return figure, list(figure.subplots(down, across, squeeze=False).flat)
+
+
+def _finish(figure: Figure, axes: list, count: int, title: str, path: Path) -> None:
+    for ax in axes[:count]:
+        ax.tick_params(labelsize=7)
+        ax.grid(alpha=0.25)
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    for ax in axes[max(0, count - 3) : count]:
+        ax.set_xlabel("time [s]", fontsize=8)
+    axes[0].legend(fontsize=7)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
