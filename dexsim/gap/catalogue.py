@@ -1,0 +1,326 @@
+"""The catalogue of effects: what each is in plain words, what leaves its trace, what it is confused with, how it is fitted.
+
+An effect offers variants for a joint: parameters of the plant with physical bounds, and where to start. Ids and
+parameter keys are those of `diagnosis.json`. To add an effect: an entry here, its lines in `plant_kernel.py` (and the
+servo table, where training is to have it too).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexsim.gap.fit import Param
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Typical sizes of one joint's motion, from which bounds and starts follow (SI; N, m for a slide).
+
+    tau: large motor torque; demand: largest torque asked for; speed: large speed; peak_speed; error: large position
+    error of the loop; stiffness: torque per position error; inertia, gravity: of the joint; span: range of motion;
+    sigma: noise of the position; nominal: believed plant parameters by name; others: other joints that moved;
+    load_torque, load_inertia: of one kg on the last link; warm: spread of the temperature [degC], 0 where unknown.
+    """
+
+    tau: float
+    demand: float
+    speed: float
+    peak_speed: float
+    error: float
+    stiffness: float
+    inertia: float
+    gravity: float
+    span: float
+    sigma: float
+    nominal: dict[str, float]
+    others: tuple[str, ...]
+    others_torque: float
+    load_torque: float
+    load_inertia: float
+    tilt: dict[str, float]
+    warm: float
+    slide: bool
+    voltage: bool
+    effort: bool
+    saturates: float  # share of samples at the believed limit
+    base_friction: float = 0.0
+    base_damping: float = 0.0
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way an effect may be there: its parameters, starts [n][P], and constants set on the plant."""
+
+    params: tuple[Param, ...]
+    starts: tuple[tuple[float, ...], ...]
+    label: str = ""
+    fixed: tuple[tuple[str, float], ...] = ()
+    note: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An entry: id, what it is (a phrase after "joint X ..."), where it shows, how its variants are made.
+
+    report: fitted values by Param key -> {key: (value, unit)} in the ids of `diagnosis.json`.
+    """
+
+    id: str
+    words: str
+    shows: str
+    variants: Callable[[Scales], list[Variant]]
+    experiment: str
+    columns: tuple[str, ...] = ()  # servo columns it writes
+
+
+CONFUSED: tuple[frozenset[str], ...] = tuple(
+    frozenset(x)
+    for x in (
+        ("backlash", "stribeck_friction", "coulomb_friction"),
+        ("command_delay", "lag"),
+        ("viscous_friction", "torque_speed_limit", "gain_mismatch"),
+        ("current_sensor", "payload", "gain_mismatch"),
+        ("coulomb_friction", "load_friction"),
+        ("supply_sag", "torque_speed_limit", "thermal"),
+        ("position_offset", "payload"),
+        ("tactile_gain", "contact_stiffness"),
+    )
+)
+"""Classes of effects that some recordings cannot tell apart (the only sets that may be reported)."""
+
+
+def _p(key, column, mode, low, high, start=0.0, unit="1"):
+    return Param(key, (column,) if isinstance(column, str) else tuple(column), mode, float(low), float(high), float(start), unit)
+
+
+def _coulomb(s: Scales) -> list[Variant]:
+    nominal = s.nominal["coulomb_friction"]
+    top = max(1.2 * s.demand, 3 * nominal, 1e-9)
+    torque = _p("torque", "coulomb_friction", "set", 0.0, top, nominal, "N.m")
+    asymmetry = _p("asymmetry", "friction_asymmetry", "set", -1.5, 1.5)
+    starts = [(nominal + f * s.tau, 0.0) for f in (0.03, 0.12, 0.35)]
+    if nominal > 0.02 * s.tau:
+        starts.append((0.5 * nominal, 0.0))
+    starts += [(nominal + 0.1 * s.tau, 0.8), (nominal + 0.1 * s.tau, -0.8)]
+    return [Variant((torque, asymmetry), tuple(starts))]
+
+
+def _stribeck(s: Scales) -> list[Variant]:
+    peak = _p("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
+    v_s = _p("v_s", "stribeck_speed", "set", 0.003 * s.speed, 1.0 * s.speed, 0.1 * s.speed, "rad/s")
+    return [Variant((peak, v_s), tuple((a * s.tau, b * s.speed) for a in (0.08, 0.3) for b in (0.03, 0.12, 0.4)))]
+
+
+def _viscous(s: Scales) -> list[Variant]:
+    nominal, unit = s.nominal["viscous_friction"], s.tau / s.speed
+    starts = [(nominal + f * unit,) for f in (0.05, 0.2, 0.6)]
+    if nominal > 0.03 * unit:
+        starts.append((0.5 * nominal,))
+    top = max(3 * unit, 4 * nominal)
+    return [Variant((_p("coefficient", "viscous_friction", "set", 0.0, top, nominal, "N.m.s/rad"),), tuple(starts))]
+
+
+def _load_friction(s: Scales) -> list[Variant]:
+    drive = _p("fraction", "load_friction", "set", 0.0, 0.95, s.nominal["load_friction"])
+    back = _p("fraction_backdriven", "load_friction_backdriven", "set", 0.0, 3.0, s.nominal["load_friction_backdriven"])
+    return [Variant((drive, back), ((0.1, 0.1), (0.35, 0.35), (0.3, 0.8)))]
+
+
+def _backlash(s: Scales) -> list[Variant]:
+    top = min(0.5 * s.span, 60 * s.error + 30 * s.sigma)
+    gap = _p("gap", "backlash", "set", 0.0, top, 0.0, "m" if s.slide else "rad")
+    starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 12.0, 40.0, 120.0)})
+    return [Variant((gap,), tuple((x,) for x in starts))]
+
+
+def _compliance(s: Scales) -> list[Variant]:
+    # not stiffer than a tenth of the loop's own spring is softness that leaves no trace
+    top = 3.0 / s.stiffness
+    soft = _p("softness", "softness", "set", 0.0, top, 0.0, "rad/N.m")
+    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.03, 0.1, 0.35, 1.0)))]
+
+
+def _delay(s: Scales) -> list[Variant]:
+    delay = _p("delay", "delay", "add", -s.nominal["delay"], 0.2, 0.0, "s")
+    return [Variant((delay,), ((0.003,), (0.012,), (0.035,), (0.08,)))]
+
+
+def _lag(s: Scales) -> list[Variant]:
+    out = [Variant((_p("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),), ((0.004,), (0.015,), (0.05,)), "drive")]
+    if s.nominal["kd"] > 0:
+        out.append(Variant((_p("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),), ((0.01,), (0.04,)), "velocity filter"))
+    return out
+
+
+def _torque_limit(s: Scales) -> list[Variant]:
+    believed = s.nominal["torque_limit"]
+    top = min(believed, 1.5 * s.demand) if s.saturates < 0.002 else believed
+    low = 0.05 * s.demand
+    if top <= low or s.voltage:
+        top = believed * 1.0
+    limit = _p("torque", "torque_limit", "set", min(low, 0.5 * top), top, top, "N.m")
+    return [Variant((limit,), tuple((max(f * min(s.demand, believed), 1.05 * low),) for f in (0.9, 0.7, 0.5, 0.3)))]
+
+
+def _speed_limit(s: Scales) -> list[Variant]:
+    believed = s.nominal["no_load_speed"]
+    top = min(believed, 30 * s.peak_speed)
+    low = min(0.8 * s.peak_speed, 0.8 * top)
+    speed = _p("no_load_speed", "no_load_speed", "set", low, top, top, "rad/s")
+    starts = [x for x in (1.1 * s.peak_speed, 1.6 * s.peak_speed, 3 * s.peak_speed, 0.8 * believed, 0.6 * believed) if low < x < top]
+    return [Variant((speed,), tuple((x,) for x in starts))] if starts else []
+
+
+def _sag(s: Scales) -> list[Variant]:
+    if not s.others or s.others_torque <= 0:
+        return []
+    top = 0.9 / s.others_torque
+    sag = _p("sag", "sag", "set", 0.0, top, 0.0, "1/N.m")
+    return [Variant((sag,), tuple((f * top,) for f in (0.1, 0.3, 0.6)))]
+
+
+def _ripple(s: Scales) -> list[Variant]:
+    out = []
+    for turns in (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32, 36, 42, 48, 56, 64, 80, 100):
+        period = 2 * np.pi / turns
+        if not s.slide and 1.2 * s.span > period > 6 * s.sigma:
+            params = (
+                _p("amplitude", "torque_ripple", "set", 0.0, 1.2 * s.tau, 0.0, "N.m"),
+                _p("per_turn", "ripple_per_turn", "set", turns * 0.85, turns * 1.15, turns),
+                _p("phase", "ripple_phase", "set", -6.3, 6.3, 0.0, "rad"),
+            )
+            a = 0.1 * s.tau
+            starts = tuple((a, float(turns), ph) for ph in (0.0, np.pi / 2, np.pi, -np.pi / 2))
+            out.append(Variant(params, starts, f"{turns} a turn"))
+    return out
+
+
+def _thermal(s: Scales) -> list[Variant]:
+    if s.warm < 2.0:
+        return []
+    out = []
+    for of, column in (("torque_constant", "thermal_torque"), ("friction", "thermal_friction"), ("resistance", "thermal_resistance")):
+        if of == "resistance" and not s.voltage:
+            continue
+        if of == "friction" and not (s.nominal["coulomb_friction"] > 0 or s.nominal["viscous_friction"] > 0):
+            continue
+        top = min(0.02 if of != "friction" else 0.1, 0.7 / s.warm)
+        # copper gains 0.39 % of resistance per degree: ten times that is a proxy of something else
+        low, high = (0.0, 0.008) if of == "resistance" else (-top, top)
+        p = _p("per_degree", column, "set", low, high, 0.0, "1/degC")
+        starts = tuple((f,) for f in ((0.25 * high, 0.7 * high) if low == 0 else (-0.5 * top, -0.15 * top, 0.15 * top, 0.5 * top)))
+        out.append(Variant((p,), starts, of, note={"of": of}))
+    return out
+
+
+def _coupling(s: Scales) -> list[Variant]:
+    out = []
+    for k, other in enumerate(s.others[:4]):
+        p = _p("ratio", "coupling", "set", -1.0, 1.0)
+        out.append(Variant((p,), ((-0.2,), (-0.03,), (0.03,), (0.2,)), other, (("coupling_from", float(k)),), {"from_joint": other}))
+    return out
+
+
+def _offset(s: Scales) -> list[Variant]:
+    if s.gravity < 0.02 * s.tau:
+        return []
+    p = _p("offset", "position_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
+    return [Variant((p,), ((-0.15,), (-0.03,), (0.03,), (0.15,)))]
+
+
+def _scale(s: Scales) -> list[Variant]:
+    out = [Variant((_p("scale", "position_scale", "set", 0.7, 1.4, 1.0),), ((0.9,), (0.97,), (1.03,), (1.12,)), "scale")]
+    if not s.slide and s.span > 0.5:
+        e = min(0.2, 0.3 * s.span)
+        params = (_p("ecc_sin", "eccentric_sin", "set", -e, e, 0.0, "rad"), _p("ecc_cos", "eccentric_cos", "set", -e, e, 0.0, "rad"))
+        out.append(Variant(params, ((0.2 * e, 0.0), (-0.2 * e, 0.0), (0.0, 0.2 * e), (0.0, -0.2 * e)), "eccentricity"))
+    return out
+
+
+def _payload(s: Scales) -> list[Variant]:
+    out = []
+    unit = s.tau / max(s.load_torque, 1e-9) if s.load_torque * s.inertia > 0.05 * s.tau * s.load_inertia else np.inf
+    unit = min(unit, 3 * s.inertia / max(s.load_inertia, 1e-12))
+    if np.isfinite(unit) and s.load_torque > 0.02 * s.gravity:
+        mass = _p("mass", "payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
+        out.append(Variant((mass,), tuple((f * unit,) for f in (0.04, 0.15, 0.5, -0.1)), "mass"))
+    for letter, size in s.tilt.items():
+        if size > 0.05 * s.tau * 0.1 and size > 0.2 * max(s.tilt.values()):
+            p = _p(f"tilt_{letter}", f"tilt_{letter}", "set", -0.8, 0.8, 0.0, "rad")
+            out.append(Variant((p,), ((-0.3,), (-0.06,), (0.06,), (0.3,)), f"tilt {letter}"))
+    return out
+
+
+def _inertia(s: Scales) -> list[Variant]:
+    p = _p("armature", "armature", "add", -0.7 * s.inertia, 6.0 * s.inertia, 0.0, "kg" if s.slide else "kg.m2")
+    return [Variant((p,), tuple((f * s.inertia,) for f in (0.12, 0.4, 1.2, -0.25)))]
+
+
+def _gain(s: Scales) -> list[Variant]:
+    params = [_p("kp_factor", "kp", "factor", 0.25, 4.0, 1.0)]
+    starts = [(0.6,), (0.85,), (1.18,), (1.6,)]
+    if s.nominal["kd"] > 0:
+        params.append(_p("kd_factor", "kd", "factor", 0.1, 6.0, 1.0))
+        starts = [(x[0], 1.0) for x in starts] + [(1.0, 0.5), (1.0, 1.6), (1.0, 3.0)]
+    return [Variant(tuple(params), tuple(starts))]
+
+
+def _deadband(s: Scales) -> list[Variant]:
+    top = max(2.5 * s.error, 6 * s.sigma)
+    p = _p("width", "deadband", "set", 0.0, top, 0.0, "m" if s.slide else "rad")
+    return [Variant((p,), tuple((f * top,) for f in (0.05, 0.15, 0.35, 0.6)))]
+
+
+def _current(s: Scales) -> list[Variant]:
+    if not s.effort:
+        return []
+    gain = _p("gain", "effort_gain", "set", -1.5, 3.0, 1.0)
+    offset = _p("offset", "effort_offset", "set", -s.tau, s.tau, 0.0, "N.m")
+    return [Variant((gain, offset), ((0.7, 0.0), (1.3, 0.0), (1.0, 0.1 * s.tau), (1.0, -0.1 * s.tau), (-1.0, 0.0)))]
+
+
+CATALOGUE: tuple[Effect, ...] = (
+    Effect("coulomb_friction", "has more (or less) dry friction than believed", "at reversals and low speed", _coulomb,
+           "slow triangles in both directions at constant load", ("coulomb_friction", "friction_asymmetry")),
+    Effect("stribeck_friction", "needs a breakaway torque above its sliding friction", "at speeds between zero and v_s", _stribeck,
+           "very slow ramps from rest, and the same faster", ("stribeck_peak", "stribeck_speed")),
+    Effect("viscous_friction", "has friction that grows with speed", "at high speed", _viscous, "constant speeds from slow to fast",
+           ("viscous_friction",)),
+    Effect("load_friction", "has friction that grows with the load on its gear", "at high load", _load_friction,
+           "the same slow motion under two or more loads", ("load_friction", "load_friction_backdriven")),
+    Effect("backlash", "has free play between motor and joint", "when the load changes sign", _backlash,
+           "small steps about a pose without load, both encoders logged if there are two", ("backlash",)),
+    Effect("compliance", "has an elastic transmission", "at high load and at 5-30 Hz", _compliance, "a chirp of 1-30 Hz", ()),
+    Effect("command_delay", "acts on its commands later than believed", "in proportion to speed", _delay, "steps and a fast chirp", ("delay",)),
+    Effect("lag", "builds its torque up with a lag", "at high acceleration", _lag, "steps and a fast chirp", ("lag",)),
+    Effect("torque_limit", "gives less torque than believed when it saturates", "at saturation", _torque_limit,
+           "large steps against a load", ("torque_limit",)),
+    Effect("torque_speed_limit", "runs out of torque at a lower speed than believed", "at high speed and torque", _speed_limit,
+           "large steps at full speed", ("no_load_speed",)),
+    Effect("supply_sag", "loses supply while other joints load it", "while other joints work", _sag,
+           "this joint moving alone, then with the others loaded", ("supply",)),
+    Effect("torque_ripple", "has a torque ripple that repeats with position", "periodically in position", _ripple,
+           "slow constant speed over the whole range", ("torque_ripple", "ripple_per_turn", "ripple_phase")),
+    Effect("thermal", "changes as it warms up", "with temperature", _thermal, "the same motion cold and warm, in random order"),
+    Effect("joint_coupling", "is dragged along by another joint", "while that joint moves", _coupling,
+           "one joint at a time, the others held"),
+    Effect("position_offset", "has an encoder zero error", "with the pose", _offset, "static poses over the whole range", ("position_offset",)),
+    Effect("position_scale", "has an encoder that is not linear in the position", "with the pose", _scale,
+           "the full range against a protractor or the stops", ("position_scale",)),
+    Effect("payload", "carries another mass (or another direction of gravity) than the model", "with the pose, also at rest", _payload,
+           "static poses over the whole range, and the same turned over"),
+    Effect("inertia", "has more (or less) inertia than the model", "at high acceleration", _inertia, "steps and a fast chirp"),
+    Effect("gain_mismatch", "runs on other gains than believed", "with the size of the error", _gain,
+           "steps of several sizes against a known load", ("kp", "kd")),
+    Effect("deadband", "ignores small position errors", "at small errors", _deadband, "small steps of increasing size", ("deadband",)),
+    Effect("current_sensor", "shows its effort with a wrong gain or offset", "in the effort alone", _current, "a hold under a known load"),
+)  # fmt: skip
+EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
+
+
+def confusable(a: str, b: str) -> bool:
+    """Whether two effects are of one class that some recordings cannot separate."""
+    return any(a in c and b in c for c in CONFUSED)

@@ -1,0 +1,158 @@
+"""The command line of `diagnose.py`: settings, progress, the verdict in ten lines."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import yaml
+
+from dexsim.errors import UserError
+
+HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
+       python diagnose.py demo=true [out=DIR]
+       python diagnose.py columns=true
+
+Find what the simulator leaves out of a recorded mechanism: where it goes wrong, which physics is missing, its size, and the
+proof on recordings not used for the fit. Writes diagnosis.json, report.html (one page), servo.yaml (what was fitted, for
+train.py servo_file=FILE), model.xml where the model changed, next_recording.mcap where another recording would help.
+
+examples:
+  python diagnose.py recordings='[a.mcap,b.mcap,c.mcap]' out=out/hand
+  python diagnose.py recordings='[a.mcap,b.mcap]' held_out='[c.mcap]' model=rig.xml servo=rig.yaml out=out/rig
+  python diagnose.py demo=true
+
+settings (key=default):
+  recordings=                 MCAP files (or bag folders): [a.mcap,b.mcap,...] or a pattern 'runs/*.mcap'
+  held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the time, is kept out
+  model=                      MuJoCo or URDF file; the xHand by default
+  servo=                      servo.yaml believed of its drives; the xHand's by default
+  out=out/diagnosis           folder for the results
+  effects=                    consider only these effects: [backlash,lag,...]; all by default
+  next=true                   also write the commands of the next recording, where one would help
+  seed=0                      of the bootstraps
+  device=cpu                  cpu | cuda: where hypotheses are simulated
+  demo=false                  make a recording with a hidden effect, diagnose it, then open the answer
+  columns=false               list the columns of servo.yaml with unit, neutral value and meaning
+  meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
+  remap.OURS=                 their name of a topic or a joint, e.g. remap./joint_states=/xhand/state
+"""
+KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "demo", "columns")
+
+
+def parse(argv: list[str]) -> dict:
+    """key=value settings; UserError for a key that does not exist or a value of the wrong type."""
+    from dexsim.actuator.columns import did_you_mean
+
+    out: dict = {"meta": {}, "remap": {}}
+    for argument in argv:
+        key, equals, text = argument.partition("=")
+        if not equals:
+            hint = f"write {argument.lstrip('-')}=..." if argument.startswith("-") else "write it as key=value"
+            raise UserError(f"'{argument}' is not a setting: {hint} (--help lists them)")
+        group, dot, name = key.partition(".")
+        if dot and group in ("meta", "remap") and name:
+            out[group][name] = text
+            continue
+        if key not in KEYS:
+            raise UserError(f"setting '{key}' does not exist.{did_you_mean(key, KEYS)} Valid: {', '.join(KEYS)}, meta.KEY, remap.OURS")
+        if key in ("recordings", "held_out", "effects"):
+            text = text.strip()
+            items = text[1:-1].split(",") if text.startswith("[") and text.endswith("]") else [text]
+            out[key] = [i.strip().strip("'\"") for i in items if i.strip()]
+        elif key in ("demo", "columns", "next"):
+            value = yaml.safe_load(text)
+            if not isinstance(value, bool):
+                raise UserError(f"{key}={text}: must be true or false")
+            out[key] = value
+        elif key == "seed":
+            if not text.lstrip("-").isdigit():
+                raise UserError(f"seed={text}: must be a whole number")
+            out[key] = int(text)
+        else:
+            out[key] = text
+    return out
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command; returns the exit status. Raises UserError."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        return 0 if argv else 2
+    given = parse(argv)
+    if given.get("columns"):
+        from dexsim.actuator.columns import describe
+
+        print(describe())
+        return 0
+    from dexsim.cli.build import quiet_warp
+    from dexsim.gap import inputs
+    from dexsim.gap.catalogue import EFFECTS
+    from dexsim.gap.diagnosis import Settings, diagnose, save
+
+    start = time.perf_counter()
+    device = given.get("device", "cpu")
+    if device != "cpu" and not device.startswith("cuda"):
+        raise UserError(f"device={device}: must be cpu or cuda")
+    quiet_warp(device)
+    demo = None
+    out = Path(given.get("out", "out/demo" if given.get("demo") else "out/diagnosis")).expanduser()
+    if given.get("demo"):
+        from dexsim.gap import demo as maker
+
+        print("Making recordings of a pendulum whose drive hides something ...", flush=True)
+        paths, model, servo, demo = maker.make(out / "recordings", seed=given.get("seed", 0))
+        given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
+    if "recordings" not in given:
+        raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
+    allowed = None
+    if given.get("effects"):
+        for e in given["effects"]:
+            if e not in EFFECTS:
+                raise UserError(f"effects: '{e}' is not in the catalogue: {', '.join(EFFECTS)}")
+        allowed = set(given["effects"])
+    settings = Settings(
+        inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
+        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, given["meta"], given["remap"],
+    )  # fmt: skip
+    result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
+    written = save(result, out)
+    print(verdict(result))
+    if demo is not None:
+        print(f"\nWhat was hidden: {', '.join(f'{k} {v:g}' for k, v in demo.items())}")
+    print("\n" + "\n".join(str(p) for p in written) + f"\n{time.perf_counter() - start:.0f} s")
+    return 0
+
+
+class Progress:
+    """Which joint is searched, and the time left."""
+
+    def __init__(self) -> None:
+        self.start = time.perf_counter()
+        self.live = sys.stdout.isatty()
+
+    def __call__(self, done: int, total: int, name: str) -> None:
+        spent = time.perf_counter() - self.start
+        left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        text = f"  searching {name} ({done + 1}/{total}){left}" if done < total else f"  searched {total} joint{'s' * (total > 1)} in {spent:.0f} s"
+        print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
+
+
+def verdict(d) -> str:
+    """The verdict in at most ten lines."""
+    data = d.data
+    lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]
+    for f in data["findings"][:4]:
+        where = ", ".join(f["where"]["joints"] or f["where"]["topics"])
+        sizes = ", ".join(
+            f"{k} {p['value']:.4g} ({p['low']:.3g} to {p['high']:.3g}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
+        )
+        lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}: {sizes or f['regime']}")
+        if f["indistinguishable"]:
+            lines.append(f"    cannot be told from {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}: {f['separating_experiment']}")
+    if data["next_recording"]:
+        lines.append(f"  record next: {data['next_recording']['why']}")
+    if d.notes:
+        lines.append(f"  note: {d.notes[0]}" + (f" (and {len(d.notes) - 1} more in report.html)" if len(d.notes) > 1 else ""))
+    return "\n".join(lines[:11])

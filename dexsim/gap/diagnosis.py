@@ -1,0 +1,487 @@
+"""The whole diagnosis: recordings in, verdict, findings, fitted servo and model, report out."""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.gap import inputs, judge, locate
+from dexsim.gap.catalogue import EFFECTS, confusable
+from dexsim.gap.findings import finding_parameters, model_changes, servo_changes
+from dexsim.gap.fit import Fitter, expand, intervals
+from dexsim.gap.prepare import Case, build
+from dexsim.gap.runs import Run, conditions
+from dexsim.gap.search import JointSearch, Outcome
+from dexsim.recording.mechanism import Mechanism
+
+KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
+SET_SHARE = 0.12  # of the bootstraps: a rival of the same class with as much belongs to the set
+
+
+@dataclass
+class Settings:
+    """What was asked. recordings, held_out: paths; model, servo: files, None for the xHand's; allowed: effect ids to
+    consider, None for all."""
+
+    recordings: list[Path]
+    out: Path
+    held_out: list[Path] | None = None
+    model: str | None = None
+    servo: str | None = None
+    seed: int = 0
+    device: str = "cpu"
+    next_recording: bool = True
+    allowed: set[str] | None = None
+    meta: dict[str, str] = field(default_factory=dict)
+    remap: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Curve:
+    """Held-out stretch of one joint for the page: measured and simulated before and after."""
+
+    joint: str
+    recording: str
+    t: np.ndarray
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    command: np.ndarray
+
+
+@dataclass
+class Diagnosis:
+    """Everything the page shows; `data` is what diagnosis.json holds."""
+
+    data: dict[str, Any]
+    sentence: str
+    notes: list[str]
+    curves: list[Curve] = field(default_factory=list)
+    spots: list[locate.Spot] = field(default_factory=list)
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)  # by joint: before, after, sigma
+    outcomes: list[Outcome] = field(default_factory=list)
+    servo: ServoTable | None = None
+    model_spec: Any = None
+    mechanism: Mechanism | None = None
+    stages: list[str] = field(default_factory=list)
+    shares: dict[str, float] = field(default_factory=dict)
+    spans: dict[str, float] = field(default_factory=dict)
+    untrained: list[str] = field(default_factory=list)
+
+
+def empty(verdict: str = "unusable") -> dict[str, Any]:
+    """diagnosis.json with nothing in it."""
+    zero = {"recordings": [], "error": "position_rmse_rad"}
+    zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
+    return {"schema": 1, "verdict": verdict, "noise_floor": {"position_rad": None, "how": "quantum"}, "nuisance": {}, "held_out": zero,
+            "findings": [], "unexplained": {"fraction_of_gap": None, "depends_on": []}, "next_recording": None}
+
+
+class Clock:
+    """Where the time goes, by stage."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.shares[stage] = self.shares.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[[int, int, str], None] | None = None) -> Diagnosis:
+    """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
+    from dexsim.recording import read
+    from dexsim.recording.mechanism import mechanism
+
+    clock = Clock()
+    notes: list[str] = []
+    m = mechanism(s.model, s.servo)
+    overlap = {p.resolve() for p in s.recordings} & {p.resolve() for p in s.held_out or []}
+    if overlap:
+        raise UserError(f"held_out: {', '.join(sorted(p.name for p in overlap))} is also in recordings; what is held out must not be fitted")
+    paths = [*s.recordings, *(s.held_out or [])]
+    names = _unique_names(paths)
+    recordings = []
+    failures = []
+    for path in paths:
+        try:
+            r = read(path, s.remap, s.meta, joints=m.joints)
+            r.path = Path(names[path])
+            recordings.append(r)
+        except UserError as error:
+            failures.append(str(error))
+            recordings.append(None)
+    clock.lap("reading and audit")
+    runs: list[Run] = []
+    held: list[int] = []
+    used: list[Any] = []
+    for i, r in enumerate(recordings):
+        if r is None:
+            continue
+        try:
+            run = inputs.to_run(r, m, notes)
+        except inputs.Unusable as error:
+            failures.append(str(error))
+            continue
+        if i >= len(s.recordings):
+            held.append(len(runs))
+        runs.append(run)
+        used.append(r)
+    channel = inputs.channel_findings([r for r in recordings if r is not None], m.joints)
+    notes += failures
+    if failures and runs and len(held) < len(runs):
+        say(f"  left out: {'; '.join(failures)}")
+    if not runs or (s.held_out and len(held) == len(runs)):
+        return _unusable("No recording can be used: " + "; ".join(failures), channel, notes, m)
+    try:
+        runs = inputs.common_joints(runs, notes)
+    except inputs.Unusable as error:
+        return _unusable(str(error), channel, notes, m)
+    if s.held_out and not held:
+        notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
+    model = m.spec.compile()
+    notes += _limits(model, runs)
+    for run in runs:
+        run.smooth()
+    moving = [j for j, name in enumerate(runs[0].joints) if max(float(np.ptp(r.q[:, j])) for r in runs) > 2e-3]
+    commanded = [j for j in range(len(runs[0].joints)) if max(float(np.ptp(r.cmd[:, j])) for r in runs) > 1e-4]
+    if not moving and not commanded:
+        return _unusable("Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged", channel, notes, m)
+
+    say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
+    cases = build(model, runs, device=s.device, dt=_step(runs))
+    clock.lap("model along the motion")
+    group = conditions(runs)
+    train, test, span_train, span_test, how = _split(runs, held, group)
+    say(f"kept out of the fit: {how}")
+    floor, floor_how = judge.floor(runs, cases)
+    say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
+
+    outcomes: list[tuple[Case, JointSearch, Outcome]] = []
+    rng = np.random.default_rng(s.seed)
+    for k, case in enumerate(cases):
+        if progress:
+            progress(k, len(cases), case.joint)
+        if not case.moved:
+            notes.append(f"{case.joint} does not move: nothing can be said of it")
+        search = JointSearch(case, train, span_train, group, seed=s.seed + k, allowed=s.allowed)
+        if len(search.long.window) == 0:
+            notes.append(f"{case.joint}: no stretch long enough to simulate")
+            continue
+        outcomes.append((case, search, search.run() if case.moved else search.idle()))
+    if progress:
+        progress(len(cases), len(cases), "")
+    clock.lap("search")
+    result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
+    clock.lap("judging on held-out data")
+    if s.next_recording:
+        _next(result, s, m)
+        clock.lap("next recording")
+    result.shares = clock.shares
+    return result
+
+
+def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock) -> Diagnosis:
+    data = empty("none")
+    data["noise_floor"] = {"position_rad": float(floor), "how": floor_how}
+    out = Diagnosis(data, "", notes, mechanism=m)
+    findings: list[dict[str, Any]] = []
+    servo = copy.deepcopy(m.table)
+    spec = m.spec.copy()
+    changed_model = False
+    squares = {"before": [], "after": []}
+    effort_squares = {"before": [], "after": []}
+    times, all_spots, leftover = [], [], []
+    for case, search, outcome in outcomes:
+        best, none = search.polish(outcome.best), search.polish(outcome.none)
+        windows = case.plant.windows(None, test, span=span_test)
+        q0, e0 = judge.free_run(case, none.fit.params, none.fit.x, windows)
+        fixed = [f for mm in best.members for f in mm.variant.fixed]
+        q1, e1 = judge.free_run(case, best.fit.params, best.fit.x, windows, fixed) if best.members else (q0, e0)
+        rows = windows.sample_row
+        measured, t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
+        before, after = (measured - q0) ** 2, (measured - q1) ** 2
+        squares["before"].append(before)
+        squares["after"].append(after)
+        times.append(t)
+        rms = lambda x: float(np.sqrt(np.mean(x))) if len(x) else 0.0  # noqa: E731
+        tau = case.plant.torque[rows]
+        ok = np.isfinite(tau)
+        eff = {"before": rms((tau - e0)[ok] ** 2), "after": rms((tau - e1)[ok] ** 2)} if ok.any() else None
+        out.joints[case.joint] = {"before": rms(before), "after": rms(after), "mae_before": float(np.abs(measured - q0).mean()),
+                                  "mae_after": float(np.abs(measured - q1).mean()), "sigma": case.sigma}
+        if eff:
+            out.joints[case.joint] |= {"effort_before": eff["before"], "effort_after": eff["after"]}
+            effort_squares["before"].append((tau - e0)[ok] ** 2)
+            effort_squares["after"].append((tau - e1)[ok] ** 2)
+        out.outcomes.append(outcome)
+        # nuisances
+        for p, x in zip(best.fit.params, best.fit.x, strict=True):
+            if p.nuisance:
+                data["nuisance"][f"{p.key}_factor@{case.joint}" if p.mode == "factor" else f"{p.key}@{case.joint}"] = round(float(x), 6)
+        bounds = intervals(best.fit, search.blocks, knee=search.r.knee)
+        bounds = search.widen(best, bounds)
+        by_member: dict[str, dict[str, float]] = {}
+        for mm in best.members:
+            keys = [f"{mm.id}.{p.key}" for p in mm.variant.params]
+            index = [[p.key for p in best.fit.params].index(k) for k in keys]
+            raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
+            spread = {p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
+            by_member[mm.id] = raw
+            rest = tuple(x for x in best.members if x is not mm)
+            without = judge_without(search, best, mm) if rest else none
+            qw, ew = judge.free_run(case, without.fit.params, without.fit.x, windows, [f for x in rest for f in x.variant.fixed])
+            rivals = outcome.rivals.get(mm.id, [])
+            confidence = outcome.confidence.get(mm.id, 0.5)
+            same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
+            signal = judge.own_signal(mm.id, case, raw, mm.variant.note)
+            active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
+            effort_only = mm.id == "current_sensor"
+            findings.append({
+                "effect": mm.id,
+                "confidence": round(float(min(confidence, 0.99)), 3),
+                "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
+                "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
+                "separating_experiment": EFFECTS[mm.id].experiment if same else None,
+                "where": {"joints": [case.joint], "taxels": [], "topics": []},
+                "regime": EFFECTS[mm.id].shows,
+                "when": judge.intervals_of(active, case, runs, train),
+                "parameters": finding_parameters(mm, raw, spread, case, m.table),
+                "held_out": {"before": rms((tau - ew)[ok] ** 2), "after": eff["after"]} if effort_only and eff else
+                            {"before": rms((measured - qw) ** 2), "after": rms(after)},
+            })  # fmt: skip
+            out.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
+        leftover += servo_changes(servo, case, best, bounds)
+        mine = model_changes(spec, case, best, by_member)
+        changed_model |= bool(mine)
+        leftover_text = [x for x in mine]
+        notes.extend(leftover_text)
+        r = search.fitter.evaluate(none.fit.params, none.fit.x)[: search.long.n]
+        rows_train = search.long.sample_row
+        regimes = {k: v[rows_train] for k, v in case.regimes.items()}
+        found = locate.spots(case.joint, r * case.sigma, search.blocks[: search.long.n], regimes, rng)
+        all_spots += found
+        case_left = search.fitter
+        with search._fix(best.members):
+            r1 = case_left.evaluate(best.fit.params, best.fit.x)[: search.long.n]
+        left = locate.control(locate.spots(case.joint, r1 * case.sigma, search.blocks[: search.long.n], regimes, rng))
+        out.joints[case.joint]["left"] = 0.0
+        if rms(r1**2) > 1.5:
+            data["unexplained"]["depends_on"] += [f"{x.text} ({case.joint})" for x in left[:2]]
+        order = np.argsort(-(before.reshape(-1)))[:1]
+        if len(rows):
+            out.curves.append(_curve(case, runs, rows, q0, q1, int(order[0])))
+    out.spots = locate.control(all_spots)
+    out.untrained = sorted(set(leftover))
+    b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
+    a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
+    slide = all(c.constants.slide for c in cases)
+    data["held_out"] = {"recordings": [runs[i].name for i in test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
+                        "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}
+    data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + sorted(findings, key=lambda f: -_weight(f))
+    only_effort = findings and all(f["effect"] == "current_sensor" for f in findings)
+    structured = any(o.none.fit.loss > 1.3**2 and (len(o.scanned) > 0) for o in out.outcomes)
+    word = judge.verdict(data["findings"], floor, b, bl, a, structured)
+    if only_effort:
+        word = "explained"
+        eb, ea = (float(np.sqrt(np.concatenate(effort_squares[k]).mean())) for k in ("before", "after"))
+        data["held_out"] |= {"error": "effort_rmse_Nm", "before": eb, "after": ea, "before_low": eb, "before_high": eb, "after_low": ea, "after_high": ea}
+    data["verdict"] = word
+    gap = b**2 - floor**2
+    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * floor else 0.0
+    if word in ("none", "explained"):
+        data["unexplained"]["depends_on"] = []
+    out.servo = servo
+    out.model_spec = spec if changed_model else None
+    out.sentence = _sentence(data, out, floor)
+    return out
+
+
+def judge_without(search: JointSearch, best, member):
+    """The best hypothesis without one member, refitted."""
+    rest = tuple(x for x in best.members if x is not member)
+    sizes = np.cumsum([len(x.variant.params) for x in best.members])[:-1]
+    values = np.split(search._values(best), sizes)
+    kept = [v for x, v in zip(best.members, values, strict=True) if x is not member]
+    return search.fit(rest, np.concatenate(kept) if kept else np.zeros(0), best, quick=True)
+
+
+def _weight(f: dict) -> float:
+    h = f["held_out"]
+    return (h["before"] - h["after"]) if h else 0.0
+
+
+def _curve(case, runs, rows, q0, q1, worst) -> Curve:
+    t, r = case.plant.t[rows], case.plant.run_of[rows]
+    run = r[worst]
+    pick = np.flatnonzero((r == run) & (np.abs(t - t[worst]) < 4.0))
+    command = runs[run].command_at(t[pick])[:, case.index]
+    return Curve(case.joint, runs[run].name, t[pick], case.plant.q[rows][pick], q0[pick], q1[pick], command)
+
+
+def _step(runs: list[Run]) -> float:
+    """Integration step [s]: 1 ms, and no coarser than half a sampling period."""
+    period = min(float(np.median(np.diff(r.t))) for r in runs)
+    return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
+
+
+def _split(runs, held, group):
+    """(training runs, test runs, spans of both, in words)."""
+    if held:
+        train = [i for i in range(len(runs)) if i not in held]
+        return train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held)
+    groups = sorted(set(group))
+    if len(groups) >= 3:
+        test = [i for i in range(len(runs)) if group[i] == groups[-1]]
+        train = [i for i in range(len(runs)) if i not in test]
+        if sum(runs[i].duration for i in train) > sum(runs[i].duration for i in test):
+            return train, test, None, None, "one condition, " + ", ".join(runs[i].name for i in test)
+    every = list(range(len(runs)))
+    cut = {i: (1 - KEEP_OUT) * runs[i].duration for i in every}
+    return every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every}, (
+        f"the last {100 * KEEP_OUT:.0f} % of each recording's time"
+    )
+
+
+def _limits(model, runs: list[Run]) -> list[str]:
+    """Measured positions outside the model's range: the limit is taken away, and said."""
+    notes = []
+    for j, name in enumerate(runs[0].joints):
+        joint = model.joint(name).id
+        if not model.jnt_limited[joint]:
+            continue
+        low, high = model.jnt_range[joint]
+        mn, mx = min(r.q[:, j].min() for r in runs), max(r.q[:, j].max() for r in runs)
+        margin = 0.02 * (high - low) + 0.01
+        if mn < low - margin or mx > high + margin:
+            notes.append(f"{name} moved {mn:.3g} to {mx:.3g}, beyond the model's range {low:.3g} to {high:.3g} (degrees for radians in the"
+                         " model, another zero, or another joint?); the range is not used")  # fmt: skip
+            model.jnt_limited[joint] = 0
+    return notes
+
+
+def _unique_names(paths: Sequence[Path]) -> dict[Path, str]:
+    names = [p.name for p in paths]
+    return {p: p.name if names.count(p.name) == 1 else f"{p.parent.name}/{p.name}" for p in paths}
+
+
+def _unusable(reason: str, channel, notes, m) -> Diagnosis:
+    data = empty("unusable")
+    data["findings"] = channel
+    data["unexplained"]["depends_on"] = []
+    data["reason"] = reason
+    return Diagnosis(data, f"{reason.rstrip('.')}.", notes, mechanism=m)
+
+
+def _sentence(data: dict, d: Diagnosis, floor: float) -> str:
+    unit = "mm" if data["held_out"]["error"].endswith("_m") else "mrad"
+    h = data["held_out"]
+    before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
+    named = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
+    if data["verdict"] == "none":
+        return prefix + (f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; "
+                         f"the floor is {1e3 * floor:.2g}.")  # fmt: skip
+    if not named:
+        depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
+        return prefix + f"Something is missing that no effect of the catalogue explains: {before:.3g} {unit} are left where the floor is {1e3 * floor:.2g}{depends}."
+    parts = []
+    for f in named[:3]:
+        joint = f["where"]["joints"][0]
+        size = next(iter(f["parameters"].items()), None)
+        how = f" ({size[0]} {size[1]['value']:.3g} {size[1]['unit']})" if size and size[1]["value"] is not None else ""
+        words = EFFECTS[f["effect"]].words
+        if f["indistinguishable"]:
+            words += f", or one of {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}, which this recording cannot tell apart"
+        parts.append(f"{joint} {words}{how}")
+    effort = data["held_out"]["error"].startswith("effort")
+    unit = "mN.m" if effort else unit
+    tail = f" Without {'it' if len(named) == 1 else 'them'} simulation is wrong by {before:.3g} {unit}; with {'it' if len(named) == 1 else 'them'}, by {after:.3g} on recordings not used for the fit"
+    return prefix + "; ".join(parts) + "." + tail + ("." if effort else f"; the floor is {1e3 * floor:.2g}.")
+
+
+def _next(d: Diagnosis, s: Settings, m: Mechanism) -> None:
+    """What to record next, written ready to send where a safe plan exists."""
+    data = d.data
+    named = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < 0.8]
+    kinds, joints, why = None, None, ""
+    table = {"coulomb_friction": ["triangles", "steps"], "stribeck_friction": ["triangles", "ladder"], "backlash": ["triangles", "chirp"],
+             "load_friction": ["triangles", "holds"], "command_delay": ["steps", "chirp"], "lag": ["steps", "chirp"],
+             "viscous_friction": ["ladder"], "torque_speed_limit": ["ladder", "steps"], "gain_mismatch": ["steps", "holds"],
+             "inertia": ["chirp"], "payload": ["holds"], "position_offset": ["holds"]}  # fmt: skip
+    if unsure:
+        f = unsure[0]
+        rivals = f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])]
+        joints = f["where"]["joints"]
+        kinds = sorted({k for e in rivals for k in table.get(e, ["steps", "chirp", "triangles"])})
+        why = f"to tell {' from '.join(dict.fromkeys(rivals))} on {joints[0]}: {EFFECTS[f['effect']].experiment}"
+    elif data["verdict"] in ("unknown", "partly_explained"):
+        worst = max(d.joints, key=lambda j: d.joints[j]["after"]) if d.joints else None
+        joints, kinds = ([worst] if worst else None), ["triangles", "ladder", "chirp", "steps", "holds"]
+        why = f"what is left on {worst} is not explained: every kind of motion, with repeats"
+    if not why:
+        return
+    data["next_recording"] = {"why": why, "commands": None}
+    try:
+        from dexsim.recording.excitation import next_recording
+
+        s.out.mkdir(parents=True, exist_ok=True)
+        next_recording(s.out / "next_recording.mcap", m, joints, kinds, seed=s.seed)
+        data["next_recording"]["commands"] = "next_recording.mcap"
+    except UserError as error:
+        d.notes.append(f"no commands for the next recording: {error}")
+
+
+def save(d: Diagnosis, out: Path) -> list[Path]:
+    """Writes diagnosis.json, report.html, servo.yaml and, where it changed, model.xml; returns what was written."""
+    from dexsim.gap.report import page
+
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    path = out / "diagnosis.json"
+    path.write_text(json.dumps(_plain(d.data), indent=1, allow_nan=False), encoding="utf-8")
+    written.append(path)
+    if d.servo is not None:
+        d.servo.save(out / "servo.yaml")
+        written.append(out / "servo.yaml")
+    if d.model_spec is not None:
+        try:
+            d.model_spec.compile()
+            (out / "model.xml").write_text(d.model_spec.to_xml(), encoding="utf-8")
+            written.append(out / "model.xml")
+        except (ValueError, mujoco.FatalError) as error:
+            d.notes.append(f"model.xml could not be written: {error}")
+    path = out / "report.html"
+    path.write_text(page(d), encoding="utf-8")
+    written.append(path)
+    return written
+
+
+def _plain(x: Any) -> Any:
+    if isinstance(x, dict):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [_plain(v) for v in x]
+    if isinstance(x, (np.floating, float)):
+        return float(x) if np.isfinite(x) else None
+    if isinstance(x, np.integer):
+        return int(x)
+    return x
+
+
+__all__ = ["SERVO_INDEX", "Diagnosis", "Fitter", "Settings", "diagnose", "expand", "save"]

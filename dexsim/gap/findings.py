@@ -1,0 +1,137 @@
+"""A fitted effect as physical parameters with intervals, as servo columns and as model fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dexsim.actuator.columns import COLUMNS, INDEX
+from dexsim.actuator.table import ServoTable
+from dexsim.gap.prepare import Case
+
+
+def _entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
+    low, high = min(low, high), max(low, high)
+    return {"value": float(value), "low": float(low), "high": float(high), "unit": unit}
+
+
+def finding_parameters(member, raw: dict[str, float], spread: dict[str, tuple[float, float]], case: Case, table: ServoTable) -> dict[str, Any]:
+    """Parameters by the keys of the catalogue, with 90 % intervals. Units of a slide joint have N, m for N.m, rad."""
+    s, out = case.scales, {}
+    get = lambda k: (raw[k], *spread[k])  # noqa: E731
+    force, length = ("N", "m") if s.slide else ("N.m", "rad")
+    e = member.id
+    if e == "coulomb_friction":
+        base = s.base_friction
+        out["torque"] = _entry(*(x + base for x in get("torque")), force)
+        out["asymmetry"] = _entry(*get("asymmetry"), "1")
+    elif e == "stribeck_friction":
+        out = {"peak": _entry(*get("peak"), force), "v_s": _entry(*get("v_s"), f"{length}/s")}
+    elif e == "viscous_friction":
+        out["coefficient"] = _entry(*(x + s.base_damping for x in get("coefficient")), f"{force}.s/{length}")
+    elif e == "load_friction":
+        out = {k: _entry(*get(k), "1") for k in ("fraction", "fraction_backdriven")}
+    elif e == "backlash":
+        out["gap"] = _entry(*get("gap"), length)
+    elif e == "compliance":
+        value, low, high = get("softness")
+        invert = lambda x: 1.0 / max(x, 1e-9)  # noqa: E731
+        out["stiffness"] = _entry(invert(value), invert(high), invert(low), f"{force}/{length}")
+    elif e == "command_delay":
+        out["delay"] = _entry(*get("delay"), "s")
+    elif e == "lag":
+        out["time_constant"] = _entry(*get("time_constant"), "s")
+    elif e == "torque_limit":
+        out["torque"] = _entry(*get("torque"), force)
+    elif e == "torque_speed_limit":
+        out["no_load_speed"] = _entry(*get("no_load_speed"), f"{length}/s")
+    elif e == "supply_sag":
+        out["sag"] = _entry(*get("sag"), f"1/({force})")
+    elif e == "torque_ripple":
+        out = {"amplitude": _entry(*get("amplitude"), force), "per_turn": _entry(*get("per_turn"), "1")}
+    elif e == "thermal":
+        out["per_degree"] = _entry(*get("per_degree"), "1/degC")
+        out["of"] = {"value": member.variant.note["of"], "low": None, "high": None, "unit": ""}
+    elif e == "joint_coupling":
+        out["ratio"] = _entry(*get("ratio"), "1")
+        out["from_joint"] = {"value": member.variant.note["from_joint"], "low": None, "high": None, "unit": ""}
+    elif e == "position_offset":
+        out["offset"] = _entry(*get("offset"), length)
+    elif e == "position_scale":
+        if "scale" in raw:
+            out["scale"] = _entry(*get("scale"), "1")
+        else:
+            size = np.hypot(raw["ecc_sin"], raw["ecc_cos"])
+            half = 0.5 * max(np.ptp(spread["ecc_sin"]), np.ptp(spread["ecc_cos"]))
+            out["eccentricity"] = _entry(size, max(size - half, 0.0), size + half, "rad")
+    elif e == "payload":
+        if "mass" in raw:
+            out["mass"] = _entry(*get("mass"), "kg")
+        else:
+            tilt = [raw.get(f"tilt_{k}", 0.0) for k in "xyz"]
+            lows = [spread.get(f"tilt_{k}", (0.0, 0.0))[0] for k in "xyz"]
+            highs = [spread.get(f"tilt_{k}", (0.0, 0.0))[1] for k in "xyz"]
+            out["tilt"] = {"value": [float(x) for x in tilt], "low": [float(x) for x in lows], "high": [float(x) for x in highs], "unit": "rad"}
+    elif e == "inertia":
+        out["armature"] = _entry(*get("armature"), "kg" if s.slide else "kg.m2")
+    elif e == "gain_mismatch":
+        out = {k: _entry(*get(k), "1") for k in raw}
+    elif e == "deadband":
+        out["width"] = _entry(*get("width"), length)
+    elif e == "current_sensor":
+        out["gain"] = _entry(*get("gain"), "1")
+        per = table.current([case.joint])[0]
+        factor = per if np.isfinite(per) else 1.0
+        out["offset"] = _entry(*(x * factor for x in get("offset")), "A" if np.isfinite(per) else force)
+    return out
+
+
+def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> list[str]:
+    """Writes what was fitted into the servo table, with intervals; returns what the table has no column for."""
+    left = []
+    for p, x, (low, high) in zip(trial.fit.params, trial.fit.x, bounds, strict=True):
+        if p.nuisance and p.key in ("delay", "lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges:
+            continue
+        for name in p.columns:
+            if name not in INDEX:
+                if not p.nuisance and name not in ("armature", "payload"):
+                    left.append(f"{name}@{case.joint}")
+                continue
+            column = COLUMNS[INDEX[name]]
+            nominal = case.scales.nominal[name]
+            if p.mode == "factor":
+                value, lo, hi = x * nominal, low * nominal, high * nominal
+            elif p.mode == "add":
+                value, lo, hi = nominal + x, nominal + low, nominal + high
+            else:
+                value, lo, hi = x, low, high
+            value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
+            table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
+    return left
+
+
+def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]]) -> list[str]:
+    """Writes effects that live in the model into its spec; returns what was changed, in words."""
+    said = []
+    if "inertia" in by_member:
+        joint = spec.joint(case.joint)
+        armature = float(np.ravel(joint.armature)[0]) + by_member["inertia"]["armature"]
+        if armature >= 0:
+            joint.armature = armature
+            said.append(f"model.xml: armature of {case.joint} is {armature:.3g}")
+        else:
+            said.append(f"{case.joint} has {-by_member['inertia']['armature']:.3g} kg.m2 less inertia than the model's links and armature together; "
+                        "change its links' inertia")  # fmt: skip
+    mass = by_member.get("payload", {}).get("mass")
+    if mass is not None:
+        from dexsim.gap.mechanics import leaf_of
+
+        model = spec.compile()
+        body = leaf_of(model, int(model.jnt_bodyid[model.joint(case.joint).id]))
+        if mass > 0:
+            name = model.body(body).name
+            spec.body(name).add_geom(name=f"payload_{case.joint}", type=2, size=[0.004, 0, 0], mass=mass,
+                                     pos=model.body_ipos[body].tolist(), contype=0, conaffinity=0, group=3)  # fmt: skip
+            said.append(f"model.xml: {mass:.3g} kg added to {name}")
+    return said

@@ -1,0 +1,154 @@
+"""Errors on what was kept out of the fit, the floor, the regime and the samples of an effect, the verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexsim.gap.fit import Param, expand
+from dexsim.gap.plant import Windows
+from dexsim.gap.plant_columns import INDEX
+from dexsim.gap.prepare import Case
+from dexsim.gap.runs import Run, same_commands
+
+
+def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
+    """(noise floor of the position error, how): from repeats of the same commands, else from split samples, else from
+    the encoder's quantum. Root mean square over joints."""
+    sums, count = 0.0, 0
+    for i, a in enumerate(runs):
+        for b in runs[i + 1 :]:
+            if not same_commands(a, b):
+                continue
+            t = np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
+            # repeats are aligned by their commands, which were sent at the same times from the start
+            for j in range(len(a.joints)):
+                d = np.interp(a.t[0] + t, a.t, a.q[:, j]) - np.interp(b.t[0] + t, b.t, b.q[:, j])
+                sums, count = sums + float((d**2).sum()) / 2.0, count + len(t)
+    split = float(np.sqrt(np.mean([c.sigma**2 for c in cases])))
+    quantum = float(np.sqrt(np.mean([c.quantum**2 for c in cases]))) / np.sqrt(12)
+    if count:
+        return max(float(np.sqrt(sums / count)), split), "repeats"
+    return split, "quantum" if split <= 1.02 * quantum else "split"
+
+
+def free_run(case: Case, params: list[Param], x: np.ndarray, windows: Windows, fixed=()) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated position and motor torque [n] at the windows' samples, from their first sample on without correction."""
+    plants = expand(case.plant, params, x[None])
+    for name, value in fixed:
+        plants[:, :, INDEX[name]] = value
+    q, tau = case.plant.simulate(plants, windows)
+    return q[0], plants[0, 0, INDEX["effort_gain"]] * tau[0] + plants[0, 0, INDEX["effort_offset"]]
+
+
+def rms_interval(squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = 0.5) -> tuple[float, float, float]:
+    """(rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all joints."""
+    rng = np.random.default_rng(seed)
+    sums, counts = [], []
+    for s, t in zip(squares, times, strict=True):
+        b = ((t - t[0]) / block).astype(int) if len(t) else np.zeros(0, int)
+        if len(b):
+            sums.append(np.bincount(b, s))
+            counts.append(np.bincount(b))
+    if not sums:
+        return 0.0, 0.0, 0.0
+    sums, counts = np.concatenate(sums), np.concatenate(counts)
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    n = len(sums)
+    pick = rng.integers(0, n, (400, n))
+    values = np.sqrt(sums[pick].sum(1) / counts[pick].sum(1))
+    return float(np.sqrt(sums.sum() / counts.sum())), float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))
+
+
+def own_signal(effect: str, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+    """[n] how strongly the effect acts at each measured sample (its own torque, or the signal it changes)."""
+    m = case.regimes
+    v, a, load, e = m["speed"], m["acceleration"], m["load"], m["position error"]
+    s = case.scales
+    small = 0.02 * s.speed
+    tau = np.abs(m["_torque"])
+    if effect == "coulomb_friction":
+        return (v > small).astype(float)
+    if effect == "stribeck_friction":
+        return np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2)) * ((v > 0.2 * small) | (tau > 0))
+    if effect in ("viscous_friction", "command_delay", "lag"):
+        return a if effect == "lag" else v
+    if effect == "load_friction":
+        return tau
+    if effect == "backlash":
+        return _near_sign_change(case, m["_load"] + m["_friction"], 0.04)
+    if effect == "compliance":
+        return load
+    if effect == "torque_limit":
+        limit = values.get("torque", s.demand)
+        return np.maximum(np.abs(m["_asked"]) - limit, 0.0)
+    if effect == "torque_speed_limit":
+        line = s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.demand
+        return np.maximum(np.abs(m["_asked"]) - line * np.maximum(1 - v / values.get("no_load_speed", s.peak_speed), 0), 0.0)
+    if effect == "torque_ripple":
+        return np.abs(np.sin(values.get("per_turn", 1) * m["position"] + values.get("phase", 0.0)))
+    if effect == "thermal":
+        return np.abs(m.get("temperature", m["time"]) - np.min(m.get("temperature", m["time"]))) * tau
+    if effect == "joint_coupling":
+        k = list(s.others).index(note["from_joint"]) if note.get("from_joint") in s.others else 0
+        return np.abs(m.get(f"_drag{k}", v))
+    if effect == "supply_sag":
+        return m.get("_others", v)
+    if effect == "payload":
+        return np.abs(m["_gravity"])
+    if effect == "inertia":
+        return a
+    if effect == "gain_mismatch":
+        return e
+    if effect == "deadband":
+        return (e < values.get("width", 0.0)).astype(float)
+    if effect == "current_sensor":
+        return tau
+    return np.ones_like(v)
+
+
+def _near_sign_change(case: Case, x: np.ndarray, seconds: float) -> np.ndarray:
+    t, run = case.plant.t, case.plant.run_of
+    out = np.zeros(len(t))
+    change = np.flatnonzero((np.sign(x[1:]) != np.sign(x[:-1])) & (run[1:] == run[:-1]))
+    for i in change:
+        j = np.searchsorted(t[case.plant.rows(int(run[i]))], [t[i], t[i] + seconds]) + case.plant.rows(int(run[i])).start
+        out[j[0] : j[1] + 1] = 1.0
+    return out
+
+
+def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int], join: float = 0.03) -> list[dict]:
+    """Stretches of time in which `active` [n] bool holds, by recording, short gaps joined; the longest 400."""
+    out = []
+    for r in use:
+        rows = case.plant.rows(r)
+        t, on = case.plant.t[rows], active[rows]
+        if not on.any():
+            continue
+        edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
+        step = float(np.median(np.diff(t)))
+        start, end = t[edge[::2]], t[edge[1::2] - 1] + step
+        merged = [[start[0], end[0]]]
+        for a, b in zip(start[1:], end[1:], strict=True):
+            if a - merged[-1][1] < join:
+                merged[-1][1] = b
+            else:
+                merged.append([a, b])
+        out += [{"recording": runs[r].name, "start": round(float(a), 4), "end": round(float(b), 4)} for a, b in merged]
+    out.sort(key=lambda w: w["start"] - w["end"])
+    out = out[:400]
+    return sorted(out, key=lambda w: (w["recording"], w["start"]))
+
+
+def verdict(findings: list[dict], floor_: float, before: float, before_low: float, after: float, structured: bool) -> str:
+    """The one word."""
+    named = [f for f in findings if f["effect"] != "bad_channel"]
+    if not named:
+        if before_low <= 1.3 * floor_ or not structured:
+            return "none"
+        return "unknown"
+    if after <= 1.3 * floor_:
+        return "explained"
+    gap = max(before - floor_, 1e-12)
+    if (before - after) / gap >= 0.3:
+        return "partly_explained"
+    return "unknown"

@@ -1,0 +1,226 @@
+"""Batched simulation of one joint's recorded windows under many parameter guesses (see `plant_kernel.py`)."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from dexsim.gap import plant_kernel as pk
+from dexsim.gap.mechanics import JointConstants
+from dexsim.gap.plant_columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
+
+THREADS = 2  # CPU launches release the interpreter: two run side by side
+
+
+@dataclass
+class Windows:
+    """W stretches of recordings, to be simulated apart. Everything a launch needs, samples of all windows in a row.
+
+    window [W, 8], window_t [W]: see the kernel; sample_step, sample_part [n]; of each sample: its window [n], its row
+    in the joint's measurements [n]. run [W]: which run a window is of.
+    """
+
+    window: np.ndarray
+    window_t: np.ndarray
+    sample_step: np.ndarray
+    sample_part: np.ndarray
+    sample_window: np.ndarray
+    sample_row: np.ndarray
+    run: np.ndarray
+    device: dict | None = None
+
+    @property
+    def n(self) -> int:
+        return len(self.sample_row)
+
+
+class JointPlant:
+    """One joint over all runs: measurements in a row, series on the integration grid, and the simulation.
+
+    t, q, run_of [n]: time in its run [s], measured position [rad], which run. torque [n] or None: measured motor
+    torque [N.m]. nominal [R, C]: plant parameters believed in each run.
+    """
+
+    def __init__(self, joint: str, constants: JointConstants, dt: float, voltage: bool, loop: str, position: str,
+                 device: str = "cpu"):
+        self.joint, self.constants, self.dt = joint, constants, dt
+        self.voltage, self.loop, self.position, self.device = voltage, loop, position, device
+        self.nominal: list[np.ndarray] = []
+        self._series, self._cmd_t, self._cmd = [], [], []
+        self._t, self._q, self._torque, self._start, self._grid, self._cmds = [], [], [], [], [0], [0]
+        self._rows = [0]
+        self.open_stage = 0  # 0 whole loop; 1 recorded motor torque; 2 recorded duty drives the joint
+        self._ready = False
+
+    def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
+            cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None, exact: dict[str, np.ndarray]):
+        """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]."""
+        t0 = float(t[0])
+        steps = max(int(np.ceil((float(t[-1]) - t0) / self.dt)) + 2, 2)
+        grid = t0 + self.dt * np.arange(steps)
+        fine = np.stack([np.interp(grid, times, series[:, e]) for e in range(len(SERIES))], 1)
+        for name, values in exact.items():
+            fine[:, SERIES_INDEX[name]] = np.interp(grid, t, values)
+        if "enabled" in exact:
+            k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
+            fine[:, SERIES_INDEX["enabled"]] = exact["enabled"][k]
+        self._series.append(fine)
+        self._grid.append(self._grid[-1] + steps)
+        self._cmd_t.append(cmd_t)
+        self._cmd.append(cmd)
+        self._cmds.append(self._cmds[-1] + len(cmd_t))
+        self._t.append(t)
+        self._q.append(q)
+        self._torque.append(np.full(len(t), np.nan) if torque is None else torque)
+        self._rows.append(self._rows[-1] + len(t))
+        self.nominal.append(nominal)
+        self._start.append(t0)
+
+    def finish(self) -> None:
+        """After the last `add`."""
+        self.t, self.q = np.concatenate(self._t), np.concatenate(self._q)
+        self.torque = np.concatenate(self._torque)
+        self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
+        self.series = np.concatenate(self._series)
+        self._consts = np.zeros(pk.CONSTS)
+        c = self.constants
+        kp = max(float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])), 1e-9)
+        stiff = 30.0 * kp + c.inertia * (2 * np.pi * 40.0) ** 2
+        self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
+                           c.low, c.high, stiff, c.slide, 0)
+        self.contact_stiffness = stiff
+        up = lambda x, d=wp.float64: wp.array(np.ascontiguousarray(x), dtype=d, device=self.device)  # noqa: E731
+        self._up = up
+        self._d = dict(series=up(self.series), cmd_t=up(np.concatenate(self._cmd_t)), cmd=up(np.concatenate(self._cmd)))
+        self._ready = True
+
+    @property
+    def runs(self) -> int:
+        return len(self._t)
+
+    def rows(self, run: int) -> slice:
+        """Rows of a run in the measurements."""
+        return slice(self._rows[run], self._rows[run + 1])
+
+    def windows(self, length: float | None, runs: list[int] | None = None, warm: float = 0.15, stride: float | None = None,
+                span: dict[int, tuple[float, float]] | None = None) -> Windows:
+        """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
+
+        span: part of a run [s from its start] to keep to.
+        """
+        window, window_t, step, part, of, row, run_of = [], [], [], [], [], [], []
+        for r in range(self.runs) if runs is None else runs:
+            t = self._t[r]
+            begin, stop = 0.0, t[-1] - t[0]
+            if span and r in span:
+                begin, stop = max(begin, span[r][0]), min(stop, span[r][1])
+            size = (stop - begin) if length is None else min(length, stop - begin)
+            if size <= 0:
+                continue
+            count = max(int((stop - begin) / (stride or size) + 1e-6), 1)
+            if length is not None and stride is None:
+                size = (stop - begin) / count  # no remainder is lost
+            for i in range(count):
+                a = begin + i * (stride or size)
+                b = a + size
+                w = min(warm, a) if length is not None else 0.0
+                lo, hi = np.searchsorted(t - t[0], [a - 1e-9, b - 1e-9])
+                if i == count - 1 and b >= stop - 1e-6:
+                    hi = int(np.searchsorted(t - t[0], b + 1e-9))
+                if hi - lo < 3:
+                    continue
+                g = int(round((a - w) / self.dt))
+                first_time = self._start[r] + g * self.dt
+                warm_steps = int(round(w / self.dt))
+                at = (t[lo:hi] - first_time) / self.dt
+                at = np.maximum(at, 0.0)
+                total = int(np.floor(at[-1])) + 1
+                total = min(total, self._grid[r + 1] - self._grid[r] - g)
+                s = np.minimum(np.floor(at).astype(int), total - 1)
+                c0, c1 = self._cmds[r], self._cmds[r + 1]
+                k = c0 + int(np.clip(np.searchsorted(self._cmd_t[r], first_time - 0.6) - 1, 0, c1 - c0 - 1))
+                window.append([self._grid[r] + g, total, warm_steps, len(row), hi - lo, c0, c1, k])
+                window_t.append(first_time)
+                step.extend(s)
+                part.extend(at - s)
+                of.extend([len(window) - 1] * (hi - lo))
+                row.extend(range(self._rows[r] + lo, self._rows[r] + hi))
+                run_of.append(r)
+        return Windows(
+            np.array(window, np.int32).reshape(-1, 8), np.array(window_t), np.array(step, np.int32), np.array(part, float),
+            np.array(of, int), np.array(row, int), np.array(run_of, int),
+        )  # fmt: skip
+
+    def simulate(self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None,
+                 open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
+
+        params [H, R, C]: plant parameters by run; inits [H, 2]: added to the initial position and velocity.
+        """
+        H, n = len(params), windows.n
+        if inits is None:
+            inits = np.zeros((H, 2))
+        q, torque = np.empty((H, n)), np.empty((H, n))
+        if windows.device is None:
+            windows.device = {}
+        # one launch a set of runs that shares its parameters: a guess is a row, so rows are (guess, distinct run)
+        by_run = [np.unique(windows.run)[i] for i in range(len(np.unique(windows.run)))]
+        groups: dict[bytes, list[int]] = {}
+        for r in by_run:
+            groups.setdefault(params[:, r].tobytes(), []).append(int(r))
+        consts = self._consts.copy()
+        consts[pk.C_OPEN] = open_stage
+        for group in groups.values():
+            key = tuple(group)
+            if key not in windows.device:
+                pick = np.flatnonzero(np.isin(windows.run, group))
+                keep = np.isin(windows.sample_window, pick)
+                w = windows.window[pick].copy()
+                w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
+                windows.device[key] = (
+                    np.flatnonzero(keep), len(pick), self._up(w, wp.int32), self._up(windows.window_t[pick]),
+                    self._up(windows.sample_step[keep], wp.int32), self._up(windows.sample_part[keep]),
+                )  # fmt: skip
+            keep, count, w, wt, ss, sp = windows.device[key]
+            shape = (H, len(keep))
+            oq, ot = np.empty(shape), np.empty(shape)
+            cpu = self.device == "cpu"
+            dq = wp.array(oq, dtype=wp.float64, device="cpu", copy=False) if cpu else wp.empty(shape, dtype=wp.float64, device=self.device)
+            do = wp.array(ot, dtype=wp.float64, device="cpu", copy=False) if cpu else wp.empty(shape, dtype=wp.float64, device=self.device)
+            p, init, cc = self._up(params[:, group[0]]), self._up(inits), self._up(consts)
+            d = self._d
+            args = (p, init, cc, d["series"], d["cmd_t"], d["cmd"], w, wt, ss, sp, dq, do)
+            kernel = pk.plant_kernel()
+
+            def launch(first, number, args=args, count=count):
+                wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, *args], device=self.device)
+
+            if cpu and H > 1 and THREADS > 1:
+                half = (H + 1) // 2
+                helper = threading.Thread(target=launch, args=(half, H - half))
+                helper.start()
+                launch(0, half)
+                helper.join()
+            else:
+                launch(0, H)
+            if not cpu:
+                oq, ot = dq.numpy(), do.numpy()
+            q[:, keep], torque[:, keep] = oq, ot
+        return q, torque
+
+    def base(self) -> np.ndarray:
+        """[R, C] nominal parameters by run."""
+        return np.stack(self.nominal)
+
+
+def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:
+    """[C] plant parameters of a servo table's row [21] (infinite limits made large), all extras neutral."""
+    row = NEUTRAL.copy()
+    row[: len(servo_row)] = servo_row
+    row[INDEX["rotor"]] = rotor
+    row[~np.isfinite(row)] = 1e9
+    assert len(row) == len(NAMES)
+    return row

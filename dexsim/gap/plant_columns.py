@@ -1,0 +1,57 @@
+"""Parameters of one joint in the gap's own plant: the servo's columns, then what the servo table does not hold.
+
+Every one has a neutral value at which it is not there, as in `dexsim.actuator.columns`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexsim.actuator.columns import COLUMNS as SERVO_COLUMNS
+
+EXTRA: tuple[tuple[str, float, str, str], ...] = (
+    # name, neutral, unit, meaning
+    ("inertia_scale", 1.0, "1", "factor on the model's inertia about the joint"),
+    ("gravity_scale", 1.0, "1", "factor on the model's gravity torque"),
+    ("armature", 0.0, "kg.m2", "reflected rotor inertia beyond the model's"),
+    ("payload", 0.0, "kg", "mass added at the centre of mass of the last link"),
+    ("tilt_x", 0.0, "rad", "gravity turned about the world's x"),
+    ("tilt_y", 0.0, "rad", "gravity turned about the world's y"),
+    ("tilt_z", 0.0, "rad", "gravity turned about the world's z"),
+    ("backlash", 0.0, "rad", "total free play between rotor and link"),
+    ("softness", 0.0, "rad/N.m", "1 / stiffness of the transmission"),
+    ("rotor", 0.0, "kg.m2", "rotor's part of the inertia, used where there is play or elasticity"),
+    ("sag", 0.0, "1/N.m", "supply lost per N.m that the other joints' motors give"),
+    ("thermal_torque", 0.0, "1/degC", "relative change of the torque constant per degree"),
+    ("thermal_friction", 0.0, "1/degC", "relative change of dry and viscous friction per degree"),
+    ("thermal_resistance", 0.0, "1/degC", "relative change of the winding resistance per degree"),
+    ("coupling", 0.0, "1", "how far the joint is dragged per motion of another"),
+    ("eccentric_sin", 0.0, "rad", "encoder error, sin of the position"),
+    ("eccentric_cos", 0.0, "rad", "encoder error, cos of the position - 1"),
+    ("speed_lag", 0.0, "s", "first-order lag of the velocity that the loop's kd acts on"),
+    ("bias", 0.0, "N.m", "constant torque on the joint"),
+    ("coupling_from", 0.0, "1", "which of the draggers"),
+    ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
+    ("effort_offset", 0.0, "N.m", "added to the shown effort"),
+)
+
+NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)
+INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
+NEUTRAL: np.ndarray = np.array([c.neutral for c in SERVO_COLUMNS] + [e[1] for e in EXTRA])
+
+# What the mechanism and the recording prescribe along a joint's trajectory, on the integration grid.
+SERIES: tuple[str, ...] = (
+    "q", "v",  # smoothed measured motion of the joint itself
+    "inertia",  # about the joint, the model's armature included
+    "gravity_cos", "gravity_sin",  # gravity bias torque = cos * cos(q - q_meas) + sin * sin(q - q_meas)
+    "rest",  # bias torque of the other joints' motion (Coriolis, coupling inertia) and springs
+    "load_inertia", "load_cos", "load_sin",  # the same of a unit mass on the last link
+    "tilt_x_cos", "tilt_x_sin", "tilt_y_cos", "tilt_y_sin", "tilt_z_cos", "tilt_z_sin",  # per rad of tilt
+    "supply",  # measured supply over nominal
+    "others_torque",  # sum of the other joints' |motor torque|, N.m
+    "warmth",  # temperature above the reference, degC
+    "enabled",
+    "drive",  # recorded motor torque (or duty) where a stage is tested with its recorded input
+    "drag0", "drag1", "drag2", "drag3",  # motion of the joints that may drag this one, from its first sample, rad
+)  # fmt: skip
+SERIES_INDEX: dict[str, int] = {name: i for i, name in enumerate(SERIES)}

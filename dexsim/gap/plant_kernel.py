@@ -1,0 +1,422 @@
+"""One joint through many windows under many parameter guesses: a Warp kernel, one thread per guess and window.
+
+In free air each joint is its own small system once the other joints' measured motion is prescribed:
+
+    I(t) dv/dt = eta * motor - gravity(q, t) - rest(t) - friction(v) - viscous v
+
+with I, gravity and rest taken from the MuJoCo model along the measured motion (`mechanics.py`); the motor's law is that
+of `dexsim.actuator.kernel`, line for line, so a fitted column means the same there. With play or elasticity, rotor
+and link are two inertias joined by a spring with a gap, integrated implicitly (no stiffness limit on the step). Dry
+friction is solved exactly in each step (a joint sticks when the level can hold it), not approximated by a smooth law.
+"""
+
+# No `from __future__ import annotations`: Warp resolves these annotations from the closure.
+
+from functools import lru_cache
+
+import warp as wp
+
+from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
+
+f64 = wp.float64
+TWO_BODY_STEPS = 2  # sub-steps of the two-inertia plant in one step of the grid
+
+# constants of a joint: consts[...]
+C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
+CONSTS = 10
+P_KP, P_KD, P_DEADBAND, P_LIMIT, P_NLS, P_EFF, P_DELAY, P_LAG, P_SUPPLY = (
+    INDEX[n] for n in ("kp", "kd", "deadband", "torque_limit", "no_load_speed", "efficiency", "delay", "lag", "supply")
+)
+P_COULOMB, P_ASYM, P_PEAK, P_VS, P_VISC, P_LOAD, P_BACK = (
+    INDEX[n]
+    for n in (
+        "coulomb_friction", "friction_asymmetry", "stribeck_peak", "stribeck_speed", "viscous_friction",
+        "load_friction", "load_friction_backdriven",
+    )
+)  # fmt: skip
+P_RIPPLE, P_TURN, P_PHASE, P_OFFSET, P_SCALE = (
+    INDEX[n] for n in ("torque_ripple", "ripple_per_turn", "ripple_phase", "position_offset", "position_scale")
+)
+P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, P_SAG = (
+    INDEX[n]
+    for n in (
+        "inertia_scale", "gravity_scale", "armature", "payload", "tilt_x", "tilt_y", "tilt_z", "backlash", "softness",
+        "rotor", "sag",
+    )
+)  # fmt: skip
+P_TTORQUE, P_TFRICTION, P_TRES, P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS = (
+    INDEX[n]
+    for n in (
+        "thermal_torque", "thermal_friction", "thermal_resistance", "coupling", "eccentric_sin", "eccentric_cos",
+        "speed_lag", "bias",
+    )
+)  # fmt: skip
+X = SERIES_INDEX
+XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
+    X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
+)
+XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
+XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
+P_FROM = INDEX["coupling_from"]
+
+
+@lru_cache(maxsize=None)
+def plant_kernel():
+    """The kernel; inputs documented at its launch in `plant.py`."""
+
+    @wp.func
+    def law(
+        e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
+        dt: f64, voltage: f64,
+    ):  # fmt: skip
+        """(motor torque now, at the end of the step at unchanged speed, its slope in that speed) of the servo's law."""
+        zero = f64(0.0)
+        one = f64(1.0)
+        now = kp * e - kd * v_m
+        pd = now - kp * dt * v_m
+        slope = scale * (kp * dt + kd)
+        if wp.abs(e) < deadband:
+            now = zero
+            pd = zero
+            slope = zero
+        motor_now = zero
+        motor = zero
+        damping = zero
+        if voltage > zero:
+            line = tau0 / nls
+            motor_now = tau0 * supply * wp.clamp(now, -one, one) - line * v
+            motor = tau0 * supply * wp.clamp(pd, -one, one) - line * v
+            damping = tau0 * supply * slope + line
+            if wp.abs(pd) > one:
+                unlimited = tau0 * supply * pd - line * v
+                ratio = zero
+                if unlimited != zero:
+                    ratio = wp.clamp(motor / unlimited, zero, one)
+                damping = wp.max(ratio * damping, line)
+        else:
+            x = wp.abs(v) / (nls * supply)
+            limit = zero
+            if x < one:
+                limit = tau0 * (one - x)
+            motor_now = wp.clamp(now, -limit, limit)
+            motor = wp.clamp(pd, -limit, limit)
+            damping = slope
+            if wp.abs(pd) > limit:
+                line = tau0 / (nls * supply)
+                if pd * v < zero:
+                    line = zero
+                elif limit == zero:
+                    line = zero
+                damping = wp.max(slope * limit / wp.abs(pd), line)
+        return wp.vec3d(motor_now, motor, damping)
+
+    @wp.func
+    def measured(q: f64, scale: f64, offset: f64, esin: f64, ecos: f64, round_: bool):
+        """What the encoder shows at position q."""
+        m = scale * q + offset
+        if round_:
+            m += esin * wp.sin(q) + ecos * (wp.cos(q) - f64(1.0))
+        return m
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def plant(
+        first: int,  # first guess of this launch
+        dt: f64,
+        params: wp.array2d(dtype=f64),  # [H, C]
+        inits: wp.array2d(dtype=f64),  # [H, 2] added to the initial position and velocity
+        consts: wp.array(dtype=f64),
+        series: wp.array2d(dtype=f64),  # [G, E]
+        cmd_t: wp.array(dtype=f64),
+        cmd: wp.array(dtype=f64),
+        window: wp.array2d(dtype=int),  # [W, 8] grid start, steps, warm steps, first sample, samples, cmd range, first cmd
+        window_t: wp.array(dtype=f64),  # [W] time at the grid start
+        sample_step: wp.array(dtype=int),  # [n] step of the window in which the sample falls
+        sample_part: wp.array(dtype=f64),  # [n] where in it, 0..1
+        out_q: wp.array2d(dtype=f64),  # [H, n]
+        out_torque: wp.array2d(dtype=f64),  # [H, n]
+    ):
+        hh, w = wp.tid()
+        h = first + hh
+        zero = f64(0.0)
+        one = f64(1.0)
+        half = f64(0.5)
+        g0 = window[w, 0]
+        steps = window[w, 1]
+        warm = window[w, 2]
+        s = window[w, 3]
+        s_end = s + window[w, 4]
+        c_end = window[w, 6]
+        k = window[w, 7]
+        t = window_t[w]
+
+        kp = params[h, P_KP]
+        kd = params[h, P_KD]
+        scale = params[h, P_SCALE]
+        offset = params[h, P_OFFSET]
+        esin = params[h, P_ESIN]
+        ecos = params[h, P_ECOS]
+        delay = params[h, P_DELAY]
+        gap2 = half * params[h, P_GAP]
+        soft = params[h, P_SOFT]
+        two = gap2 > zero or soft > zero
+        round_ = esin != zero or ecos != zero  # an eccentric encoder
+        turn = params[h, P_TURN]
+        ripple = params[h, P_RIPPLE]
+        peak = params[h, P_PEAK]
+        tilted = params[h, P_TX] != zero or params[h, P_TY] != zero or params[h, P_TZ] != zero
+        speed_lag = params[h, P_SPEEDLAG]
+        voltage = consts[C_VOLTAGE]
+        base_damping = consts[C_DAMPING]
+        base_friction = consts[C_FRICTION]
+        low = consts[C_LOW]
+        high = consts[C_HIGH]
+
+        # measured = scale * q + offset + eccentricity(q): invert once, by two fixed-point steps
+        m0 = series[g0, XQ]
+        q = (m0 - offset) / scale
+        q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
+        q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
+        v = series[g0, XV] / scale
+        if warm == 0:
+            q += inits[h, 0]
+            v += inits[h, 1]
+        qm = q
+        vm = v
+        last = zero
+        v_f = v
+        fresh = int(1)
+        prev_q = zero
+        prev_tau = zero
+
+        for i in range(steps):
+            g = g0 + i
+            # the recorded motion is held on the joint while the drive's own state settles
+            if i < warm:
+                m1 = series[g, XQ]
+                if round_:
+                    m1 = m1 - esin * wp.sin(q) - ecos * (wp.cos(q) - one)
+                q = (m1 - offset) / scale
+                v = series[g, XV] / scale
+                if i == warm - 1:
+                    q += inits[h, 0]
+                    v += inits[h, 1]
+                if not two:
+                    qm = q
+                    vm = v
+            if i == 0 and two:
+                qm = q
+                vm = v
+
+            # target in force at the end of this step, averaged over it
+            end = t + dt - delay
+            while k + 1 < c_end and cmd_t[k + 1] <= end - dt:
+                k += 1
+            target = cmd[k]
+            kk = int(k)
+            while kk + 1 < c_end and cmd_t[kk + 1] < end:
+                part = wp.clamp((end - cmd_t[kk + 1]) / dt, zero, one)
+                target += part * (cmd[kk + 1] - cmd[kk])
+                kk += 1
+            target += params[h, P_COUPLING] * series[g, XDRAG + int(params[h, P_FROM])]
+
+            warmth = series[g, XWARM]
+            torque_factor = one + params[h, P_TTORQUE] * warmth
+            friction_factor = wp.max(one + params[h, P_TFRICTION] * warmth, zero)
+            resistance = wp.max(one + params[h, P_TRES] * warmth, f64(0.1))
+            tau0 = params[h, P_LIMIT] * torque_factor
+            nls = params[h, P_NLS]
+            if voltage > zero:
+                tau0 = tau0 / resistance
+                nls = nls / torque_factor
+            supply = params[h, P_SUPPLY] * series[g, XSUP] * wp.max(one - params[h, P_SAG] * series[g, XOTH], f64(0.05))
+            eff = params[h, P_EFF]
+            if voltage <= zero:
+                eff = eff * torque_factor
+
+            inertia = params[h, P_ISCALE] * series[g, XI] + params[h, P_ARM] + params[h, P_PAYLOAD] * series[g, XLI]
+            gc = params[h, P_GSCALE] * series[g, XGC] + params[h, P_PAYLOAD] * series[g, XLC]
+            gs = params[h, P_GSCALE] * series[g, XGS] + params[h, P_PAYLOAD] * series[g, XLS]
+            if tilted:
+                gc += params[h, P_TX] * series[g, XTXC] + params[h, P_TY] * series[g, XTYC] + params[h, P_TZ] * series[g, XTZC]
+                gs += params[h, P_TX] * series[g, XTXS] + params[h, P_TY] * series[g, XTYS] + params[h, P_TZ] * series[g, XTZS]
+            inertia = wp.max(inertia, f64(1.0e-9))
+
+            reported = measured(q, scale, offset, esin, ecos, round_)
+            shown = reported
+            if consts[C_POS_MOTOR] > zero:
+                shown = measured(qm, scale, offset, esin, ecos, round_)
+
+            visc = base_damping + params[h, P_VISC] * friction_factor
+            n_sub = int(1)
+            if two:
+                n_sub = TWO_BODY_STEPS
+            dts = dt / f64(n_sub)
+            for sub in range(n_sub):
+                q_l = reported
+                v_l = v
+                if two and consts[C_LOOP_MOTOR] > zero:
+                    q_l = measured(qm, scale, offset, esin, ecos, round_)
+                    v_l = vm
+                elif sub > 0:
+                    q_l = measured(q, scale, offset, esin, ecos, round_)
+                if fresh == 1 or speed_lag <= zero:
+                    v_f = v_l
+                else:
+                    v_f += dts / (speed_lag + dts) * (v_l - v_f)
+                e = target - q_l
+                v_drive = vm
+                if not two:
+                    v_drive = v
+                # the lag acts on the velocity that kd sees; without it v_f is v_l
+                torque = law(
+                    e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, dts, voltage
+                )
+                now = torque[0]
+                motor = torque[1]
+                damping = torque[2]
+                if consts[C_OPEN] > zero:  # the stage after the drive, with its recorded input
+                    now = series[g, XDRIVE]
+                    motor = now
+                    damping = zero
+                    if consts[C_OPEN] > f64(1.5):  # that input is the duty
+                        line = tau0 / nls
+                        now = tau0 * supply * series[g, XDRIVE] - line * v_drive
+                        motor = now
+                        damping = line
+                if series[g, XON] < half:
+                    now = zero
+                    motor = zero
+                    damping = zero
+                blend = dts / (params[h, P_LAG] + dts)
+                if fresh == 1:
+                    last = now
+                    fresh = 0
+                now = last + blend * (now - last)
+                motor = last + blend * (motor - last)
+                damping = blend * damping
+                before = last
+                last = now
+                applied = eff * motor
+                damping = eff * damping
+
+                if ripple != zero:
+                    applied += ripple * wp.sin(turn * q + params[h, P_PHASE])
+                applied += params[h, P_BIAS]
+
+                v_fric = v
+                if two:
+                    v_fric = vm
+                fraction = params[h, P_LOAD]
+                if before * v_fric < zero:
+                    fraction = params[h, P_BACK]
+                level = params[h, P_COULOMB]
+                if peak > zero:
+                    ratio_v = v_fric / params[h, P_VS]
+                    if wp.abs(ratio_v) < f64(5.0):
+                        level += peak * wp.exp(-ratio_v * ratio_v)
+                level = level * friction_factor + fraction * wp.abs(before)
+                applied -= half * params[h, P_ASYM] * level
+
+                load = gc
+                if consts[C_SLIDE] < half:
+                    dq = (measured(q, scale, offset, esin, ecos, round_) - series[g, XQ]) / scale
+                    load = gc * wp.cos(dq) + gs * wp.sin(dq)
+                load += series[g, XR]
+                stop_d = zero
+                if q < low:
+                    load -= consts[C_STIFF] * (low - q - dts * v)
+                    stop_d = consts[C_STIFF] * f64(0.02)
+                if q > high:
+                    load += consts[C_STIFF] * (q + dts * v - high)
+                    stop_d = consts[C_STIFF] * f64(0.02)
+
+                if not two:
+                    level += base_friction
+                    a = inertia / dts + damping + visc + stop_d
+                    free = (inertia / dts * v + applied + damping * v - load) / a
+                    if wp.abs(free) * a <= level:
+                        free = zero
+                    else:
+                        free -= wp.sign(free) * level / a
+                    if i >= warm:
+                        v = free
+                        q += dts * v
+                    qm = q
+                    vm = v
+                else:
+                    rotor = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
+                    link = inertia - rotor
+                    stiff = one / wp.max(soft, f64(1.0e-9))
+                    if soft <= zero:
+                        stiff = consts[C_STIFF]
+                    damp = f64(0.1) * wp.sqrt(stiff * link)
+                    if soft <= zero:
+                        damp = wp.sqrt(stiff * rotor * link / inertia)  # contact of gear teeth: little rebound
+                    twist = qm + dts * vm - q - dts * v
+                    engaged = zero
+                    side = zero
+                    if wp.abs(twist) >= gap2:
+                        engaged = one
+                        side = wp.sign(twist) * gap2
+                    kh = engaged * (stiff * dts + damp)
+                    pull = engaged * stiff * (qm - q - side)
+                    d_m = damping
+                    d_l = zero
+                    if consts[C_LOOP_MOTOR] < half and voltage < half:
+                        d_m = zero
+                        d_l = damping
+                    # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
+                    a11 = rotor / dts + params[h, P_VISC] * friction_factor + kh + d_m
+                    a12 = -kh + d_l
+                    a21 = -kh
+                    a22 = link / dts + base_damping + kh + stop_d
+                    b1 = rotor / dts * vm + applied + d_m * vm + d_l * v - pull
+                    b2 = link / dts * v - load + pull
+                    if i < warm:  # link held
+                        a21 = zero
+                        a22 = one
+                        b2 = v
+                    det = a11 * a22 - a12 * a21
+                    x1 = (b1 * a22 - a12 * b2) / det
+                    gain = a22 / det
+                    if wp.abs(x1) <= gain * level:
+                        x1 = zero
+                        x2 = b2 / a22
+                    else:
+                        x1 -= wp.sign(x1) * gain * level
+                        x2 = (b2 - a21 * x1) / a22
+                    if base_friction > zero and i >= warm:
+                        push = base_friction / a22
+                        if wp.abs(x2) <= push:
+                            x2 = zero
+                        else:
+                            x2 -= wp.sign(x2) * push
+                    vm = x1
+                    qm += dts * vm
+                    if i >= warm:
+                        v = x2
+                        q += dts * v
+                    if i < warm:  # a held link must not let the rotor run past the play
+                        qm = wp.clamp(qm, q - gap2 - wp.abs(last) / stiff * f64(2.0), q + gap2 + wp.abs(last) / stiff * f64(2.0))
+
+            if not (wp.abs(q) < f64(1.0e4)):  # diverged: keep it finite, far off
+                q = f64(1.0e4)
+                v = zero
+                qm = q
+                vm = zero
+            nxt = measured(q, scale, offset, esin, ecos, round_)
+            if consts[C_POS_MOTOR] > zero:
+                nxt = measured(qm, scale, offset, esin, ecos, round_)
+            if i < warm and consts[C_POS_MOTOR] <= zero:
+                nxt = shown
+            if i == 0:
+                prev_tau = last
+            while s < s_end and sample_step[s] == i:
+                p = sample_part[s]
+                out_q[h, s] = shown + p * (nxt - shown)
+                out_torque[h, s] = prev_tau + p * (last - prev_tau)
+                s += 1
+            prev_tau = last
+            t += dt
+
+    return plant

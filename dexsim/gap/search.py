@@ -1,0 +1,592 @@
+"""Which effects a joint has: a priced scan of the catalogue, fits of the best, judged on conditions left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Variant, confusable
+from dexsim.gap.fit import Fitted, Fitter, Param, Residuals
+from dexsim.gap.plant import Windows
+from dexsim.gap.plant_columns import INDEX, NAMES
+from dexsim.gap.prepare import BELIEF, Case
+
+SHORT, LONG = 1.0, 5.0  # s: windows of the scan and of the comparisons
+LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
+PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
+BOOTSTRAPS = 300
+SECOND = 0.02  # of what earlier effects removed: what a further one must remove
+ENOUGH = 1.3  # x the noise: an error within it needs no effect
+MOST = 4  # effects on one joint
+
+
+@dataclass(frozen=True)
+class Member:
+    """One effect in a hypothesis: the effect, its variant."""
+
+    effect: Effect
+    variant: Variant
+
+    @property
+    def id(self) -> str:
+        return self.effect.id
+
+
+@dataclass
+class Trial:
+    """A hypothesis that was fitted: its members, the fit on all training windows, losses on left-out blocks [B]."""
+
+    members: tuple[Member, ...]
+    fit: Fitted
+    left_out: np.ndarray | None = None
+    folds: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        return tuple(m.id for m in self.members)
+
+
+@dataclass
+class Outcome:
+    """What the search of one joint ends with."""
+
+    joint: str
+    none: Trial
+    best: Trial
+    rivals: dict[str, list[tuple[str, float]]]  # by effect: what else would do, with its share of bootstraps
+    confidence: dict[str, float]
+    gains: dict[str, float]  # by effect: share of the squared left-out error that it removes
+    price: dict[str, float]
+    scanned: list[tuple[str, float, float]]  # (effect, share of squared error in the scan, its price)
+    note: str = ""
+
+
+class JointSearch:
+    """The search on one joint. train: run indices; span: part of each run to use; folds [R]: condition of each run."""
+
+    def __init__(self, case: Case, train: list[int], span: dict[int, tuple[float, float]] | None, conditions: list[int],
+                 seed: int = 0, allowed: set[str] | None = None, long: float = LONG, say: Callable[[str], None] | None = None):
+        self.case, self.train, self.span = case, train, span
+        self.rng = np.random.default_rng(seed)
+        self.allowed = allowed
+        self.say = say or (lambda _: None)
+        plant = case.plant
+        self.short = plant.windows(SHORT, train, span=span)
+        self.long = plant.windows(long, train, span=span)
+        sigma = case.sigma
+        self.r = Residuals(sigma, case.sigma_torque, sigma_q0=0.7 * sigma, sigma_v0=max(sigma / 0.02, 0.02 * case.scales.speed))
+        self.scan_fitter = Fitter(plant, self.short, self.r)
+        self.fitter = Fitter(plant, self.long, self.r)
+        groups = sorted({conditions[r] for r in train})
+        if len(groups) >= 3:
+            self.fold_of = np.array([groups.index(conditions[r]) for r in self.long.run])
+            if len(groups) > 4:
+                self.fold_of %= 4
+            self.fold_by = "conditions"
+        else:
+            count = len(self.long.window)
+            self.fold_of = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
+            self.fold_by = "time"
+        self.blocks = self._blocks(self.fitter, self.long)
+        self.all_nuisances = self._nuisances()
+        self.nuisances = self.all_nuisances
+
+    # -- pieces ------------------------------------------------------------------------------------------------------------
+    def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
+        """Block of each residual [m]: half-second stretches of one window."""
+        t = self.case.plant.t[w.sample_row]
+        start = np.zeros(len(w.window))
+        np.minimum.at(start := np.full(len(w.window), np.inf), w.sample_window, t)
+        b = w.sample_window * 1000 + ((t - start[w.sample_window]) / 0.5).astype(int)
+        _, b = np.unique(b, return_inverse=True)
+        return np.concatenate([b, b]) if fitter.use_torque else b
+
+    def _nuisances(self) -> list[Param]:
+        """What is refitted with every hypothesis: believed figures inside +- 5 %, stated ranges, unknowns."""
+        c, s = self.case, self.case.scales
+        out = []
+        for name in ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
+                     "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
+                     "position_offset", "position_scale"):
+            value = s.nominal[name]
+            if name in c.unknown:
+                guess = self._unknown(name)
+                if guess is not None:
+                    out.append(guess)
+            elif name in c.ranges:
+                low, high = c.ranges[name]
+                if name in ("kp", "kd") or (value > 0 and name in ("torque_limit", "no_load_speed")):
+                    out.append(Param(name, (name,), "factor", low / value, high / value, 1.0, nuisance=True))
+                else:
+                    out.append(Param(name, (name,), "set", low, high, value, nuisance=True))
+            elif name in ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "load_friction",
+                          "load_friction_backdriven", "stribeck_peak") and 0 < value < 1e8:
+                out.append(Param(name, (name,), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+        rate = c.loop_rate or 1000.0
+        taken = {p.columns[0] for p in out}
+        # a sampled loop acts half a period late and a clock is read when it is read
+        if "delay" not in taken:
+            d = s.nominal["delay"]
+            out.append(Param("delay", ("delay",), "add", -min(d, 0.002), 0.002, 0.0, "s", nuisance=True))
+        if "lag" not in taken:
+            out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True))
+        out.append(Param("inertia", ("inertia_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+        if s.gravity > 0.01 * s.tau:
+            out.append(Param("gravity", ("gravity_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+        if c.constants.damping > 0:
+            d = BELIEF * c.constants.damping
+            out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
+        if c.sigma_torque > 0:
+            out.append(Param("effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+        return out
+
+    def _unknown(self, name: str) -> Param | None:
+        for effect in CATALOGUE:
+            if name in effect.columns or name in ("kp", "kd"):
+                for v in effect.variants(self.case.scales):
+                    for i, p in enumerate(v.params):
+                        if p.columns == (name,):
+                            start = v.starts[min(1, len(v.starts) - 1)][i]
+                            return Param(name, p.columns, p.mode, p.low, p.high, start, p.unit, nuisance=True)
+        return None
+
+    def _params(self, members: tuple[Member, ...]) -> list[Param]:
+        """Effects' parameters, then the nuisances that act on no column of theirs."""
+        mine = [p for m in members for p in _named(m)]
+        taken = {c for p in mine for c in p.columns}
+        return mine + [p for p in self.nuisances if not taken & set(p.columns)]
+
+    def _fix(self, members: tuple[Member, ...]):
+        """Constants of the variants, written to the plant's nominal for the time of a fit."""
+        return _Fixed(self.case.plant, [f for m in members for f in m.variant.fixed])
+
+    # -- stages ------------------------------------------------------------------------------------------------------------
+    def start(self) -> Trial:
+        """No effect: the nuisances alone. Those without a trace are left out from here on."""
+        params = self.all_nuisances
+        f = self.scan_fitter.fit(params, iterations=6)
+        if params:
+            span = np.array([p.span for p in params])
+            trace = np.sqrt((f.jacobian**2).mean(0)) * span
+            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > 0.02]
+        keep = [i for i, p in enumerate(params) if p in self.nuisances]
+        x = f.x[keep]
+        # large residuals are effects still to be named: the knee follows them down
+        self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
+        fit = self.fitter.fit(self.nuisances, x0=x, iterations=8)
+        return Trial((), fit)
+
+    def scan(self, current: Trial) -> list[tuple[float, float, Member, np.ndarray]]:
+        """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
+        case = self.case
+        params = current.fit.params
+        fitter = self.scan_fitter
+        with self._fix(current.members):
+            here = fitter.fit(params, x0=current.fit.x, iterations=0)
+            x = current.fit.x
+            raw, s = fitter.init_directions(params, x)
+            r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
+        base = expand_one(case, params, x)
+        taken = {m.id for m in current.members}
+        guesses, owners = [], []
+        for effect in CATALOGUE:
+            if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
+                continue
+            for variant in effect.variants(case.scales):
+                if any(set(p.columns) & {c for n in self.nuisances if n.span > 0.5 and n.mode == "factor" for c in n.columns} for p in variant.params):
+                    continue  # already free
+                for start in variant.starts:
+                    g = base.copy()
+                    for name, value in variant.fixed:
+                        g[:, INDEX[name]] = value
+                    for p, value in zip(variant.params, start, strict=True):
+                        value = float(np.clip(value, p.low, p.high))
+                        p.apply(g[None], np.array([value]), case.plant.base())
+                    guesses.append(_legal(g))
+                    owners.append((Member(effect, variant), np.array(start)))
+        rows = []
+        J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
+        k = self.r.knee
+        weight = np.minimum(1.0, k / np.maximum(np.abs(r0), 1e-9)) if k > 0 else np.ones_like(r0)
+        sw = np.sqrt(weight)
+        Jw, rw = J * sw[:, None], r0 * sw
+        # nuisances absorb what they may: a prior of a quarter of their span
+        gram = Jw.T @ Jw + np.diag([16.0 * float(np.mean(rw**2)) if p.nuisance else 1e-9 for p in params]) if params else None
+        project = lambda y: y - Jw @ np.linalg.solve(gram, Jw.T @ y) if params else y  # noqa: E731
+        total = float(rw @ rw)
+        clean = project(rw)
+        block = fitter.window
+        count = fitter.count
+        flips = self.rng.choice([-1.0, 1.0], size=(BOOTSTRAPS, count))
+        null = np.zeros(BOOTSTRAPS)
+        size = max(1, int(2e7 // max(len(r0), 1)))
+        for a in range(0, len(guesses), size):
+            with self._fix(()):
+                q = self._simulate(fitter, np.stack(guesses[a : a + size]), s)
+            for i, res in enumerate(q):
+                d = project((r0 - res) * sw)
+                dd = float(d @ d)
+                if not np.isfinite(dd) or dd < 1e-6 * total * 1e-3 + 1e-12:
+                    continue
+                part = np.bincount(block, d * clean, count)
+                dot = float(part.sum())
+                c = np.clip(dot / dd, 0.0, 2.0)
+                gain = (2 * c * dot - c * c * dd) / total
+                null = np.maximum(null, np.maximum(flips @ part, 0.0) ** 2 / dd / total)
+                member, start = owners[a + i]
+                rows.append((gain, member, start))
+        best: dict[tuple, tuple] = {}
+        for gain, member, start in rows:
+            key = (member.id, member.variant.label)
+            if key not in best or gain > best[key][0]:
+                best[key] = (gain, member, start)
+        out = [(g, float(np.mean(null >= g)), m, st) for g, m, st in best.values()]
+        return sorted(out, key=lambda o: -o[0])
+
+    def _simulate(self, fitter: Fitter, plants: np.ndarray, s) -> np.ndarray:
+        q, tau = self.case.plant.simulate(plants, fitter.w)
+        return fitter.eliminated(fitter.compare(q, tau, plants), s)
+
+    def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
+        """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long ones."""
+        params = self._params(members)
+        x0 = np.array([p.start for p in params], float)
+        if like is not None:
+            known = {p.key: v for p, v in zip(like.fit.params, like.fit.x, strict=True)}
+            x0 = np.array([known.get(p.key, v) for p, v in zip(params, x0, strict=True)])
+        x0[: len(starts)] = starts
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        n = sum(len(m.variant.params) for m in members)
+        # an optimizer stalls at a bound: start 5 % inside for what was given
+        inside = np.clip(x0, low + 0.02 * (high - low), high - 0.02 * (high - low))
+        x0[:n] = np.where(np.array([p.mode == "add" for p in params[:n]]), x0[:n], inside[:n]) if n else x0[:n]
+        with self._fix(members):
+            f = self.scan_fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2)
+            a = self.fitter.fit(params, x0=f.x, iterations=4 if quick else 7, tolerance=5e-3)
+            if like is not None and not quick and a.loss > like.fit.loss:
+                b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3)
+                a = b if b.loss < a.loss else a
+        return Trial(members, a)
+
+    def cross(self, trial: Trial) -> np.ndarray:
+        """Losses by block [B] when the block's condition is left out of the fit: from the optimum of all, one bounded
+        Gauss-Newton step on the other conditions, its length chosen there."""
+        if trial.left_out is not None:
+            return trial.left_out
+        f, fitter = trial.fit, self.fitter
+        P = len(f.params)
+        out = np.zeros(int(self.blocks.max()) + 1)
+        low, high = np.array([p.low for p in f.params]), np.array([p.high for p in f.params])
+        span = high - low
+        folds = np.unique(self.fold_of)
+        fold = self.fold_of[fitter.window]
+        k = self.r.knee
+        weight = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+        guesses = [f.x]
+        lengths = (0.35, 1.0)
+        for number in folds:
+            on = fold != number if len(folds) > 1 else fold == number
+            if P == 0:
+                continue
+            J = f.jacobian[on] * span
+            w = weight[on]
+            A, b = (J * w[:, None]).T @ J, -(J * w[:, None]).T @ f.residual[on]
+            free = ~(((f.x <= low + 1e-12) & (b < 0)) | ((f.x >= high - 1e-12) & (b > 0)))
+            step = np.zeros(P)
+            i = np.flatnonzero(free)
+            if len(i):
+                M = A[np.ix_(i, i)] + np.diag(1e-3 * np.diag(A)[i] + 1e-9 * np.trace(A) + 1e-12)
+                step[i] = np.linalg.solve(M, b[i])
+            step = np.clip(step, -0.3, 0.3)
+            guesses += [np.clip(f.x + length * step * span, low, high) for length in lengths]
+        with self._fix(trial.members):
+            _, s = fitter.init_directions(f.params, f.x) if fitter.eliminate else (None, None)
+            res = fitter.eliminated(fitter.residuals(f.params, np.array(guesses)), s)
+        a = np.abs(res)
+        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+        for n, number in enumerate(folds):
+            test = fold == number
+            on = ~test if len(folds) > 1 else test
+            options = [0] if P == 0 else [0, *range(1 + n * len(lengths), 1 + (n + 1) * len(lengths))]
+            best = min(options, key=lambda o: a[o][on].sum())
+            trial.folds.append(np.array(guesses)[best])
+            out += np.bincount(self.blocks[test], a[best][test], len(out))
+        trial.left_out = out
+        return out
+
+    # -- the search ------------------------------------------------------------------------------------------------------------
+    def run(self, shortlist: int = 6) -> Outcome:
+        """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
+        self.fitted: dict[frozenset, Trial] = {}
+        none = self.start()
+        self.none_loss = self.cross(none)
+        current = none
+        gains, price, scanned = {}, {}, []
+        rivals: dict[str, list[tuple[str, float]]] = {}
+        confidence: dict[str, float] = {}
+        per = len(self.blocks)
+        pool: dict[str, tuple[Member, np.ndarray]] = {}
+        level: list[Trial] = []
+        for _ in range(MOST):
+            loss = float(self.cross(current).sum()) / per
+            if loss < ENOUGH**2:
+                break
+            scan = self.scan(current)
+            if not scanned:
+                scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
+            if not scan:
+                break
+            listed = self._shortlist(scan, shortlist)
+            if not listed:
+                break
+            trials = []
+            for gain, p, member, start in listed:
+                pool.setdefault(member.id, (member, start))
+                seed = self._values(current) if current.members else np.zeros(0)
+                trial = self.fit((*current.members, member), np.concatenate([seed, start]), current)
+                price[member.id] = p
+                trials.append(trial)
+                self.fitted[frozenset(trial.ids)] = trial
+            trials.sort(key=lambda tr: tr.fit.loss)
+            trials = trials[:4]
+            for trial in trials:
+                self.cross(trial)
+            best = min(trials, key=lambda tr: tr.left_out.sum())
+            if not self._earns(best, current):
+                # a pair may be there where neither of its halves is seen alone
+                best = self._pair(current, listed[:4]) or current
+                if best is current:
+                    break
+            current, level = best, trials
+            if len(current.members) > 1:
+                current, level = self._swap(current, pool, level)
+        current = self._drop(current)
+        final = self.rivals(current, pool)
+        for m in current.members:
+            rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
+        return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned)
+
+    def _shortlist(self, scan, size):
+        """The best variants of the best effects, and what the first is confused with."""
+        seen: dict[str, int] = {}
+        out = []
+        for row in scan:
+            g, p, m, _ = row
+            if g < 0.25 * LEAST or p > 4 * PRICE:
+                continue
+            if seen.get(m.id, 0) >= (2 if m.id in ("torque_ripple", "payload", "thermal", "joint_coupling") else 1):
+                continue
+            leader = out[0][2].id if out else None
+            if len(out) < size or (leader and confusable(leader, m.id) and len(out) < size + 2):
+                seen[m.id] = seen.get(m.id, 0) + 1
+                out.append(row)
+        return out
+
+    def _values(self, trial: Trial) -> np.ndarray:
+        n = sum(len(m.variant.params) for m in trial.members)
+        return trial.fit.x[:n]
+
+    def _earns(self, new: Trial, old: Trial) -> bool:
+        a, b = self.cross(old), self.cross(new)
+        gain = 1 - b.sum() / a.sum()
+        if gain < LEAST:
+            return False
+        if old.members:  # what follows must matter beside what was found
+            rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
+            if rms(a) - rms(b) < SECOND * (rms(self.none_loss) - rms(a)):
+                return False
+        return bool(np.quantile(self._boot(a - b), 0.03) > 0)
+
+    def _boot(self, x: np.ndarray) -> np.ndarray:
+        """Sums of a block bootstrap of x [B]: 2-s stretches of neighbouring half-second blocks."""
+        n = len(x)
+        size = min(4, n)
+        starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
+        index = (starts[..., None] + np.arange(size)) % n
+        return x[index.reshape(BOOTSTRAPS, -1)].sum(1)
+
+    def _pair(self, current: Trial, listed) -> Trial | None:
+        best = None
+        for i, (_, _, m1, s1) in enumerate(listed):
+            for _, _, m2, s2 in listed[i + 1 :]:
+                if m1.id == m2.id or not _compatible(m1, m2):
+                    continue
+                trial = self.fit((*current.members, m1, m2), np.concatenate([self._values(current), s1, s2]), current, quick=True)
+                if best is None or trial.fit.loss < best.fit.loss:
+                    best = trial
+        if best is not None and self._earns(best, current):
+            return best
+        return None
+
+    def _swap(self, current: Trial, pool, level):
+        """Each earlier member replaced by others of the pool, while the rest stays."""
+        best = current
+        for i, member in enumerate(current.members[:-1]):
+            rest = [m for k, m in enumerate(current.members) if k != i]
+            values = np.split(self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1])
+            kept = [v for k, v in enumerate(values) if k != i]
+            for key, (other, start) in list(pool.items()):
+                if key in current.ids or not confusable(key, member.id) or any(not _compatible(other, m) for m in rest):
+                    continue
+                trial = self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                if trial.fit.loss < best.fit.loss and self.cross(trial).sum() < self.cross(best).sum():
+                    best = trial
+        return best, level
+
+    def _drop(self, current: Trial) -> Trial:
+        """Members that no longer earn their place are let go."""
+        changed = True
+        while changed and len(current.members) > 1:
+            changed = False
+            for i in range(len(current.members)):
+                rest = tuple(m for k, m in enumerate(current.members) if k != i)
+                values = np.split(self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1])
+                kept = np.concatenate([v for k, v in enumerate(values) if k != i])
+                less = self.fit(rest, kept, current, quick=True)
+                if not self._earns(current, less):
+                    current, changed = less, True
+                    break
+        return current
+
+    def rivals(self, current: Trial, pool) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
+        """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
+        out = {}
+        mine = self.cross(current)
+        sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+        values = np.split(self._values(current), sizes)
+        for i, member in enumerate(current.members):
+            rest = tuple(m for k, m in enumerate(current.members) if k != i)
+            kept = [v for k, v in enumerate(values) if k != i]
+            without = self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
+            lost = self.cross(without) if without else self.cross(self._none(current))
+            others: list[Trial] = []
+            for key, (other, start) in pool.items():
+                if key == member.id or key in current.ids or any(not _compatible(other, m) for m in rest):
+                    continue
+                known = self.fitted.get(frozenset((key, *(m.id for m in rest))))
+                if known is None and len(others) >= 3 and not confusable(key, member.id):
+                    continue
+                trial = known or self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                # one that cannot follow even what it was fitted to is no rival
+                if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
+                    self.cross(trial)
+                    others.append(trial)
+            table = np.stack([mine, *[t.left_out for t in others], lost])
+            n = table.shape[1]
+            size = min(4, n)
+            starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
+            index = ((starts[..., None] + np.arange(size)) % n).reshape(BOOTSTRAPS, -1)
+            sums = table[:, index].sum(-1)
+            # a rival within 3 % of the best counts for half: finer than the plant is to be trusted
+            weight = np.exp(-np.clip((sums / sums.min(0) - 1) / 0.03, 0, 50))
+            shares = (weight / weight.sum(0)).mean(1)
+            rows = [(next(x for x in t.ids if x not in {m.id for m in rest}), float(s)) for t, s in zip(others, shares[1:-1], strict=True)]
+            rows.sort(key=lambda r: -r[1])
+            out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
+        return out
+
+    def idle(self) -> Outcome:
+        """No search: the nuisances alone."""
+        self.fitted = {}
+        none = self.start()
+        self.none_loss = self.cross(none)
+        return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
+
+    def polish(self, trial: Trial) -> Trial:
+        """The trial refitted on whole training recordings run free from their first sample, where that follows them
+        better than the windows' fit: state carried over windows is right there."""
+        plant = self.case.plant
+        whole = plant.windows(None, self.train, span=self.span)
+        r = Residuals(self.r.sigma_q, self.r.sigma_torque, knee=max(self.r.knee, 3.0))
+        fitter = Fitter(plant, whole, r)
+        params = trial.fit.params
+        with self._fix(trial.members):
+            here = fitter.residuals(params, trial.fit.x[None])[0]
+            fitter.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
+            f = fitter.fit(params, x0=trial.fit.x, iterations=5, tolerance=5e-3)
+            if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
+                again = self.fitter.fit(params, x0=f.x, iterations=0)
+                if again.loss < 1.5 * trial.fit.loss:
+                    return Trial(trial.members, again, trial.left_out, trial.folds)
+        return trial
+
+    def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
+        """Intervals not narrower than what the fits without one condition each disagree by (a jackknife), nor than half a
+        percent: the plant is not truer than that."""
+        x = trial.fit.x
+        if len(x) == 0:
+            return bounds
+        half = 0.5 * (bounds[:, 1] - bounds[:, 0])
+        folds = np.array([f for f in trial.folds if len(f) == len(x)])
+        if len(folds) >= 2:
+            n = len(folds)
+            jack = np.sqrt((n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0))
+            half = np.maximum(half, 1.645 * jack)
+        half = np.maximum(half, 0.005 * np.abs(x))
+        low, high = np.array([p.low for p in trial.fit.params]), np.array([p.high for p in trial.fit.params])
+        return np.stack([np.maximum(x - half, low), np.minimum(x + half, high)], 1)
+
+    def _none(self, current: Trial) -> Trial:
+        if not hasattr(self, "_none_trial"):
+            self._none_trial = self.fit((), np.zeros(0))
+        return self._none_trial
+
+
+class _Fixed:
+    """Constants set on a plant's nominal inside a `with`."""
+
+    def __init__(self, plant, pairs):
+        self.plant, self.pairs = plant, pairs
+
+    def __enter__(self):
+        self.saved = self.plant.nominal
+        if self.pairs:
+            self.plant.nominal = [row.copy() for row in self.saved]
+            for name, value in self.pairs:
+                for row in self.plant.nominal:
+                    row[INDEX[name]] = value
+
+    def __exit__(self, *exc):
+        self.plant.nominal = self.saved
+
+
+def _named(member: Member) -> list[Param]:
+    """The member's parameters with keys unique in a hypothesis."""
+    from dataclasses import replace
+
+    return [replace(p, key=f"{member.id}.{p.key}") for p in member.variant.params]
+
+
+def _compatible(a: Member, b: Member) -> bool:
+    return not ({c for p in a.variant.params for c in p.columns} & {c for p in b.variant.params for c in p.columns})
+
+
+def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
+    """[R, C] plant parameters at one guess."""
+    from dexsim.gap.fit import expand
+
+    return expand(case.plant, params, x[None])[0]
+
+
+def _legal(g: np.ndarray) -> np.ndarray:
+    for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
+        g[:, INDEX[name]] = np.maximum(g[:, INDEX[name]], 0.0)
+    return g
+
+
+def subset(w: Windows, keep: np.ndarray) -> Windows:
+    """The windows where keep [W] bool holds."""
+    pick = np.flatnonzero(keep)
+    new = np.full(len(w.window), -1)
+    new[pick] = np.arange(len(pick))
+    samples = keep[w.sample_window]
+    window = w.window[pick].copy()
+    if len(pick):
+        window[:, 3] = np.concatenate([[0], np.cumsum(window[:-1, 4])])
+    return Windows(window, w.window_t[pick], w.sample_step[samples], w.sample_part[samples], new[w.sample_window[samples]],
+                   w.sample_row[samples], w.run[pick])
+
+
+__all__ = ["EFFECTS", "JointSearch", "Member", "NAMES", "Outcome", "Trial", "subset"]
