@@ -17,7 +17,8 @@ DRAG = 30.0  # N.s/m on the object, so that it stays where it was put
 
 def _press(env, seed: int) -> dict[str, torch.Tensor]:
     """Objects of 30 to 500 g pressed on the middle fingertip, along its pad's normal, by weight and 0 to 4 N more, until
-    at rest; the hand is locked in random postures."""
+    at rest; the hand is locked in random postures. Friction of 2 makes
+    contacts stick (they creep, as MuJoCo's friction does)."""
     g = torch.Generator().manual_seed(seed)
 
     def u(low, high, *shape):
@@ -28,7 +29,7 @@ def _press(env, seed: int) -> dict[str, torch.Tensor]:
     rows = torch.tensor([names.index(s) for s in ("sphere", "box", "rock", "egg")])[torch.arange(N) % 4]
     mass = torch.tensor(np.geomspace(0.03, 0.5, N)[torch.randperm(N, generator=g).numpy()], dtype=torch.float32)
     k = u(4000, 9000)
-    o.write(torch.ones(N, dtype=torch.bool), rows, torch.full((N, 3), 1.2), mass, torch.zeros(N, 3), torch.ones(N), k, torch.ones(N))
+    o.write(torch.ones(N, dtype=torch.bool), rows, torch.full((N, 3), 1.2), mass, torch.zeros(N, 3), torch.full((N,), 2.0), k, torch.ones(N))
     env.touch.shape_id.copy_(o.variant.to(torch.int32))
     env.touch.shape_size.copy_(o.size)
     hand = torch.zeros(N, 12)
@@ -47,7 +48,8 @@ def _press(env, seed: int) -> dict[str, torch.Tensor]:
     pose[:, :3] = pad + normal * (o.radius + 0.002)[:, None]
     env.place(everyone, hand, pose, torch.zeros(N, 6))
     e.field("dof_armature")[:, :12] = 1e4
-    e.field("dof_damping")[:, 12:15], e.field("dof_damping")[:, 15:] = DRAG, 1e3
+    e.field("dof_damping")[:, 12:15] = DRAG
+    e.field("body_inertia")[:, o.body] *= 1e6  # turns too slowly to matter
     more = u(0.0, 4.0)
     e.field("opt.gravity").copy_(-9.81 * normal.to(e.t.qpos.dtype))
     e.t.xfrc_applied[:, o.body, :3] = -(more[:, None] * normal).to(e.t.qpos.dtype)
