@@ -194,6 +194,29 @@ def test_every_shape_comes_to_lie_on_its_surface(kind):
     assert max(low) < 1e-3 and min(low) > -1.5e-3, dict(zip(names, low, strict=True))
 
 
+def test_bounding_volumes_hold_each_slot(scene):
+    """Broad phases trust them: a sphere and a box about each slot in use, no smaller than it and hardly larger."""
+    e, s, objects = scene
+    write(objects, **random_values(e.n, len(s.variants), 12))
+    for w in range(e.n):
+        m = e.batch.get_model(w)
+        for g in objects.slots.tolist():
+            if np.linalg.norm(m.geom_pos[g]) > 1:
+                continue
+            kind, (a, b, c) = mujoco.mjtGeom(m.geom_type[g]), m.geom_size[g]
+            if kind == mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = m.geom_dataid[g]
+                v = m.mesh_vert[m.mesh_vertadr[mesh]:m.mesh_vertadr[mesh] + m.mesh_vertnum[mesh]]
+                low, high, radius = v.min(0), v.max(0), np.linalg.norm(v, axis=1).max()
+            else:
+                high = np.array({"BOX": (a, b, c), "SPHERE": (a, a, a), "CAPSULE": (a, a, a + b)}[kind.name.removeprefix("mjGEOM_")])
+                low, radius = -high, {"BOX": np.hypot(np.hypot(a, b), c), "SPHERE": a, "CAPSULE": a + b}[kind.name.removeprefix("mjGEOM_")]
+            box = m.geom_aabb[g]
+            assert radius * 0.99999 <= m.geom_rbound[g] < 1.8 * radius, (w, g)
+            assert (box[:3] - box[3:] <= low + 1e-6).all() and (box[:3] + box[3:] >= high - 1e-6).all()
+            assert (box[3:] < 1.2 * (high - low) / 2 + 1e-4).all()
+
+
 @pytest.mark.parametrize("which", ["scene", "warp_scene"])
 def test_parked_slots_are_far_and_per_world_frames_are_used(which, request):
     e, s, objects = request.getfixturevalue(which)
