@@ -29,6 +29,7 @@ def timing(series: Series) -> Iterator[Finding]:
                       "error" if len(same) > len(t) / 2 else "warning", end=float(t[same[-1]]))
     if period == 0.0:
         return
+    period = max(period, 0.5 * float(dt.mean()))  # where most come in bursts, the median says nothing
     regular = np.percentile(dt, 75) < 1.5 * period and np.percentile(dt, 25) > 0.5 * period
     gaps = np.flatnonzero(dt > GAP * period)
     # a command may be sent only when it changes: then its pauses say nothing

@@ -89,7 +89,7 @@ class _Reading:
         used = [m.log_time for theirs, _ in self.sources.values() for s in self.streams[theirs] for m in s.messages]
         if not used:
             raise UserError(f"recording {path}: no message that can be read; topics: {self._describe_topics()}"
-                            + "".join(f"; {f.text}" for f in self.findings[:3]))
+                            + self._losses())
         self.start_ns = min(used)
 
     def _damage(self, c: Container) -> None:
@@ -103,6 +103,9 @@ class _Reading:
         for channel_id, count in orphans.items():
             self.findings.append(Finding("damage", "", NAN, count, f"{where}{count} messages of channel {channel_id},"
                                          " whose record (topic and type) is lost", "error"))
+
+    def _losses(self) -> str:
+        return "".join(f"; {f.text}" for f in self.findings[:3] if f.kind == "damage")
 
     # -- topics ------------------------------------------------------------------------------------------------------------
     def _topics(self, remap: dict[str, str]) -> dict[str, tuple[str, str]]:
@@ -135,7 +138,7 @@ class _Reading:
                                              f" none is used (say which with remap.{ours}=TOPIC)", "warning"))
         if schema.STATES not in out and schema.COMMANDS not in out:
             raise UserError(f"recording {self.path} has neither {schema.STATES} nor {schema.COMMANDS} (say which they are with"
-                            f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}")
+                            f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}" + self._losses())
         for ours in (schema.COMMANDS, schema.STATES):
             if ours not in out:
                 self.findings.append(Finding("missing_topic", ours, NAN, 0, "not in the recording", "warning"))
@@ -267,7 +270,7 @@ class _Reading:
                 names.match(theirs, [our], {our: their}, where)
                 mapping[their] = our
         else:
-            mapping = names.match(theirs, xhand.JOINTS, self.joint_remap, where)
+            mapping = names.match(theirs, xhand.JOINTS, self.joint_remap, where, shorter=False)
             if len(mapping) < len(theirs) and len(mapping) < 8:  # not an xHand
                 mapping = {their: their for their in theirs}
         renamed = [f"{a} is {b}" for a, b in mapping.items() if a != b]

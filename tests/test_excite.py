@@ -1,0 +1,201 @@
+"""Excitation: inside every limit, free of self-contact, shuffled, repeatable, and written for a robot to send."""
+
+from __future__ import annotations
+
+import csv
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dexsim import excite
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.recording import excitation, read, safety
+from dexsim.recording.excitation import Limits
+from dexsim.recording.mechanism import Mechanism, drive, mechanism
+from dexsim.recording.schema import Series
+from dexsim.recording.waveforms import KINDS, through
+from dexsim.sim.pendulum import pendulum_spec
+
+torch.set_num_threads(1)
+SERVO = {"joints": {"*": {"kp": 2.0, "kd": 0.05, "torque_limit": 0.5, "no_load_speed": 10.0}}}
+
+
+def rig(low=-1.0, high=1.0):
+    spec = pendulum_spec()
+    spec.compiler.degree = False
+    spec.joint("joint").limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    spec.joint("joint").range = [low, high]
+    return Mechanism(spec, ("joint",), ServoTable.from_dict(SERVO), "rig")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("a, v", [(0.8, 4.0), (0.05, 0.3), (0.3, 8.0)])
+def test_waveforms_keep_amplitude_and_speed_and_rest_at_the_ends(kind, a, v):
+    dt = 0.01
+    x = KINDS[kind](a, v, dt, np.random.default_rng(0))
+    assert abs(x[0]) < 1e-12 and abs(x[-1]) < 1e-9 and np.abs(x).max() <= a * (1 + 1e-9)
+    assert np.abs(x).max() > 0.3 * a or kind in ("ladder", "chirp")
+    if kind != "steps":
+        assert np.abs(np.diff(x)).max() / dt <= 1.02 * v
+
+
+def test_triangles_run_at_one_speed():
+    x = through((0.4, -0.4), 0.2, 0.01)
+    moving = np.abs(np.diff(x))[np.abs(np.diff(x)) > 1e-9] / 0.01
+    assert moving.min() > 0.19 and moving.max() <= 0.2 + 1e-9 and len(x) == pytest.approx(800, abs=6)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return excitation.plan(rig(), seed=1)
+
+
+@pytest.fixture(scope="module")
+def short():
+    return excitation.plan(rig(), seed=2, kinds=("steps", "chirp"))
+
+
+def test_a_plan_keeps_its_limits(plan):
+    m = plan.mechanism
+    low, high = m.limits.T
+    margin = 0.05 * (high - low)
+    assert (plan.value >= low + margin - 1e-9).all() and (plan.value <= high - margin + 1e-9).all()
+    assert plan.peaks.speed.max() <= 0.6 and plan.peaks.torque.max() <= 0.8 and not plan.peaks.contacts
+    smooth = [s for s in plan.segments if s.kind != "steps"]
+    for s in smooth:
+        assert np.abs(np.diff(s.command, axis=0)).max() * 100 <= 0.6 * 10.0 * 1.02
+    # and at a finer step than the one it was checked at
+    run = drive(m, Series(plan.t, plan.value), m.joints, float(plan.t[-1]), plan.home, 0.001)
+    assert np.abs(run.velocity).max() <= 0.62 * 10.0 and np.abs(run.torque).max() <= 0.82 * 0.5
+    assert (run.position > low).all() and (run.position < high).all()
+
+
+def test_every_kind_comes_and_one_repeats(plan):
+    kinds = [s.kind for s in plan.segments]
+    assert set(kinds) == set(KINDS) and len(kinds) == len(KINDS) + 1
+    (again,) = [s for s in plan.segments if s.repeats is not None]
+    first = plan.segments[again.repeats]
+    np.testing.assert_array_equal(plan.value[round(again.start * 100) : round(again.end * 100)], plan.value[round(first.start * 100) : round(first.end * 100)])
+
+
+def test_the_seed_decides_the_order(short):
+    np.testing.assert_array_equal(short.value, excitation.plan(rig(), seed=2, kinds=("steps", "chirp")).value)
+    orders = {tuple(s.kind for s in short.segments)}
+    orders |= {tuple(s.kind for s in excitation.plan(rig(), seed=k, kinds=("steps", "chirp")).segments) for k in (3, 4)}
+    assert len(orders) > 1
+
+
+def test_tighter_limits_make_smaller_motions():
+    wide = excitation.plan(rig(), kinds=("ladder", "steps"), repeats=0)
+    tight = excitation.plan(rig(), kinds=("ladder", "steps"), repeats=0, limits=Limits(speed=0.2, torque=0.3))
+    assert tight.peaks.speed.max() <= 0.2 and tight.peaks.torque.max() <= 0.3
+
+    def step(p):
+        (s,) = [s for s in p.segments if s.kind == "steps"]
+        return np.abs(np.diff(s.command[:, 0])).max()
+
+    def rate(p):
+        (s,) = [s for s in p.segments if s.kind == "ladder"]
+        return np.abs(np.diff(s.command[:, 0])).max()
+
+    assert step(tight) < 0.5 * step(wide) and rate(tight) < 0.5 * rate(wide)
+
+
+def two_links(gap):
+    """Two parallel fingers that meet when the first swings more than `gap` rad toward the second."""
+    x = 0.1 * np.sin(gap) + 0.02
+    xml = f"""<mujoco><compiler angle="radian"/><worldbody>
+      <body name="one"><joint name="a" axis="0 1 0" range="-1 1" limited="true"/><geom type="capsule" size="0.01" fromto="0 0 0.02 0 0 -0.1" mass="0.02" contype="4" conaffinity="8"/></body>
+      <body name="two" pos="{x} 0 0"><joint name="b" axis="0 1 0" range="-1 1" limited="true"/><geom type="capsule" size="0.01" fromto="0 0 -0.08 0 0 -0.12" mass="0.02" contype="4" conaffinity="8"/></body>
+    </worldbody></mujoco>"""
+    return Mechanism(mujoco.MjSpec.from_string(xml), ("a", "b"), ServoTable.from_dict(SERVO), "two")
+
+
+def test_bodies_that_would_meet_are_kept_apart():
+    # the model's own filter would let them pass through each other: the check must not
+    m = two_links(0.3)
+    check = safety.ContactCheck(m, np.zeros(2), 0.002)
+    assert check.near(np.zeros(2)) == []
+    side = -1 if check.near(np.array([-0.6, 0.0])) else 1
+    assert check.near(np.array([side * 0.6, 0.0])) == [("one", "two")]
+    p = excitation.plan(m, kinds=("triangles", "random", "holds"), seed=3)
+    assert not p.peaks.contacts and np.ptp(p.value, axis=0).min() > 0.1
+    independent = safety.ContactCheck(m, np.zeros(2), 0.0)
+    assert not any(independent.near(q) for q in p.value)
+    assert np.abs(side * p.value[:, 0]).max() > 0.1 and (side * p.value[:, 0]).max() < 0.6
+
+
+def test_joints_of_one_finger_take_turns():
+    m = mechanism()
+    found = excitation.groups(m, m.joints)
+    assert found == [("thumb_bend_joint", "index_bend_joint", "mid_joint1", "ring_joint1", "pinky_joint1"),
+                     ("thumb_rota_joint1", "index_joint1", "mid_joint2", "ring_joint2", "pinky_joint2"), ("thumb_rota_joint2", "index_joint2")]
+
+
+def test_the_hand_is_moved_without_self_contact(tmp_path, capsys):
+    argv = [f"out={tmp_path}", "joints=index_bend_joint,index_joint1,thumb_bend_joint", "kinds=steps,random", "seed=4", "rate=50"]
+    assert excite.main(argv) == 0
+    assert "no contact" in capsys.readouterr().out
+    m = mechanism()
+    commands = read(tmp_path / "excite.mcap")
+    assert commands.joints == m.joints and len(commands.states.position) == 0 and "not a measurement" in commands.meta["notes"]
+    with open(tmp_path / "excite.csv", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["time", *m.joints]
+    table = np.array(rows[1:], float)
+    np.testing.assert_allclose(table[:, 1:], commands.commands.value, atol=1e-6)
+    np.testing.assert_allclose(table[:, 0], commands.commands.t, atol=1e-4)
+    still = [k for k, j in enumerate(m.joints) if j not in argv[1]]
+    assert np.ptp(commands.commands.value[:, still], axis=0).max() < 1e-12
+    about = yaml.safe_load((tmp_path / "excite.yaml").read_text())
+    assert {s["kind"] for s in about["segments"]} == {"steps", "random"}
+    run = drive(m, Series(table[:, 0], table[:, 1:]), m.joints, table[-1, 0], table[0, 1:], 0.003, frame_s=0.009)
+    strict = safety.ContactCheck(m, table[0, 1:], 0.001)
+    assert not strict.along(run)
+    assert (run.position >= m.limits[:, 0] - 1e-3).all() and (run.position <= m.limits[:, 1] + 1e-3).all()
+    simulated = read(tmp_path / "excite_simulated.mcap")
+    assert not [f for f in simulated.findings if f.severity == "error"]
+
+
+def test_the_recording_that_a_diagnosis_asks_for(tmp_path):
+    excitation.next_recording(tmp_path / "next_recording.mcap", rig(), ("joint",), ("holds",), seed=5)
+    r = read(tmp_path / "next_recording.mcap")
+    assert r.joints == ("joint",) and r.commands.t[-1] > 15
+
+
+@pytest.mark.parametrize("argv, text", [
+    (["joints=index_joint1"], "out=DIR"),
+    (["out=x", "joint=3"], "expected key=value with one of"),
+    (["out=x", "joints=elbow"], "not a driven joint; those are thumb_bend_joint"),
+    (["out=x", "kinds=waltz"], "must be among triangles"),
+    (["out=x", "speed=2"], r"speed=2.0: must lie in \[0.01, 1.0\]"),
+    (["out=x", "seed=a"], "seed=a: must be a number"),
+    (["out=x", "model=nowhere.xml"], "no such file"),
+])  # fmt: skip
+def test_bad_settings(argv, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=text):
+        excite.main(argv)
+
+
+def test_a_joint_without_limits_is_refused():
+    with pytest.raises(UserError, match="'joint' has no position limits"):
+        excitation.plan(Mechanism(pendulum_spec(), ("joint",), ServoTable.from_dict(SERVO), "rig"))
+
+
+def test_a_servo_that_cannot_move_safely_is_refused():
+    m = rig()
+    m.table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1e-4, "no_load_speed": 10.0}}})
+    with pytest.raises(UserError, match="no motion of joint is safe"):
+        excitation.plan(m, kinds=("holds",))
+
+
+def test_help(capsys):
+    assert excite.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for key in excite.KEYS:
+        assert f"{key}=" in text
