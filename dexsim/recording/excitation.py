@@ -245,10 +245,12 @@ def _motion(m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tup
             return None, "it has no room to move"
         t = np.arange(len(command)) * dt
         run = _simulate(m, t, command, home)
-        why = _faults(m, safety.peaks(m, run, check), limits, RESERVE)
+        peaks = safety.peaks(m, run, check)
+        why = _faults(m, peaks, limits, RESERVE)
         if not why:
             return Segment(kind, group, command, scale), ""
-        scale *= SHRINK
+        over = max(peaks.speed.max() / limits.speed, peaks.torque.max() / limits.torque) / RESERVE
+        scale *= float(np.clip(1.0 / over, 0.5, SHRINK))
         if scale < SMALLEST:
             break
     return None, why

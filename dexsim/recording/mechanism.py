@@ -161,9 +161,10 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
     servo = Servo(engine, m.joints, m.table, control_period=max(spacing, 1e-3) if spacing else None)
     qpos = torch.as_tensor(engine.mjm.qpos0)[None].clone()
     address = engine.qpos_index(m.joints)
+    dofs = engine.dof_index(m.joints)
+    scale, offset = (servo.column(f"position_{name}")[0].double().numpy().copy() for name in ("scale", "offset"))
     start = qpos[0, address].numpy().copy()
     if initial is not None:
-        scale, offset = servo.column("position_scale")[0].double().numpy(), servo.column("position_offset")[0].double().numpy()
         start = np.where(np.isfinite(initial), (initial - offset) / scale, start)
     qpos[0, address] = torch.as_tensor(start)
     lead = None
@@ -178,6 +179,7 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
     place = np.array([m.joints.index(c) for c in columns])
     J = len(m.joints)
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
+    q_view, v_view, torque_view = engine.t.qpos[0].numpy(), engine.t.qvel[0].numpy(), servo.torque[0].numpy()
     on = None if enabled is None else np.nan_to_num(enabled.value, nan=1.0) > 0.5
     state = {"k": 0, "command": 0, "enabled": 0}
 
@@ -186,8 +188,10 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
         # stamps within this step are known to it: the servo lets each act from its own time on
         while state["command"] < len(stamps) and stamps[state["command"]] < t + timestep:
             row = commands.value[state["command"]]
-            now[place] = np.where(np.isfinite(row), row, now[place])
-            servo.send(torch.as_tensor(now)[None], stamp=float(stamps[state["command"]]))
+            new = np.where(np.isfinite(row), row, now[place])
+            if (new != now[place]).any():  # the same target again changes nothing
+                now[place] = new
+                servo.send(torch.as_tensor(now)[None], stamp=float(stamps[state["command"]]))
             state["command"] += 1
         while on is not None and state["enabled"] < len(on) and enabled.t[state["enabled"]] <= t:
             servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(servo.state.dtype)
@@ -195,11 +199,12 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
         if lead is not None:
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
             engine.t.qvel[0, v : v + 6] = torch.as_tensor(lead_speed[k])
-        out["position"][k] = servo.position()[0].numpy()
-        out["velocity"][k] = servo.velocity()[0].numpy()
+        # views of the engine's memory: `servo.position()` and the like, without a tensor a step
+        out["position"][k] = scale * q_view[address] + offset
+        out["velocity"][k] = scale * v_view[dofs]
         out["target"][k] = now
         servo.before_each()
-        out["torque"][k] = servo.torque[0].numpy()
+        out["torque"][k] = torque_view
         state["k"] = k + 1
 
     every = max(1, round(frame_s / timestep))
