@@ -10,9 +10,9 @@ from dexsim.errors import UserError
 
 USAGE = """usage: python -m dexsim.excite out=DIR [key=value ...]
 
-Write commands that show what a hand's drives do: slow triangles, a speed ladder, a chirp, steps, holds, random motion and
-repeats, in shuffled order. Every motion is simulated with the servo and made smaller until it keeps the limits of position,
-speed and torque and no two bodies come near each other.
+Write commands that show what a hand's drives do: slow triangles, a speed ladder, a chirp, steps, holds, random motion
+and repeats, in shuffled order. Every motion is simulated with the servo and made smaller until it keeps the limits of
+position, speed and torque and no two bodies come near each other.
 
   out/excite.mcap            the commands (/joint_commands)
   out/excite.csv             the same: time [s], one column a joint [rad]
@@ -53,22 +53,47 @@ def main(argv: Sequence[str]) -> int:
     m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity)
     limits = Limits(**{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance") if k in given})
     start = time.perf_counter()
-    p = plan(m, _list(given, "joints"), _list(given, "kinds"), int(_number(given, "seed", 0)), _number(given, "rate", 100.0), limits,
-             int(_number(given, "repeats", 1)), say=lambda text: print(f"  {text}", flush=True))
+    p = plan(
+        m,
+        _list(given, "joints"),
+        _list(given, "kinds"),
+        int(_number(given, "seed", 0)),
+        _number(given, "rate", 100.0),
+        limits,
+        int(_number(given, "repeats", 1)),
+        say=lambda text: print(f"  {text}", flush=True),
+    )
     print(f"\n{'start s':>9}{'end s':>9}  {'kind':<11}{'scale':>6}  joints")
     for s in p.segments:
         again = "" if s.repeats is None else f"  (repeats the one at {p.segments[s.repeats].start:.1f} s)"
         print(f"{s.start:>9.2f}{s.end:>9.2f}  {s.kind:<11}{s.scale:>6.2f}  {', '.join(s.joints)}{again}")
     for text in p.left_out:
         print(f"left out: {text}")
-    print(f"\nsimulated: speed at most {100 * p.peaks.speed.max():.0f} % of no-load, torque at most {100 * p.peaks.torque.max():.0f} % of stall,"
-          f" no contact; {p.t[-1]:.0f} s of commands, made in {time.perf_counter() - start:.0f} s")
+    print(
+        f"\nsimulated: speed at most {100 * p.peaks.speed.max():.0f} % of no-load,"
+        f" torque at most {100 * p.peaks.torque.max():.0f} % of stall,"
+        f" no contact; {p.t[-1]:.0f} s of commands, made in {time.perf_counter() - start:.0f} s"
+    )
     for path in write_plan(p, given["out"]):
         print(path)
     return 0
 
 
-KEYS = ("out", "joints", "kinds", "model", "servo", "seed", "rate", "repeats", "speed", "torque", "margin", "clearance", "gravity")
+KEYS = (
+    "out",
+    "joints",
+    "kinds",
+    "model",
+    "servo",
+    "seed",
+    "rate",
+    "repeats",
+    "speed",
+    "torque",
+    "margin",
+    "clearance",
+    "gravity",
+)
 
 
 def _settings(argv: Sequence[str]) -> dict[str, str]:

@@ -8,13 +8,29 @@ import numpy as np
 
 from dexsim.assets import xhand
 from dexsim.recording import Recording, Series, States
-from dexsim.recording.schema import (COMMANDS, DEFAULTS, EXTERNAL_FORCE, IMU, OBJECT_POSE, STATES, SUPPLY, TACTILE, TEMPERATURES)
+from dexsim.recording.schema import (
+    COMMANDS,
+    DEFAULTS,
+    EXTERNAL_FORCE,
+    IMU,
+    OBJECT_POSE,
+    STATES,
+    SUPPLY,
+    TACTILE,
+    TEMPERATURES,
+)
 
 META = DEFAULTS | {"source": "real", "robot": "rig", "effort_is": "current_A", "tactile_lsb": "0.1", "joint_names": ""}
 
 
-def signal(seconds: float = 8.0, joints: tuple[str, ...] = ("a", "b"), rate: float = 100.0, lag: float = 0.03, seed: int = 0,
-           tactile: bool = False) -> Recording:
+def signal(
+    seconds: float = 8.0,
+    joints: tuple[str, ...] = ("a", "b"),
+    rate: float = 100.0,
+    lag: float = 0.03,
+    seed: int = 0,
+    tactile: bool = False,
+) -> Recording:
     """Joints that follow sines with a lag; an effort like a proportional servo's; nothing wrong with it."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / rate)
@@ -26,8 +42,14 @@ def signal(seconds: float = 8.0, joints: tuple[str, ...] = ("a", "b"), rate: flo
     command, position = at(t), at(t - lag) + 1e-4 * rng.standard_normal((len(t), len(joints)))
     velocity = (at(t - lag + 1e-4) - at(t - lag - 1e-4)) / 2e-4
     effort = 4.0 * (command - position) + 1e-3 * rng.standard_normal(position.shape)
-    out = Recording(Path("made.mcap"), META | {"joint_names": ",".join(joints)}, joints, Series(t, command, COMMANDS, t.copy()),
-                    States(*(Series(t + 1e-3, x, STATES, t.copy()) for x in (position, velocity, effort))), start_ns=1_700_000_000_000_000_000)
+    out = Recording(
+        Path("made.mcap"),
+        META | {"joint_names": ",".join(joints)},
+        joints,
+        Series(t, command, COMMANDS, t.copy()),
+        States(*(Series(t + 1e-3, x, STATES, t.copy()) for x in (position, velocity, effort))),
+        start_ns=1_700_000_000_000_000_000,
+    )
     out.temperature = Series(t[::10], np.full((len(t[::10]), len(joints)), 31.5), TEMPERATURES)
     out.supply_voltage = Series(t[::10], np.full(len(t[::10]), 24.0), SUPPLY)
     if tactile:

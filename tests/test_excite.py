@@ -79,7 +79,10 @@ def test_every_kind_comes_and_one_repeats(plan):
     assert set(kinds) == set(KINDS) and len(kinds) == len(KINDS) + 1
     (again,) = [s for s in plan.segments if s.repeats is not None]
     first = plan.segments[again.repeats]
-    np.testing.assert_array_equal(plan.value[round(again.start * 100) : round(again.end * 100)], plan.value[round(first.start * 100) : round(first.end * 100)])
+    np.testing.assert_array_equal(
+        plan.value[round(again.start * 100) : round(again.end * 100)],
+        plan.value[round(first.start * 100) : round(first.end * 100)],
+    )
 
 
 def test_the_seed_decides_the_order(short):
@@ -108,9 +111,11 @@ def test_tighter_limits_make_smaller_motions():
 def two_links(gap):
     """Two parallel fingers that meet when the first swings more than `gap` rad toward the second."""
     x = 0.1 * np.sin(gap) + 0.02
+    joint = 'axis="0 1 0" range="-1 1" limited="true"'
+    geom = 'type="capsule" size="0.01" mass="0.02" contype="4" conaffinity="8"'
     xml = f"""<mujoco><compiler angle="radian"/><worldbody>
-      <body name="one"><joint name="a" axis="0 1 0" range="-1 1" limited="true"/><geom type="capsule" size="0.01" fromto="0 0 0.02 0 0 -0.1" mass="0.02" contype="4" conaffinity="8"/></body>
-      <body name="two" pos="{x} 0 0"><joint name="b" axis="0 1 0" range="-1 1" limited="true"/><geom type="capsule" size="0.01" fromto="0 0 -0.08 0 0 -0.12" mass="0.02" contype="4" conaffinity="8"/></body>
+      <body name="one"><joint name="a" {joint}/><geom {geom} fromto="0 0 0.02 0 0 -0.1"/></body>
+      <body name="two" pos="{x} 0 0"><joint name="b" {joint}/><geom {geom} fromto="0 0 -0.08 0 0 -0.12"/></body>
     </worldbody></mujoco>"""
     return Mechanism(mujoco.MjSpec.from_string(xml), ("a", "b"), ServoTable.from_dict(SERVO), "two")
 
@@ -132,17 +137,30 @@ def test_bodies_that_would_meet_are_kept_apart():
 def test_joints_of_one_finger_take_turns():
     m = mechanism()
     found = excitation.groups(m, m.joints)
-    assert found == [("thumb_bend_joint", "index_bend_joint", "mid_joint1", "ring_joint1", "pinky_joint1"),
-                     ("thumb_rota_joint1", "index_joint1", "mid_joint2", "ring_joint2", "pinky_joint2"), ("thumb_rota_joint2", "index_joint2")]
+    assert found == [
+        ("thumb_bend_joint", "index_bend_joint", "mid_joint1", "ring_joint1", "pinky_joint1"),
+        ("thumb_rota_joint1", "index_joint1", "mid_joint2", "ring_joint2", "pinky_joint2"),
+        ("thumb_rota_joint2", "index_joint2"),
+    ]
 
 
 def test_the_hand_is_moved_without_self_contact(tmp_path, capsys):
-    argv = [f"out={tmp_path}", "joints=index_bend_joint,index_joint1,thumb_bend_joint", "kinds=steps,random", "seed=4", "rate=50"]
+    argv = [
+        f"out={tmp_path}",
+        "joints=index_bend_joint,index_joint1,thumb_bend_joint",
+        "kinds=steps,random",
+        "seed=4",
+        "rate=50",
+    ]
     assert excite.main(argv) == 0
     assert "no contact" in capsys.readouterr().out
     m = mechanism()
     commands = read(tmp_path / "excite.mcap")
-    assert commands.joints == m.joints and len(commands.states.position) == 0 and "not a measurement" in commands.meta["notes"]
+    assert (
+        commands.joints == m.joints
+        and len(commands.states.position) == 0
+        and "not a measurement" in commands.meta["notes"]
+    )
     with open(tmp_path / "excite.csv", newline="") as file:
         rows = list(csv.reader(file))
     assert rows[0] == ["time", *m.joints]

@@ -40,19 +40,55 @@ def test_messages_are_the_bytes_that_mcap_ros2_writes():
     stamp = 12 * 10**9 + 34
     position, effort = np.array([1.0, -2.5]), np.array([0.25, np.nan])
     made = {
-        JOINT_STATE: (cdr.joint_state(stamp, ("one", "two"), position, None, effort),
-                      {"header": HEADER | {"frame_id": ""}, "name": ["one", "two"], "position": [1.0, -2.5], "velocity": [], "effort": [0.25, float("nan")]}),
-        MULTI_ARRAY: (cdr.multi_array(np.arange(6.0).reshape(2, 3), ("row", "column")),
-                      {"layout": {"dim": [{"label": "row", "size": 2, "stride": 6}, {"label": "column", "size": 3, "stride": 3}], "data_offset": 0},
-                       "data": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]}),
-        WRENCH: (cdr.wrench(stamp, "palm", np.arange(6.0)),
-                 {"header": HEADER, "wrench": {"force": {"x": 0.0, "y": 1.0, "z": 2.0}, "torque": {"x": 3.0, "y": 4.0, "z": 5.0}}}),
-        POSE: (cdr.pose(stamp, "palm", np.arange(7.0)),
-               {"header": HEADER, "pose": {"position": {"x": 0.0, "y": 1.0, "z": 2.0}, "orientation": {"w": 3.0, "x": 4.0, "y": 5.0, "z": 6.0}}}),
-        IMU_TYPE: (cdr.imu(stamp, "palm", np.arange(10.0)),
-                   {"header": HEADER, "orientation": {"w": 0.0, "x": 1.0, "y": 2.0, "z": 3.0}, "orientation_covariance": [0.0] * 9,
-                    "angular_velocity": {"x": 4.0, "y": 5.0, "z": 6.0}, "angular_velocity_covariance": [0.0] * 9,
-                    "linear_acceleration": {"x": 7.0, "y": 8.0, "z": 9.0}, "linear_acceleration_covariance": [0.0] * 9}),
+        JOINT_STATE: (
+            cdr.joint_state(stamp, ("one", "two"), position, None, effort),
+            {
+                "header": HEADER | {"frame_id": ""},
+                "name": ["one", "two"],
+                "position": [1.0, -2.5],
+                "velocity": [],
+                "effort": [0.25, float("nan")],
+            },
+        ),
+        MULTI_ARRAY: (
+            cdr.multi_array(np.arange(6.0).reshape(2, 3), ("row", "column")),
+            {
+                "layout": {
+                    "dim": [{"label": "row", "size": 2, "stride": 6}, {"label": "column", "size": 3, "stride": 3}],
+                    "data_offset": 0,
+                },
+                "data": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+            },
+        ),
+        WRENCH: (
+            cdr.wrench(stamp, "palm", np.arange(6.0)),
+            {
+                "header": HEADER,
+                "wrench": {"force": {"x": 0.0, "y": 1.0, "z": 2.0}, "torque": {"x": 3.0, "y": 4.0, "z": 5.0}},
+            },
+        ),
+        POSE: (
+            cdr.pose(stamp, "palm", np.arange(7.0)),
+            {
+                "header": HEADER,
+                "pose": {
+                    "position": {"x": 0.0, "y": 1.0, "z": 2.0},
+                    "orientation": {"w": 3.0, "x": 4.0, "y": 5.0, "z": 6.0},
+                },
+            },
+        ),
+        IMU_TYPE: (
+            cdr.imu(stamp, "palm", np.arange(10.0)),
+            {
+                "header": HEADER,
+                "orientation": {"w": 0.0, "x": 1.0, "y": 2.0, "z": 3.0},
+                "orientation_covariance": [0.0] * 9,
+                "angular_velocity": {"x": 4.0, "y": 5.0, "z": 6.0},
+                "angular_velocity_covariance": [0.0] * 9,
+                "linear_acceleration": {"x": 7.0, "y": 8.0, "z": 9.0},
+                "linear_acceleration_covariance": [0.0] * 9,
+            },
+        ),
     }
     for kind, (ours, message) in made.items():
         assert ours == serialize_dynamic(kind, DEFINITIONS[kind])[kind](message), kind
@@ -74,9 +110,16 @@ def test_every_topic_comes_back_as_it_was(tmp_path):
     write(tmp_path / "a.mcap", made)
     back = read(tmp_path / "a.mcap", audit=False)
     assert back.joints == ("a", "b") and back.start_ns == made.start_ns and back.config == made.config
-    assert {k: v for k, v in back.meta.items() if k != "effort_sign"} == {k: v for k, v in made.meta.items() if k != "effort_sign"}
+    assert {k: v for k, v in back.meta.items() if k != "effort_sign"} == {
+        k: v for k, v in made.meta.items() if k != "effort_sign"
+    }
     assert list(back.effort_sign) == [1, 1] and back.findings == []
-    pairs = [(made.commands, back.commands), (made.imu, back.imu), (made.object_pose, back.object_pose), (made.external_force, back.external_force)]
+    pairs = [
+        (made.commands, back.commands),
+        (made.imu, back.imu),
+        (made.object_pose, back.object_pose),
+        (made.external_force, back.external_force),
+    ]
     pairs += [(getattr(made.states, n), getattr(back.states, n)) for n in ("position", "velocity", "effort")]
     for a, b in pairs:
         np.testing.assert_allclose(b.t, a.t, atol=1e-9)
@@ -113,7 +156,13 @@ def test_a_bad_metadata_key_or_place_is_refused(tmp_path):
 # --- recordings of others
 
 
-def foreign(path, names=("right_hand_index_joint1", "right_hand_mid_joint1"), topics=("/hand/joint_states", "/hand/controller/joint_commands"), count=50, effort=True):
+def foreign(
+    path,
+    names=("right_hand_index_joint1", "right_hand_mid_joint1"),
+    topics=("/hand/joint_states", "/hand/controller/joint_commands"),
+    count=50,
+    effort=True,
+):
     """A bag as rosbag2 would write it: no metadata of ours, a prefix, a namespace, no velocity."""
     with open(path, "wb") as file:
         w = Ros2Writer(file, chunk_size=2000)
@@ -123,9 +172,19 @@ def foreign(path, names=("right_hand_index_joint1", "right_hand_mid_joint1"), to
             stamp = {"sec": t // 10**9, "nanosec": t % 10**9}
             header = {"stamp": stamp, "frame_id": ""}
             x = [0.5 + 0.3 * np.sin(0.1 * i), 0.4 + 0.2 * np.cos(0.1 * i)]
-            w.write_message(topics[0], kind, {"header": header, "name": list(names), "position": x, "velocity": [], "effort": x if effort else []}, t)
+            w.write_message(
+                topics[0],
+                kind,
+                {"header": header, "name": list(names), "position": x, "velocity": [], "effort": x if effort else []},
+                t,
+            )
             # the command names its joints the other way round
-            w.write_message(topics[1], kind, {"header": header, "name": list(names)[::-1], "position": x[::-1], "velocity": [], "effort": []}, t)
+            w.write_message(
+                topics[1],
+                kind,
+                {"header": header, "name": list(names)[::-1], "position": x[::-1], "velocity": [], "effort": []},
+                t,
+            )
         w.finish()
     return path
 
@@ -136,7 +195,10 @@ def test_a_ros2_bag_of_another_driver(tmp_path):
     np.testing.assert_array_equal(r.commands.value, r.states.position.value)
     assert r.states.velocity is None and r.states.effort is not None
     topics = {f.topic: f.text for f in r.findings if f.kind == "topic"}
-    assert "/hand/joint_states" in topics["/joint_states"] and "/hand/controller/joint_commands" in topics["/joint_commands"]
+    assert (
+        "/hand/joint_states" in topics["/joint_states"]
+        and "/hand/controller/joint_commands" in topics["/joint_commands"]
+    )
     stated = {f.text.split()[0]: f.severity for f in r.findings if f.kind == "missing_metadata"}
     assert stated["effort_is"] == stated["effort_sign"] == stated["gravity"] == "warning" and r.effort_is == "torque_Nm"
 
@@ -144,10 +206,16 @@ def test_a_ros2_bag_of_another_driver(tmp_path):
 def test_topics_and_names_given_by_hand(tmp_path):
     path = foreign(tmp_path / "bag.mcap", names=("m7", "m9"), topics=("/a", "/b"))
     assert read(path, remap={"/joint_states": "/a"}).joints == ("m7", "m9")
-    r = read(path, remap={"joint_states": "/a", "/joint_commands": "/b", "elbow": "m9", "shoulder": "m7"}, joints=("shoulder", "elbow", "wrist"))
+    r = read(
+        path,
+        remap={"joint_states": "/a", "/joint_commands": "/b", "elbow": "m9", "shoulder": "m7"},
+        joints=("shoulder", "elbow", "wrist"),
+    )
     assert r.joints == ("shoulder", "elbow")
     assert r.states.position.value[0, 0] == pytest.approx(0.5)
-    r = read(path, remap={"/joint_states": "/a", "elbow": "m9"}, joints=("elbow",))  # a subset: the other is left out, and said
+    r = read(
+        path, remap={"/joint_states": "/a", "elbow": "m9"}, joints=("elbow",)
+    )  # a subset: the other is left out, and said
     assert r.joints == ("elbow",) and any("left out: m7" in f.text for f in r.findings)
     with pytest.raises(UserError, match="has no topic '/c'.*/a .*JointState"):
         read(path, remap={"/joint_states": "/c"})
@@ -159,13 +227,19 @@ def test_topics_and_names_given_by_hand(tmp_path):
 
 def test_a_short_name_is_not_taken_for_another(tmp_path):
     assert read(foreign(tmp_path / "a.mcap", names=("joint", "bend_joint"))).joints == ("joint", "bend_joint")
-    r = read(foreign(tmp_path / "b.mcap", names=("joint1", "mid_joint1")), joints=("rig_joint1", "mid_joint1", "x_joint2"))
+    r = read(
+        foreign(tmp_path / "b.mcap", names=("joint1", "mid_joint1")), joints=("rig_joint1", "mid_joint1", "x_joint2")
+    )
     assert r.joints == ("rig_joint1", "mid_joint1")
-    assert read(foreign(tmp_path / "c.mcap", names=("joint1", "b")), joints=("x_joint1", "y_joint1", "b")).joints == ("b",)
+    assert read(foreign(tmp_path / "c.mcap", names=("joint1", "b")), joints=("x_joint1", "y_joint1", "b")).joints == (
+        "b",
+    )
 
 
 def test_two_hands_in_one_bag(tmp_path):
-    r = read(foreign(tmp_path / "b.mcap", names=("left_hand_index_joint1", "right_hand_index_joint1")), joints=xhand.JOINTS)
+    r = read(
+        foreign(tmp_path / "b.mcap", names=("left_hand_index_joint1", "right_hand_index_joint1")), joints=xhand.JOINTS
+    )
     assert r.joints == ("index_joint1",) and r.states.position.value[0, 0] == pytest.approx(0.6)
     with pytest.raises(UserError, match="could both be joint 'index_joint1'.*remap.index_joint1="):
         read(foreign(tmp_path / "c.mcap", names=("one/index_joint1", "two/index_joint1")), joints=xhand.JOINTS)
@@ -173,15 +247,29 @@ def test_two_hands_in_one_bag(tmp_path):
 
 def test_metadata_beside_the_file_and_by_hand(tmp_path):
     path = foreign(tmp_path / "bag.mcap")
-    (tmp_path / "bag.mcap.yaml").write_text(yaml.safe_dump({"effort_is": "current_A", "effort_sign": -1, "effort_unit": "mA", "gravity": [0, 0, 9.81], "servo": {"joints": {"*": {"kp": 2}}}}))
+    (tmp_path / "bag.mcap.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "effort_is": "current_A",
+                "effort_sign": -1,
+                "effort_unit": "mA",
+                "gravity": [0, 0, 9.81],
+                "servo": {"joints": {"*": {"kp": 2}}},
+            }
+        )
+    )
     r = read(path, meta={"robot": "mine", "effort_sign": "-1,+1"})
     assert r.effort_is == "current_A" and r.meta["robot"] == "mine" and r.gravity[2] == 9.81
     assert list(r.effort_sign) == [-1, 1] and yaml.safe_load(r.meta["servo"]) == {"joints": {"*": {"kp": 2}}}
     np.testing.assert_allclose(r.states.effort.value, 1e-3 * r.states.position.value)
     np.testing.assert_allclose(r.signed_effort().value[:, 0], -r.states.effort.value[:, 0])
     assert "metadata_override" in kinds(r) and "unit" in kinds(r)
-    for bad, text in (({"effort_is": "mA"}, "must be one of current_A"), ({"effort": "x"}, "does not exist"), ({"effort_sign": "+1,-1,+1"}, "must be 2 numbers"),
-                      ({"servo": "a: [1"}, "is not YAML")):
+    for bad, text in (
+        ({"effort_is": "mA"}, "must be one of current_A"),
+        ({"effort": "x"}, "does not exist"),
+        ({"effort_sign": "+1,-1,+1"}, "must be 2 numbers"),
+        ({"servo": "a: [1"}, "is not YAML"),
+    ):
         with pytest.raises(UserError, match=text):
             read(path, meta=bad)
 
@@ -220,7 +308,12 @@ def test_json_messages(tmp_path):
         touch = w.register_channel("/tactile", "json", schema)
         for i in range(20):
             t = 5 * 10**9 + i * 10**7
-            message = {"header": {"stamp": {"sec": t // 10**9, "nsec": t % 10**9}}, "name": ["b", "a"], "position": [0.1 * i, None], "effort": [1, 2]}
+            message = {
+                "header": {"stamp": {"sec": t // 10**9, "nsec": t % 10**9}},
+                "name": ["b", "a"],
+                "position": [0.1 * i, None],
+                "effort": [1, 2],
+            }
             w.add_message(states, t, json.dumps(message).encode(), t)
             w.add_message(touch, t, json.dumps({"data": [float(i)] * 30}).encode(), t)
         w.finish()
@@ -256,7 +349,12 @@ def test_an_unknown_encoding_is_named(tmp_path):
     with open(tmp_path / "p.mcap", "wb") as out:
         w = McapWriter(out)
         w.start()
-        w.add_message(w.register_channel("/joint_states", "ros1", w.register_schema("sensor_msgs/JointState", "ros1msg", b"x")), 1, b"abc", 1)
+        w.add_message(
+            w.register_channel("/joint_states", "ros1", w.register_schema("sensor_msgs/JointState", "ros1msg", b"x")),
+            1,
+            b"abc",
+            1,
+        )
         w.finish()
     with pytest.raises(UserError, match="encoded as 'ros1'"):
         read(tmp_path / "p.mcap")
@@ -265,7 +363,15 @@ def test_an_unknown_encoding_is_named(tmp_path):
 # --- files in a bad state
 
 
-@pytest.mark.parametrize("content, text", [(b"", "is empty"), (b"hello world", "not an MCAP"), (b"SQLite format 3\0", "ros2 bag convert"), (None, "does not exist")])
+@pytest.mark.parametrize(
+    "content, text",
+    [
+        (b"", "is empty"),
+        (b"hello world", "not an MCAP"),
+        (b"SQLite format 3\0", "ros2 bag convert"),
+        (None, "does not exist"),
+    ],
+)
 def test_what_is_no_recording(tmp_path, content, text):
     if content is not None:
         (tmp_path / "a.mcap").write_bytes(content)
@@ -276,7 +382,12 @@ def test_what_is_no_recording(tmp_path, content, text):
 def test_a_recording_without_joints_lists_what_it_has(tmp_path):
     with open(tmp_path / "a.mcap", "wb") as file:
         w = Ros2Writer(file)
-        w.write_message("/odd", w.register_msgdef(MULTI_ARRAY, DEFINITIONS[MULTI_ARRAY]), {"layout": {"dim": [], "data_offset": 0}, "data": [1.0]}, 1)
+        w.write_message(
+            "/odd",
+            w.register_msgdef(MULTI_ARRAY, DEFINITIONS[MULTI_ARRAY]),
+            {"layout": {"dim": [], "data_offset": 0}, "data": [1.0]},
+            1,
+        )
         w.finish()
     with pytest.raises(UserError, match="neither /joint_states nor /joint_commands.*/odd"):
         read(tmp_path / "a.mcap")
@@ -367,7 +478,9 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path):
     with open(tmp_path / "a.mcap", "wb") as file:
         w = McapWriter(file)
         w.start(profile="ros2")
-        channel = w.register_channel("/joint_states", "cdr", w.register_schema(JOINT_STATE, "ros2msg", DEFINITIONS[JOINT_STATE].encode()))
+        channel = w.register_channel(
+            "/joint_states", "cdr", w.register_schema(JOINT_STATE, "ros2msg", DEFINITIONS[JOINT_STATE].encode())
+        )
         for i in range(30):
             data = cdr.joint_state(10**9 + i, ("a",), np.array([float(i)]))
             w.add_message(channel, 10**9 + i * 10**7, data[:30] if i in (7, 8) else data, 0)

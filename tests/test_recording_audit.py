@@ -227,9 +227,41 @@ def spike(r):
     return "spike", "/joint_states", "b", 3.331, 1
 
 
-FAULTS = (gap, dropped, held, slow_sensor, repeated_stamp, stuck, wrap16, wrap16_in_amperes, wrapped_duty, wrapped_angle, wrapped_taxels, saturated_taxels,
-          saturated_effort, lost_sign, wrong_sign, degrees, degrees_commanded, counts, degrees_a_second, milliamperes, percent, millivolts, kelvin,
-          millimetres, in_g, nan, late_clock, drifting_clock, state_before_command, shifted_topic, repeated_time, buffered, spike)
+FAULTS = (
+    gap,
+    dropped,
+    held,
+    slow_sensor,
+    repeated_stamp,
+    stuck,
+    wrap16,
+    wrap16_in_amperes,
+    wrapped_duty,
+    wrapped_angle,
+    wrapped_taxels,
+    saturated_taxels,
+    saturated_effort,
+    lost_sign,
+    wrong_sign,
+    degrees,
+    degrees_commanded,
+    counts,
+    degrees_a_second,
+    milliamperes,
+    percent,
+    millivolts,
+    kelvin,
+    millimetres,
+    in_g,
+    nan,
+    late_clock,
+    drifting_clock,
+    state_before_command,
+    shifted_topic,
+    repeated_time,
+    buffered,
+    spike,
+)
 
 
 @pytest.mark.parametrize("plant", FAULTS, ids=lambda f: f.__name__)

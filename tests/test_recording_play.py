@@ -23,7 +23,19 @@ from dexsim.sim.pendulum import pendulum_spec
 
 torch.set_num_threads(1)
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-SERVO = {"joints": {"*": {"kp": 2.0, "kd": 0.05, "torque_limit": 1.0, "no_load_speed": 12.0, "delay": 0.013, "coulomb_friction": 0.01}}, "current_per_torque": 0.9}
+SERVO = {
+    "joints": {
+        "*": {
+            "kp": 2.0,
+            "kd": 0.05,
+            "torque_limit": 1.0,
+            "no_load_speed": 12.0,
+            "delay": 0.013,
+            "coulomb_friction": 0.01,
+        }
+    },
+    "current_per_torque": 0.9,
+}
 
 
 def pendulum(servo=None, **options):
@@ -57,7 +69,10 @@ def test_statics_of_a_driven_pendulum():
 
 def test_targets_act_at_their_stamps_whatever_the_step():
     m = pendulum({"joints": {"*": {"kp": 2.0, "kd": 0.2, "delay": 0.02}}})
-    runs = [mech.drive(m, Series(np.array([0.0, 0.1237]), np.array([[0.0], [0.3]])), ("joint",), 0.4, timestep=h) for h in (0.0005, 0.004)]
+    runs = [
+        mech.drive(m, Series(np.array([0.0, 0.1237]), np.array([[0.0], [0.3]])), ("joint",), 0.4, timestep=h)
+        for h in (0.0005, 0.004)
+    ]
     fine, coarse = runs
     assert np.abs(np.interp(coarse.t, fine.t, fine.position[:, 0]) - coarse.position[:, 0]).max() < 0.01
     assert np.abs(coarse.position[coarse.t < 0.1437, 0]).max() < 1e-12  # not before stamp and delay
@@ -162,22 +177,38 @@ def test_replay_of_a_bench_recording(tmp_path, capsys):
     model, servo = _saved_pendulum(tmp_path / "rig")
     truth = pendulum()
     commands = sines(3.0, 1, size=0.5)
-    dense = mech.recorded(mech.drive(truth, commands, ("joint",), 3.0, np.zeros(1)), truth, commands, ("joint",), rate=500.0)
+    dense = mech.recorded(
+        mech.drive(truth, commands, ("joint",), 3.0, np.zeros(1)), truth, commands, ("joint",), rate=500.0
+    )
     hardware = realistic(dense, 1, truth.table.current(("joint",)))
     hardware.meta["servo"] = ""
     write(tmp_path / "bench.mcap", hardware)
-    ready = start.for_play([f"replay={tmp_path / 'bench.mcap'}", f"model={model}", f"servo={servo}", f"out={tmp_path / 'out'}", "video=false", "meta.robot=bench"], CONFIGS)
+    ready = start.for_play(
+        [
+            f"replay={tmp_path / 'bench.mcap'}",
+            f"model={model}",
+            f"servo={servo}",
+            f"out={tmp_path / 'out'}",
+            "video=false",
+            "meta.robot=bench",
+        ],
+        CONFIGS,
+    )
     from dexsim.cli import play
 
     assert play.run(ready) == 0
     about = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert about["position_rmse_rad"]["joint"] < 1e-3 and about["torque_rmse_Nm"]["joint"] < 2e-3  # a quantum is 1.5 mrad
+    assert (
+        about["position_rmse_rad"]["joint"] < 1e-3 and about["torque_rmse_Nm"]["joint"] < 2e-3
+    )  # a quantum is 1.5 mrad
     assert about["current_per_torque_fitted"] == [] and about["current_per_torque"]["joint"] == 0.9
     for name in ("position.png", "effort.png", "simulated.mcap"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
     assert not (tmp_path / "out" / "force.png").exists() and "position RMSE" in capsys.readouterr().out
     # the wrong servo shows
-    wrong = mech.Mechanism(truth.spec, ("joint",), ServoTable.from_dict(mech.merged(SERVO, {"joints": {"*": {"delay": 0.06}}})), "pendulum")
+    wrong = mech.Mechanism(
+        truth.spec, ("joint",), ServoTable.from_dict(mech.merged(SERVO, {"joints": {"*": {"delay": 0.06}}})), "pendulum"
+    )
     r = read(tmp_path / "bench.mcap")
     assert compare(r, mech.replay(r, wrong), wrong).position_rmse()[0] > 10 * about["position_rmse_rad"]["joint"]
 
@@ -235,7 +266,15 @@ def played(tmp_path_factory):
         _, _, done, _ = env.step(0.2 * (2 * torch.rand(4, 12, generator=generator) - 1))
         if done[:2].any():
             break
-        seen.append((env.q[:2].clone(), env.torque[:2].clone(), env.target[:2].clone(), env.touch.raw[:2].clone(), env.object_pose[:2].clone()))
+        seen.append(
+            (
+                env.q[:2].clone(),
+                env.torque[:2].clone(),
+                env.target[:2].clone(),
+                env.touch.raw[:2].clone(),
+                env.object_pose[:2].clone(),
+            )
+        )
     folder = tmp_path_factory.mktemp("played")
     paths = recorder.save(folder / "p.mcap")
     recorder.save(folder / "r.mcap", realistic=True)
@@ -248,7 +287,9 @@ def test_a_play_is_recorded_as_it_was(played):
     for w, path in enumerate(paths):
         r = read(path)
         assert not [f for f in r.findings if f.severity == "error"], table(r.findings)
-        assert len(r.states.position) == len(r.commands) * env.decimation and np.diff(r.commands.t) == pytest.approx(env.dt)
+        assert len(r.states.position) == len(r.commands) * env.decimation and np.diff(r.commands.t) == pytest.approx(
+            env.dt
+        )
         for k in range(len(seen) - 1):
             q, _, target, raw, pose = (x[w].numpy() for x in seen[k])
             # the state after step k is the one before the first physics step of k + 1
@@ -259,7 +300,9 @@ def test_a_play_is_recorded_as_it_was(played):
             np.testing.assert_allclose(r.object_pose.value[row], pose, atol=1e-6)
         assert yaml.safe_load(r.config)["recorded_world"]["index"] == w
         servo = ServoTable.from_dict(yaml.safe_load(r.meta["servo"])).nominal(r.joints)
-        np.testing.assert_allclose(servo, env.servo.params[w].numpy(), rtol=1e-5, atol=1e-9) if not env.done[w] else None
+        np.testing.assert_allclose(servo, env.servo.params[w].numpy(), rtol=1e-5, atol=1e-9) if not env.done[
+            w
+        ] else None
 
 
 def r_offset(env, world):

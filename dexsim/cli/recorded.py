@@ -15,7 +15,8 @@ USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
-    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "remap", "meta"}."""
+    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep",
+    "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments
 
     own: dict[str, str] = {}
@@ -44,12 +45,21 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
             options = sorted(p.stem for p in (config_dir / "servo").glob("*.yaml"))
             raise UserError(f"servo={servo}: must be a servo.yaml file, or one of {', '.join(options)}")
         servo = str(path)
-    return {"replay": own["replay"], "model": own.get("model") or None, "servo": servo, "out": own.get("out") or None,
-            "video": own.get("video", "true") == "true", "timestep": timestep, "remap": remap, "meta": meta}
+    return {
+        "replay": own["replay"],
+        "model": own.get("model") or None,
+        "servo": servo,
+        "out": own.get("out") or None,
+        "video": own.get("video", "true") == "true",
+        "timestep": timestep,
+        "remap": remap,
+        "meta": meta,
+    }
 
 
 def run(play: dict[str, Any]) -> int:
-    """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and video.mp4."""
+    """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and
+    video.mp4."""
     import yaml
 
     from dexsim.cli.build import quiet_warp
@@ -70,17 +80,31 @@ def run(play: dict[str, Any]) -> int:
     timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
     led = led_object.add_object(m, recording)
     out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
-    print(f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
-          + (", the object led along its recorded path" if led else ""), flush=True)
-    result = mechanism.replay(recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if led else None)
+    print(
+        f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
+        + (", the object led along its recorded path" if led else ""),
+        flush=True,
+    )
+    result = mechanism.replay(
+        recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if led else None
+    )
     c = compare.compare(recording, result, m, forces=led)
     position, effort = c.position_rmse(), c.effort_rmse()
-    rows = [(j, f"{1e3 * p:.2f}", f"{e:.4f}" if e == e else "-") for j, p, e in zip(c.joints, position, effort, strict=True)]
+    rows = [
+        (j, f"{1e3 * p:.2f}", f"{e:.4f}" if e == e else "-") for j, p, e in zip(c.joints, position, effort, strict=True)
+    ]
     print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")
-    about = {"replay": str(path), "model": model or "xhand_right", "timestep_s": timestep, "object": "led" if led else "none",
-             "position_rmse_rad": _plain(c.joints, position), "torque_rmse_Nm": _plain(c.joints, effort),
-             "current_per_torque": _plain(c.joints, c.effort_scale), "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
-             "findings": [f"{f.severity}: {f.kind} {f.topic} {f.text}".strip() for f in recording.findings]}
+    about = {
+        "replay": str(path),
+        "model": model or "xhand_right",
+        "timestep_s": timestep,
+        "object": "led" if led else "none",
+        "position_rmse_rad": _plain(c.joints, position),
+        "torque_rmse_Nm": _plain(c.joints, effort),
+        "current_per_torque": _plain(c.joints, c.effort_scale),
+        "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
+        "findings": [f"{f.severity}: {f.kind} {f.topic} {f.text}".strip() for f in recording.findings],
+    }
     (out / "metrics.json").write_text(json.dumps(about, indent=2) + "\n")
     print(f"metrics  {out / 'metrics.json'}")
     write(out / "simulated.mcap", mechanism.recorded(result, m, recording.commands, recording.joints))
@@ -114,7 +138,10 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
         from dexsim.assets import xhand
 
         names = xhand.FINGERS
-        force = tuple(None if s is None else np.stack([np.interp(frames, s[0], x) for x in s[1].T], 1) for s in (c.finger_force, c.finger_force_simulated))
+        force = tuple(
+            None if s is None else np.stack([np.interp(frames, s[0], x) for x in s[1].T], 1)
+            for s in (c.finger_force, c.finger_force_simulated)
+        )
     if len(state):
         seen = result.qpos.copy()
         for a, column in zip(address, state.value.T, strict=True):
@@ -127,7 +154,12 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
     if m.robot != "xhand_right":
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        camera = {"lookat": [float(x) for x in model.stat.center], "distance": 2.2 * float(model.stat.extent), "azimuth": 120.0, "elevation": -20.0}
+        camera = {
+            "lookat": [float(x) for x in model.stat.center],
+            "distance": 2.2 * float(model.stat.extent),
+            "azimuth": 120.0,
+            "elevation": -20.0,
+        }
     try:
         render(clips, path, result.frame_s, names, camera=camera, progress=Ticker("frames"))
         print(f"video    {path}")

@@ -48,16 +48,38 @@ KINDS: dict[str, str] = {
 def audit(recording: Recording) -> list[Finding]:
     """Findings about the signals of a recording, in order of topic and time; [] for a clean one."""
     r = recording
-    series: list[Series] = [s for s in (r.commands, r.states.position, r.temperature, r.duty, r.enabled, r.supply_voltage, r.tactile,
-                                        r.external_force, r.object_pose, r.imu) if s is not None]
+    series: list[Series] = [
+        s
+        for s in (
+            r.commands,
+            r.states.position,
+            r.temperature,
+            r.duty,
+            r.enabled,
+            r.supply_voltage,
+            r.tactile,
+            r.external_force,
+            r.object_pose,
+            r.imu,
+        )
+        if s is not None
+    ]
     found: list[Finding] = []
     with np.errstate(all="ignore"):
         for s in series:
             found += audit_time.timing(s)
         found += audit_time.stamps(series)
         found += audit_time.between_topics(r)
-        for check in (audit_values.finite, audit_values.wraps, audit_values.spikes, audit_values.held, audit_values.stuck,
-                      audit_values.saturation, audit_values.signs, audit_values.units):
+        for check in (
+            audit_values.finite,
+            audit_values.wraps,
+            audit_values.spikes,
+            audit_values.held,
+            audit_values.stuck,
+            audit_values.saturation,
+            audit_values.signs,
+            audit_values.units,
+        ):
             found += check(r)
     return sorted(found, key=lambda f: (f.topic, f.time if np.isfinite(f.time) else -1.0))
 
@@ -76,10 +98,24 @@ def table(findings: Sequence[Finding]) -> str:
 
 def summary(r: Recording) -> str:
     """One line a topic: samples, rate, span."""
-    lines = [f"{r.path}: {r.meta['source']}, {r.meta['robot']}, {len(r.joints)} joints, {r.duration:.2f} s, effort {r.effort_is}"]
-    parts = (("commands", r.commands), ("states", r.states.position), ("  velocity", r.states.velocity), ("  effort", r.states.effort),
-             ("temperature", r.temperature), ("duty", r.duty), ("enabled", r.enabled), ("supply voltage", r.supply_voltage), ("tactile", r.tactile),
-             ("external force", r.external_force), ("object pose", r.object_pose), ("imu", r.imu))
+    lines = [
+        f"{r.path}: {r.meta['source']}, {r.meta['robot']}, {len(r.joints)} joints, {r.duration:.2f} s,"
+        f" effort {r.effort_is}"
+    ]
+    parts = (
+        ("commands", r.commands),
+        ("states", r.states.position),
+        ("  velocity", r.states.velocity),
+        ("  effort", r.states.effort),
+        ("temperature", r.temperature),
+        ("duty", r.duty),
+        ("enabled", r.enabled),
+        ("supply voltage", r.supply_voltage),
+        ("tactile", r.tactile),
+        ("external force", r.external_force),
+        ("object pose", r.object_pose),
+        ("imu", r.imu),
+    )
     for name, s in parts:
         if s is not None and len(s):
             rate = (len(s) - 1) / (s.t[-1] - s.t[0]) if len(s) > 1 and s.t[-1] > s.t[0] else float("nan")
@@ -93,7 +129,10 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.recording.reader import read
 
     if not argv or argv[0] in ("-h", "--help"):
-        print("usage: python -m dexsim.recording.audit FILE [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]\n\nkinds of findings:")
+        print(
+            "usage: python -m dexsim.recording.audit FILE [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]\n\n"
+            "kinds of findings:"
+        )
         print("\n".join(f"  {kind:<20}{text}" for kind, text in KINDS.items()))
         return 0 if argv else 2
     paths, remap, meta = read_arguments(argv)

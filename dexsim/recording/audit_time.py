@@ -25,8 +25,15 @@ def timing(series: Series) -> Iterator[Finding]:
     period = float(np.median(dt[dt > 0])) if (dt > 0).any() else 0.0
     same = np.flatnonzero(dt == 0)
     if len(same):
-        yield Finding("time_repeated", topic, float(t[same[0]]), len(same), f"{len(same)} samples have the host time of the one before",
-                      "error" if len(same) > len(t) / 2 else "warning", end=float(t[same[-1]]))
+        yield Finding(
+            "time_repeated",
+            topic,
+            float(t[same[0]]),
+            len(same),
+            f"{len(same)} samples have the host time of the one before",
+            "error" if len(same) > len(t) / 2 else "warning",
+            end=float(t[same[-1]]),
+        )
     if period == 0.0:
         return
     period = max(period, 0.5 * float(dt.mean()))  # where most come in bursts, the median says nothing
@@ -35,18 +42,39 @@ def timing(series: Series) -> Iterator[Finding]:
     # a command may be sent only when it changes: then its pauses say nothing
     if len(gaps) and regular and (topic != COMMANDS or len(gaps) < 0.02 * len(t)):
         longest = gaps[np.argmax(dt[gaps])]
-        yield Finding("gap", topic, float(t[gaps[0]]), len(gaps),
-                      f"{len(gaps)} gaps of more than {GAP:g} periods ({period * 1e3:.3g} ms); the longest is {dt[longest] * 1e3:.4g} ms at {t[longest]:.3f} s",
-                      "info" if topic == COMMANDS else "warning", end=float(t[gaps[-1] + 1]))
+        yield Finding(
+            "gap",
+            topic,
+            float(t[gaps[0]]),
+            len(gaps),
+            f"{len(gaps)} gaps of more than {GAP:g} periods ({period * 1e3:.3g} ms);"
+            f" the longest is {dt[longest] * 1e3:.4g} ms at {t[longest]:.3f} s",
+            "info" if topic == COMMANDS else "warning",
+            end=float(t[gaps[-1] + 1]),
+        )
     dropped = np.flatnonzero((dt > 1.6 * period) & (dt <= GAP * period))
     if len(dropped) and regular and len(dropped) > 0.001 * len(t):
-        yield Finding("dropped", topic, float(t[dropped[0]]), len(dropped),
-                      f"{len(dropped)} samples or so are missing singly ({100 * len(dropped) / len(t):.2g} %)", "info", end=float(t[dropped[-1]]))
+        yield Finding(
+            "dropped",
+            topic,
+            float(t[dropped[0]]),
+            len(dropped),
+            f"{len(dropped)} samples or so are missing singly ({100 * len(dropped) / len(t):.2g} %)",
+            "info",
+            end=float(t[dropped[-1]]),
+        )
     burst = np.flatnonzero((dt > 0) & (dt < 0.1 * period))
     if len(burst) > 0.05 * len(t):
-        yield Finding("burst", topic, float(t[burst[0]]), len(burst),
-                      f"{len(burst)} samples came within a tenth of a period of the one before: read from a buffer, not when measured",
-                      "warning", end=float(t[burst[-1]]))
+        yield Finding(
+            "burst",
+            topic,
+            float(t[burst[0]]),
+            len(burst),
+            f"{len(burst)} samples came within a tenth of a period of the one before:"
+            " read from a buffer, not when measured",
+            "warning",
+            end=float(t[burst[-1]]),
+        )
 
 
 def stamps(all_series: list[Series]) -> Iterator[Finding]:
@@ -63,31 +91,75 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
         middle = float(np.median(late))
         again = np.flatnonzero((np.diff(stamp) == 0) & (np.diff(t) > 0))
         if len(again):
-            yield Finding("held", topic, float(t[again[0] + 1]), len(again), f"{len(again)} messages carry the header.stamp of the one before: repeated",
-                          "warning", end=float(t[again[-1] + 1]))
+            yield Finding(
+                "held",
+                topic,
+                float(t[again[0] + 1]),
+                len(again),
+                f"{len(again)} messages carry the header.stamp of the one before: repeated",
+                "warning",
+                end=float(t[again[-1] + 1]),
+            )
         back = np.flatnonzero(np.diff(stamp) < 0)
         if len(back):
-            yield Finding("time_not_monotonic", topic, float(t[back[0] + 1]), len(back), f"header.stamp goes backwards {len(back)} times",
-                          "warning", end=float(t[back[-1] + 1]))
+            yield Finding(
+                "time_not_monotonic",
+                topic,
+                float(t[back[0] + 1]),
+                len(back),
+                f"header.stamp goes backwards {len(back)} times",
+                "warning",
+                end=float(t[back[-1] + 1]),
+            )
         other_epoch = abs(middle) > EPOCH_S
         if not other_epoch:
             offsets[topic] = middle
             if abs(middle) > SKEW_S:
-                yield Finding("clock_skew", topic, float(t[0]), len(t), f"header.stamp is {abs(middle) * 1e3:.4g} ms {'behind' if middle > 0 else 'ahead of'}"
-                              " host time (median); host time is used", "warning", end=float(t[-1]))
+                yield Finding(
+                    "clock_skew",
+                    topic,
+                    float(t[0]),
+                    len(t),
+                    f"header.stamp is {abs(middle) * 1e3:.4g} ms {'behind' if middle > 0 else 'ahead of'}"
+                    " host time (median); host time is used",
+                    "warning",
+                    end=float(t[-1]),
+                )
         rate = _slope(t, late)
         if len(t) > 50 and abs(rate) * 1e6 > DRIFT_PPM and abs(rate) * (t[-1] - t[0]) > 0.5 * SKEW_S:
-            yield Finding("clock_skew", topic, float(t[0]), len(t), f"header.stamp drifts against host time by {rate * 1e6:+.0f} ppm:"
-                          f" {rate * (t[-1] - t[0]) * 1e3:+.3g} ms over the recording", "error", end=float(t[-1]))
+            yield Finding(
+                "clock_skew",
+                topic,
+                float(t[0]),
+                len(t),
+                f"header.stamp drifts against host time by {rate * 1e6:+.0f} ppm:"
+                f" {rate * (t[-1] - t[0]) * 1e3:+.3g} ms over the recording",
+                "error",
+                end=float(t[-1]),
+            )
         jumps = np.flatnonzero(np.abs(np.diff(late)) > 5 * SKEW_S)
         if len(jumps) and abs(np.median(late[: jumps[0] + 1]) - np.median(late[jumps[-1] + 1 :])) > 5 * SKEW_S:
-            yield Finding("clock_skew", topic, float(t[jumps[0] + 1]), len(jumps), f"header.stamp jumps against host time by {np.diff(late)[jumps[0]] * -1e3:+.4g} ms",
-                          "error", end=float(t[jumps[-1] + 1]))
+            yield Finding(
+                "clock_skew",
+                topic,
+                float(t[jumps[0] + 1]),
+                len(jumps),
+                f"header.stamp jumps against host time by {np.diff(late)[jumps[0]] * -1e3:+.4g} ms",
+                "error",
+                end=float(t[jumps[-1] + 1]),
+            )
     if len(offsets) > 1:
         low, high = min(offsets, key=offsets.get), max(offsets, key=offsets.get)
         apart = offsets[high] - offsets[low]
         if apart > 2 * SKEW_S:
-            yield Finding("clock_skew", high, 0.0, 1, f"the clocks that stamp {high} and {low} are {apart * 1e3:.4g} ms apart", "warning")
+            yield Finding(
+                "clock_skew",
+                high,
+                0.0,
+                1,
+                f"the clocks that stamp {high} and {low} are {apart * 1e3:.4g} ms apart",
+                "warning",
+            )
 
 
 def between_topics(r: Recording) -> Iterator[Finding]:
@@ -99,13 +171,33 @@ def between_topics(r: Recording) -> Iterator[Finding]:
         if other is None or len(other) < 20:
             continue
         first, last = other.t[0] - state.t[0], other.t[-1] - state.t[-1]
-        if min(abs(first), abs(last)) > SHIFT_S and first * last > 0 and abs(first - last) < 0.3 * max(abs(first), abs(last)):
-            yield Finding("clock_skew", other.topic, float(other.t[0]), len(other), f"begins {first:+.3g} s and ends {last:+.3g} s from {state.topic}:"
-                          " shifted as a whole, so their host times may be of two clocks", "warning", end=float(other.t[-1]))
+        if (
+            min(abs(first), abs(last)) > SHIFT_S
+            and first * last > 0
+            and abs(first - last) < 0.3 * max(abs(first), abs(last))
+        ):
+            yield Finding(
+                "clock_skew",
+                other.topic,
+                float(other.t[0]),
+                len(other),
+                f"begins {first:+.3g} s and ends {last:+.3g} s from {state.topic}:"
+                " shifted as a whole, so their host times may be of two clocks",
+                "warning",
+                end=float(other.t[-1]),
+            )
     lead = command_lead(r)
     if lead is not None and lead > LEAD_S + 0.5 * float(np.median(np.diff(state.t))):
-        yield Finding("clock_skew", state.topic, 0.0, len(state), f"motion comes {lead * 1e3:.3g} ms before its command (median over joints):"
-                      f" the host times of {state.topic} and {COMMANDS} are not of one clock", "error", end=float(state.t[-1]))
+        yield Finding(
+            "clock_skew",
+            state.topic,
+            0.0,
+            len(state),
+            f"motion comes {lead * 1e3:.3g} ms before its command (median over joints):"
+            f" the host times of {state.topic} and {COMMANDS} are not of one clock",
+            "error",
+            end=float(state.t[-1]),
+        )
 
 
 def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float | None:
@@ -120,11 +212,17 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
         return None
     grid = np.arange(start, end, step)
     for j in range(len(r.joints)):
-        command, position = _held_at(grid, r.commands.t, r.commands.value[:, j]), _line(grid, state.t, state.value[:, j])
+        command, position = (
+            _held_at(grid, r.commands.t, r.commands.value[:, j]),
+            _line(grid, state.t, state.value[:, j]),
+        )
         if command is None or position is None:
             continue
         half = len(grid) // 2
-        parts = [_lead(command[part], position[part], int(reach / step)) for part in (slice(None), slice(0, half), slice(half, None))]
+        parts = [
+            _lead(command[part], position[part], int(reach / step))
+            for part in (slice(None), slice(0, half), slice(half, None))
+        ]
         if all(p is not None for p in parts) and max(parts) - min(parts) <= 3:
             leads.append(parts[0] * step)
     return float(np.median(leads)) if leads else None

@@ -7,17 +7,22 @@ from collections.abc import Iterator
 import numpy as np
 
 from dexsim.assets import xhand
-from dexsim.recording.schema import COMMANDS, STATES, TACTILE, Finding, Recording, Series
+from dexsim.recording.schema import STATES, TACTILE, Finding, Recording, Series
 
 NAN = float("nan")
 MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 65536.0, 65.536, 2.0**32)  # angles, 8, 12, 16 (also in thousandths), 32 bit
-RATIOS = {180 / np.pi: "degrees", 4096 / (2 * np.pi): "counts of a 12-bit encoder", 1000.0: "thousandths",
-          65536 / (2 * np.pi): "counts of a 16-bit encoder"}
+RATIOS = {
+    180 / np.pi: "degrees",
+    4096 / (2 * np.pi): "counts of a 12-bit encoder",
+    1000.0: "thousandths",
+    65536 / (2 * np.pi): "counts of a 16-bit encoder",
+}
 SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousandths of rad/s"}
 
 
 def quantum(x: np.ndarray) -> float:
-    """Step of a quantised signal: the largest that divides (nearly) all differences of its values; 0 where there is none."""
+    """Step of a quantised signal: the largest that divides (nearly) all differences of its values; 0 where there is
+    none."""
     values = np.unique(x[np.isfinite(x)])
     if len(values) < 3:
         return 0.0
@@ -38,8 +43,15 @@ def is_integer(x: np.ndarray) -> bool:
 def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarray]]:
     """(topic, quantity, joint, t, values [T]) of every per-joint signal."""
     s = r.states
-    for series, name in ((r.commands, "command"), (s.position, "position"), (s.velocity, "velocity"), (s.effort, "effort"),
-                         (r.temperature, "temperature"), (r.duty, "duty"), (r.enabled, "enabled")):
+    for series, name in (
+        (r.commands, "command"),
+        (s.position, "position"),
+        (s.velocity, "velocity"),
+        (s.effort, "effort"),
+        (r.temperature, "temperature"),
+        (r.duty, "duty"),
+        (r.enabled, "enabled"),
+    ):
         if series is not None and len(series):
             for j, joint in enumerate(r.joints):
                 yield series.topic, name, joint, series.t, series.value[:, j]
@@ -56,14 +68,29 @@ def finite(r: Recording) -> Iterator[Finding]:
             severity = "warning" if name == "position" else "info"
             yield Finding("absent", topic, float(t[0]), len(x), f"no {name} of {joint}", severity, joint, float(t[-1]))
         elif np.isinf(x).any() or name not in ("command", "enabled"):
-            yield Finding("nan", topic, float(t[at[0]]), len(at), f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples",
-                          "warning", joint, float(t[at[-1]]))
+            yield Finding(
+                "nan",
+                topic,
+                float(t[at[0]]),
+                len(at),
+                f"{name} of {joint} is not a finite number in {len(at)} of {len(x)} samples",
+                "warning",
+                joint,
+                float(t[at[-1]]),
+            )
     for series in (r.tactile, r.supply_voltage, r.external_force, r.object_pose, r.imu):
         if series is not None:
             bad = np.flatnonzero(~np.isfinite(series.value.reshape(len(series), -1)).all(1))
             if len(bad):
-                yield Finding("nan", series.topic, float(series.t[bad[0]]), len(bad), f"{len(bad)} of {len(series)} samples hold values that are not finite",
-                              "warning", end=float(series.t[bad[-1]]))
+                yield Finding(
+                    "nan",
+                    series.topic,
+                    float(series.t[bad[0]]),
+                    len(bad),
+                    f"{len(bad)} of {len(series)} samples hold values that are not finite",
+                    "warning",
+                    end=float(series.t[bad[-1]]),
+                )
 
 
 def wraps(r: Recording) -> Iterator[Finding]:
@@ -73,8 +100,21 @@ def wraps(r: Recording) -> Iterator[Finding]:
             found = wrapped(x)
             if found is not None:
                 m, at = found
-                what = "the angle starts again after a turn" if m in (2 * np.pi, 360.0) else f"a signed number was read as unsigned (modulus {m:g})"
-                yield Finding("wrap", topic, float(t[at[0]]), len(at), f"{name} of {joint} jumps by {m:.6g}: {what}", "error", joint, float(t[at[-1]]))
+                what = (
+                    "the angle starts again after a turn"
+                    if m in (2 * np.pi, 360.0)
+                    else f"a signed number was read as unsigned (modulus {m:g})"
+                )
+                yield Finding(
+                    "wrap",
+                    topic,
+                    float(t[at[0]]),
+                    len(at),
+                    f"{name} of {joint} jumps by {m:.6g}: {what}",
+                    "error",
+                    joint,
+                    float(t[at[-1]]),
+                )
     if r.tactile is not None and len(r.tactile) > 5:
         value = r.tactile.value
         for axis, label in enumerate(("fx", "fy", "fz")):
@@ -86,8 +126,16 @@ def wraps(r: Recording) -> Iterator[Finding]:
             # -1 as 255: large values, with hardly any between them and the small ones, reached in one step
             if jumps.any() and axis < 2 and (x[~high & ~low].size < 0.2 * high.sum()):
                 at = np.flatnonzero(high.any(1))
-                yield Finding("wrap", TACTILE, float(r.tactile.t[at[0]]), int(high.sum()), f"{label} holds values near 255 beside values near 0 and no negative ones:"
-                              " signed bytes were read as unsigned", "error", end=float(r.tactile.t[at[-1]]))
+                yield Finding(
+                    "wrap",
+                    TACTILE,
+                    float(r.tactile.t[at[0]]),
+                    int(high.sum()),
+                    f"{label} holds values near 255 beside values near 0 and no negative ones:"
+                    " signed bytes were read as unsigned",
+                    "error",
+                    end=float(r.tactile.t[at[-1]]),
+                )
 
 
 def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
@@ -125,8 +173,17 @@ def spikes(r: Recording) -> Iterator[Finding]:
         typical = np.percentile(np.abs(np.diff(x)), 99)
         at = np.flatnonzero(there & (away > 0.1) & (away > 5 * typical) & (np.abs(x[2:] - x[:-2]) < 0.5 * away)) + 1
         if len(at):
-            yield Finding("spike", s.topic, float(s.t[at[0]]), len(at), f"position of {joint}: {len(at)} single samples far from both neighbours"
-                          f" (by up to {away[at - 1].max():.3g})", "warning", joint, float(s.t[at[-1]]))
+            yield Finding(
+                "spike",
+                s.topic,
+                float(s.t[at[0]]),
+                len(at),
+                f"position of {joint}: {len(at)} single samples far from both neighbours"
+                f" (by up to {away[at - 1].max():.3g})",
+                "warning",
+                joint,
+                float(s.t[at[-1]]),
+            )
 
 
 def held(r: Recording) -> Iterator[Finding]:
@@ -147,20 +204,43 @@ def held(r: Recording) -> Iterator[Finding]:
         alone[j] = late & ~same_row
     if stale.sum() >= 3:
         at = np.flatnonzero(stale)
-        yield Finding("held", s.topic, float(s.t[at[0]]), len(at), f"{len(at)} whole samples repeat the one before while joints move", "warning", end=float(s.t[at[-1]]))
+        yield Finding(
+            "held",
+            s.topic,
+            float(s.t[at[0]]),
+            len(at),
+            f"{len(at)} whole samples repeat the one before while joints move",
+            "warning",
+            end=float(s.t[at[-1]]),
+        )
     for j, late in alone.items():
         at = np.flatnonzero(late)
         if len(at) >= (5 if effort is not None else 12):
-            yield Finding("held", s.topic, float(s.t[at[0]]), len(at), f"{r.joints[j]}: {len(at)} samples repeat the one before while it moves and others go on",
-                          "warning", r.joints[j], float(s.t[at[-1]]))
+            yield Finding(
+                "held",
+                s.topic,
+                float(s.t[at[0]]),
+                len(at),
+                f"{r.joints[j]}: {len(at)} samples repeat the one before while it moves and others go on",
+                "warning",
+                r.joints[j],
+                float(s.t[at[-1]]),
+            )
     if r.tactile is not None and len(r.tactile) > 10:
         x = r.tactile.value.reshape(len(r.tactile), -1)
         total = np.nansum(np.abs(x), axis=1)
         late = repeats(r.tactile.t, total) & np.append(False, (np.diff(x, axis=0) == 0).all(1))
         if late.sum() >= 3:
             at = np.flatnonzero(late)
-            yield Finding("held", TACTILE, float(r.tactile.t[at[0]]), len(at), f"{len(at)} samples repeat the one before while the force changes", "warning",
-                          end=float(r.tactile.t[at[-1]]))
+            yield Finding(
+                "held",
+                TACTILE,
+                float(r.tactile.t[at[0]]),
+                len(at),
+                f"{len(at)} samples repeat the one before while the force changes",
+                "warning",
+                end=float(r.tactile.t[at[-1]]),
+            )
 
 
 def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -196,15 +276,36 @@ def stuck(r: Recording) -> Iterator[Finding]:
         if len(s) > 20 and np.isfinite(x).any() and np.nanmax(x) == np.nanmin(x) and len(r.commands):
             c = r.commands.value[:, j]
             if np.isfinite(c).any() and np.nanmax(c) - np.nanmin(c) > 0.1:
-                yield Finding("stuck", STATES, float(s.t[0]), len(s), f"position of {joint} is {x[0]:.4g} throughout while its command spans"
-                              f" {np.nanmax(c) - np.nanmin(c):.3g}", "error", joint, float(s.t[-1]))
+                yield Finding(
+                    "stuck",
+                    STATES,
+                    float(s.t[0]),
+                    len(s),
+                    f"position of {joint} is {x[0]:.4g} throughout while its command spans"
+                    f" {np.nanmax(c) - np.nanmin(c):.3g}",
+                    "error",
+                    joint,
+                    float(s.t[-1]),
+                )
     e = r.states.effort
     if e is not None and len(e) > 20:
         for j, joint in enumerate(r.joints):
             x = e.value[:, j]
-            if np.isfinite(x).any() and np.nanmax(x) == np.nanmin(x) and np.nanmax(s.value[:, j]) - np.nanmin(s.value[:, j]) > 0.05:
-                yield Finding("stuck", STATES, float(e.t[0]), len(e), f"effort of {joint} is {x[np.isfinite(x)][0]:.4g} throughout while it moves",
-                              "error", joint, float(e.t[-1]))
+            if (
+                np.isfinite(x).any()
+                and np.nanmax(x) == np.nanmin(x)
+                and np.nanmax(s.value[:, j]) - np.nanmin(s.value[:, j]) > 0.05
+            ):
+                yield Finding(
+                    "stuck",
+                    STATES,
+                    float(e.t[0]),
+                    len(e),
+                    f"effort of {joint} is {x[np.isfinite(x)][0]:.4g} throughout while it moves",
+                    "error",
+                    joint,
+                    float(e.t[-1]),
+                )
 
 
 def saturation(r: Recording) -> Iterator[Finding]:
@@ -222,15 +323,32 @@ def saturation(r: Recording) -> Iterator[Finding]:
             long = [run for run in runs if len(run) >= 3]
             near = ((np.abs(x - limit) < 0.05 * np.ptp(x)) & (x != limit)).sum()
             if len(long) >= 2 and sum(map(len, long)) > near:
-                yield Finding("saturation", topic, float(t[long[0][0]]), len(at), f"{name} of {joint} is at its {side} value, {limit:.4g}, in {len(at)} samples",
-                              "info", joint, float(t[long[-1][-1]]))
+                yield Finding(
+                    "saturation",
+                    topic,
+                    float(t[long[0][0]]),
+                    len(at),
+                    f"{name} of {joint} is at its {side} value, {limit:.4g}, in {len(at)} samples",
+                    "info",
+                    joint,
+                    float(t[long[-1][-1]]),
+                )
     if r.tactile is not None and r.meta["tactile_unit"] == "count" and is_integer(r.tactile.value):
         v = r.tactile.value
-        full = np.stack([(v[..., 0] >= 127) | (v[..., 0] <= -128), (v[..., 1] >= 127) | (v[..., 1] <= -128), v[..., 2] >= 255])
+        full = np.stack(
+            [(v[..., 0] >= 127) | (v[..., 0] <= -128), (v[..., 1] >= 127) | (v[..., 1] <= -128), v[..., 2] >= 255]
+        )
         if full.any():
             at = np.flatnonzero(full.any((0, 2, 3)))
-            yield Finding("saturation", TACTILE, float(r.tactile.t[at[0]]), int(full.sum()), f"taxels at the end of their 8-bit range ({full.any((0, 1)).sum()} of them)",
-                          "warning", end=float(r.tactile.t[at[-1]]))
+            yield Finding(
+                "saturation",
+                TACTILE,
+                float(r.tactile.t[at[0]]),
+                int(full.sum()),
+                f"taxels at the end of their 8-bit range ({full.any((0, 1)).sum()} of them)",
+                "warning",
+                end=float(r.tactile.t[at[-1]]),
+            )
 
 
 def signs(r: Recording) -> Iterator[Finding]:
@@ -252,15 +370,42 @@ def signs(r: Recording) -> Iterator[Finding]:
         plain, absolute = _corr(x, d), _corr(x, np.abs(d))
         if both > 0.15 and (x >= 0).all() and absolute > 0.3 and absolute > plain * stated[j] + 0.2:
             lost.append(j)
-            yield Finding("lost_sign", STATES, float(t[0]), len(x), f"effort of {joint} is never negative and follows the size, not the sign, of what drives it"
-                          f" (correlation {absolute:.2f} against {plain:.2f})", "error", joint, float(t[-1]))
+            yield Finding(
+                "lost_sign",
+                STATES,
+                float(t[0]),
+                len(x),
+                f"effort of {joint} is never negative and follows the size, not the sign, of what drives it"
+                f" (correlation {absolute:.2f} against {plain:.2f})",
+                "error",
+                joint,
+                float(t[-1]),
+            )
         elif both > 0.15 and not (x >= 0).all() and plain * stated[j] < -0.5:
-            yield Finding("sign_mismatch", STATES, float(t[0]), len(x), f"effort of {joint} is opposite to what effort_sign={int(stated[j]):+d} says"
-                          f" (correlation {plain * stated[j]:.2f} with target minus position)", "error", joint, float(t[-1]))
+            yield Finding(
+                "sign_mismatch",
+                STATES,
+                float(t[0]),
+                len(x),
+                f"effort of {joint} is opposite to what effort_sign={int(stated[j]):+d} says"
+                f" (correlation {plain * stated[j]:.2f} with target minus position)",
+                "error",
+                joint,
+                float(t[-1]),
+            )
     if lost and not (e.value < 0).any():
         rest = [r.joints[j] for j in range(len(r.joints)) if j not in lost and np.nanmax(e.value[:, j]) > 0]
         if rest:
-            yield Finding("lost_sign", STATES, float(e.t[0]), len(e), f"effort of {', '.join(rest)} is never negative either", "warning", "", float(e.t[-1]))
+            yield Finding(
+                "lost_sign",
+                STATES,
+                float(e.t[0]),
+                len(e),
+                f"effort of {', '.join(rest)} is never negative either",
+                "warning",
+                "",
+                float(e.t[-1]),
+            )
 
 
 def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
@@ -284,7 +429,9 @@ def units(r: Recording) -> Iterator[Finding]:
     limits = dict(zip(xhand.JOINTS, xhand.joint_limits(), strict=True)) if set(r.joints) <= set(xhand.JOINTS) else {}
 
     def finding(series: Series, text: str, joint: str = "", severity: str = "error") -> Finding:
-        return Finding("unit", series.topic, float(series.t[0]), len(series), text, severity, joint, float(series.t[-1]))
+        return Finding(
+            "unit", series.topic, float(series.t[0]), len(series), text, severity, joint, float(series.t[-1])
+        )
 
     for series, name in ((s.position, "position"), (c, "command")):
         for j, joint in enumerate(r.joints):
@@ -294,7 +441,11 @@ def units(r: Recording) -> Iterator[Finding]:
             top = float(np.nanmax(np.abs(x)))
             if joint in limits and top > np.abs(limits[joint]).max() + 0.5:
                 guess = "counts?" if is_integer(x) and top > 200 else "degrees?" if top < 400 else "counts?"
-                yield finding(series, f"{name} of {joint} reaches {top:.4g} rad, its limit is {np.abs(limits[joint]).max():.3g}: {guess}", joint)
+                yield finding(
+                    series,
+                    f"{name} of {joint} reaches {top:.4g} rad, its limit is {np.abs(limits[joint]).max():.3g}: {guess}",
+                    joint,
+                )
             elif not limits and is_integer(x) and top > 100:
                 yield finding(series, f"{name} of {joint} holds whole numbers up to {top:.0f}: encoder counts?", joint)
             elif not limits and 4 * np.pi < top < 400 and _jumpless(x):
@@ -306,7 +457,11 @@ def units(r: Recording) -> Iterator[Finding]:
             for known, unit in RATIOS.items():
                 for k, whose in ((known, "position"), (1 / known, "command")):
                     if ratio is not None and abs(ratio / k - 1) < 0.1:
-                        yield finding(s.position if whose == "position" else c, f"{whose} of {joint} is {known:.4g} times the other: {unit}?", joint)
+                        yield finding(
+                            s.position if whose == "position" else c,
+                            f"{whose} of {joint} is {known:.4g} times the other: {unit}?",
+                            joint,
+                        )
         if s.velocity is not None and len(s.velocity) > 20 and np.isfinite(s.velocity.value[:, j]).all():
             speed = np.gradient(s.position.value[:, j], s.position.t) if (np.diff(s.position.t) > 0).all() else None
             ratio = None if speed is None else _ratio(_smooth(speed), _smooth(s.velocity.value[:, j]))
@@ -314,10 +469,16 @@ def units(r: Recording) -> Iterator[Finding]:
                 yield finding(s.velocity, f"velocity of {joint} has the opposite sign of its position's change", joint)
             for known, unit in SPEED_RATIOS.items():
                 if ratio is not None and abs(ratio / known - 1) < 0.15:
-                    yield finding(s.velocity, f"velocity of {joint} is {ratio:.4g} times its position's change: {unit}?", joint)
+                    yield finding(
+                        s.velocity, f"velocity of {joint} is {ratio:.4g} times its position's change: {unit}?", joint
+                    )
     yield from _effort_units(r, finding)
-    plain = ((r.temperature, "temperature", -40.0, 150.0, "degC"), (r.duty, "duty", -1.02, 1.02, "full drive"), (r.supply_voltage, "supply voltage", 0.0, 100.0, "V"),
-             (r.enabled, "enabled", 0.0, 1.0, "0 or 1"))
+    plain = (
+        (r.temperature, "temperature", -40.0, 150.0, "degC"),
+        (r.duty, "duty", -1.02, 1.02, "full drive"),
+        (r.supply_voltage, "supply voltage", 0.0, 100.0, "V"),
+        (r.enabled, "enabled", 0.0, 1.0, "0 or 1"),
+    )
     for series, name, low, high, unit in plain:
         if series is None:
             continue
@@ -326,16 +487,39 @@ def units(r: Recording) -> Iterator[Finding]:
             bad[:, [wrapped(x) is not None for x in series.value.T]] = False
         if bad.any():
             t = series.t[bad.reshape(len(series), -1).any(1)]
-            yield Finding("unit", series.topic, float(t[0]), int(bad.sum()), f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
-                          f" {low:g} .. {high:g} is possible", "error", end=float(t[-1]))
-    if r.tactile is not None and r.meta["tactile_unit"] == "N" and is_integer(r.tactile.value) and np.nanmax(np.abs(r.tactile.value)) > 20:
-        yield finding(r.tactile, f"tactile_unit is N, yet all values are whole and reach {np.nanmax(np.abs(r.tactile.value)):.0f}: counts?")
-    if r.tactile is not None and r.meta["tactile_unit"] == "count" and not is_integer(r.tactile.value) and np.nanmax(np.abs(r.tactile.value)) > 0:
+            yield Finding(
+                "unit",
+                series.topic,
+                float(t[0]),
+                int(bad.sum()),
+                f"{name} reaches {np.nanmin(series.value):.4g} .. {np.nanmax(series.value):.4g} {unit};"
+                f" {low:g} .. {high:g} is possible",
+                "error",
+                end=float(t[-1]),
+            )
+    if (
+        r.tactile is not None
+        and r.meta["tactile_unit"] == "N"
+        and is_integer(r.tactile.value)
+        and np.nanmax(np.abs(r.tactile.value)) > 20
+    ):
+        yield finding(
+            r.tactile,
+            f"tactile_unit is N, yet all values are whole and reach {np.nanmax(np.abs(r.tactile.value)):.0f}: counts?",
+        )
+    if (
+        r.tactile is not None
+        and r.meta["tactile_unit"] == "count"
+        and not is_integer(r.tactile.value)
+        and np.nanmax(np.abs(r.tactile.value)) > 0
+    ):
         yield finding(r.tactile, "tactile_unit is count, yet values are not whole: newtons?")
     if r.object_pose is not None:
         p = r.object_pose.value
         if np.nanmedian(np.abs(p[:, :3]).max(1)) > 10:
-            yield finding(r.object_pose, f"the object is {np.nanmedian(np.abs(p[:, :3]).max(1)):.4g} m away: millimetres?")
+            yield finding(
+                r.object_pose, f"the object is {np.nanmedian(np.abs(p[:, :3]).max(1)):.4g} m away: millimetres?"
+            )
         if np.nanmax(np.abs(np.linalg.norm(p[:, 3:], axis=1) - 1)) > 0.02:
             yield finding(r.object_pose, "the orientation is not a unit quaternion")
     if r.imu is not None:
@@ -382,5 +566,3 @@ def _corr(a: np.ndarray, b: np.ndarray) -> float:
 def _jumpless(x: np.ndarray) -> bool:
     x = x[np.isfinite(x)]
     return len(x) > 1 and float(np.abs(np.diff(x)).max()) < 0.5 * np.ptp(x)
-
-

@@ -63,8 +63,13 @@ class Cdr:
         return bytes(self._b)
 
 
-def joint_state(stamp_ns: int, names: Sequence[str], position: np.ndarray | None, velocity: np.ndarray | None = None,
-                effort: np.ndarray | None = None) -> bytes:
+def joint_state(
+    stamp_ns: int,
+    names: Sequence[str],
+    position: np.ndarray | None,
+    velocity: np.ndarray | None = None,
+    effort: np.ndarray | None = None,
+) -> bytes:
     """sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
     c = Cdr()
     c.header(stamp_ns)

@@ -22,9 +22,9 @@ RECORDED, SIMULATED, COMMANDED = "#1f5fa8", "#d1641b", "#9a9a9a"
 class Comparison:
     """A recording beside its simulation at the recording's own times. Arrays [T, J], NaN where not recorded.
 
-    effort is in N.m: a recorded current is divided by the A per N.m that is known (`effort_scale` [J]) or, where none is
-    (`fitted` [J] bool), by the one that fits best here. finger_force, finger_force_simulated: (t, [T, F]) or None;
-    force_unit: N or count.
+    effort is in N.m: a recorded current is divided by the A per N.m that is known (`effort_scale` [J]) or, where
+    none is (`fitted` [J] bool), by the one that fits best here. finger_force, finger_force_simulated: (t, [T, F]) or
+    None; force_unit: N or count.
     """
 
     joints: tuple[str, ...]
@@ -43,7 +43,11 @@ class Comparison:
 
     def position_rmse(self) -> np.ndarray:
         """[J] rad."""
-        return np.sqrt(np.nanmean((self.position - self.position_simulated) ** 2, axis=0)) if len(self.t) else np.full(len(self.joints), np.nan)
+        return (
+            np.sqrt(np.nanmean((self.position - self.position_simulated) ** 2, axis=0))
+            if len(self.t)
+            else np.full(len(self.joints), np.nan)
+        )
 
     def effort_rmse(self) -> np.ndarray:
         """[J] N.m; NaN where no effort was recorded."""
@@ -78,7 +82,9 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
                 power = float((simulated[ok, j] ** 2).sum())
                 scale[j] = float((effort[ok, j] * simulated[ok, j]).sum()) / power if power > 0 else np.nan
             effort = effort / np.where(scale == 0, np.nan, scale)
-    out = Comparison(recording.joints, t, run.target[held][:, columns], position, at(run.position), effort, simulated, scale, fitted)
+    out = Comparison(
+        recording.joints, t, run.target[held][:, columns], position, at(run.position), effort, simulated, scale, fitted
+    )
     if recording.tactile is not None:
         known = recording.tactile_lsb is not None
         touch = recording.tactile_newtons() if known else recording.tactile
@@ -91,16 +97,37 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
 
 def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
     """position.png, effort.png and, where touch was recorded or simulated, force.png: one panel a joint or finger."""
-    paths = [_panels(folder / "position.png", f"{title}: position [rad]", c.joints, c.t,
-                     [("command", COMMANDED, c.target), ("recorded", RECORDED, c.position), ("simulated", SIMULATED, c.position_simulated)],
-                     [f"RMSE {1e3 * x:.2f} mrad" for x in c.position_rmse()])]
-    notes = [f"{s:.2f} A per N.m{' (fitted)' if f else ''}" if s != 1 else "" for s, f in zip(c.effort_scale, c.fitted, strict=True)]
+    paths = [
+        _panels(
+            folder / "position.png",
+            f"{title}: position [rad]",
+            c.joints,
+            c.t,
+            [
+                ("command", COMMANDED, c.target),
+                ("recorded", RECORDED, c.position),
+                ("simulated", SIMULATED, c.position_simulated),
+            ],
+            [f"RMSE {1e3 * x:.2f} mrad" for x in c.position_rmse()],
+        )
+    ]
+    notes = [
+        f"{s:.2f} A per N.m{' (fitted)' if f else ''}" if s != 1 else ""
+        for s, f in zip(c.effort_scale, c.fitted, strict=True)
+    ]
     lines = [("simulated", SIMULATED, c.effort_simulated)]
     if c.effort is not None:
         lines.insert(0, ("recorded", RECORDED, c.effort))
     paths.append(_panels(folder / "effort.png", f"{title}: motor torque [N.m]", c.joints, c.t, lines, notes))
     if c.finger_force is not None or c.finger_force_simulated is not None:
-        series = [(n, col, s) for n, col, s in (("recorded", RECORDED, c.finger_force), ("simulated", SIMULATED, c.finger_force_simulated)) if s is not None]
+        series = [
+            (n, col, s)
+            for n, col, s in (
+                ("recorded", RECORDED, c.finger_force),
+                ("simulated", SIMULATED, c.finger_force_simulated),
+            )
+            if s is not None
+        ]
         count = max(s[1].shape[1] for _, _, s in series)
         names = xhand.FINGERS if count == len(xhand.FINGERS) else tuple(f"pad {k}" for k in range(count))
         figure, axes = _grid(count)

@@ -22,7 +22,16 @@ from dexsim.errors import UserError
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = 9  # opcode and length
-_BROKEN = (McapError, CRCValidationError, ValueError, struct.error, EOFError, zstandard.ZstdError, RuntimeError, MemoryError)
+_BROKEN = (
+    McapError,
+    CRCValidationError,
+    ValueError,
+    struct.error,
+    EOFError,
+    zstandard.ZstdError,
+    RuntimeError,
+    MemoryError,
+)
 
 
 @dataclass
@@ -54,7 +63,11 @@ def open_container(path: Path) -> Container:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
     if data[: len(MAGIC)] != MAGIC:
         what = "empty" if not size else "not an MCAP file"
-        hint = "; convert it with `ros2 bag convert`, or record with `ros2 bag record -s mcap`" if data[:6] == b"SQLite" else ""
+        hint = (
+            "; convert it with `ros2 bag convert`, or record with `ros2 bag record -s mcap`"
+            if data[:6] == b"SQLite"
+            else ""
+        )
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
     out = Container(path)
     finished = False
@@ -67,7 +80,9 @@ def open_container(path: Path) -> Container:
         elif len(body) == length:
             _plain(opcode, body, length, out)
     if not finished:
-        out.damage.append((None, 0, f"the file ends at byte {size} without its index: it was cut off, or its writer was killed"))
+        out.damage.append(
+            (None, 0, f"the file ends at byte {size} without its index: it was cut off, or its writer was killed")
+        )
     return out
 
 
@@ -138,7 +153,8 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
 
 
 def _chunk(body: bytes, cut: bool, out: Container) -> None:
-    """The records of a chunk. One whose checksum fails is left out whole; of one cut short, what is complete is kept."""
+    """The records of a chunk. One whose checksum fails is left out whole; of one cut short, what is complete is
+    kept."""
     before = len(out.messages)
     span = None
     try:

@@ -48,9 +48,11 @@ def is_standard(channel: Channel, schema: Schema | None, kind: str) -> bool:
 def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], JointSample]:
     """Reads joint states. part: dotted path of the sub-message that holds them ("" the message itself)."""
     if not part and is_standard(channel, schema, JOINT_STATE):
+
         def fast(data: bytes) -> JointSample:
             stamp, names, *arrays = cdr.read_joint_state(data)
             return JointSample(names, *arrays, stamp or None)
+
         return fast
     decode = decoder(channel, schema)
 
@@ -61,19 +63,31 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable
         if isinstance(m, (list, tuple, np.ndarray)):  # the path leads straight to the positions
             return JointSample([], floats(m), np.zeros(0), np.zeros(0), stamp)
         if get(m, "points"):  # trajectory_msgs/JointTrajectory: its first point
-            return JointSample(list(get(m, "joint_names") or []), floats(get(get(m, "points")[0], "positions")),
-                               np.zeros(0), np.zeros(0), stamp)
+            return JointSample(
+                list(get(m, "joint_names") or []),
+                floats(get(get(m, "points")[0], "positions")),
+                np.zeros(0),
+                np.zeros(0),
+                stamp,
+            )
         names = first(m, "name", "names", "joint_names") or first(whole, "name", "names", "joint_names") or []
         position = first(m, "position", "positions", "data")
         if position is None:
             raise ValueError("no field 'position'")
-        return JointSample(list(names), floats(position), floats(first(m, "velocity", "velocities")),
-                           floats(first(m, "effort", "efforts", "current")), stamp)
+        return JointSample(
+            list(names),
+            floats(position),
+            floats(first(m, "velocity", "velocities")),
+            floats(first(m, "effort", "efforts", "current")),
+            stamp,
+        )
 
     return read
 
 
-def array_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], tuple[tuple[int, ...], np.ndarray]]:
+def array_reader(
+    channel: Channel, schema: Schema | None, part: str
+) -> Callable[[bytes], tuple[tuple[int, ...], np.ndarray]]:
     """Reads arrays: (dimensions or (), flat values)."""
     if not part and is_standard(channel, schema, MULTI_ARRAY):
         return cdr.read_multi_array
@@ -95,7 +109,9 @@ def array_reader(channel: Channel, schema: Schema | None, part: str) -> Callable
     return read
 
 
-def vector_reader(channel: Channel, schema: Schema | None, part: str, kind: str) -> Callable[[bytes], tuple[np.ndarray, int | None, str]]:
+def vector_reader(
+    channel: Channel, schema: Schema | None, part: str, kind: str
+) -> Callable[[bytes], tuple[np.ndarray, int | None, str]]:
     """Reads a wrench [6], a pose [7] or an IMU [10] (see `schema.Recording`): (values, stamp, frame)."""
     decode = decoder(channel, schema)
     pick = {"wrench": _wrench, "pose": _pose, "imu": _imu}[kind]
@@ -103,7 +119,11 @@ def vector_reader(channel: Channel, schema: Schema | None, part: str, kind: str)
     def read(data: bytes) -> tuple[np.ndarray, int | None, str]:
         whole = decode(data)
         header = get(whole, "header")
-        return pick(walk(whole, part)), stamp_of(whole), str((get(header, "frame_id") if header is not None else "") or "")
+        return (
+            pick(walk(whole, part)),
+            stamp_of(whole),
+            str((get(header, "frame_id") if header is not None else "") or ""),
+        )
 
     return read
 
@@ -167,7 +187,9 @@ def _pose(m: Any) -> np.ndarray:
 
 def _imu(m: Any) -> np.ndarray:
     q, w, a = (get(m, n) for n in ("orientation", "angular_velocity", "linear_acceleration"))
-    return np.array([_number(get(q, k)) for k in "wxyz"] + [_number(get(w, k)) for k in "xyz"] + [_number(get(a, k)) for k in "xyz"])
+    return np.array(
+        [_number(get(q, k)) for k in "wxyz"] + [_number(get(w, k)) for k in "xyz"] + [_number(get(a, k)) for k in "xyz"]
+    )
 
 
 def _number(value: Any) -> float:
@@ -189,8 +211,10 @@ def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
     if schema.encoding != "ros2msg" or not text.strip():  # IDL, or none stored: the standard messages are known anyway
         text = DEFINITIONS.get(schema.name, "")
         if not text:
-            raise Unreadable(f"its type {schema.name} is described in '{schema.encoding or 'nothing'}', which is not read;"
-                             " record it with message definitions (ros2msg)")
+            raise Unreadable(
+                f"its type {schema.name} is described in '{schema.encoding or 'nothing'}', which is not read;"
+                " record it with message definitions (ros2msg)"
+            )
     try:
         return generate_dynamic(schema.name, text)[schema.name]
     except Exception as error:  # the parser raises whatever it likes

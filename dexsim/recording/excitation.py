@@ -1,4 +1,5 @@
-"""Safe command trajectories that show what a mechanism's drives do. Used by `python -m dexsim.excite` and the diagnosis."""
+"""Safe command trajectories that show what a mechanism's drives do. Used by `python -m dexsim.excite` and the
+diagnosis."""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ CHECK_STEP, FRAME = 0.004, 0.008  # s: physics step and spacing of contact check
 
 @dataclass
 class Limits:
-    """What a motion may reach. speed: fraction of the no-load speed; torque: fraction of the stall torque; margin: share of
-    a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours."""
+    """What a motion may reach. speed: fraction of the no-load speed; torque: fraction of the stall torque; margin:
+    share of a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours."""
 
     speed: float = 0.6
     torque: float = 0.8
@@ -37,8 +38,8 @@ class Limits:
 
 @dataclass
 class Segment:
-    """One motion of a plan: kind, joints that move, start and end [s], the factor by which it was made smaller to be safe,
-    and the number of the segment that it repeats (None: it is new)."""
+    """One motion of a plan: kind, joints that move, start and end [s], the factor by which it was made smaller to be
+    safe, and the number of the segment that it repeats (None: it is new)."""
 
     kind: str
     joints: tuple[str, ...]
@@ -51,7 +52,8 @@ class Segment:
 
 @dataclass
 class Plan:
-    """Commands t [T] s, value [T, J] rad (or m), home [J], segments in order; run: the simulation that found it safe."""
+    """Commands t [T] s, value [T, J] rad (or m), home [J], segments in order; run: the simulation that found it
+    safe."""
 
     mechanism: Mechanism
     t: np.ndarray
@@ -64,13 +66,23 @@ class Plan:
     exempt: list[tuple[str, str]] = field(default_factory=list)
 
 
-def plan(m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str] | None = None, seed: int = 0, rate: float = 100.0,
-         limits: Limits = Limits(), repeats: int = 1, say: Callable[[str], None] = lambda text: None) -> Plan:
-    """A safe sequence of motions of `joints` (default all) of these `kinds` (default all), in an order shuffled by `seed`.
+def plan(
+    m: Mechanism,
+    joints: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
+    seed: int = 0,
+    rate: float = 100.0,
+    limits: Limits = Limits(),
+    repeats: int = 1,
+    say: Callable[[str], None] = lambda text: None,
+) -> Plan:
+    """A safe sequence of motions of `joints` (default all) of these `kinds` (default all), in an order shuffled by
+    `seed`.
 
     Each motion begins and ends at rest at home and is simulated with the mechanism's servo; it is made smaller until it
     keeps the limits and nothing touches, or left out. repeats: how many of the motions of each group of joints come a
-    second time, at another place in the order (they measure the noise floor). Raises UserError for joints without limits.
+    second time, at another place in the order (they measure the noise floor). Raises UserError for joints without
+    limits.
     """
     moving = tuple(joints) if joints is not None else m.joints
     chosen = tuple(kinds) if kinds is not None else tuple(KINDS)
@@ -97,7 +109,10 @@ def plan(m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str]
         else:
             made.append(segment)
     if not made:
-        raise UserError(f"no motion of {', '.join(moving)} is safe: {'; '.join(left_out)}; relax speed=, torque=, margin= or clearance=")
+        raise UserError(
+            f"no motion of {', '.join(moving)} is safe: {'; '.join(left_out)};"
+            " relax speed=, torque=, margin= or clearance="
+        )
     order = [int(i) for i in rng.permutation(len(made))]
     order += _repeated(made, repeats, rng)
     order = [order[int(i)] for i in rng.permutation(len(order))]
@@ -108,7 +123,17 @@ def plan(m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str]
     for index in order:
         source = made[index]
         parts += [source.command, rest]
-        segments.append(Segment(source.kind, source.joints, source.command, source.scale, at * dt, (at + len(source.command)) * dt, first.get(index)))
+        segments.append(
+            Segment(
+                source.kind,
+                source.joints,
+                source.command,
+                source.scale,
+                at * dt,
+                (at + len(source.command)) * dt,
+                first.get(index),
+            )
+        )
         first.setdefault(index, len(segments) - 1)
         at += len(source.command) + len(rest)
     value = np.concatenate(parts)
@@ -123,7 +148,8 @@ def plan(m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str]
 
 
 def groups(m: Mechanism, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """Joints that move at the same time: the k-th of every branch of the tree (a finger), so that no joint carries another."""
+    """Joints that move at the same time: the k-th of every branch of the tree (a finger), so that no joint carries
+    another."""
     model = m.spec.compile()
     branches: dict[int, list[str]] = {}
     body_of = {j: int(model.joint(j).bodyid[0]) for j in m.joints}
@@ -140,8 +166,8 @@ def groups(m: Mechanism, joints: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def write_plan(p: Plan, folder: str | Path, name: str = "excite") -> list[Path]:
-    """`name`.mcap and `name`.csv (the commands), `name`_simulated.mcap (what the simulation made of them) and `name`.yaml
-    (what moves when, what was left out, the peaks). Returns the paths."""
+    """`name`.mcap and `name`.csv (the commands), `name`_simulated.mcap (what the simulation made of them) and
+    `name`.yaml (what moves when, what was left out, the peaks). Returns the paths."""
     folder = Path(folder).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -162,16 +188,32 @@ def write_plan(p: Plan, folder: str | Path, name: str = "excite") -> list[Path]:
 def write_commands(p: Plan, path: str | Path) -> None:
     """The commands alone, as a recording without states."""
     m = p.mechanism
-    notes = yaml.safe_dump([[s.kind, list(s.joints), round(s.start, 3), round(s.end, 3)] for s in p.segments], default_flow_style=True, width=10**6)
-    meta = {"source": "sim", "robot": m.robot, "effort_is": "none", "effort_sign": "+1", "gravity": " ".join(f"{g:g}" for g in m.spec.option.gravity),
-            "notes": "commands to send, not a measurement; kind, joints, start, end: " + notes.strip()}
+    notes = yaml.safe_dump(
+        [[s.kind, list(s.joints), round(s.start, 3), round(s.end, 3)] for s in p.segments],
+        default_flow_style=True,
+        width=10**6,
+    )
+    meta = {
+        "source": "sim",
+        "robot": m.robot,
+        "effort_is": "none",
+        "effort_sign": "+1",
+        "gravity": " ".join(f"{g:g}" for g in m.spec.option.gravity),
+        "notes": "commands to send, not a measurement; kind, joints, start, end: " + notes.strip(),
+    }
     with Writer(path, m.joints, meta, start_ns=1_000_000_000) as w:
         for t, row in zip(p.t, p.value, strict=True):
             w.add_command(float(t), row)
 
 
-def next_recording(path: str | Path, m: Mechanism, joints: Sequence[str] | None = None, kinds: Sequence[str] | None = None,
-                   seed: int = 0, limits: Limits = Limits()) -> Plan:
+def next_recording(
+    path: str | Path,
+    m: Mechanism,
+    joints: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
+    seed: int = 0,
+    limits: Limits = Limits(),
+) -> Plan:
     """The recording that a diagnosis asks for: a safe plan of these joints and kinds of motion, written as `path`."""
     made = plan(m, joints, kinds, seed, limits=limits)
     write_commands(made, path)
@@ -182,17 +224,31 @@ def summary(p: Plan) -> dict:
     """The plan as plain data."""
     joints = p.mechanism.joints
     return {
-        "robot": p.mechanism.robot, "seconds": round(float(p.t[-1]), 2), "rate_hz": round(float(1 / (p.t[1] - p.t[0])), 3),
+        "robot": p.mechanism.robot,
+        "seconds": round(float(p.t[-1]), 2),
+        "rate_hz": round(float(1 / (p.t[1] - p.t[0])), 3),
         "home": {j: round(float(q), 4) for j, q in zip(joints, p.home, strict=True)},
-        "peaks": {j: {"speed_fraction": round(float(v), 3), "torque_fraction": round(float(x), 3)}
-                  for j, v, x in zip(joints, p.peaks.speed, p.peaks.torque, strict=True)},
-        "segments": [{"kind": s.kind, "joints": list(s.joints), "start": round(s.start, 3), "end": round(s.end, 3), "scale": round(s.scale, 3)}
-                     | ({} if s.repeats is None else {"repeats": s.repeats}) for s in p.segments],
-        "left_out": p.left_out, "bodies_not_checked_against_each_other": [list(pair) for pair in p.exempt],
+        "peaks": {
+            j: {"speed_fraction": round(float(v), 3), "torque_fraction": round(float(x), 3)}
+            for j, v, x in zip(joints, p.peaks.speed, p.peaks.torque, strict=True)
+        },
+        "segments": [
+            {
+                "kind": s.kind,
+                "joints": list(s.joints),
+                "start": round(s.start, 3),
+                "end": round(s.end, 3),
+                "scale": round(s.scale, 3),
+            }
+            | ({} if s.repeats is None else {"repeats": s.repeats})
+            for s in p.segments
+        ],
+        "left_out": p.left_out,
+        "bodies_not_checked_against_each_other": [list(pair) for pair in p.exempt],
     }
 
 
-# -- how it is made ------------------------------------------------------------------------------------------------------
+# -- how it is made -----------------------------------------------------------
 
 
 def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Limits) -> None:
@@ -200,11 +256,18 @@ def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Li
         if joint not in m.joints:
             raise UserError(f"joints={joint}: not a driven joint; those are {', '.join(m.joints)}")
         if not np.isfinite(m.limits[m.joints.index(joint)]).all():
-            raise UserError(f"joint '{joint}' has no position limits in the model: give it a range there before it is excited")
+            raise UserError(
+                f"joint '{joint}' has no position limits in the model: give it a range there before it is excited"
+            )
     for kind in kinds:
         if kind not in KINDS:
             raise UserError(f"kinds={kind}: must be among {', '.join(KINDS)}")
-    for name, low, high in (("speed", 0.01, 1.0), ("torque", 0.01, 1.0), ("margin", 0.0, 0.4), ("clearance", 0.0, 0.05)):
+    for name, low, high in (
+        ("speed", 0.01, 1.0),
+        ("torque", 0.01, 1.0),
+        ("margin", 0.0, 0.4),
+        ("clearance", 0.0, 0.05),
+    ):
         if not low <= getattr(limits, name) <= high:
             raise UserError(f"{name}={getattr(limits, name)}: must lie in [{low}, {high}]")
 
@@ -220,7 +283,9 @@ def _range(m: Mechanism, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.nda
     return low, high, np.clip(rest, low, high)
 
 
-def _free(check: safety.ContactCheck, home: np.ndarray, j: int, low: np.ndarray, high: np.ndarray, count: int = 60) -> tuple[float, float]:
+def _free(
+    check: safety.ContactCheck, home: np.ndarray, j: int, low: np.ndarray, high: np.ndarray, count: int = 60
+) -> tuple[float, float]:
     """The interval around home in which joint j touches nothing, the others at home."""
     ends = []
     for end in (low[j], high[j]):
@@ -235,8 +300,17 @@ def _free(check: safety.ContactCheck, home: np.ndarray, j: int, low: np.ndarray,
     return ends[0], ends[1]
 
 
-def _motion(m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tuple[float, float]], home: np.ndarray, limits: Limits,
-            check: safety.ContactCheck, dt: float, seed: int) -> tuple[Segment | None, str]:
+def _motion(
+    m: Mechanism,
+    kind: str,
+    group: tuple[str, ...],
+    free: dict[str, tuple[float, float]],
+    home: np.ndarray,
+    limits: Limits,
+    check: safety.ContactCheck,
+    dt: float,
+    seed: int,
+) -> tuple[Segment | None, str]:
     """The largest safe version of a motion, or None and why there is none."""
     scale, why = 1.0, ""
     for _ in range(TRIES):
@@ -256,8 +330,17 @@ def _motion(m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tup
     return None, why
 
 
-def _command(m: Mechanism, kind: str, group: tuple[str, ...], free: dict[str, tuple[float, float]], home: np.ndarray, limits: Limits,
-             dt: float, seed: int, scale: float) -> np.ndarray | None:
+def _command(
+    m: Mechanism,
+    kind: str,
+    group: tuple[str, ...],
+    free: dict[str, tuple[float, float]],
+    home: np.ndarray,
+    limits: Limits,
+    dt: float,
+    seed: int,
+    scale: float,
+) -> np.ndarray | None:
     """Targets [T, J]: from home to each joint's centre, the motion, and back."""
     kp, stall = m.column("kp"), m.column("torque_limit")
     rng = np.random.default_rng(seed)

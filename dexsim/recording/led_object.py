@@ -15,15 +15,21 @@ from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
 
 NAME, JOINT = "object", "object_free"
-TYPES = {"box": mujoco.mjtGeom.mjGEOM_BOX, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE}
-PAIRS = tuple(ContactPair(f, ("geom", geom), ("body", NAME)) for f, geom in zip(xhand.FINGERS, xhand.TIP_GEOMS, strict=True))
+TYPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+PAIRS = tuple(
+    ContactPair(f, ("geom", geom), ("body", NAME)) for f, geom in zip(xhand.FINGERS, xhand.TIP_GEOMS, strict=True)
+)
 """Fingertip on object, one a finger."""
 
 
 def add_object(m: Mechanism, recording: Recording) -> bool:
-    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction; False where the recording
-    does not say what it was, or its path is missing. The object follows its recorded path: fingers press on it, it does not
-    yield, so forces follow the error of the joints rather than the balance of a grasp."""
+    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction; False where
+    the recording does not say what it was, or its path is missing. The object follows its recorded path: fingers
+    press on it, it does not yield, so forces follow the error of the joints rather than the balance of a grasp."""
     config = yaml.safe_load(recording.config) if recording.config else None
     about = (config or {}).get("recorded_world", {}).get("object") if isinstance(config, dict) else None
     if not about or recording.object_pose is None or m.robot != "xhand_right" or about["shape"] not in library():
@@ -31,7 +37,9 @@ def add_object(m: Mechanism, recording: Recording) -> bool:
     shape, size = library()[about["shape"]], np.array(about["size"], float)
     body = m.spec.worldbody.add_body(name=NAME, pos=recording.object_pose.value[0, :3])
     body.add_freejoint(name=JOINT)
-    common: dict[str, Any] = dict(contype=xhand.OBJECT_BIT, conaffinity=xhand.HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4])
+    common: dict[str, Any] = dict(
+        contype=xhand.OBJECT_BIT, conaffinity=xhand.HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
+    )
     if shape.kind in TYPES:
         body.add_geom(type=TYPES[shape.kind], size=size, **common)
     else:
@@ -55,7 +63,10 @@ def _contact(spec: mujoco.MjSpec, about: dict[str, Any], d: float) -> None:
             continue
         geom.friction[0] = about["friction"]
         if geom.name in xhand.TIP_GEOMS:
-            a = model.body_invweight0[model.geom(geom.name).bodyid[0], 0] + model.body_invweight0[model.body(NAME).id, 0]
+            a = (
+                model.body_invweight0[model.geom(geom.name).bodyid[0], 0]
+                + model.body_invweight0[model.body(NAME).id, 0]
+            )
             k = about["stiffness"] * (1 - d) * a
             geom.solimp = [d, d, 1e-3, 0.5, 2.0]
             geom.solref = [-k, -2 * about["damping_ratio"] * np.sqrt(k)]

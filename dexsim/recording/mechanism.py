@@ -61,12 +61,20 @@ def xhand_servo_dict() -> dict[str, Any]:
     if path.is_file():
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     rows = zip(xhand.JOINTS, xhand.efforts(), xhand.speeds(), strict=True)
-    return {"joints": {"*": {"kp": 4.0, "kd": 0.1}} | {j: {"torque_limit": float(e), "no_load_speed": float(v)} for j, e, v in rows}}
+    return {
+        "joints": {"*": {"kp": 4.0, "kd": 0.1}}
+        | {j: {"torque_limit": float(e), "no_load_speed": float(v)} for j, e, v in rows}
+    }
 
 
-def mechanism(model: str | Path | None = None, servo: str | Path | dict | None = None, joints: Sequence[str] | None = None,
-              gravity: Sequence[float] | None = None) -> Mechanism:
-    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping); by default the xHand and its own.
+def mechanism(
+    model: str | Path | None = None,
+    servo: str | Path | dict | None = None,
+    joints: Sequence[str] | None = None,
+    gravity: Sequence[float] | None = None,
+) -> Mechanism:
+    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping); by default the xHand and
+    its own.
 
     joints: the driven ones; by default those of the xHand, else every hinge and slide of the model. gravity: [3] m/s2,
     world frame. Raises UserError for a model or servo that does not serve.
@@ -90,7 +98,9 @@ def mechanism(model: str | Path | None = None, servo: str | Path | dict | None =
         table = _table(servo)
     if gravity is not None:
         spec.option.gravity = [float(g) for g in gravity]
-    hinges = [j.name for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and j.name]
+    hinges = [
+        j.name for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and j.name
+    ]
     chosen = tuple(joints) if joints is not None else (xhand.JOINTS if model is None else tuple(hinges))
     for joint in chosen:
         if joint not in hinges:
@@ -100,13 +110,18 @@ def mechanism(model: str | Path | None = None, servo: str | Path | dict | None =
     return Mechanism(spec, chosen, table, robot)
 
 
-def for_recording(recording: Recording, model: str | Path | None = None, servo: str | Path | dict | None = None) -> Mechanism:
+def for_recording(
+    recording: Recording, model: str | Path | None = None, servo: str | Path | dict | None = None
+) -> Mechanism:
     """The mechanism that a recording was made with: its gravity, its `servo` over the believed table, its joints driven
     (the model's others stay where they are, driven to their initial position)."""
     out = mechanism(model, servo, None, recording.gravity)
     missing = [j for j in recording.joints if j not in out.joints]
     if missing:
-        raise UserError(f"recording {recording.path} has joints that the model has not: {', '.join(missing)}; its joints: {', '.join(out.joints)}")
+        raise UserError(
+            f"recording {recording.path} has joints that the model has not: {', '.join(missing)};"
+            f" its joints: {', '.join(out.joints)}"
+        )
     if recording.meta.get("servo"):
         over = yaml.safe_load(recording.meta["servo"])
         out.table = ServoTable.from_dict(merged(out.table.to_dict(), over), source=f"servo of {recording.path}")
@@ -114,7 +129,8 @@ def for_recording(recording: Recording, model: str | Path | None = None, servo: 
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`over` laid over `base`, mapping by mapping; the servo file's value mappings {value, low, high} are replaced whole."""
+    """`over` laid over `base`, mapping by mapping; the servo file's value mappings {value, low, high} are replaced
+    whole."""
     out = copy.deepcopy(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(out.get(key), dict) and "value" not in value:
@@ -126,9 +142,9 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """What the simulation did, one row a physics step. t [T] s; position, velocity, torque, target [T, J] (as the encoders and
-    the current report; target: the last one sent); qpos [F, nq] and pair_normal [F, P] (N, of each contact pair) every
-    `frame_s`."""
+    """What the simulation did, one row a physics step. t [T] s; position, velocity, torque, target [T, J] (as the
+    encoders and the current report; target: the last one sent); qpos [F, nq] and pair_normal [F, P] (N, of each
+    contact pair) every `frame_s`."""
 
     t: np.ndarray
     position: np.ndarray
@@ -141,15 +157,24 @@ class Run:
     pair_normal: np.ndarray
 
 
-def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: float, initial: np.ndarray | None = None,
-          timestep: float = 0.002, enabled: Series | None = None, frame_s: float = 0.02, pairs: Sequence[ContactPair] = (),
-          follow: tuple[str, Series] | None = None) -> Run:
+def drive(
+    m: Mechanism,
+    commands: Series,
+    columns: Sequence[str],
+    duration: float,
+    initial: np.ndarray | None = None,
+    timestep: float = 0.002,
+    enabled: Series | None = None,
+    frame_s: float = 0.02,
+    pairs: Sequence[ContactPair] = (),
+    follow: tuple[str, Series] | None = None,
+) -> Run:
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
-    commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]: start and
-    first target of the mechanism's joints (NaN or None: the model's own). enabled: like commands, 0 frees a joint.
-    pairs: contact pairs to measure. follow: (name of a free joint, poses [T, 7]): a body that is led along a recorded
-    path. Deterministic. Engine: C MuJoCo.
+    commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]:
+    start and first target of the mechanism's joints (NaN or None: the model's own). enabled: like commands, 0 frees
+    a joint. pairs: contact pairs to measure. follow: (name of a free joint, poses [T, 7]): a body that is led along
+    a recorded path. Deterministic. Engine: C MuJoCo.
     """
     spec = m.spec.copy()
     spec.option.timestep = timestep
@@ -194,7 +219,9 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
                 servo.send(torch.as_tensor(now)[None], stamp=float(stamps[state["command"]]))
             state["command"] += 1
         while on is not None and state["enabled"] < len(on) and enabled.t[state["enabled"]] <= t:
-            servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(servo.state.dtype)
+            servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(
+                servo.state.dtype
+            )
             state["enabled"] += 1
         if lead is not None:
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
@@ -213,12 +240,19 @@ def drive(m: Mechanism, commands: Series, columns: Sequence[str], duration: floa
         frames.append(engine.t.qpos[0].numpy().copy())
         engine.step(min(every, steps - first), before_each)
         forces.append(engine.t.pair_normal[0].numpy().copy())
-    return Run(np.arange(steps) * timestep, **out, qpos=np.array(frames), frame_s=every * timestep, model=engine.mjm,
-               pair_normal=np.array(forces).reshape(len(frames), len(pairs)))
+    return Run(
+        np.arange(steps) * timestep,
+        **out,
+        qpos=np.array(frames),
+        frame_s=every * timestep,
+        model=engine.mjm,
+        pair_normal=np.array(forces).reshape(len(frames), len(pairs)),
+    )
 
 
-def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0,
-             start_ns: int = 1_000_000_000) -> Recording:
+def recorded(
+    run: Run, m: Mechanism, commands: Series, columns: Sequence[str], rate: float = 200.0, start_ns: int = 1_000_000_000
+) -> Recording:
     """The run as a simulated recording: commands as sent, states `rate` times a second (Hz; at most the physics rate),
     torque in N.m. `realistic` makes of it what the hardware would have delivered."""
     every = max(1, round(1.0 / rate / (run.t[1] - run.t[0]))) if len(run.t) > 1 else 1
@@ -226,14 +260,34 @@ def recorded(run: Run, m: Mechanism, commands: Series, columns: Sequence[str], r
     value = np.full((len(commands), len(m.joints)), np.nan)
     value[:, [m.joints.index(c) for c in columns]] = commands.value
     gravity = " ".join(f"{g:g}" for g in m.spec.option.gravity)
-    meta = {"schema": "1", "source": "sim", "robot": m.robot, "joint_names": ",".join(m.joints), "effort_is": "torque_Nm", "effort_sign": "+1",
-            "gravity": gravity, "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False)}
+    meta = {
+        "schema": "1",
+        "source": "sim",
+        "robot": m.robot,
+        "joint_names": ",".join(m.joints),
+        "effort_is": "torque_Nm",
+        "effort_sign": "+1",
+        "gravity": gravity,
+        "servo": yaml.safe_dump(m.table.to_dict(), sort_keys=False),
+    }
     series = lambda x, topic: Series(t, x[::every], topic, t.copy())  # noqa: E731
-    return Recording(Path("simulated.mcap"), DEFAULTS | meta, m.joints, Series(commands.t, value, COMMANDS, commands.t.copy()),
-                     States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)), start_ns=start_ns)
+    return Recording(
+        Path("simulated.mcap"),
+        DEFAULTS | meta,
+        m.joints,
+        Series(commands.t, value, COMMANDS, commands.t.copy()),
+        States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)),
+        start_ns=start_ns,
+    )
 
 
-def replay(recording: Recording, m: Mechanism, timestep: float = 0.002, pairs: Sequence[ContactPair] = (), follow: str | None = None) -> Run:
+def replay(
+    recording: Recording,
+    m: Mechanism,
+    timestep: float = 0.002,
+    pairs: Sequence[ContactPair] = (),
+    follow: str | None = None,
+) -> Run:
     """Drive the mechanism with a recording's commands from the recorded first position (free run, no correction).
 
     pairs: contact pairs to measure. follow: name of the free joint that is led along the recorded object's path.
@@ -248,11 +302,14 @@ def replay(recording: Recording, m: Mechanism, timestep: float = 0.002, pairs: S
             initial[m.joints.index(joint)] = state.value[seen[0], j]
     end = max(recording.duration, float(recording.commands.t[-1])) + timestep
     led = None if follow is None or recording.object_pose is None else (follow, recording.object_pose)
-    return drive(m, recording.commands, recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led)
+    return drive(
+        m, recording.commands, recording.joints, end, initial, timestep, recording.enabled, pairs=pairs, follow=led
+    )
 
 
 def _path(poses: Series, steps: int, timestep: float) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [K, 7] at each physics step, and the speeds [K, 6] (linear in the world, angular in the body) that led there."""
+    """Poses [K, 7] at each physics step, and the speeds [K, 6] (linear in the world, angular in the body) that led
+    there."""
     value = poses.value.copy()
     turned = np.cumprod(np.where((value[1:, 3:] * value[:-1, 3:]).sum(1) < 0, -1.0, 1.0))
     value[1:, 3:] *= turned[:, None]  # q and -q are one orientation: take the near one

@@ -24,16 +24,30 @@ def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tup
     beside_path = path.with_name(path.name + ".yaml")
     beside = _read(beside_path) if beside_path.is_file() else {}
     stated = {k: str(v) for k, v in own.items() if k in VALID}
-    findings = [Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
-                for k in own if k not in VALID]
+    findings = [
+        Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
+        for k in own
+        if k not in VALID
+    ]
     for source, values in ((str(beside_path), beside), ("meta.*", given)):
         for key, value in values.items():
             if key not in VALID:
-                raise UserError(f"{source}: metadata key '{key}' does not exist.{did_you_mean(key, VALID)} Valid: {', '.join(VALID)}")
+                raise UserError(
+                    f"{source}: metadata key '{key}' does not exist.{did_you_mean(key, VALID)}"
+                    f" Valid: {', '.join(VALID)}"
+                )
             text = _text(value)
             if stated.get(key, text) != text:
-                findings.append(Finding("metadata_override", "", NAN, 1,
-                                        f"{key}: '{stated[key]}' as recorded, '{text}' by {source}; the latter is used", "info"))
+                findings.append(
+                    Finding(
+                        "metadata_override",
+                        "",
+                        NAN,
+                        1,
+                        f"{key}: '{stated[key]}' as recorded, '{text}' by {source}; the latter is used",
+                        "info",
+                    )
+                )
             stated[key] = text
     _check(path, stated)
     return stated, findings
@@ -50,11 +64,24 @@ def complete(stated: dict[str, str], has_effort: bool, has_tactile: bool) -> lis
 
     default("effort_is", "torque_Nm" if has_effort else "none", "warning" if has_effort else "info")
     for key, value in DEFAULTS.items():
-        important = (key == "effort_sign" and has_effort) or (key in ("tactile_unit", "tactile_lsb", "tactile_axis_sign") and has_tactile) \
+        important = (
+            (key == "effort_sign" and has_effort)
+            or (key in ("tactile_unit", "tactile_lsb", "tactile_axis_sign") and has_tactile)
             or key == "gravity"
+        )
         default(key, value, "warning" if important else "info")
-    return [Finding("missing_metadata", "", NAN, 1, f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)", severity)
-            for key, value, severity in missing if key not in ("servo", "notes")]
+    return [
+        Finding(
+            "missing_metadata",
+            "",
+            NAN,
+            1,
+            f"{key} is not stated; '{value}' is assumed (state it with meta.{key}=...)",
+            severity,
+        )
+        for key, value, severity in missing
+        if key not in ("servo", "notes")
+    ]
 
 
 def own_record(records: list[Any]) -> dict[str, str]:
@@ -87,7 +114,10 @@ def _check(path: Path, stated: Mapping[str, str]) -> None:
     choices |= {key: tuple(units) for key, units in UNIT_KEYS.items()}
     for key, valid in choices.items():
         if key in stated and stated[key] not in valid:
-            raise UserError(f"{path}: metadata {key}='{stated[key]}' must be one of {', '.join(valid)}; correct it with meta.{key}=...")
+            raise UserError(
+                f"{path}: metadata {key}='{stated[key]}' must be one of {', '.join(valid)};"
+                f" correct it with meta.{key}=..."
+            )
     if stated.get("servo"):
         try:
             raw = yaml.safe_load(stated["servo"])

@@ -21,8 +21,13 @@ NAN = float("nan")
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
-def read(path: str | Path, remap: Mapping[str, str] | None = None, meta: Mapping[str, Any] | None = None,
-         joints: Sequence[str] | None = None, audit: bool = True) -> Recording:
+def read(
+    path: str | Path,
+    remap: Mapping[str, str] | None = None,
+    meta: Mapping[str, Any] | None = None,
+    joints: Sequence[str] | None = None,
+    audit: bool = True,
+) -> Recording:
     """The recording in an MCAP file, or in a folder that `ros2 bag record -s mcap` wrote.
 
     Arguments:
@@ -40,7 +45,9 @@ def read(path: str | Path, remap: Mapping[str, str] | None = None, meta: Mapping
     path = Path(path).expanduser()
     containers = [open_container(p) for p in _files(path)]
     reading = _Reading(path, containers, dict(remap or {}))
-    stated, findings = metadata.collect(path, metadata.own_record([m for c in containers for m in c.metadata]), dict(meta or {}))
+    stated, findings = metadata.collect(
+        path, metadata.own_record([m for c in containers for m in c.metadata]), dict(meta or {})
+    )
     reading.findings += findings
     recording = reading.build(stated, joints)
     if audit:
@@ -82,14 +89,21 @@ class _Reading:
             for channel_id, channel in c.channels.items():
                 stream = _Stream(channel, c.schemas.get(channel.schema_id), by_channel.get(channel_id, []))
                 self.streams.setdefault(channel.topic, []).append(stream)
-        self.config = next((c.attachments[schema.ATTACHMENT].decode("utf-8", "replace") for c in containers
-                            if schema.ATTACHMENT in c.attachments), None)
+        self.config = next(
+            (
+                c.attachments[schema.ATTACHMENT].decode("utf-8", "replace")
+                for c in containers
+                if schema.ATTACHMENT in c.attachments
+            ),
+            None,
+        )
         self.sources = self._topics({_slash(k): v for k, v in remap.items() if _is_topic(k)})
         self.joint_remap = {k: v for k, v in remap.items() if not _is_topic(k)}
         used = [m.log_time for theirs, _ in self.sources.values() for s in self.streams[theirs] for m in s.messages]
         if not used:
-            raise UserError(f"recording {path}: no message that can be read; topics: {self._describe_topics()}"
-                            + self._losses())
+            raise UserError(
+                f"recording {path}: no message that can be read; topics: {self._describe_topics()}" + self._losses()
+            )
         self.start_ns = min(used)
 
     def _damage(self, c: Container) -> None:
@@ -101,16 +115,24 @@ class _Reading:
             if m.channel_id not in c.channels:
                 orphans[m.channel_id] = orphans.get(m.channel_id, 0) + 1
         for channel_id, count in orphans.items():
-            self.findings.append(Finding("damage", "", NAN, count, f"{where}{count} messages of channel {channel_id},"
-                                         " whose record (topic and type) is lost", "error"))
+            self.findings.append(
+                Finding(
+                    "damage",
+                    "",
+                    NAN,
+                    count,
+                    f"{where}{count} messages of channel {channel_id}, whose record (topic and type) is lost",
+                    "error",
+                )
+            )
 
     def _losses(self) -> str:
         return "".join(f"; {f.text}" for f in self.findings[:3] if f.kind == "damage")
 
-    # -- topics ------------------------------------------------------------------------------------------------------------
+    # -- topics -------------------------------------------------------------------
     def _topics(self, remap: dict[str, str]) -> dict[str, tuple[str, str]]:
-        """Our topic -> (theirs, part): as stated, else of the same name, else of the same name in a namespace, else (for
-        joint states) the only one of the type."""
+        """Our topic -> (theirs, part): as stated, else of the same name, else of the same name in a namespace, else
+        (for joint states) the only one of the type."""
         for ours in remap:
             if ours not in schema.TOPICS:
                 raise UserError(f"remap.{ours}: no such topic; topics are {', '.join(schema.TOPICS)}")
@@ -118,7 +140,9 @@ class _Reading:
         for ours, target in remap.items():
             theirs, _, part = target.partition("#")
             if theirs not in self.streams:
-                raise UserError(f"recording {self.path} has no topic '{theirs}' (remap.{ours}); it has: {self._describe_topics()}")
+                raise UserError(
+                    f"recording {self.path} has no topic '{theirs}' (remap.{ours}); it has: {self._describe_topics()}"
+                )
             out[ours] = (theirs, part)
         for ours in schema.TOPICS:
             if ours not in out and ours in self.streams:
@@ -132,13 +156,27 @@ class _Reading:
                 fits = [t for t in self.streams if t not in taken and self._is_a(t, kind, strict=True)]
             if len(fits) == 1:
                 out[ours] = (fits[0], "")
-                self.findings.append(Finding("topic", ours, NAN, 1, f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info"))
+                self.findings.append(
+                    Finding(
+                        "topic", ours, NAN, 1, f"read from {fits[0]} (say otherwise with remap.{ours}=TOPIC)", "info"
+                    )
+                )
             elif len(fits) > 1:
-                self.findings.append(Finding("topic", ours, NAN, len(fits), f"could be any of {', '.join(fits)};"
-                                             f" none is used (say which with remap.{ours}=TOPIC)", "warning"))
+                self.findings.append(
+                    Finding(
+                        "topic",
+                        ours,
+                        NAN,
+                        len(fits),
+                        f"could be any of {', '.join(fits)}; none is used (say which with remap.{ours}=TOPIC)",
+                        "warning",
+                    )
+                )
         if schema.STATES not in out and schema.COMMANDS not in out:
-            raise UserError(f"recording {self.path} has neither {schema.STATES} nor {schema.COMMANDS} (say which they are with"
-                            f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}" + self._losses())
+            raise UserError(
+                f"recording {self.path} has neither {schema.STATES} nor {schema.COMMANDS} (say which they are with"
+                f" remap.{schema.STATES}=TOPIC); its topics: {self._describe_topics()}" + self._losses()
+            )
         for ours in (schema.COMMANDS, schema.STATES):
             if ours not in out:
                 self.findings.append(Finding("missing_topic", ours, NAN, 0, "not in the recording", "warning"))
@@ -147,13 +185,20 @@ class _Reading:
     def _is_a(self, topic: str, kind: str, strict: bool = False) -> bool:
         s = self.streams[topic][0]
         name = s.schema.name if s.schema is not None else ""
-        return name.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) or (not strict and s.channel.message_encoding != "cdr")
+        return name.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) or (
+            not strict and s.channel.message_encoding != "cdr"
+        )
 
     def _describe_topics(self) -> str:
-        rows = [f"{t} ({s[0].schema.name if s[0].schema else '?'}, {s[0].channel.message_encoding})" for t, s in sorted(self.streams.items())]
+        rows = [
+            f"{t} ({s[0].schema.name if s[0].schema else '?'}, {s[0].channel.message_encoding})"
+            for t, s in sorted(self.streams.items())
+        ]
         return ", ".join(rows) or "none"
 
-    def _decode(self, ours: str, make: Callable[[Channel, McapSchema | None, str], Callable[[bytes], Any]]) -> tuple[np.ndarray, list[Any]]:
+    def _decode(
+        self, ours: str, make: Callable[[Channel, McapSchema | None, str], Callable[[bytes], Any]]
+    ) -> tuple[np.ndarray, list[Any]]:
         """Host times [T] s and decoded messages of one of our topics, in order of time."""
         if ours not in self.sources:
             return np.zeros(0), []
@@ -165,7 +210,9 @@ class _Reading:
             except decode.Unreadable as error:
                 if ours in (schema.COMMANDS, schema.STATES):
                     raise UserError(f"recording {self.path}: topic {theirs} cannot be read: {error}") from None
-                self.findings.append(Finding("unreadable", ours, NAN, len(stream.messages), f"{theirs}: {error}", "error"))
+                self.findings.append(
+                    Finding("unreadable", ours, NAN, len(stream.messages), f"{theirs}: {error}", "error")
+                )
                 continue
             for m in stream.messages:
                 t = (m.log_time - self.start_ns) * 1e-9
@@ -177,20 +224,31 @@ class _Reading:
                 times.append(t)
                 out.append(value)
         if bad:
-            self.findings.append(Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error"))
+            self.findings.append(
+                Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error")
+            )
             if not out and ours == schema.STATES:
                 raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
         t = np.array(times)
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
-            self.findings.append(Finding("time_not_monotonic", ours, float(t[back[0] + 1]), len(back),
-                                         f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
-                                         " samples are returned in order of time", "error", end=float(t[back[-1] + 1])))
+            self.findings.append(
+                Finding(
+                    "time_not_monotonic",
+                    ours,
+                    float(t[back[0] + 1]),
+                    len(back),
+                    f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
+                    " samples are returned in order of time",
+                    "error",
+                    end=float(t[back[-1] + 1]),
+                )
+            )
             order = np.argsort(t, kind="stable")
             t, out = t[order], [out[i] for i in order]
         return t, out
 
-    # -- values ------------------------------------------------------------------------------------------------------------
+    # -- values -------------------------------------------------------------------
     def build(self, stated: dict[str, str], joints: Sequence[str] | None) -> Recording:
         """The recording, with metadata complete."""
         t_command, commands = self._decode(schema.COMMANDS, decode.joint_reader)
@@ -207,7 +265,16 @@ class _Reading:
         has_tactile = schema.TACTILE in self.sources
         self.findings += metadata.complete(stated, has_effort, has_tactile)
         if "joint_names" not in stated:
-            self.findings.append(Finding("missing_metadata", "", NAN, 1, f"joint_names is not stated; the messages' own is used: {', '.join(theirs)}", "info"))
+            self.findings.append(
+                Finding(
+                    "missing_metadata",
+                    "",
+                    NAN,
+                    1,
+                    f"joint_names is not stated; the messages' own is used: {', '.join(theirs)}",
+                    "info",
+                )
+            )
         sign = schema.per_joint_sign(stated["effort_sign"], tuple(theirs), str(self.path))
         stated["effort_sign"] = ",".join(f"{int(sign[list(column).index(k)]):+d}" for k in range(len(ours)))
         stated["joint_names"] = ",".join(ours)
@@ -215,24 +282,35 @@ class _Reading:
         place = _Placer(theirs, column, len(ours))
         command = self._joint_series(schema.COMMANDS, t_command, commands, "position", place, scale["position"])
         out = Recording(
-            path=self.path, meta=stated, joints=ours,
+            path=self.path,
+            meta=stated,
+            joints=ours,
             commands=command if command is not None else Series.empty(schema.COMMANDS, len(ours)),
             states=States(
                 self._joint_series(schema.STATES, t_state, states, "position", place, scale["position"])
                 or Series.empty(schema.STATES, len(ours)),
                 self._joint_series(schema.STATES, t_state, states, "velocity", place, scale["position"]),
-                self._joint_series(schema.STATES, t_state, states, "effort", place, scale["effort"])),
-            start_ns=self.start_ns, config=self.config)
+                self._joint_series(schema.STATES, t_state, states, "effort", place, scale["effort"]),
+            ),
+            start_ns=self.start_ns,
+            config=self.config,
+        )
         for topic, name in ((schema.TEMPERATURES, "temperature"), (schema.DUTY, "duty"), (schema.ENABLED, "enabled")):
             setattr(out, name, self._joint_array(topic, place))
         out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
         out.tactile = self._array(schema.TACTILE, _tactile_shape)
-        for topic, name in ((schema.EXTERNAL_FORCE, "external_force"), (schema.OBJECT_POSE, "object_pose"), (schema.IMU, "imu")):
+        for topic, name in (
+            (schema.EXTERNAL_FORCE, "external_force"),
+            (schema.OBJECT_POSE, "object_pose"),
+            (schema.IMU, "imu"),
+        ):
             setattr(out, name, self._vectors(topic))
         out.findings = self.findings
         return out
 
-    def _their_joints(self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None) -> list[str]:
+    def _their_joints(
+        self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
+    ) -> list[str]:
         """The recording's own joint names: `joint_names` first, then as they appear in messages."""
         listed = list(schema.joint_names(stated.get("joint_names", "")))
         seen: dict[str, None] = dict.fromkeys(listed)
@@ -246,15 +324,31 @@ class _Reading:
                 unnamed = max(unnamed, len(s.position) if not s.names else 0)
         if seen:
             if unnamed > len(listed or seen):
-                raise UserError(f"recording {self.path}: {unnamed} values a message without names, but joint_names lists {len(listed or seen)};"
-                                " state them all with meta.joint_names=a,b,...")
+                raise UserError(
+                    f"recording {self.path}: {unnamed} values a message without names, but"
+                    f" joint_names lists {len(listed or seen)};"
+                    " state them all with meta.joint_names=a,b,..."
+                )
             return list(seen)
         if joints is not None and unnamed == len(joints):
             names_ = list(joints)
         else:
-            names_ = list(xhand.JOINTS) if unnamed == len(xhand.JOINTS) and joints is None else [f"joint{i}" for i in range(unnamed)]
-        self.findings.append(Finding("missing_metadata", "", NAN, 1, "neither the messages nor joint_names name the joints; assumed:"
-                                     f" {', '.join(names_)} (state meta.joint_names=...)", "warning"))
+            names_ = (
+                list(xhand.JOINTS)
+                if unnamed == len(xhand.JOINTS) and joints is None
+                else [f"joint{i}" for i in range(unnamed)]
+            )
+        self.findings.append(
+            Finding(
+                "missing_metadata",
+                "",
+                NAN,
+                1,
+                "neither the messages nor joint_names name the joints; assumed:"
+                f" {', '.join(names_)} (state meta.joint_names=...)",
+                "warning",
+            )
+        )
         return names_
 
     def _match(self, theirs: list[str], joints: Sequence[str] | None) -> dict[str, str]:
@@ -262,8 +356,11 @@ class _Reading:
         if joints is not None:
             mapping = names.match(theirs, joints, self.joint_remap, where)
             if not mapping:
-                raise UserError(f"recording {where}: none of its joints ({', '.join(theirs)}) is one of the model's ({', '.join(joints)});"
-                                " say which they are with remap.OURS=THEIRS")
+                raise UserError(
+                    f"recording {where}: none of its joints ({', '.join(theirs)}) is one of the model's"
+                    f" ({', '.join(joints)});"
+                    " say which they are with remap.OURS=THEIRS"
+                )
         elif self.joint_remap and not set(self.joint_remap) <= set(xhand.JOINTS):
             mapping = {their: their for their in theirs}
             for our, their in self.joint_remap.items():
@@ -278,7 +375,11 @@ class _Reading:
         if renamed:
             self.findings.append(Finding("joint_names", "", NAN, len(renamed), "; ".join(renamed), "info"))
         if left:
-            self.findings.append(Finding("joint_names", "", NAN, len(left), f"not joints of the model, left out: {', '.join(left)}", "info"))
+            self.findings.append(
+                Finding(
+                    "joint_names", "", NAN, len(left), f"not joints of the model, left out: {', '.join(left)}", "info"
+                )
+            )
         return mapping
 
     def _units(self, stated: dict[str, str]) -> dict[str, float]:
@@ -292,7 +393,9 @@ class _Reading:
                     del stated[key]  # the values returned are SI
         return out
 
-    def _joint_series(self, topic: str, t: np.ndarray, samples: list, name: str, place: _Placer, scale: float) -> Series | None:
+    def _joint_series(
+        self, topic: str, t: np.ndarray, samples: list, name: str, place: _Placer, scale: float
+    ) -> Series | None:
         if not samples or (name != "position" and not any(len(getattr(s, name)) for s in samples)):
             return None
         value = np.full((len(t), place.count), np.nan)
@@ -308,8 +411,17 @@ class _Reading:
                 keep, columns = to
                 value[i, columns] = values[keep]
         if bad:
-            self.findings.append(Finding("malformed", topic, float(t[bad[0]]), len(bad), f"{name}: as many values as names are expected; samples left out",
-                                         "error", end=float(t[bad[-1]])))
+            self.findings.append(
+                Finding(
+                    "malformed",
+                    topic,
+                    float(t[bad[0]]),
+                    len(bad),
+                    f"{name}: as many values as names are expected; samples left out",
+                    "error",
+                    end=float(t[bad[-1]]),
+                )
+            )
         stamp = np.array([np.nan if s.stamp is None else (s.stamp - self.start_ns) * 1e-9 for s in samples])
         return Series(t, value * scale, topic, None if np.isnan(stamp).all() else stamp)
 
@@ -335,8 +447,16 @@ class _Reading:
                 keep.append(i)
         if len(keep) < len(messages):
             first = next(i for i in range(len(messages)) if i not in set(keep))
-            self.findings.append(Finding("malformed", topic, float(t[first]), len(messages) - len(keep),
-                                         f"values of an unexpected number ({len(messages[first][1])}); samples left out", "error"))
+            self.findings.append(
+                Finding(
+                    "malformed",
+                    topic,
+                    float(t[first]),
+                    len(messages) - len(keep),
+                    f"values of an unexpected number ({len(messages[first][1])}); samples left out",
+                    "error",
+                )
+            )
         return Series(t[keep], np.array(rows, dtype=float), topic) if rows else None
 
     def _vectors(self, topic: str) -> Series | None:
@@ -345,8 +465,13 @@ class _Reading:
         if not messages:
             return None
         stamp = np.array([np.nan if s is None else (s - self.start_ns) * 1e-9 for _, s, _ in messages])
-        return Series(t, np.array([v for v, _, _ in messages]).reshape(len(t), size), topic,
-                      None if np.isnan(stamp).all() else stamp, messages[0][2])
+        return Series(
+            t,
+            np.array([v for v, _, _ in messages]).reshape(len(t), size),
+            topic,
+            None if np.isnan(stamp).all() else stamp,
+            messages[0][2],
+        )
 
 
 class _Placer:

@@ -13,15 +13,15 @@ import numpy as np
 from dexsim.recording.schema import Recording, Series, States
 
 CURRENT_PER_TORQUE = 2.7
-"""A per N.m where the servo table does not know it: 170 mA read from a finger joint at a standing error of 15.6 mrad, which
-is 0.062 N.m with the table's kp of 4 N.m/rad. A stand-in until calibration measures it."""
+"""A per N.m where the servo table does not know it: 170 mA read from a finger joint at a standing error of 15.6
+mrad, which is 0.062 N.m with the table's kp of 4 N.m/rad. A stand-in until calibration measures it."""
 
 
 @dataclass(frozen=True)
 class Hardware:
-    """The readings. rates [Hz]: range from which a recording's rate is drawn; jitter: standard deviation of a period over
-    the period; late: share of readings delayed by `late_s` on average; drop: share that is lost; position_lsb [rad];
-    current_lsb [A]; taxel_lsb [N]; axis_sign: the vendor's taxel axes over ours."""
+    """The readings. rates [Hz]: range from which a recording's rate is drawn; jitter: standard deviation of a period
+    over the period; late: share of readings delayed by `late_s` on average; drop: share that is lost; position_lsb
+    [rad]; current_lsb [A]; taxel_lsb [N]; axis_sign: the vendor's taxel axes over ours."""
 
     rates: tuple[float, float] = (83.0, 104.0)
     jitter: float = 0.01
@@ -45,8 +45,12 @@ def sample_times(start: float, end: float, rng: np.random.Generator, hardware: H
     return t[(t < end) & (rng.random(count) >= hardware.drop)]
 
 
-def realistic(recording: Recording, seed: int = 0, current_per_torque: np.ndarray | float | None = None,
-              hardware: Hardware = Hardware()) -> Recording:
+def realistic(
+    recording: Recording,
+    seed: int = 0,
+    current_per_torque: np.ndarray | float | None = None,
+    hardware: Hardware = Hardware(),
+) -> Recording:
     """The recording as the hardware would have delivered it; the given one (dense, in N.m and N) is not changed.
 
     current_per_torque: A per N.m, [J] or one value; NaN or None: `CURRENT_PER_TORQUE`, said in the notes. Commands
@@ -63,7 +67,9 @@ def realistic(recording: Recording, seed: int = 0, current_per_torque: np.ndarra
         effort = _at(recording.states.effort, t)
         value = effort.value * recording.effort_sign
         if recording.effort_is == "torque_Nm":
-            scale = np.broadcast_to(np.asarray(np.nan if current_per_torque is None else current_per_torque, float), value.shape[1:])
+            scale = np.broadcast_to(
+                np.asarray(np.nan if current_per_torque is None else current_per_torque, float), value.shape[1:]
+            )
             if np.isnan(scale).any():
                 notes.append(f"current_per_torque unknown: {CURRENT_PER_TORQUE} A per N.m assumed")
             value = value * np.where(np.isnan(scale), CURRENT_PER_TORQUE, scale)
@@ -75,8 +81,11 @@ def realistic(recording: Recording, seed: int = 0, current_per_torque: np.ndarra
         counts = np.round(held.value * np.array(hardware.axis_sign) / hardware.taxel_lsb)
         held.value = np.clip(counts, [-128, -128, 0], [127, 127, 255])
         out.tactile = held
-        meta |= {"tactile_unit": "count", "tactile_lsb": f"{hardware.taxel_lsb:g}",
-                 "tactile_axis_sign": ",".join(f"{s:+d}" for s in hardware.axis_sign)}
+        meta |= {
+            "tactile_unit": "count",
+            "tactile_lsb": f"{hardware.taxel_lsb:g}",
+            "tactile_axis_sign": ",".join(f"{s:+d}" for s in hardware.axis_sign),
+        }
     notes.append(f"sampled like the hardware (seed {seed})")
     meta["notes"] = "; ".join(n for n in notes if n)
     for name in ("temperature", "duty", "enabled", "supply_voltage"):

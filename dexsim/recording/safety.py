@@ -1,4 +1,5 @@
-"""Whether a motion is safe on a real mechanism: limits of position, speed and torque, and no self-contact; in simulation."""
+"""Whether a motion is safe on a real mechanism: limits of position, speed and torque, and no self-contact; in
+simulation."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from dexsim.recording.mechanism import Mechanism, Run
 
 @dataclass
 class Peaks:
-    """What a motion reached. speed, torque [J]: largest, over the limit (a fraction); below: largest excess over the position
-    limits [rad]; contacts: pairs of bodies that came nearer than the clearance, with the time of the first."""
+    """What a motion reached. speed, torque [J]: largest, over the limit (a fraction); below: largest excess over the
+    position limits [rad]; contacts: pairs of bodies that came nearer than the clearance, with the time of the first."""
 
     speed: np.ndarray
     torque: np.ndarray

@@ -35,7 +35,7 @@ KEYS: dict[str, str] = {
     "robot": "e.g. xhand_right",
     "joint_names": "comma-separated: the order of unnamed arrays",
     "effort_is": "current_A, torque_Nm or none",
-    "effort_sign": "per joint: +1 where positive effort drives toward positive position, -1, or 0 where the sign is lost",
+    "effort_sign": "per joint: +1 where positive effort drives to positive position, -1, or 0 where the sign is lost",
     "tactile_unit": "N or count",
     "tactile_lsb": "newtons a count, or unknown",
     "tactile_axis_sign": "three signs that bring the vendor's taxel axes to ours",
@@ -96,12 +96,19 @@ string label
 uint32 size
 uint32 stride
 """,
-    WRENCH: _HEADER + "Wrench wrench" + _HEADER_DEFS + """================================================================================
+    WRENCH: _HEADER
+    + "Wrench wrench"
+    + _HEADER_DEFS
+    + """================================================================================
 MSG: geometry_msgs/Wrench
 Vector3 force
 Vector3 torque
-""" + _VECTOR,
-    POSE: _HEADER + "Pose pose" + _HEADER_DEFS + """================================================================================
+"""
+    + _VECTOR,
+    POSE: _HEADER
+    + "Pose pose"
+    + _HEADER_DEFS
+    + """================================================================================
 MSG: geometry_msgs/Pose
 Point position
 Quaternion orientation
@@ -110,13 +117,18 @@ MSG: geometry_msgs/Point
 float64 x
 float64 y
 float64 z
-""" + _QUATERNION,
-    IMU_TYPE: _HEADER + """geometry_msgs/Quaternion orientation
+"""
+    + _QUATERNION,
+    IMU_TYPE: _HEADER
+    + """geometry_msgs/Quaternion orientation
 float64[9] orientation_covariance
 geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance""" + _HEADER_DEFS + _QUATERNION + _VECTOR,
+float64[9] linear_acceleration_covariance"""
+    + _HEADER_DEFS
+    + _QUATERNION
+    + _VECTOR,
 }
 """ROS 2 type -> message definition, as rosbag2 stores it."""
 
@@ -161,7 +173,9 @@ class Series:
     def between(self, start: float, end: float) -> Series:
         """The samples with start <= t < end [s]."""
         keep = (self.t >= start) & (self.t < end)
-        return replace(self, t=self.t[keep], value=self.value[keep], stamp=None if self.stamp is None else self.stamp[keep])
+        return replace(
+            self, t=self.t[keep], value=self.value[keep], stamp=None if self.stamp is None else self.stamp[keep]
+        )
 
     @classmethod
     def empty(cls, topic: str, *shape: int) -> Series:
@@ -214,7 +228,7 @@ class Recording:
 
     @property
     def effort_is(self) -> str:
-        """"current_A", "torque_Nm" or "none"."""
+        """ "current_A", "torque_Nm" or "none"."""
         return self.meta["effort_is"]
 
     @property
@@ -253,7 +267,9 @@ class Recording:
         if self.tactile is None:
             return None
         if self.tactile_lsb is None:
-            raise UserError(f"{self.path}: tactile_unit is count and tactile_lsb is unknown; state meta.tactile_lsb=<N a count>")
+            raise UserError(
+                f"{self.path}: tactile_unit is count and tactile_lsb is unknown; state meta.tactile_lsb=<N a count>"
+            )
         return replace(self.tactile, value=self.tactile.value * (self.tactile_lsb * self.tactile_axis_sign))
 
 
@@ -264,7 +280,10 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
     except ValueError:
         values = np.zeros(0)
     if len(values) != count:
-        raise UserError(f"{where}: metadata {key}='{text}' must be {count} number{'s' * (count > 1)}; correct it with meta.{key}=...")
+        raise UserError(
+            f"{where}: metadata {key}='{text}' must be {count} number{'s' * (count > 1)};"
+            f" correct it with meta.{key}=..."
+        )
     return values
 
 
@@ -273,7 +292,9 @@ def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray
     count = len(text.replace(",", " ").split())
     values = numbers(text, 1 if count == 1 else len(joints), "effort_sign", where)
     if not np.isin(values, (-1, 0, 1)).all():
-        raise UserError(f"{where}: metadata effort_sign='{text}' must hold +1, -1 or 0; correct it with meta.effort_sign=...")
+        raise UserError(
+            f"{where}: metadata effort_sign='{text}' must hold +1, -1 or 0; correct it with meta.effort_sign=..."
+        )
     return np.broadcast_to(values, len(joints)).copy()
 
 

@@ -23,8 +23,8 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 @lru_cache(maxsize=None)
 def copy_kernel(real):
-    """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the object's
-    pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph."""
+    """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
+    object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_rows(
@@ -67,9 +67,9 @@ def next_slot(count: int, slot: wp.array(dtype=int)):
 class PlayRecorder:
     """Records the first whole episode of the first `count` worlds of a hand environment; others are not touched.
 
-    A launch a physics step copies the chosen rows on the device; one copy a control step brings them to the host. Attach
-    before the episodes begin; `save` writes what there is. An episode's recording ends when the world is reset, or when
-    gravity turns (a recording has one direction of gravity).
+    A launch a physics step copies the chosen rows on the device; one copy a control step brings them to the host.
+    Attach before the episodes begin; `save` writes what there is. An episode's recording ends when the world is
+    reset, or when gravity turns (a recording has one direction of gravity).
     """
 
     def __init__(self, env: Any, count: int, config: dict[str, Any]):
@@ -86,7 +86,8 @@ class PlayRecorder:
         with wp.ScopedDevice(engine.device):
             self._args = [
                 wp.array(list(range(count)), dtype=int), wp.array(engine.qpos_index(self.joints), dtype=int),
-                wp.array(engine.dof_index(self.joints), dtype=int), int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]),
+                wp.array(engine.dof_index(self.joints), dtype=int),
+                int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]),
                 engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params,
                 wp.zeros(1, dtype=int), wp.zeros((K, count, 1 + 3 * J + 7), dtype=engine.real),
             ]  # fmt: skip
@@ -162,9 +163,18 @@ class PlayRecorder:
         servo = self.env.servo.table
         gravity = " ".join(f"{g:g}" for g in track.gravity)
         notes = f"world {track.world['index']} of a play; object {track.world['object']['shape']}"
-        meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(self.joints), "effort_is": "torque_Nm", "effort_sign": "+1",
-                           "tactile_unit": "N", "tactile_lsb": "1", "gravity": gravity, "notes": "; ".join([notes, *track.notes]),
-                           "servo": yaml.safe_dump(servo.to_dict() | {"joints": track.servo}, sort_keys=False)}
+        meta = DEFAULTS | {
+            "source": "sim",
+            "robot": "xhand_right",
+            "joint_names": ",".join(self.joints),
+            "effort_is": "torque_Nm",
+            "effort_sign": "+1",
+            "tactile_unit": "N",
+            "tactile_lsb": "1",
+            "gravity": gravity,
+            "notes": "; ".join([notes, *track.notes]),
+            "servo": yaml.safe_dump(servo.to_dict() | {"joints": track.servo}, sort_keys=False),
+        }
         tactile = None
         if track.touch:
             force = np.stack(track.touch)
@@ -172,8 +182,17 @@ class PlayRecorder:
                 force = np.stack([np.zeros_like(force), np.zeros_like(force), force], -1)
             tactile = Series(np.array(track.touch_times), force, TACTILE)
         config = yaml.safe_dump(self.config | {"recorded_world": track.world}, sort_keys=False)
-        return Recording(Path("play.mcap"), meta, self.joints, Series(command_t, np.stack(track.targets), COMMANDS, command_t.copy()),
-                         States(*parts), tactile=tactile, object_pose=pose, config=config, start_ns=1_000_000_000)
+        return Recording(
+            Path("play.mcap"),
+            meta,
+            self.joints,
+            Series(command_t, np.stack(track.targets), COMMANDS, command_t.copy()),
+            States(*parts),
+            tactile=tactile,
+            object_pose=pose,
+            config=config,
+            start_ns=1_000_000_000,
+        )
 
 
 class _Track:
@@ -191,7 +210,15 @@ class _Track:
         self.notes: list[str] = []
         self.over = False
 
-    def add(self, rows: np.ndarray, target: np.ndarray, gravity: np.ndarray, done: np.ndarray, touch: np.ndarray | None, dt: float) -> None:
+    def add(
+        self,
+        rows: np.ndarray,
+        target: np.ndarray,
+        gravity: np.ndarray,
+        done: np.ndarray,
+        touch: np.ndarray | None,
+        dt: float,
+    ) -> None:
         """One control step: rows [K, W], target [J] and touch as they are after it."""
         start = float(rows[0, 0])
         if not self.over and self.times and start <= self.times[-1]:
@@ -220,8 +247,24 @@ def _world(env: Any, k: int) -> dict[str, Any]:
     o = env.objects
     variant = env.scene.variants[int(o.variant[k])]
     params = env.servo.params[k].double().cpu().numpy()
-    servo = {joint: {name: float(params[j, c]) for c, name in enumerate(NAMES) if np.isfinite(params[j, c]) and params[j, c] != COLUMNS[c].neutral}
-             for j, joint in enumerate(env.servo.joints)}
-    return {"index": k, "servo": servo,
-            "object": {"shape": variant.shape.name, "kind": variant.shape.kind, "size": [float(x) for x in o.size[k]], "mass": float(o.mass[k]),
-                       "friction": float(o.friction[k]), "stiffness": float(o.stiffness[k]), "damping_ratio": float(o.damping_ratio[k])}}
+    servo = {
+        joint: {
+            name: float(params[j, c])
+            for c, name in enumerate(NAMES)
+            if np.isfinite(params[j, c]) and params[j, c] != COLUMNS[c].neutral
+        }
+        for j, joint in enumerate(env.servo.joints)
+    }
+    return {
+        "index": k,
+        "servo": servo,
+        "object": {
+            "shape": variant.shape.name,
+            "kind": variant.shape.kind,
+            "size": [float(x) for x in o.size[k]],
+            "mass": float(o.mass[k]),
+            "friction": float(o.friction[k]),
+            "stiffness": float(o.stiffness[k]),
+            "damping_ratio": float(o.damping_ratio[k]),
+        },
+    }

@@ -45,7 +45,9 @@ def ladder(a: float, v: float, dt: float, rng: np.random.Generator) -> np.ndarra
     return np.concatenate([np.concatenate([p, np.zeros(round(0.2 / dt))]) for p in (*parts, parts[2], parts[0])])
 
 
-def chirp(a: float, v: float, dt: float, rng: np.random.Generator, low: float = 0.3, high: float = 8.0, seconds: float = 12.0) -> np.ndarray:
+def chirp(
+    a: float, v: float, dt: float, rng: np.random.Generator, low: float = 0.3, high: float = 8.0, seconds: float = 12.0
+) -> np.ndarray:
     """A sine from 0.3 to 8 Hz, smaller as it gets faster: delay, lag, inertia, elasticity."""
     t = np.arange(0, seconds, dt)
     rate = np.log(high / low) / seconds
@@ -65,7 +67,10 @@ def holds(a: float, v: float, dt: float, rng: np.random.Generator) -> np.ndarray
     """Stand for 2 s at six places, each reached from both sides: load, offsets, stiction, drift."""
     out, at = [np.zeros(1)], 0.0
     for level in (0.4 * a, 0.8 * a, 0.4 * a, -0.4 * a, -0.8 * a, -0.4 * a):
-        out += [minimum_jerk(at, level, max(PEAK * abs(level - at) / (0.5 * v), 0.3), dt), np.full(round(2.0 / dt), level)]
+        out += [
+            minimum_jerk(at, level, max(PEAK * abs(level - at) / (0.5 * v), 0.3), dt),
+            np.full(round(2.0 / dt), level),
+        ]
         at = level
     return np.concatenate([*out, minimum_jerk(at, 0.0, max(PEAK * abs(at) / (0.5 * v), 0.3), dt)])
 
@@ -82,5 +87,12 @@ def random_motion(a: float, v: float, dt: float, rng: np.random.Generator, secon
     return np.concatenate([*out, minimum_jerk(at, 0.0, max(PEAK * abs(at) / v, 0.3), dt)])
 
 
-KINDS: dict[str, Waveform] = {"triangles": triangles, "ladder": ladder, "chirp": chirp, "steps": steps, "holds": holds, "random": random_motion}
+KINDS: dict[str, Waveform] = {
+    "triangles": triangles,
+    "ladder": ladder,
+    "chirp": chirp,
+    "steps": steps,
+    "holds": holds,
+    "random": random_motion,
+}
 """Name -> motion. "random" moves all joints at once, the others one joint of each finger."""

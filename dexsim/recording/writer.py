@@ -31,8 +31,16 @@ class Writer:
     Not thread-safe: a real-time loop hands samples to the one thread that owns the writer.
     """
 
-    def __init__(self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any] | None = None,
-                 start_ns: int | None = None, config: str | None = None, chunk_s: float = 1.0, chunk_bytes: int = 1 << 18):
+    def __init__(
+        self,
+        path: str | Path,
+        joints: Sequence[str],
+        meta: Mapping[str, Any] | None = None,
+        start_ns: int | None = None,
+        config: str | None = None,
+        chunk_s: float = 1.0,
+        chunk_bytes: int = 1 << 18,
+    ):
         self.path, self.joints = Path(path).expanduser(), tuple(joints)
         self.start_ns = time.time_ns() if start_ns is None else int(start_ns)
         self.meta = {"schema": "1", "joint_names": ",".join(joints)} | {k: str(v) for k, v in (meta or {}).items()}
@@ -47,7 +55,9 @@ class Writer:
         self._mcap.start(profile="ros2", library="dexsim")
         self._mcap.add_metadata(schema.METADATA, self.meta)
         if config is not None:
-            self._mcap.add_attachment(self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode())
+            self._mcap.add_attachment(
+                self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode()
+            )
         self._file.flush()
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -59,8 +69,14 @@ class Writer:
         """Targets [J] sent to the servos [rad]; NaN: none for this joint."""
         self._joints(schema.COMMANDS, t, position, None, None, stamp)
 
-    def add_state(self, t: float, position: np.ndarray, velocity: np.ndarray | None = None,
-                  effort: np.ndarray | None = None, stamp: float | None = None) -> None:
+    def add_state(
+        self,
+        t: float,
+        position: np.ndarray,
+        velocity: np.ndarray | None = None,
+        effort: np.ndarray | None = None,
+        stamp: float | None = None,
+    ) -> None:
         """Measured position, velocity, effort [J] each."""
         self._joints(schema.STATES, t, position, velocity, effort, stamp)
 
@@ -116,9 +132,18 @@ class Writer:
     def _ns(self, t: float) -> int:
         return self.start_ns + round(t * 1e9)
 
-    def _joints(self, topic: str, t: float, position: np.ndarray, velocity: np.ndarray | None, effort: np.ndarray | None,
-                stamp: float | None) -> None:
-        self._message(topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), self.joints, position, velocity, effort))
+    def _joints(
+        self,
+        topic: str,
+        t: float,
+        position: np.ndarray,
+        velocity: np.ndarray | None,
+        effort: np.ndarray | None,
+        stamp: float | None,
+    ) -> None:
+        self._message(
+            topic, t, cdr.joint_state(self._ns(t if stamp is None else stamp), self.joints, position, velocity, effort)
+        )
 
     def _array(self, topic: str, t: float, value: np.ndarray, labels: Sequence[str]) -> None:
         self._message(topic, t, cdr.multi_array(value, labels))
@@ -155,8 +180,13 @@ def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]
     for i, t in enumerate(s.position.t):
         rest = [None if x is None else x.value[i] for x in (s.velocity, s.effort)]
         yield t, 1, w.add_state, (t, s.position.value[i], *rest, _stamp(s.position, i))
-    plain = ((r.temperature, w.add_temperature), (r.duty, w.add_duty), (r.enabled, w.add_enabled),
-             (r.supply_voltage, w.add_supply_voltage), (r.tactile, w.add_tactile))
+    plain = (
+        (r.temperature, w.add_temperature),
+        (r.duty, w.add_duty),
+        (r.enabled, w.add_enabled),
+        (r.supply_voltage, w.add_supply_voltage),
+        (r.tactile, w.add_tactile),
+    )
     for order, (series, add) in enumerate(plain, start=2):
         for i, t in enumerate([] if series is None else series.t):
             yield t, order, add, (t, series.value[i])
