@@ -76,6 +76,12 @@ def stuck(r):
     return "stuck", "/joint_states", "b", 0.0, 800
 
 
+def stuck_effort(r):
+    r.states.position.value[:, 0] *= 0.3  # far from its target, without a current
+    r.states.effort.value[:, 0] = 0.0
+    return "stuck", "/joint_states", "a", 0.001, 800
+
+
 def wrap16(r):
     e = r.states.effort
     e.value[:, 0] = np.mod(np.round(1000 * e.value[:, 0]), 65536)
@@ -234,6 +240,7 @@ FAULTS = (
     slow_sensor,
     repeated_stamp,
     stuck,
+    stuck_effort,
     wrap16,
     wrap16_in_amperes,
     wrapped_duty,
@@ -294,6 +301,13 @@ def test_stick_and_slip_is_not_a_stale_reading():
     stuck_at = np.round(q / 0.05) * 0.05  # jumps, and rests exactly between them
     r.states.position.value[:, 0] = stuck_at
     assert not found(r, "held")
+
+
+def test_a_drive_inside_its_deadband_is_not_stuck():
+    r = recordings.signal(8.0)
+    r.states.effort.value[:, 0] = 0.0
+    r.states.position.value[:, 0] = r.commands.value[:, 0] + 1e-3
+    assert not found(r, "stuck")
 
 
 def test_time_that_goes_backwards_is_reported_and_ordered(tmp_path):

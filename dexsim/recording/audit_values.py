@@ -291,11 +291,11 @@ def stuck(r: Recording) -> Iterator[Finding]:
     if e is not None and len(e) > 20:
         for j, joint in enumerate(r.joints):
             x = e.value[:, j]
-            if (
-                np.isfinite(x).any()
-                and np.nanmax(x) == np.nanmin(x)
-                and np.nanmax(s.value[:, j]) - np.nanmin(s.value[:, j]) > 0.05
-            ):
+            if not np.isfinite(x).any() or np.nanmax(x) != np.nanmin(x):
+                continue
+            drive = np.abs(_drive(r, j, e.t))
+            # what drives it is beyond what a deadband or dry friction may hide
+            if (drive[np.isfinite(drive)] > 0.05).mean() > 0.05 and np.ptp(s.value[:, j]) > 0.05:
                 yield Finding(
                     "stuck",
                     STATES,
