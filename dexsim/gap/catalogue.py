@@ -168,9 +168,9 @@ def _torque_limit(s: Scales) -> list[Variant]:
 def _speed_limit(s: Scales) -> list[Variant]:
     believed = s.nominal["no_load_speed"]
     top = min(believed, 30 * s.peak_speed)
-    low = min(0.8 * s.peak_speed, 0.8 * top)
+    low = min(0.3 * s.peak_speed, 0.8 * top)
     speed = _p("no_load_speed", "no_load_speed", "set", low, top, top, "rad/s")
-    starts = [x for x in (1.1 * s.peak_speed, 1.6 * s.peak_speed, 3 * s.peak_speed, 0.8 * believed, 0.6 * believed) if low < x < top]
+    starts = [x for x in (0.7 * s.peak_speed, 1.1 * s.peak_speed, 1.6 * s.peak_speed, 3 * s.peak_speed, 0.8 * believed, 0.6 * believed) if low < x < top]
     return [Variant((speed,), tuple((x,) for x in starts))] if starts else []
 
 
@@ -207,7 +207,7 @@ def _thermal(s: Scales) -> list[Variant]:
             continue
         if of == "friction" and not (s.nominal["coulomb_friction"] > 0 or s.nominal["viscous_friction"] > 0):
             continue
-        top = min(0.02 if of != "friction" else 0.1, 0.7 / s.warm)
+        top = min(0.03 if of != "friction" else 0.1, 0.7 / s.warm)
         # copper gains 0.39 % of resistance per degree: ten times that is a proxy of something else
         low, high = (0.0, 0.008) if of == "resistance" else (-top, top)
         p = _p("per_degree", column, "set", low, high, 0.0, "1/degC")

@@ -77,6 +77,7 @@ class Diagnosis:
     stages: list[str] = field(default_factory=list)
     shares: dict[str, float] = field(default_factory=dict)
     spans: dict[str, float] = field(default_factory=dict)
+    mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
 
 
@@ -165,6 +166,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     cases = build(model, runs, device=s.device, dt=_step(runs))
     clock.lap("model along the motion")
     group = conditions(runs)
+    drives = [json.dumps(_plain(r.servo.to_dict()), sort_keys=True) for r in runs]
+    fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
     train, test, span_train, span_test, how = _split(runs, held, group)
     say(f"kept out of the fit: {how}")
     floor, floor_how = judge.floor(runs, cases)
@@ -177,7 +180,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
             progress(k, len(cases), case.joint)
         if not case.moved:
             notes.append(f"{case.joint} does not move: nothing can be said of it")
-        search = JointSearch(case, train, span_train, group, seed=s.seed + k, allowed=s.allowed)
+        search = JointSearch(case, train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed)
         if len(search.long.window) == 0:
             notes.append(f"{case.joint}: no stretch long enough to simulate")
             continue
@@ -227,6 +230,10 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             out.joints[case.joint] |= {"effort_before": eff["before"], "effort_after": eff["after"]}
             effort_squares["before"].append((tau - e0)[ok] ** 2)
             effort_squares["after"].append((tau - e1)[ok] ** 2)
+        for i in test:
+            pick = case.plant.run_of[rows] == i
+            if pick.any():
+                out.mae[case.joint, runs[i].name] = (float(np.abs(measured - q0)[pick].mean()), float(np.abs(measured - q1)[pick].mean()))
         out.outcomes.append(outcome)
         # nuisances
         for p, x in zip(best.fit.params, best.fit.x, strict=True):

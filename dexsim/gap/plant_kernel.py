@@ -19,7 +19,7 @@ import warp as wp
 from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
 
 f64 = wp.float64
-TWO_BODY_STEPS = 2  # sub-steps of the two-inertia plant in one step of the grid
+TWO_BODY_STEPS = 3  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
@@ -67,9 +67,12 @@ def plant_kernel():
     @wp.func
     def law(
         e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
-        dt: f64, voltage: f64,
+        dt: f64, voltage: f64, gain: f64, drift: f64,
     ):  # fmt: skip
-        """(motor torque now, at the end of the step at unchanged speed, its slope in that speed) of the servo's law."""
+        """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
+        motor's speed). gain, drift: the change of speed in this step is gain * torque + drift.
+
+        At its limit the torque keeps to the limit for the whole step, unless the step's end is within the limits."""
         zero = f64(0.0)
         one = f64(1.0)
         now = kp * e - kd * v_m
@@ -81,18 +84,18 @@ def plant_kernel():
             slope = zero
         motor_now = zero
         motor = zero
-        damping = zero
+        line = zero
         if voltage > zero:
             line = tau0 / nls
             motor_now = tau0 * supply * wp.clamp(now, -one, one) - line * v
             motor = tau0 * supply * wp.clamp(pd, -one, one) - line * v
-            damping = tau0 * supply * slope + line
             if wp.abs(pd) > one:
-                unlimited = tau0 * supply * pd - line * v
-                ratio = zero
-                if unlimited != zero:
-                    ratio = wp.clamp(motor / unlimited, zero, one)
-                damping = wp.max(ratio * damping, line)
+                end = pd - slope * (gain * motor + drift)
+                if end * wp.sign(pd) >= one:
+                    slope = zero
+                else:
+                    slope = slope / wp.abs(pd)
+            slope = tau0 * supply * slope
         else:
             x = wp.abs(v) / (nls * supply)
             limit = zero
@@ -100,15 +103,15 @@ def plant_kernel():
                 limit = tau0 * (one - x)
             motor_now = wp.clamp(now, -limit, limit)
             motor = wp.clamp(pd, -limit, limit)
-            damping = slope
             if wp.abs(pd) > limit:
-                line = tau0 / (nls * supply)
-                if pd * v < zero:
-                    line = zero
-                elif limit == zero:
-                    line = zero
-                damping = wp.max(slope * limit / wp.abs(pd), line)
-        return wp.vec3d(motor_now, motor, damping)
+                end = pd - slope * (gain * motor + drift)
+                if end * wp.sign(pd) >= limit:
+                    slope = zero
+                    if pd * v > zero and limit > zero:
+                        line = tau0 / (nls * supply)
+                else:
+                    slope = slope * limit / wp.abs(pd)
+        return wp.vec4d(motor_now, motor, slope, line)
 
     @wp.func
     def measured(q: f64, scale: f64, offset: f64, esin: f64, ecos: f64, round_: bool):
@@ -268,37 +271,56 @@ def plant_kernel():
                 if not two:
                     v_drive = v
                 # the lag acts on the velocity that kd sees; without it v_f is v_l
+                load = gc
+                if consts[C_SLIDE] < half:
+                    dq = q - series[g, XQ]  # the model was evaluated at the measured pose
+                    load = gc * wp.cos(dq) + gs * wp.sin(dq)
+                load += series[g, XR]
+                # theta-method: the middle of the step where it is smooth, its end where it is stiff
+                theta = one
+                if not two:
+                    stiffness = eff * (kd + kp * dts)
+                    if voltage > zero:
+                        stiffness = eff * tau0 * (supply * (kd + kp * dts) + one / nls)
+                    theta = wp.clamp(half + half * ((stiffness + visc) * dts / inertia - f64(0.6)), half, one)
+                body = inertia
+                if two and wp.abs(qm - q) < gap2:
+                    body = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
+                step = theta * dts
                 torque = law(
-                    e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, dts, voltage
+                    e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
+                    eff * step / body, -load * step / body,
                 )
                 now = torque[0]
                 motor = torque[1]
                 damping = torque[2]
+                slope_m = torque[3]
                 if consts[C_OPEN] > zero:  # the stage after the drive, with its recorded input
                     now = series[g, XDRIVE]
                     motor = now
                     damping = zero
+                    slope_m = zero
                     if consts[C_OPEN] > f64(1.5):  # that input is the duty
                         line = tau0 / nls
                         now = tau0 * supply * series[g, XDRIVE] - line * v_drive
                         motor = now
-                        damping = line
+                        slope_m = line
                 if series[g, XON] < half:
                     now = zero
                     motor = zero
                     damping = zero
+                    slope_m = zero
                 blend = dts / (params[h, P_LAG] + dts)
                 if fresh == 1:
                     last = now
                     fresh = 0
                 now = last + blend * (now - last)
                 motor = last + blend * (motor - last)
-                damping = blend * damping
+                damping = eff * blend * damping
+                slope_m = eff * blend * slope_m
                 before = last
                 last = now
                 applied = eff * motor
-                damping = eff * damping
-
                 if ripple != zero:
                     applied += ripple * wp.sin(turn * q + params[h, P_PHASE])
                 applied += params[h, P_BIAS]
@@ -317,11 +339,6 @@ def plant_kernel():
                 level = level * friction_factor + fraction * wp.abs(before)
                 applied -= half * params[h, P_ASYM] * level
 
-                load = gc
-                if consts[C_SLIDE] < half:
-                    dq = (measured(q, scale, offset, esin, ecos, round_) - series[g, XQ]) / scale
-                    load = gc * wp.cos(dq) + gs * wp.sin(dq)
-                load += series[g, XR]
                 stop_d = zero
                 if q < low:
                     load -= consts[C_STIFF] * (low - q - dts * v)
@@ -332,15 +349,19 @@ def plant_kernel():
 
                 if not two:
                     level += base_friction
-                    a = inertia / dts + damping + visc + stop_d
-                    free = (inertia / dts * v + applied + damping * v - load) / a
-                    if wp.abs(free) * a <= level:
-                        free = zero
-                    else:
-                        free -= wp.sign(free) * level / a
+                    damping += slope_m
+                    a = inertia / (theta * dts) + damping + visc + stop_d
+                    free = (inertia / (theta * dts) * v + applied + damping * v - load) / a
                     if i >= warm:
-                        v = free
-                        q += dts * v
+                        if wp.abs(free) * a <= level:
+                            v = zero
+                        else:
+                            free -= wp.sign(free) * level / a
+                            q += dts * free
+                            ahead = v + (free - v) / theta
+                            if ahead * free < zero:  # friction stops the joint within the step
+                                ahead = zero
+                            v = ahead
                     qm = q
                     vm = v
                 else:
@@ -351,7 +372,7 @@ def plant_kernel():
                         stiff = consts[C_STIFF]
                     damp = f64(0.1) * wp.sqrt(stiff * link)
                     if soft <= zero:
-                        damp = wp.sqrt(stiff * rotor * link / inertia)  # contact of gear teeth: little rebound
+                        damp = f64(0.25) * wp.sqrt(stiff * rotor * link / inertia)  # gear teeth rebound
                     twist = qm + dts * vm - q - dts * v
                     engaged = zero
                     side = zero
@@ -360,10 +381,10 @@ def plant_kernel():
                         side = wp.sign(twist) * gap2
                     kh = engaged * (stiff * dts + damp)
                     pull = engaged * stiff * (qm - q - side)
-                    d_m = damping
+                    d_m = damping + slope_m
                     d_l = zero
-                    if consts[C_LOOP_MOTOR] < half and voltage < half:
-                        d_m = zero
+                    if consts[C_LOOP_MOTOR] < half:
+                        d_m = slope_m
                         d_l = damping
                     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
                     a11 = rotor / dts + params[h, P_VISC] * friction_factor + kh + d_m

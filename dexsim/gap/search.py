@@ -213,8 +213,11 @@ class JointSearch:
         sw = np.sqrt(weight)
         Jw, rw = J * sw[:, None], r0 * sw
         # nuisances absorb what they may: a prior of a quarter of their span
-        gram = Jw.T @ Jw + np.diag([16.0 * float(np.mean(rw**2)) if p.nuisance else 1e-9 for p in params]) if params else None
-        project = lambda y: y - Jw @ np.linalg.solve(gram, Jw.T @ y) if params else y  # noqa: E731
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        inside = (x > low + 0.02 * (high - low)) & (x < high - 0.02 * (high - low)) if params else np.zeros(0, bool)
+        Jw = Jw[:, inside]  # one at its bound has nothing left to give
+        gram = Jw.T @ Jw + 16.0 * float(np.mean(rw**2)) * np.eye(Jw.shape[1])
+        project = lambda y: y - Jw @ np.linalg.solve(gram, Jw.T @ y) if Jw.shape[1] else y  # noqa: E731
         total = float(rw @ rw)
         clean = project(rw)
         block = fitter.window

@@ -1,0 +1,1 @@
+"""Real recordings, made by others, converted to the recording format and diagnosed: `python -m benchmarks.real`."""

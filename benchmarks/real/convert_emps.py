@@ -1,0 +1,58 @@
+"""EMPS, a linear drive at 1 kHz (Janot, Gautier, Brunot 2019, nonlinearbenchmark.org): closed loop, force from the drive's voltage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.real.common import dump, save
+from dexsim.errors import UserError
+
+KP, KV, FORCE_PER_VOLT = 160.18, 243.45, 35.1507  # 1/s, V/(m/s), N/V: of the benchmark's controller and drive
+MODEL = """<mujoco model="emps">
+  <option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <body name="carriage">
+      <joint name="carriage" type="slide" axis="1 0 0"/>
+      <geom name="mass" type="box" size="0.1 0.1 0.05" mass="{mass}" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+REFERENCE = {"mass": 95.1089, "viscous": 203.5034, "coulomb": 20.3935, "offset": -3.1648}
+
+
+@dataclass
+class Emps:
+    """Converted files."""
+
+    estimation: Path
+    pulses: Path
+    model: Path
+    servo: Path
+
+
+def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
+    """Converts DATA_EMPS.mat and DATA_EMPS_PULSES.mat. mass: believed [kg]; of the friction nothing is."""
+    from scipy.io import loadmat
+
+    if not (data / "DATA_EMPS.mat").is_file():
+        raise UserError(f"{data}: no DATA_EMPS.mat; download the EMPS benchmark from nonlinearbenchmark.org")
+    out.mkdir(parents=True, exist_ok=True)
+    model = out / "emps.xml"
+    model.write_text(MODEL.format(mass=mass), encoding="utf-8")
+    servo = dump(out / "emps.yaml", {
+        "drive": "torque", "loop_rate": 1000,
+        "joints": {"*": {"kp": float(KP * KV * FORCE_PER_VOLT) if KP * KV * FORCE_PER_VOLT < 1e5 else 1e5, "kd": 1e4}},
+    })  # fmt: skip
+    paths = []
+    for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
+        raw = loadmat(data / f"{name}.mat")
+        get = lambda key, raw=raw: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
+        t, q, target, force = get("t"), get("qm"), get("qg"), float(raw["gtau"].squeeze()) * get("vir")
+        # every second sample of the states is enough, and all commands
+        paths.append(save(out / f"{name.lower()}.mcap", ("carriage",), t, target[:, None], t[::2], q[::2, None], effort=force[::2, None],
+                          robot="emps", gravity="0 0 0"))  # fmt: skip
+    return Emps(paths[0], paths[1], model, servo)
