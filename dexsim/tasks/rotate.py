@@ -138,7 +138,8 @@ class RotateEnv(HandEnv):
             raise UserError(f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "
                             f"{math.radians(abs(goal['angle'])):.3g} rad, or goals are reached as they are set")
         if "box" not in t["objects"]["train"]:
-            raise UserError(f"task.objects.train={t['objects']['train']}: the rotation task needs 'box', whose held poses it starts from")
+            raise UserError(f"task.objects.train={t['objects']['train']}: the rotation task needs 'box', "
+                            "whose held poses it starts from")
         for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.com", -0.25, 0.25),
                                 ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0), ("imu.delay", 0.0, 0.5),
                                 ("imu.heading_rate", -0.2, 0.2), ("imu.tilt", -0.3, 0.3)):
@@ -259,13 +260,15 @@ class RotateEnv(HandEnv):
         tips = self.tips.reshape(n, 15)
         if t["perception"] == "imu":
             parts = {
-                "joint_angle": angle, "relative_orientation": self._relative(), "last_action": self.action, "contact_centre": centre,
-                "contact_force": self.touch.force, "fingertip_position": tips + sense["tip_noise"] * s.normal(15),
+                "joint_angle": angle, "relative_orientation": self._relative(), "last_action": self.action,
+                "contact_centre": centre, "contact_force": self.touch.force, "fingertip_position": tips + sense["tip_noise"] * s.normal(15),
             }  # fmt: skip
             actor = torch.cat([parts[row[0]] for row in self._actor_rows()], 1)
         else:
-            parts = {"joint_angle": angle, "joint_velocity": self.qd + sense["velocity_noise"] * s.normal(12), "last_action": self.action,
-                     "contact_centre": centre, "contact_force": self.touch.force}
+            parts = {
+                "joint_angle": angle, "joint_velocity": self.qd + sense["velocity_noise"] * s.normal(12),
+                "last_action": self.action, "contact_centre": centre, "contact_force": self.touch.force,
+            }  # fmt: skip
             frame = torch.cat([parts[row[0]] for row in self._actor_rows(frames=1)], 1)
             frame = torch.where(self.nan[:, None], torch.zeros_like(frame), frame)
             if advance:
@@ -308,7 +311,8 @@ class RotateEnv(HandEnv):
         step = rot @ torch.where(new[..., None], rot, self.tip_rot).transpose(-1, -2)
         linear = (self.tips - torch.where(new, self.tips, self.tip_last)) / self.dt
         # half the antisymmetric part is sin(angle) * axis: at 15 rad/s and 25 ms 2 % short of the angle
-        turn = torch.stack([step[..., 2, 1] - step[..., 1, 2], step[..., 0, 2] - step[..., 2, 0], step[..., 1, 0] - step[..., 0, 1]], -1) / 2
+        twice = (step[..., 2, 1] - step[..., 1, 2], step[..., 0, 2] - step[..., 2, 0], step[..., 1, 0] - step[..., 0, 1])
+        turn = torch.stack(twice, -1) / 2
         self.tip_velocity.copy_(torch.cat([linear, turn / self.dt], -1))
         self.tip_rot.copy_(rot)
         self.tip_last.copy_(self.tips)
@@ -375,16 +379,19 @@ class RotateEnv(HandEnv):
         if t["critic"] == "privileged":
             critic += [(name, width, "privileged") for name, width in PRIVILEGED]
         limit, r = t["termination"], t["reward"]
+        actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in self._actor_rows()]
+        edge = 1000 * self.grasps.edge
         return {
-            "observations": {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in self._actor_rows()], "critic": critic},
+            "observations": {"actor": actor, "critic": critic},
             "action": [(j, float(lo), float(hi), f"rad ({t['action']['mode']})")
                        for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
             "rewards": [(k, w, notes[k]) for k, w in t["rewards"].items() if w],
             "terminations": [("dropped", f"centre {limit['distance']} m from its start or below {limit['below']} m"),
                              ("tipped", f"{limit['tilt']} rad away from lying on its face"), ("nan", "state not finite"),
                              ("time_out", f"{self.max_episode_length} steps")],
-            "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],
-            "notes": [f"{len(self.grasps)} held poses, cubes of {1000 * self.grasps.edge.min():.0f}-{1000 * self.grasps.edge.max():.0f} mm",
+            "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
+                              for name, (lo, hi, log) in self.sampler.ranges.items()],
+            "notes": [f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
                       f"reached: rotation error below {r['delta_rot']} rad and drift below {r['delta_pos']} m"],
         }
 

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
-HEADER = ("Contact center", "Contact force", "Force weighted", "Orientation", "Cons. success trials (sorted)", "Average", "Median",
-          "Succ. time (Ave.) s", "Time to fall (Ave.) s")
+HEADER = ("Contact center", "Contact force", "Force weighted", "Orientation", "Cons. success trials (sorted)", "Average",
+          "Median", "Succ. time (Ave.) s", "Time to fall (Ave.) s")
 """Columns of the paper's rotation table."""
 ENDS = ("dropped", "tipped", "nan", "capped")
 
@@ -109,7 +109,8 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
             score.append(count[shown].cpu().numpy())
         if k % 40 == 39:
             if progress is not None:
-                progress(done + min(n, episodes - done) * (k + 1) // steps, episodes, f"{(k + 1) * dt:.0f} s, {int(alive.sum())} still turning")
+                at = done + min(n, episodes - done) * (k + 1) // steps
+                progress(at, episodes, f"{(k + 1) * dt:.0f} s, {int(alive.sum())} still turning")
             if not bool(alive.any()):
                 break
     out = {
@@ -121,7 +122,8 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
         out["frames"] = {
             "model": models, "dt": dt, "names": ("thumb", "index", "mid", "ring", "pinky"), "full": 5.0,
             "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
-            "label": [f"{edge[w]:.0f} mm, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s" for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
+            "label": [f"{edge[w]:.0f} mm, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
+                      for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
             "overlay": [{"force": np.stack([f[i] for f in force[:s]])} for i, s in enumerate(stop)],
             "camera": {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0},
         }  # fmt: skip
@@ -172,7 +174,8 @@ def _successes_plot(ax, successes: np.ndarray) -> None:
 def _survival_plot(ax, time: np.ndarray, cap: float) -> None:
     t = np.sort(time)
     fallen = t < cap
-    ax.step(np.concatenate([[0], t[fallen], [cap]]), np.concatenate([[100], 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t)), [100 * (~fallen).mean()]]), where="post")
+    left = 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t))
+    ax.step([0, *t[fallen], cap], [100, *left, 100 * (~fallen).mean()], where="post")
     ax.set_xlabel("time [s]")
     ax.set_ylabel("trials still turning [%]")
     ax.set_ylim(0, 102)

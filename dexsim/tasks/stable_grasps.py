@@ -119,7 +119,8 @@ def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     _play(env, CLOSE, start.target)
     _play(env, SETTLE)
     end = GraspSet(start.edge, env.q.clone(), env.target.clone(), env.object_pose.clone())
-    still = (env.object_velocity[:, :3].norm(dim=1) < 0.01) & (env.object_velocity[:, 3:].norm(dim=1) < 0.1) & (env.qd.abs().amax(1) < 0.2)
+    v, w = env.object_velocity.split(3, 1)
+    still = (v.norm(dim=1) < 0.01) & (w.norm(dim=1) < 0.1) & (env.qd.abs().amax(1) < 0.2)
     flat = rotation.tilt(end.pose[:, 3:], env.axis) < TILT
     touched = (env.tip_force > 0.02).sum(1) >= TIPS
     inside = (end.pose[:, 2] > 0.03) & (end.pose[:, :2] - torch.tensor(MIDDLE)).norm(dim=1).lt(AROUND)
