@@ -41,18 +41,30 @@ def main(argv: list[str]) -> dict:
     env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
     action = torch.zeros(worlds, env.num_actions, device=device)
     close = torch.zeros_like(action)
-    close[:, 4:] = 0.3
-    close[:, :3] = 0.3
+    close[:, 4:] = 0.5
+    close[:, :3] = 0.4
     env.step(action)
     env.step(action)
     ready = time.perf_counter() - start
-    for k in range(80):  # into a closed grasp: more contacts, as in training
-        env.step(close if k > 14 else action)
+    for k in range(120):  # into a grasp of moderate force: the contacts of training
+        env.step(torch.where((env.torque / env.effort).abs() > 0.4, action, close) if k > 16 else action)
     e = env.engine
-    bare = _time(device, lambda: e.step(env.decimation), steps)
-    driven = _time(device, lambda: e.step(env.decimation, env.servo.before_each), steps)
-    touched = _time(device, lambda: e.step(env.decimation, env.servo.before_each, env.touch.launch), steps)
-    full = _time(device, lambda: env.step(close), steps)
+    ones = torch.ones(worlds, dtype=torch.bool, device=device)
+    qpos, qvel = e.t.qpos.clone(), e.t.qvel.clone()
+
+    def timed(fn) -> float:
+        """Seconds of fn, all worlds put back into the same grasp first."""
+        e.set_state(ones, qpos, qvel)
+        return _time(device, fn, steps)
+
+    # Bare physics: joint friction and damping stay as the servo left them; its last torques go on acting.
+    forces = e.t.qfrc_applied.clone()
+    e.set_state(ones, qpos, qvel)
+    e.t.qfrc_applied.copy_(forces)
+    bare = _time(device, lambda: e.step(env.decimation), 8)
+    driven = timed(lambda: e.step(env.decimation, env.servo.before_each))
+    touched = timed(lambda: e.step(env.decimation, env.servo.before_each, env.touch.launch))
+    full = timed(lambda: env.step(action))
     peaks = e.peaks()
     out = {
         "benchmark": "step", "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu", "engine": e.kind,

@@ -34,8 +34,8 @@ PALM_CENTRE = 0.065  # z of the palm frame on the root link's fingers axis (m)
 # Only what an object in the palm can reach: the backs of palm and fingers have none.
 _PHALANX = [((0.003, 0, 0), (0.003, 0, 0.0584), 0.0081)]
 _PALM_RADIUS = 0.0115
-_PALM_Y = np.linspace(-0.0502 + _PALM_RADIUS, 0.0437 - _PALM_RADIUS, 6)
-_PALM_TOP = [0.082, 0.087, 0.089, 0.091, 0.083, 0.074]  # below each finger's root joint
+_PALM_Y = np.linspace(-0.0502 + _PALM_RADIUS, 0.0437 - _PALM_RADIUS, 4)
+_PALM_TOP = [0.082, 0.088, 0.089, 0.074]  # below each finger's root joint
 CAPSULES = {
     "right_hand_link": [
         ((0.025 - _PALM_RADIUS, y, 0.0135), (0.025 - _PALM_RADIUS, y, top), _PALM_RADIUS)
@@ -47,10 +47,10 @@ CAPSULES = {
         ((-0.0055, 0.003, -0.0016), (-0.0055, 0.0535, -0.0016), 0.0135),
     ],
     "right_hand_thumb_rota_link2": [((-0.0095, 0, 0), (0.0095, 0, 0), 0.008)],
-    "right_hand_index_bend_link": [((0.0012, 0, 0.0045), (0.0012, 0, 0.0190), 0.008)],
+    "right_hand_index_bend_link": [],
     # The index finger's root barrel belongs to its sideways link.
     "right_hand_index_rota_link1": [((0.003, 0, 0.0138), (0.003, 0, 0.0584), 0.0081)],
-    "right_hand_index_rota_link2": [((0, 0, 0), (0.001, 0, 0.0075), 0.0079)],
+    "right_hand_index_rota_link2": [],  # its barrel lies within the end of the link before it
 }
 for _finger in ("mid", "ring", "pinky"):
     CAPSULES[f"right_hand_{_finger}_link1"] = _PHALANX
