@@ -194,13 +194,13 @@ def plant_kernel():
         for i in range(steps):
             g = g0 + i
             # the recorded motion is held on the joint while the drive's own state settles
-            if i < warm:
+            if i <= warm and warm > 0:
                 m1 = series[g, XQ]
                 if round_:
                     m1 = m1 - esin * wp.sin(q) - ecos * (wp.cos(q) - one)
                 q = (m1 - offset) / scale
                 v = series[g, XV] / scale
-                if i == warm - 1:
+                if i == warm:
                     q += inits[h, 0]
                     v += inits[h, 1]
                 if not two:

@@ -13,7 +13,7 @@ from dexsim.gap.plant import Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
 
-SHORT, LONG = 1.0, 5.0  # s: windows of the scan and of the comparisons
+SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
@@ -92,6 +92,8 @@ class JointSearch:
         self.blocks = self._blocks(self.fitter, self.long)
         self.all_nuisances = self._nuisances()
         self.nuisances = self.all_nuisances
+        believed = [p for p in self.all_nuisances if p.key not in case.unknown and not (p.mode == "factor" and p.span > 0.3)]
+        self.wide = {c for p in self.all_nuisances if p not in believed for c in p.columns}
 
     # -- pieces ------------------------------------------------------------------------------------------------------------
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
@@ -195,8 +197,8 @@ class JointSearch:
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for variant in effect.variants(case.scales):
-                if any(set(p.columns) & {c for n in self.nuisances if n.span > 0.5 and n.mode == "factor" for c in n.columns} for p in variant.params):
-                    continue  # already free
+                if any(set(p.columns) & self.wide for p in variant.params):
+                    continue  # not believed to be anything in particular, and fitted anyway
                 for start in variant.starts:
                     g = base.copy()
                     for name, value in variant.fixed:
@@ -252,8 +254,8 @@ class JointSearch:
         q, tau = self.case.plant.simulate(plants, fitter.w)
         return fitter.eliminated(fitter.compare(q, tau, plants), s)
 
-    def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
-        """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long ones."""
+    def draft(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None):
+        """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
         params = self._params(members)
         x0 = np.array([p.start for p in params], float)
         if like is not None:
@@ -262,16 +264,30 @@ class JointSearch:
         x0[: len(starts)] = starts
         low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
         n = sum(len(m.variant.params) for m in members)
-        # an optimizer stalls at a bound: start 5 % inside for what was given
+        # an optimizer stalls at a bound: start inside it
         inside = np.clip(x0, low + 0.02 * (high - low), high - 0.02 * (high - low))
-        x0[:n] = np.where(np.array([p.mode == "add" for p in params[:n]]), x0[:n], inside[:n]) if n else x0[:n]
+        free = np.array([p.mode == "add" for p in params[:n]], bool)
+        x0[:n] = np.where(free, x0[:n], inside[:n])
         with self._fix(members):
-            f = self.scan_fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2)
-            a = self.fitter.fit(params, x0=f.x, iterations=4 if quick else 7, tolerance=5e-3)
+            return members, x0, self.scan_fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2)
+
+    def finish(self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False) -> Trial:
+        """The draft refitted on long windows."""
+        params = short.params
+        with self._fix(members):
+            a = self.fitter.fit(params, x0=short.x, iterations=4 if quick else 7, tolerance=5e-3)
             if like is not None and not quick and a.loss > like.fit.loss:
                 b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3)
                 a = b if b.loss < a.loss else a
         return Trial(members, a)
+
+    def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
+        """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long ones."""
+        return self.finish(*self.draft(members, starts, like), like, quick)
+
+    def _score(self, trial: Trial) -> float:
+        """Left-out loss with a price on parameters: 3 % each."""
+        return float(self.cross(trial).sum()) * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
 
     def cross(self, trial: Trial) -> np.ndarray:
         """Losses by block [B] when the block's condition is left out of the fit: from the optimum of all, one bounded
@@ -344,19 +360,24 @@ class JointSearch:
             listed = self._shortlist(scan, shortlist)
             if not listed:
                 break
-            trials = []
-            for gain, p, member, start in listed:
-                pool.setdefault(member.id, (member, start))
-                seed = self._values(current) if current.members else np.zeros(0)
-                trial = self.fit((*current.members, member), np.concatenate([seed, start]), current)
+            drafts = []
+            for _, p, member, start in listed:
+                if member.id not in pool or price.get(member.id, 1.0) > p:
+                    pool[member.id] = (member, start)
                 price[member.id] = p
+                drafts.append(self.draft((*current.members, member), np.concatenate([self._values(current), start]), current))
+            drafts.sort(key=lambda d: d[2].loss)
+            good = [d for k, d in enumerate(drafts) if k < 2 or (k < 5 and d[2].loss < 2.0 * drafts[0][2].loss + 0.3)]
+            trials = []
+            for d in good:
+                trial = self.finish(*d, current)
                 trials.append(trial)
-                self.fitted[frozenset(trial.ids)] = trial
-            trials.sort(key=lambda tr: tr.fit.loss)
-            trials = trials[:4]
+                known = self.fitted.get(frozenset(trial.ids))
+                if known is None or trial.fit.loss < known.fit.loss:
+                    self.fitted[frozenset(trial.ids)] = trial
             for trial in trials:
                 self.cross(trial)
-            best = min(trials, key=lambda tr: tr.left_out.sum())
+            best = min(trials, key=self._score)
             if not self._earns(best, current):
                 # a pair may be there where neither of its halves is seen alone
                 best = self._pair(current, listed[:4]) or current

@@ -1,0 +1,435 @@
+"""The diagnosis: its plant against the servo's reference and MuJoCo, planted effects, nothing planted, bad input, the page."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator import reference
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.gap import command, demo, inputs, judge, locate
+from dexsim.gap.catalogue import CATALOGUE, EFFECTS, confusable
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.plant import JointPlant, nominal_row
+from dexsim.gap.plant_columns import INDEX, NEUTRAL
+from dexsim.gap.prepare import build, noise
+from dexsim.gap.runs import Run, conditions, local_polynomial
+from dexsim.gap.search import JointSearch
+from dexsim.recording import read, write
+from dexsim.recording.mechanism import drive, mechanism
+
+SERVO = {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}
+
+
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(demo.MODEL)
+
+
+def motion(kind: int, seconds: float, seed: int = 0):
+    return demo.commands(kind, seconds, np.random.default_rng(seed))
+
+
+def plant_run(name: str, kind: int, seconds: float, changes: dict[str, float], seed: int = 0, noisy: bool = True) -> Run:
+    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name')."""
+    t_cmd, cmd = motion(kind, seconds, seed)
+    t = np.arange(0.0, seconds - 0.02, 0.01) + (np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01))))
+    table = ServoTable.from_dict({"joints": {"*": SERVO}, "loop_rate": 1000})
+    rough = Run(name, ("joint",), t_cmd, cmd[:, None], t, np.interp(t, t_cmd, cmd)[:, None], table, np.array([0, 0, -9.81]))
+    for _ in range(3):  # the series are those of the motion itself
+        rough.qs = None
+        rough.smooth()
+        plant = build(model(), [rough])[0].plant
+        params = plant.base()[None].copy()
+        for key, value in changes.items():
+            c = INDEX[key.lstrip("*")]
+            params[..., c] = params[..., c] * value if key.startswith("*") else value
+        q, _ = plant.simulate(params, plant.windows(None))
+        rough.q = q[0][:, None].copy()
+    rough.qs = None
+    if noisy:
+        rough.q = np.round(rough.q / 1.534e-3) * 1.534e-3
+    return rough
+
+
+def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds=(0, 1, 3), seconds: float = 6.0):
+    """The search's outcome on runs of our own plant, its nominal a few percent off."""
+    off = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96} if off is None else off
+    runs = [plant_run(f"run{k}", k, seconds, off | changes, seed=k) for k in kinds]
+    for r in runs:
+        r.smooth()
+    case = build(model(), runs)[0]
+    return JointSearch(case, list(range(len(runs))), None, conditions(runs)).run()
+
+
+# -- the plant ------------------------------------------------------------------------------------------------------------
+
+
+def test_plant_columns_begin_with_the_servos():
+    for name, i in SERVO_INDEX.items():
+        assert INDEX[name] == i
+    assert NEUTRAL[INDEX["position_scale"]] == 1 and NEUTRAL[INDEX["backlash"]] == 0
+
+
+def test_a_stuck_drive_rests_where_the_servo_law_balances_gravity():
+    run = plant_run("hold", 1, 2.0, {"coulomb_friction": 0.0, "viscous_friction": 0.01}, noisy=False)
+    run.cmd[:] = 0.6
+    run.q[:] = 0.55
+    run.qs = None
+    plant = build(model(), [run])[0].plant
+    params = plant.base()[None].copy()
+    params[..., INDEX["coulomb_friction"]] = 0.0
+    q, tau = plant.simulate(params, plant.windows(None))
+    rest, torque = q[0, -1], tau[0, -1]
+    row = run.servo.nominal(["joint"])[0]
+    law = reference.servo(row, 0.6, rest, 0.0, dt=1e-9)["torque"]
+    assert torque == pytest.approx(law, rel=1e-3)
+    assert law == pytest.approx(0.15 * 9.81 * 0.1 * np.sin(rest), rel=2e-3)
+
+
+@pytest.mark.parametrize("change", [{}, {"deadband": 0.03}, {"load_friction": 0.2, "load_friction_backdriven": 0.3}, {"delay": 0.02}])
+def test_plant_follows_the_full_simulation(change):
+    """C MuJoCo with the servo kernel and the gap's own one-joint plant, the same columns: the same motion."""
+    t_cmd, cmd = motion(0, 3.0)
+    table = ServoTable.from_dict({"joints": {"*": SERVO | change}})
+    from dexsim.recording.schema import COMMANDS, Series
+
+    m = mechanism_of(table)
+    full = drive(m, Series(t_cmd, cmd[:, None], COMMANDS, t_cmd), ["joint"], 3.0, timestep=5e-4)
+    pick = slice(0, None, 20)
+    run = Run("full", ("joint",), t_cmd, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81]))
+    run.smooth()
+    plant = build(model(), [run])[0].plant
+    q, _ = plant.simulate(plant.base()[None], plant.windows(None))
+    assert np.sqrt(np.mean((q[0] - plant.q) ** 2)) < 2e-3
+    if change:
+        plain = plant.base()[None].copy()
+        plain[0, 0, :21] = nominal_row(ServoTable.from_dict({"joints": {"*": SERVO}}).nominal(["joint"])[0], 0.0)[:21]
+        other, _ = plant.simulate(plain, plant.windows(None))
+        assert np.sqrt(np.mean((other[0] - plant.q) ** 2)) > 4e-3  # the column matters
+
+
+def mechanism_of(table: ServoTable):
+    spec = mujoco.MjSpec.from_string(demo.MODEL)
+    from dexsim.recording.mechanism import Mechanism
+
+    return Mechanism(spec, ("joint",), table, "pendulum")
+
+
+def test_step_size_does_not_change_a_motion_with_play():
+    run = plant_run("play", 0, 3.0, {}, noisy=False)
+    run.smooth()
+    out = []
+    for dt in (1e-3, 2.5e-4):
+        plant = build(model(), [run], dt=dt)[0].plant
+        params = plant.base()[None].copy()
+        params[..., INDEX["backlash"]] = 0.02
+        out.append(plant.simulate(params, plant.windows(None))[0][0])
+    assert np.sqrt(np.mean((out[0] - out[1]) ** 2)) < 1.5e-3
+
+
+def test_windows_begin_on_the_recorded_motion():
+    run = plant_run("w", 0, 3.0, {}, noisy=False)
+    run.smooth()
+    plant: JointPlant = build(model(), [run])[0].plant
+    w = plant.windows(0.5)
+    q, _ = plant.simulate(plant.base()[None], w)
+    first = np.flatnonzero(np.r_[True, np.diff(w.sample_window) > 0])
+    assert np.abs(q[0, first] - plant.q[w.sample_row[first]]).max() < 2e-3
+    assert len(w.sample_row) == len(np.unique(w.sample_row))
+
+
+# -- pieces ------------------------------------------------------------------------------------------------------------
+
+
+def test_local_polynomial_differentiates_an_irregular_parabola():
+    t = np.sort(np.random.default_rng(0).uniform(0, 1, 200))
+    x, v, a = local_polynomial(t, (0.3 + 2 * t - 3 * t**2)[:, None])
+    inner = slice(8, -8)
+    assert np.allclose(v[inner, 0], (2 - 6 * t)[inner], atol=1e-5) and np.allclose(a[inner, 0], -6, atol=1e-3)
+    assert np.allclose(x[:, 0], 0.3 + 2 * t - 3 * t**2, atol=1e-6)
+
+
+def test_noise_and_quantum():
+    rng = np.random.default_rng(1)
+    t = np.arange(0, 20, 0.01)
+    smooth = np.sin(t)
+    sigma, quantum = noise(t, smooth + 2e-3 * rng.standard_normal(len(t)))
+    assert sigma == pytest.approx(2e-3, rel=0.1) and quantum == 0.0
+    sigma, quantum = noise(t, np.round(smooth / 1e-3) * 1e-3)
+    assert quantum == pytest.approx(1e-3) and sigma == pytest.approx(1e-3 / np.sqrt(12), rel=0.25)
+
+
+def test_floor_from_repeats_of_the_same_commands():
+    rng = np.random.default_rng(2)
+    runs = []
+    for k in range(2):
+        r = plant_run("a", 0, 3.0, {}, noisy=False)
+        r.q = r.q + 3e-3 * rng.standard_normal(r.q.shape)
+        r.qs = None
+        r.smooth()
+        runs.append(r)
+    assert conditions(runs) == [0, 0]
+    value, how = judge.floor(runs, build(model(), runs))
+    assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
+
+
+def test_map_finds_the_regime_and_controls_false_discoveries():
+    rng = np.random.default_rng(3)
+    n = 6000
+    speed, other = rng.uniform(0, 1, n), rng.uniform(0, 1, n)
+    block = np.arange(n) // 50
+    plain = rng.standard_normal(n)
+    found = locate.control(locate.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
+    assert found and found[0].regime == "speed" and found[0].low > 0.7
+    assert not locate.control(locate.spots("j", plain, block, {"speed": speed, "load": other}, rng))
+
+
+def test_rms_interval_covers():
+    rng = np.random.default_rng(4)
+    t = np.arange(0, 60, 0.01)
+    e = np.convolve(rng.standard_normal(len(t)), np.ones(20) / np.sqrt(20), "same")
+    value, low, high = judge.rms_interval([e**2], [t])
+    assert low < 1.0 < high and low < value < high and high - low < 0.3
+
+
+def test_catalogue_is_that_of_the_specification():
+    joint = {"coulomb_friction", "stribeck_friction", "viscous_friction", "load_friction", "backlash", "compliance", "command_delay", "lag",
+             "torque_limit", "torque_speed_limit", "supply_sag", "torque_ripple", "thermal", "joint_coupling", "position_offset", "position_scale",
+             "payload", "inertia", "gain_mismatch", "deadband", "current_sensor"}  # fmt: skip
+    assert joint == set(EFFECTS)
+    assert confusable("backlash", "stribeck_friction") and not confusable("backlash", "inertia")
+    runs = [plant_run("s", 0, 3.0, {})]
+    runs[0].smooth()
+    scales = build(model(), runs)[0].scales
+    for effect in CATALOGUE:
+        for v in effect.variants(scales):
+            assert v.starts
+            for start in v.starts:
+                assert len(start) == len(v.params)
+            for p in v.params:
+                assert p.low < p.high
+
+
+# -- planted effects, in our own plant ------------------------------------------------------------------------------------------------------------
+
+PLANTED = [
+    ("coulomb_friction", {"coulomb_friction": 0.06}, "torque", 0.06),
+    ("viscous_friction", {"viscous_friction": 0.03}, "coefficient", 0.03),
+    ("command_delay", {"delay": 0.02}, "delay", 0.02),
+    ("gain_mismatch", {"kp": 1.4}, "kp_factor", 0.7),
+    ("deadband", {"deadband": 0.03}, "width", 0.03),
+]
+MORE = [
+    ("stribeck_friction", {"stribeck_peak": 0.06, "stribeck_speed": 0.2}, "peak", 0.06),
+    ("load_friction", {"load_friction": 0.25, "load_friction_backdriven": 0.25}, "fraction", 0.25),
+    ("torque_limit", {"torque_limit": 0.12}, "torque", 0.12),
+    ("torque_speed_limit", {"no_load_speed": 3.5}, "no_load_speed", 3.5),
+    ("torque_ripple", {"torque_ripple": 0.04, "ripple_per_turn": 12.0}, "amplitude", 0.04),
+    ("inertia", {"armature": 1.2e-3}, "armature", 1.2e-3),
+    ("payload", {"payload": 0.06}, "mass", 0.06),
+    ("lag", {"lag": 0.02}, "time_constant", 0.02),
+]
+
+
+def check_planted(effect, changes, key, value):
+    outcome = search(changes)
+    assert outcome.best.members, f"{effect}: nothing found; scan {outcome.scanned[:4]}"
+    first = outcome.best.members[0]
+    rivals = [e for e, share in outcome.rivals[first.id] if share > 0.1 and confusable(e, first.id)]
+    assert first.id == effect or effect in rivals, f"{outcome.best.ids} {outcome.rivals}"
+    if first.id == effect:
+        assert outcome.best.fit.value(f"{effect}.{key}") == pytest.approx(value, rel=0.15)
+
+
+@pytest.mark.parametrize(("effect", "changes", "key", "value"), PLANTED, ids=[p[0] for p in PLANTED])
+def test_planted_effect_is_named_and_sized(effect, changes, key, value):
+    check_planted(effect, changes, key, value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "changes", "key", "value"), MORE, ids=[p[0] for p in MORE])
+def test_more_planted_effects(effect, changes, key, value):
+    check_planted(effect, changes, key, value)
+
+
+def test_nothing_planted_nothing_found():
+    outcome = search({}, {"*kp": 0.97, "*kd": 1.04, "*inertia_scale": 1.03, "*coulomb_friction": 1.04, "*gravity_scale": 0.98})
+    assert not outcome.best.members
+
+
+# -- the command ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    paths, model_path, servo, _ = demo.make(folder, "command_delay", seconds=5.0)
+    return folder, paths, model_path, servo
+
+
+@pytest.fixture(scope="module")
+def answer(rig):
+    folder, paths, model_path, servo = rig
+    d = diagnose(Settings(paths, folder / "out", None, str(model_path), str(servo)), say=lambda _: None)
+    save(d, folder / "out")
+    return d, folder / "out"
+
+
+KEYS = {"schema", "verdict", "noise_floor", "nuisance", "held_out", "findings", "unexplained", "next_recording"}
+FINDING = {"effect", "confidence", "alternatives", "indistinguishable", "separating_experiment", "where", "regime", "when", "parameters", "held_out"}
+
+
+def test_diagnosis_json_has_the_keys_of_the_specification(answer):
+    d, out = answer
+    data = json.loads((out / "diagnosis.json").read_text())
+    assert set(data) == KEYS and data["schema"] == 1
+    assert data["verdict"] in ("explained", "partly_explained")
+    assert set(data["noise_floor"]) == {"position_rad", "how"} and data["noise_floor"]["how"] in ("repeats", "split", "quantum")
+    assert {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"} <= set(data["held_out"])
+    f = data["findings"][0]
+    assert set(f) == FINDING and set(f["where"]) == {"joints", "taxels", "topics"}
+    assert f["effect"] == "command_delay" and f["where"]["joints"] == ["joint"]
+    p = f["parameters"]["delay"]
+    assert set(p) == {"value", "low", "high", "unit"} and p["value"] == pytest.approx(0.02, abs=0.003) and p["low"] <= p["value"] <= p["high"]
+    assert all(w["end"] >= w["start"] and w["recording"].endswith(".mcap") for w in f["when"])
+    assert data["held_out"]["after"] < 0.4 * data["held_out"]["before"]
+    assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on"}
+
+
+def test_fitted_servo_loads_again_with_its_interval(answer):
+    d, out = answer
+    value = ServoTable.load(out / "servo.yaml").value("joint", "delay")
+    assert value.value == pytest.approx(0.02, abs=0.003) and value.low < value.value < value.high
+
+
+class WellFormed(html.parser.HTMLParser):
+    VOID = {"meta", "br", "link", "img", "hr", "input"}
+
+    def __init__(self):
+        super().__init__()
+        self.stack, self.tags, self.outside = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.outside += [v for k, v in attrs if k in ("src", "href")]
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.stack and self.stack.pop() == tag, f"</{tag}> closes nothing"
+
+
+def test_report_is_one_well_formed_page_that_stands_alone(answer):
+    d, out = answer
+    text = (out / "report.html").read_text(encoding="utf-8")
+    page = WellFormed()
+    page.feed(text)
+    assert not page.stack and not page.outside and "script" not in page.tags
+    assert page.tags.count("svg") >= 3 and d.sentence.split(".")[0] in text
+    assert "nan" not in text.lower().replace("nance", "")
+
+
+def test_terminal_verdict_is_at_most_ten_lines(answer):
+    text = command.verdict(answer[0]).strip().splitlines()
+    assert len(text) <= 10 and text[0].startswith(("EXPLAINED", "PARTLY EXPLAINED"))
+
+
+# -- bad input ------------------------------------------------------------------------------------------------------------
+
+
+def changed(rig, tmp_path, change, index=0):
+    folder, paths, model_path, servo = rig
+    r = read(paths[index], joints=["joint"])
+    change(r)
+    path = tmp_path / "changed.mcap"
+    write(path, r)
+    return Settings([path], tmp_path / "out", None, str(model_path), str(servo), next_recording=False)
+
+
+def run(settings):
+    d = diagnose(settings, say=lambda _: None)
+    save(d, settings.out)
+    json.loads((settings.out / "diagnosis.json").read_text())
+    return d
+
+
+@pytest.mark.parametrize("what", ["no commands", "no states", "one sample", "all nan", "no motion", "other joints"])
+def test_unusable_recordings_are_a_verdict(rig, tmp_path, what):
+    def change(r):
+        p, c = r.states.position, r.commands
+        if what == "no commands":
+            c.t, c.value, c.stamp = c.t[:0], c.value[:0], None
+        elif what == "no states":
+            p.t, p.value, p.stamp = p.t[:0], p.value[:0], None
+        elif what == "one sample":
+            p.t, p.value, p.stamp = p.t[:1], p.value[:1], None
+        elif what == "all nan":
+            p.value = np.full_like(p.value, np.nan)
+        elif what == "no motion":
+            p.value = np.full_like(p.value, 0.1)
+            c.value = np.full_like(c.value, 0.1)
+        elif what == "other joints":
+            r.joints = ("elbow",)
+            r.meta["joint_names"] = "elbow"
+        if what in ("no states", "one sample"):
+            r.states.velocity = r.states.effort = None
+        else:
+            r.states.effort = None
+
+    d = run(changed(rig, tmp_path, change))
+    assert d.data["verdict"] == "unusable" and d.sentence and not any(f["effect"] in EFFECTS for f in d.data["findings"])
+
+
+def test_some_missing_samples_are_said_not_fatal(rig, tmp_path):
+    def change(r):
+        r.states.position.value[50:60] = np.nan
+
+    d = run(changed(rig, tmp_path, change))
+    assert d.data["verdict"] != "unusable"
+
+
+def test_model_range_in_the_wrong_unit_is_said(rig, tmp_path):
+    folder, paths, model_path, servo = rig
+    wrong = tmp_path / "wrong.xml"
+    wrong.write_text(model_path.read_text().replace('angle="radian"', 'angle="degree"'))
+    d = diagnose(Settings(paths[:2], tmp_path / "out", None, str(wrong), str(servo), next_recording=False), say=lambda _: None)
+    assert any("range" in n and "joint" in n for n in d.notes)
+
+
+def test_user_errors_are_one_line(rig, tmp_path):
+    folder, paths, model_path, servo = rig
+    with pytest.raises(UserError, match="also in recordings"):
+        diagnose(Settings(paths, tmp_path, paths[:1], str(model_path), str(servo)), say=lambda _: None)
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    with pytest.raises(UserError, match="broken.xml"):
+        diagnose(Settings(paths, tmp_path, None, str(broken), str(servo)), say=lambda _: None)
+    for argv, text in ((["recording=a"], "Did you mean 'recordings'"), (["--out=x"], "Did you mean 'out'"), (["demo=perhaps"], "true or false"), (["out=x"], "recordings")):
+        with pytest.raises(UserError, match=text):
+            command.main(argv)
+    with pytest.raises(UserError, match="does not exist"):
+        inputs.files(["nowhere.mcap"], "recordings")
+
+
+def test_help_and_columns(capsys):
+    assert command.main(["--help"]) == 0 and "held_out" in capsys.readouterr().out
+    assert command.main(["columns=true"]) == 0 and "stribeck_peak" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_demo_finds_what_it_hid(tmp_path):
+    folder = tmp_path / "demo"
+    assert command.main(["demo=true", f"out={folder}"]) == 0
+    data = json.loads((folder / "diagnosis.json").read_text())
+    assert data["findings"][0]["effect"] == "stribeck_friction"
+    shutil.rmtree(folder)
