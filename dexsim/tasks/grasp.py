@@ -198,7 +198,7 @@ class GraspEnv(HandEnv):
             "action": w["action"] * (self.action - self.last_action).square().sum(1),  # R_action
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
-            "grip": w["grip"] * contact[:, 0] * contact[:, 1:].any(1),
+            "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
             "force_error": w["force_error"] * ((force[:, 1:] - self.command[:, None] * self.f_max).abs().mean(1) / self.f_max),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),

@@ -169,7 +169,7 @@ def _rate(ok: np.ndarray, among: np.ndarray) -> float | None:
 
 
 def _corr(a: np.ndarray, b: np.ndarray) -> float | None:
-    return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 0 and b.std() > 0 else None
+    return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 1e-9 and b.std() > 1e-9 else None
 
 
 def _metrics(r: dict, k: dict, f_max: float) -> dict:
