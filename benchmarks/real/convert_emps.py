@@ -11,6 +11,7 @@ from benchmarks.real.common import dump, save
 from dexsim.errors import UserError
 
 KP, KV, FORCE_PER_VOLT = 160.18, 243.45, 35.1507  # 1/s, V/(m/s), N/V: of the benchmark's controller and drive
+VOLTS = 10.0
 MODEL = """<mujoco model="emps">
   <option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
   <worldbody>
@@ -43,9 +44,11 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
     out.mkdir(parents=True, exist_ok=True)
     model = out / "emps.xml"
     model.write_text(MODEL.format(mass=mass), encoding="utf-8")
+    # the law is volts = KV * (KP * error - speed); as a duty of 10 V, of which the drive makes FORCE_PER_VOLT * 10 N
     servo = dump(out / "emps.yaml", {
-        "drive": "torque", "loop_rate": 1000,
-        "joints": {"*": {"kp": float(KP * KV * FORCE_PER_VOLT) if KP * KV * FORCE_PER_VOLT < 1e5 else 1e5, "kd": 1e4}},
+        "drive": "voltage", "loop_rate": 1000,
+        "joints": {"*": {"kp": KP * KV / VOLTS, "kd": KV / VOLTS, "torque_limit": FORCE_PER_VOLT * VOLTS, "coulomb_friction": "unknown",
+                         "viscous_friction": "unknown"}},
     })  # fmt: skip
     paths = []
     for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):

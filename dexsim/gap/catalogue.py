@@ -48,6 +48,7 @@ class Scales:
     saturates: float  # share of samples at the believed limit
     base_friction: float = 0.0
     base_damping: float = 0.0
+    armature: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ def _coulomb(s: Scales) -> list[Variant]:
 
 def _stribeck(s: Scales) -> list[Variant]:
     peak = _p("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
-    v_s = _p("v_s", "stribeck_speed", "set", 0.003 * s.speed, 1.0 * s.speed, 0.1 * s.speed, "rad/s")
-    return [Variant((peak, v_s), tuple((a * s.tau, b * s.speed) for a in (0.08, 0.3) for b in (0.03, 0.12, 0.4)))]
+    v_s = _p("v_s", "stribeck_speed", "set", 0.003 * s.speed, 0.35 * s.speed, 0.1 * s.speed, "rad/s")
+    return [Variant((peak, v_s), tuple((a * s.tau, b * s.speed) for a in (0.08, 0.3) for b in (0.02, 0.08, 0.25)))]
 
 
 def _viscous(s: Scales) -> list[Variant]:
@@ -133,7 +134,11 @@ def _backlash(s: Scales) -> list[Variant]:
     top = min(0.5 * s.span, 60 * s.error + 30 * s.sigma)
     gap = _p("gap", "backlash", "set", 0.0, top, 0.0, "m" if s.slide else "rad")
     starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 12.0, 40.0, 120.0)})
-    return [Variant((gap,), tuple((x,) for x in starts))]
+    rebound = _p("rebound", "rebound", "set", 0.02, 0.7, 0.1)
+    params, extra = (gap, rebound), (0.1,)
+    if s.armature <= 0:  # how much of the inertia is the rotor's is not known
+        params, extra = (*params, _p("rotor", "rotor", "set", 0.05 * s.inertia, 0.95 * s.inertia, 0.3 * s.inertia)), (0.1, 0.3 * s.inertia)
+    return [Variant(params, tuple((x, *extra) for x in starts))]
 
 
 def _compliance(s: Scales) -> list[Variant]:

@@ -19,6 +19,7 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("tilt_y", 0.0, "rad", "gravity turned about the world's y"),
     ("tilt_z", 0.0, "rad", "gravity turned about the world's z"),
     ("backlash", 0.0, "rad", "total free play between rotor and link"),
+    ("rebound", 0.1, "1", "damping ratio of the contact at the ends of the play"),
     ("softness", 0.0, "rad/N.m", "1 / stiffness of the transmission"),
     ("rotor", 0.0, "kg.m2", "rotor's part of the inertia, used where there is play or elasticity"),
     ("sag", 0.0, "1/N.m", "supply lost per N.m that the other joints' motors give"),

@@ -19,7 +19,7 @@ import warp as wp
 from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
 
 f64 = wp.float64
-TWO_BODY_STEPS = 3  # sub-steps of the two-inertia plant in one step of the grid
+TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
@@ -57,7 +57,7 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
 )
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
 XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
-P_FROM = INDEX["coupling_from"]
+P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 
 
 @lru_cache(maxsize=None)
@@ -372,7 +372,7 @@ def plant_kernel():
                         stiff = consts[C_STIFF]
                     damp = f64(0.1) * wp.sqrt(stiff * link)
                     if soft <= zero:
-                        damp = f64(0.25) * wp.sqrt(stiff * rotor * link / inertia)  # gear teeth rebound
+                        damp = f64(2.0) * params[h, P_REBOUND] * wp.sqrt(stiff * rotor * link / inertia)  # how gear teeth rebound
                     twist = qm + dts * vm - q - dts * v
                     engaged = zero
                     side = zero

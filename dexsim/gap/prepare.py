@@ -167,7 +167,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99), load_torque=big(load_t), load_inertia=float(np.median(load_i)),
         tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"}, warm=warm, slide=constants.slide, voltage=voltage,
         effort=effort_noise > 0, saturates=float(np.mean(np.abs(asked) >= (1.0 if False else limit) * 0.98)),
-        base_friction=constants.friction, base_damping=constants.damping,
+        base_friction=constants.friction, base_damping=constants.damping, armature=constants.armature,
     )  # fmt: skip
     table = runs[0].servo
     ranges, unknown = {}, []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
+BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.3  # x the noise: an error within it needs no effect
 MOST = 4  # effects on one joint
@@ -169,6 +170,12 @@ class JointSearch:
         """No effect: the nuisances alone. Those without a trace are left out from here on."""
         params = self.all_nuisances
         f = self.scan_fitter.fit(params, iterations=6)
+        if self.scan_fitter.use_torque:  # neither signal drowns the other: what is missing shows in both
+            n = self.scan_fitter.w.n
+            parts = [float(np.sqrt(np.mean(x**2))) for x in (f.residual[:n], f.residual[n:][self.scan_fitter.tau_on])]
+            self.r.sigma_q *= max(1.0, BALANCE * parts[0])
+            self.r.sigma_torque *= max(1.0, BALANCE * parts[1])
+            f = self.scan_fitter.fit(params, x0=f.x, iterations=4)
         if params:
             span = np.array([p.span for p in params])
             trace = np.sqrt((f.jacobian**2).mean(0)) * span
@@ -197,8 +204,9 @@ class JointSearch:
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for variant in effect.variants(case.scales):
-                if any(set(p.columns) & self.wide for p in variant.params):
-                    continue  # not believed to be anything in particular, and fitted anyway
+                variant = self._narrow(variant)
+                if variant is None:
+                    continue
                 for start in variant.starts:
                     g = base.copy()
                     for name, value in variant.fixed:
@@ -249,6 +257,16 @@ class JointSearch:
                 best[key] = (gain, member, start)
         out = [(g, float(np.mean(null >= g)), m, st) for g, m, st in best.values()]
         return sorted(out, key=lambda o: -o[0])
+
+    def _narrow(self, variant: Variant) -> Variant | None:
+        """The variant without parameters that are fitted anyway, because nothing in particular is believed of them."""
+        keep = [i for i, p in enumerate(variant.params) if not set(p.columns) & self.wide]
+        if len(keep) == len(variant.params):
+            return variant
+        if not keep or all(variant.params[i].key in ("per_turn", "phase", "v_s") for i in keep):
+            return None
+        starts = tuple(dict.fromkeys(tuple(s[i] for i in keep) for s in variant.starts))
+        return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)
 
     def _simulate(self, fitter: Fitter, plants: np.ndarray, s) -> np.ndarray:
         q, tau = self.case.plant.simulate(plants, fitter.w)
@@ -578,8 +596,6 @@ class _Fixed:
 
 def _named(member: Member) -> list[Param]:
     """The member's parameters with keys unique in a hypothesis."""
-    from dataclasses import replace
-
     return [replace(p, key=f"{member.id}.{p.key}") for p in member.variant.params]
 
 
