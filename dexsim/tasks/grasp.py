@@ -8,6 +8,7 @@ configs/task/grasp.yaml.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from dexsim.assets import xhand
@@ -297,3 +298,24 @@ class GraspEnv(HandEnv):
         from dexsim.tasks.grasp_eval import evaluate
 
         return evaluate(self, policy, episodes, seed, progress)
+
+    def scripted_policy(self, rate: float = 0.5, wait: float = 0.35):
+        """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then close
+        thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd of its
+        maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
+        if self.task["action"]["mode"] != "relative":
+            raise UserError(f"policy=scripted: moves by task.action.mode=relative, not {self.task['action']['mode']}")
+        start = dict(zip((row[0] for row in OBSERVATION), np.cumsum([0, *(row[1] for row in OBSERVATION)]), strict=False))
+        torque, vz, command = start["joint_torque"], start["object_velocity"] + 2, start["force_command"]
+        closing = torch.zeros(self.num_actions, device=self.device)
+        closing[INNER + OUTER], closing[:3] = rate, torch.tensor([rate, 0.8 * rate, 0.8 * rate], device=self.device)
+        age = torch.zeros(self.num_envs, device=self.device)
+
+        def policy(obs) -> torch.Tensor:
+            x = obs["actor"]
+            # a finite difference of a noisy height is exactly zero only where an episode has just begun
+            age.copy_(torch.where(x[:, vz] == 0, torch.zeros_like(age), age + self.dt))
+            light = x[:, torque : torque + self.num_actions].abs() < (0.1 + 0.6 * x[:, command])[:, None]
+            return closing * (light & (age >= wait)[:, None])
+
+        return policy
