@@ -14,7 +14,7 @@ from dexsim.actuator import reference
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import command, demo, inputs, judge, locate
+from dexsim.gap import command, demo, inputs, judge, locate, stage, touch
 from dexsim.gap.catalogue import CATALOGUE, EFFECTS, confusable
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.plant import JointPlant, nominal_row
@@ -189,6 +189,31 @@ def test_map_finds_the_regime_and_controls_false_discoveries():
     found = locate.control(locate.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
     assert found and found[0].regime == "speed" and found[0].low > 0.7
     assert not locate.control(locate.spots("j", plain, block, {"speed": speed, "load": other}, rng))
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.7])
+def test_stage_test_reads_the_drives_gain(factor):
+    r = plant_run("s", 0, 4.0, {}, noisy=False)
+    r.smooth()
+    cases = build(model(), [r])
+    r.torque = (2.0 * (r.command_at(r.t) - r.q) - 0.04 * r.vs) * factor
+    (found,) = stage.tests(cases, [r], [0])
+    assert found.slope == pytest.approx(factor, rel=0.02) and found.delay == 0.0 and found.sound == (factor == 1.0)
+
+
+def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
+    from pathlib import Path
+
+    from dexsim.recording import Recording, Series, States
+
+    t = np.arange(0, 2, 0.02)
+    grid = np.exp(-0.5 * ((np.arange(10)[:, None] - 5) ** 2 + (np.arange(12)[None] - 6) ** 2) / 4).reshape(-1)
+    z = np.zeros((len(t), 5, 120, 3))
+    z[:, 1, :, 2] = np.round(100 * np.abs(np.sin(t))[:, None] * grid)
+    z[:, 1, 5 * 12 + 7, 2] = 0.0
+    empty = Series.empty("x", 1)
+    found = touch.findings([Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))])
+    assert [f["where"]["taxels"] for f in found] == [["1:67"]]
 
 
 def test_rms_interval_covers():

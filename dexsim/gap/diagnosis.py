@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import inputs, judge, locate
+from dexsim.gap import inputs, judge, locate, stage, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.findings import finding_parameters, model_changes, servo_changes
 from dexsim.gap.fit import Fitter, expand, intervals
@@ -142,6 +142,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         runs.append(run)
         used.append(r)
     channel = inputs.channel_findings([r for r in recordings if r is not None], m.joints)
+    channel += touch.findings([r for r in recordings if r is not None])
     notes += failures
     if failures and runs and len(held) < len(runs):
         say(f"  left out: {'; '.join(failures)}")
@@ -173,6 +174,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     floor, floor_how = judge.floor(runs, cases)
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
+    stages = stage.tests(cases, runs, train, s.seed)
+    for x in stages[:4]:
+        say(f"  {x.text}")
+    clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
     rng = np.random.default_rng(s.seed)
     for k, case in enumerate(cases):
@@ -189,6 +194,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         progress(len(cases), len(cases), "")
     clock.lap("search")
     result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
+    result.stages = [x.text for x in stages]
     clock.lap("judging on held-out data")
     if s.next_recording:
         _next(result, s, m)
@@ -428,7 +434,7 @@ def _sentence(data: dict, d: Diagnosis, floor: float) -> str:
     unit = "mm" if data["held_out"]["error"].endswith("_m") else "mrad"
     h = data["held_out"]
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
-    named = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    named = [f for f in data["findings"] if f["effect"] in EFFECTS]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
     prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
     if data["verdict"] == "none":
@@ -455,7 +461,7 @@ def _sentence(data: dict, d: Diagnosis, floor: float) -> str:
 def _next(d: Diagnosis, s: Settings, m: Mechanism) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
-    named = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    named = [f for f in data["findings"] if f["effect"] in EFFECTS]
     unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < 0.8]
     kinds, joints, why = None, None, ""
     table = {"coulomb_friction": ["triangles", "steps"], "stribeck_friction": ["triangles", "ladder"], "backlash": ["triangles", "chirp"],

@@ -141,7 +141,7 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
 
 def verdict(findings: list[dict], floor_: float, before: float, before_low: float, after: float, structured: bool) -> str:
     """The one word."""
-    named = [f for f in findings if f["effect"] != "bad_channel"]
+    named = [f for f in findings if f["held_out"]]
     if not named:
         if before_low <= 1.3 * floor_ or not structured:
             return "none"

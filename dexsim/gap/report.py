@@ -42,6 +42,8 @@ def page(d: Diagnosis) -> str:
         parts.append(_curves(d))
     parts.append(_when(d))
     parts.append(_map(d))
+    if d.stages:
+        parts.append("<section><h2>Stage by stage</h2><ul>" + "".join(f"<li>{_t(x)}</li>" for x in d.stages) + "</ul></section>")
     parts.append(_next(d))
     parts.append(_notes(d))
     body = "\n".join(p for p in parts if p)
@@ -122,13 +124,13 @@ def _findings(d: Diagnosis) -> str:
         k = 1e3
         error = f"{k * h['before']:.3g} &#8594; {k * h['after']:.3g}" if h else "&#8211;"
         name = f["effect"].replace("_", " ")
-        words = EFFECTS[f["effect"]].words if f["effect"] in EFFECTS else "a signal is not what it says"
+        words = EFFECTS[f["effect"]].words if f["effect"] in EFFECTS else "is not what it says"
         rivals = ", ".join(f"{a['effect'].replace('_', ' ')} ({100 * a['confidence']:.0f} %)" for a in f["alternatives"] if a["confidence"] >= 0.005)
         lost = f"<br/><span class='soft'>Runner-up: {_t(rivals)}; it follows the left-out stretches less well.</span>" if rivals else (
             "<br/><span class='soft'>No other effect of the catalogue comes near.</span>" if f["effect"] in EFFECTS else "")
         if f["indistinguishable"]:
             lost = f"<br/><b>Cannot be told apart here:</b> {_t(', '.join(x.replace('_', ' ') for x in f['indistinguishable']))}. To separate them: {_t(f['separating_experiment'])}."
-        where = ", ".join(f["where"]["joints"] or f["where"]["topics"])
+        where = ", ".join(f["where"]["joints"] or f["where"]["taxels"] or f["where"]["topics"])
         rows.append(f'<tr><td><b>{_t(name)}</b><br/><span class="soft">{_t(where)} {_t(words)}; it shows {_t(f["regime"])}.</span>{lost}</td>'
                     f'<td>{_parameters(f)}</td><td class="n">{100 * f["confidence"]:.0f} %</td><td class="n">{error}</td></tr>')  # fmt: skip
     return ('<section><h2>What is missing</h2><table><tr><th>effect</th><th>parameters (90 % interval)</th><th class="n">confidence</th>'

@@ -17,6 +17,7 @@ SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
+BUDGET = 100.0  # s of a joint's recordings that the search simulates
 BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.3  # x the noise: an error within it needs no effect
@@ -76,6 +77,7 @@ class JointSearch:
         plant = case.plant
         self.short = plant.windows(SHORT, train, span=span)
         self.long = plant.windows(long, train, span=span)
+        self.short, self.long = (_thin(w, plant) for w in (self.short, self.long))
         sigma = case.sigma
         self.r = Residuals(sigma, case.sigma_torque, sigma_q0=0.7 * sigma, sigma_v0=max(sigma / 0.02, 0.02 * case.scales.speed))
         self.scan_fitter = Fitter(plant, self.short, self.r)
@@ -614,6 +616,16 @@ def _legal(g: np.ndarray) -> np.ndarray:
     for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
         g[:, INDEX[name]] = np.maximum(g[:, INDEX[name]], 0.0)
     return g
+
+
+def _thin(w: Windows, plant) -> Windows:
+    """At most BUDGET seconds of windows, evenly over all: more would say little more."""
+    seconds = float(w.window[:, 1].sum()) * plant.dt
+    if seconds <= BUDGET:
+        return w
+    keep = np.zeros(len(w.window), bool)
+    keep[np.unique(np.linspace(0, len(w.window) - 1, max(int(len(w.window) * BUDGET / seconds), 8)).astype(int))] = True
+    return subset(w, keep)
 
 
 def subset(w: Windows, keep: np.ndarray) -> Windows:
