@@ -21,6 +21,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     out = folder.make(_out(start), "out=")
     what = start.source or f"policy {play['policy']}"
     env = build.build_env(cfg, make_env, {"policy": what, "results": out})
+    env.dump_folder = out  # for worlds that were not finite
     if start.data is not None:
         checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))
         policy = load_policy(start.data, env, str(start.source))

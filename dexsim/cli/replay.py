@@ -23,6 +23,7 @@ def replay(env: Any, policy: Policy, out: Path, episodes: int, seed: int, video:
     """
     with torch.no_grad():
         result = env.evaluate(policy, episodes=episodes, seed=seed, progress=Ticker("episodes"))
+    env.check()  # figures of worlds that lost contacts are worth nothing
     metrics = result["metrics"]
     (out / "metrics.json").write_text(json.dumps(_plain(metrics | {"about": about | {"seed": seed}}), indent=2) + "\n")
     rows = [(name, value) for name, value in metrics.items() if not isinstance(value, (list, dict))]

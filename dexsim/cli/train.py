@@ -31,6 +31,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     folder.write_config(where, cfg)
     with Stop() as stop:
         env = build.build_env(cfg, make_env, {"run": where})
+        env.dump_folder = where  # for worlds that were not finite
         build.print_tables(env)
         stop.asked()  # Ctrl-C while compiling: nothing to save
         runner = Runner(env, cfg, machine.versions())

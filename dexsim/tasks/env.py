@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
 import torch
@@ -27,6 +28,7 @@ from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import xhand_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
+from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
 
@@ -93,6 +95,7 @@ class HandEnv(VecEnv):
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()
+        self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
         self.reset_all()
 
@@ -162,10 +165,12 @@ class HandEnv(VecEnv):
     def _before(self) -> None:
         self.act(self._action_in)
         self.before_physics()
+        self._nan_dump.before()
 
     def _after(self) -> None:
         self.episode_length_buf += 1
         self.read_state()
+        self._nan_dump.after(self.nan)
         ends = self.terminated()
         ends["nan"] = self.nan
         dead = torch.stack(list(ends.values())).any(0)
@@ -360,7 +365,12 @@ class HandEnv(VecEnv):
         return model
 
     def check(self) -> None:
-        """Raise UserError if contacts were lost since the last call. Reads from the device: once an iteration."""
+        """Raise UserError if contacts were lost since the last call; write a world that was not finite to `dump_folder`
+        (a file nan_<k>.npz). Reads from the device: once an iteration."""
+        path = self._nan_dump.write(Path(self.dump_folder))
+        if path is not None:
+            print(f"a world was not finite and began anew ({int(self.nan_count)} so far); one is kept in {path}: "
+                  f"python -m dexsim.tasks.nan_dump {path} repeats the step", flush=True)
         self.engine.check_overflow()
 
     @property
