@@ -12,6 +12,8 @@ import numpy as np
 import torch
 
 from dexsim.assets import xhand
+from dexsim.deploy import observations
+from dexsim.deploy.observations import ACTOR_SIZE, OBSERVATION
 from dexsim.errors import UserError
 from dexsim.tasks import rotation, terms
 from dexsim.tasks.env import HandEnv
@@ -23,17 +25,6 @@ FINGER_ROOT = [xhand.FLEXION_ROOT[f] for f in xhand.FINGERS]
 INNER, OUTER = [4, 6, 8, 10], [5, 7, 9, 11]
 """First and second flexion joints of the four fingers (SDK order)."""
 
-OBSERVATION = (  # table (a): name, width, unit, what it is on hardware
-    ("joint_angle", 12, "rad", "measured"),
-    ("joint_torque", 12, "tau/tau_max", "motor current, as calibrated"),
-    ("object_position", 3, "m", "x, y held at their first value; z from vision: noisy, delayed"),
-    ("object_velocity", 3, "m/s", "finite difference of the measured z; x, y zero"),
-    ("contact_force", 5, "F/F_max", "sum of a pad's normal forces"),
-    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
-    ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
-    ("force_command", 1, "F/F_max", "0..1"),
-)
-ACTOR_SIZE = sum(row[1] for row in OBSERVATION)
 assert ACTOR_SIZE == 66
 
 PRIVILEGED = (
@@ -218,22 +209,18 @@ class GraspEnv(HandEnv):
         if advance:
             self.z_history.copy_(torch.cat([z[:, None], self.z_history[:, :-1]], 1))
             seen = self.z_history.gather(1, self.z_delay[:, None])[:, 0] + sense["vision_z_noise"] * s.normal()
-            self.vz_seen.copy_((seen - self.z_seen) / self.dt)
+            self.vz_seen.copy_(observations.height_speed(seen, self.z_seen, self.dt))
             self.z_seen.copy_(seen)
         fresh = self.episode_length_buf == 0
         vz = torch.where(fresh, torch.zeros_like(z), self.vz_seen)
-        zero2 = torch.zeros(n, 2, device=self.device)
         torque_max = self.effort
-        actor = torch.cat([
-            self.q + sense["joint_noise"] * s.normal(12),
-            self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
-            self.first_xy, self.z_seen[:, None],
-            zero2, vz[:, None],
-            self.touch.force / self.f_max,
-            self.touch.centre.reshape(n, 15),
-            self.tips.reshape(n, 15) + sense["tip_noise"] * s.normal(15),
-            self.command[:, None],
-        ], 1)  # fmt: skip
+        actor = observations.build(observations.Signals(
+            joint_position=self.q + sense["joint_noise"] * s.normal(12),
+            joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
+            object_xy=self.first_xy, object_z=self.z_seen, object_vz=vz,
+            touch_force=self.touch.force, touch_centre=self.touch.centre,
+            fingertip=self.tips + sense["tip_noise"] * s.normal(15).reshape(n, 5, 3),
+            command=self.command), self.f_max)  # the deployed loop builds its own with the same function
         critic = [
             self.q, self.torque / torque_max, self.object_pose[:, :3], self.object_velocity[:, :3],
             self.touch.force_clean / self.f_max, self.touch.centre_clean.reshape(n, 15), self.tips.reshape(n, 15), self.command[:, None],
