@@ -1,0 +1,267 @@
+"""A policy bundle: python -m dexsim.export checkpoint=... out=DIR; python -m dexsim.export check=DIR."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dexsim.errors import UserError
+
+USAGE = """usage: python -m dexsim.export checkpoint=FILE out=DIR [key=value ...]
+       python -m dexsim.export check=DIR
+
+Write a policy as one folder that a robot can run:
+
+  DIR/policy.onnx     observation -> action, the observations' normalization inside, one file
+  DIR/manifest.yaml   what every number of the observation is; joints, fingers, actions, rates, calibration, perception
+  DIR/golden.npz      inputs and outputs of this machine, which check=DIR recomputes with onnxruntime
+  DIR/config.yaml     the training's settings, for the simulated hand
+
+settings (key=default):
+  checkpoint=         policy.pt, last.pt or model_*.pt
+  out=                a new or empty folder
+  calibration=        calibration.yaml of python calibrate.py (default: nothing measured, assumptions stated)
+  check=              a bundle to recompute
+  steps=64            golden rows from a simulated episode; as many again are drawn at random
+  seed=0              of both
+"""
+KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed")
+TOLERANCE = 1e-5
+OPSET = 17
+
+
+def main(argv: Sequence[str]) -> int:
+    """Returns the exit status. Raises UserError."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(USAGE, end="")
+        return 0 if argv else 2
+    given = _settings(argv)
+    if "check" in given:
+        if len(given) > 1:
+            raise UserError("check=DIR goes alone")
+        return 0 if check(given["check"]) else 1
+    for key in ("checkpoint", "out"):
+        if not given.get(key):
+            raise UserError(f"say {key}=... (python -m dexsim.export --help)")
+    out = export(given["checkpoint"], given["out"], given.get("calibration"), _whole(given, "steps", 64), _whole(given, "seed", 0))
+    return 0 if check(out) else 1
+
+
+def export(checkpoint: str, out: str | Path, calibration: str | None = None, steps: int = 64, seed: int = 0) -> Path:
+    """Write the bundle of a checkpoint; returns its folder. Raises UserError."""
+    from dexsim.calibration.file import Calibration
+    from dexsim.cli import folder
+    from dexsim.cli.build import quiet_warp
+    from dexsim.deploy import bundle
+    from dexsim.learning import checkpoint as checkpoints
+    from dexsim.learning.ppo import load_policy
+
+    data = checkpoints.load(checkpoint)
+    task = data["config"]["choices"]["task"]
+    if data["config"]["task"].get("name", task) != "grasp":
+        raise UserError(f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of task=grasp only")
+    measured = None if calibration is None else Calibration.load(calibration)
+    out = Path(out).expanduser()
+    if out.is_dir() and any(out.iterdir()):
+        raise UserError(f"out={out}: already holds files; choose another folder")
+    out = folder.make(out, "out=")
+    import torch
+
+    from dexsim.tasks import make_env
+
+    quiet_warp("cpu")
+    torch.manual_seed(seed)
+    cfg = data["config"] | {"device": "cpu", "worlds": 1}
+    print("building the task, for its scales and for golden episodes ...", flush=True)
+    env = make_env(cfg, 1, "cpu", seed, "mujoco")
+    checkpoints.check_layout(data, checkpoints.layout_of(env), checkpoint)
+    policy = load_policy(data, env, str(checkpoint))
+    model = policy.as_onnx(verbose=False).eval().to("cpu")
+    path = out / bundle.POLICY
+    with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
+        warnings.simplefilter("ignore")
+        torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False, opset_version=OPSET,
+                          input_names=["observation"], output_names=["action"],
+                          dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
+    rows = golden(env, policy, model, steps, seed)
+    import numpy as np
+    import yaml
+
+    np.savez_compressed(out / bundle.GOLDEN, **rows)
+    measured = Calibration.default(env.effort.double().numpy()) if measured is None else measured
+    m = manifest(env, data, measured, path, len(rows["observation"]))
+    (out / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
+    (out / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
+    for text in measured.assumed:
+        print(f"note     {text}")
+    print(f"bundle   {out}")
+    return out
+
+
+def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
+    """Inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets before and
+    after they were built from and led to, and as many random observations."""
+    import numpy as np
+    import torch
+
+    from dexsim.deploy import observations
+
+    seen: list[tuple] = []
+    build = observations.build
+    kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))}
+
+    def watch(signals: Any, force_max: float) -> Any:
+        seen.append(type(signals)(*(x.clone() for x in signals)))  # some are the task's own memory
+        return build(signals, force_max)
+
+    env.rng.manual_seed(seed)
+    observations.build = watch  # the task calls it by its module
+    try:
+        with torch.no_grad():
+            env.reset_all()
+            for _ in range(steps):
+                obs = env.get_observations()
+                signals, q, before = seen[-1], env.q.clone(), env.target.clone()
+                env.step(policy(obs))
+                if bool(env.done[0]):
+                    continue  # the target is the new episode's
+                kept["observation"].append(obs["actor"][0])
+                for name, value in zip(signals._fields, signals, strict=True):
+                    kept[f"signal_{name}"].append(value[0].clone())
+                for name, value in (("q", q[0]), ("before", before[0]), ("target", env.target[0].clone())):
+                    kept[name].append(value)
+    finally:
+        observations.build = build
+    rng = torch.Generator().manual_seed(seed)
+    episode = torch.stack(kept["observation"])
+    spread = episode.mean(0) + 3 * episode.std(0).clamp(min=0.05) * torch.randn(steps, episode.shape[1], generator=rng)
+    with torch.no_grad():
+        everything = torch.cat([episode, spread])
+        action = model(everything)
+    out = {k: torch.stack(v).numpy() for k, v in kept.items() if k != "observation"}
+    out |= {"observation": everything.numpy(), "action": action.numpy(), "force_max": np.float64(env.f_max)}
+    return out
+
+
+def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
+    """Everything that a robot must know, as plain data."""
+    from dexsim.assets import xhand
+    from dexsim.deploy import bundle, observations
+
+    task, cfg = env.task, data["config"]
+    at, table = 0, []
+    for name, width, unit, source in observations.OBSERVATION:
+        scaling = {"tau/tau_max": "torque [N.m] / normalization.tau_max", "F/F_max": "force [N] / normalization.force_max_N"}.get(unit, "none")
+        if name == "force_command":
+            scaling = "the commanded share of normalization.force_max_N"
+        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": observations.FRAME[name],
+                      "order": observations.ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
+        at += width
+    floats = lambda x: [round(float(v), 9) for v in x]  # noqa: E731
+    action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]), "lead": float(task["action"]["lead"]),
+              "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
+              "speed_limit_rad_s": floats(xhand.speeds()), "order": "joints"}  # fmt: skip
+    return {
+        "format": bundle.FORMAT, "version": bundle.VERSION, "task": "grasp",
+        "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",
+                   "observation_size": at, "action_size": env.num_actions, "opset": OPSET, "dtype": "float32",
+                   "normalization": "inside: feed the observation as the table below states it"},
+        "observation": table,
+        "joints": list(xhand.JOINTS), "fingers": list(xhand.FINGERS),
+        "taxels": {"per_finger": xhand.TAXELS_PER_FINGER, "index": "column * 12 + row", "layout": "xhand_right"},
+        "action": action,
+        "initial_pose": floats(env.pose0),
+        "rates": {"policy_period_s": env.dt, "policy_hz": round(1 / env.dt, 4), "read_hz": 100.0,
+                  "height_delay_s": [float(x) for x in task["sensors"]["vision_delay"]]},
+        "normalization": {"tau_max": floats(env.effort), "force_max_N": float(env.f_max)},
+        "calibration": calibration.to_dict(),
+        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the palm's centre,"
+                                        " along the palm's normal", "object_xy": "held at the first value",
+                       "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
+        "servo": cfg["servo"],
+        "golden": {"file": bundle.GOLDEN, "rows": rows, "tolerance": TOLERANCE},
+        "versions": _versions(data),
+        "trained": {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "git": data["git"]},
+    }  # fmt: skip
+
+
+def _versions(data: dict[str, Any]) -> dict[str, Any]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    here = {}
+    for name in ("dexsim", "torch", "onnx", "onnxruntime", "numpy", "mujoco"):
+        try:
+            here[name] = version(name)
+        except PackageNotFoundError:
+            here[name] = "not installed"
+    return {"bundle": 1, "exported_with": here, "trained_with": {k: str(v) for k, v in data["versions"].items()}}
+
+
+def check(path: str | Path) -> bool:
+    """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints the largest
+    differences. False where one is beyond the manifest's tolerance."""
+    import numpy as np
+    import torch
+
+    from dexsim.deploy import bundle, observations
+    from dexsim.deploy.action import ActionRule
+
+    b = bundle.load(path)
+    m = b.manifest
+    file = b.path / bundle.GOLDEN
+    try:
+        rows = dict(np.load(file, allow_pickle=False))
+        observation, expected = rows["observation"], rows["action"]
+        n = len(rows["q"])
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise UserError(f"{file}: cannot be read ({str(error).splitlines()[0][:100]}); export the bundle again") from None
+    here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
+    ours = [row[:3] for row in observations.OBSERVATION]
+    if here != ours:
+        bad = next(i for i in range(len(here) + 1) if here[: i + 1] != ours[: i + 1])
+        raise UserError(f"{path}: observation {here[bad:bad + 1]} is not this dexsim's {ours[bad:bad + 1]}: use the dexsim of its versions")
+    built = observations.build(
+        observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields)), float(rows["force_max"]))
+    rule = ActionRule.from_manifest(m["action"])
+    targets = np.stack([rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)])
+    single = np.concatenate([b.act(row[None]) for row in observation])
+    apart = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
+    found = {
+        "actions": float(apart(b.act(observation), expected).max()),
+        "actions, one row at a time": float(apart(single, expected).max()),
+        "observations": float(np.abs(built.numpy() - observation[:n]).max()),
+        "targets [rad]": float(np.abs(targets - rows["target"]).max()),
+    }
+    limit = float(m["golden"]["tolerance"])
+    for name, value in found.items():
+        print(f"golden   {name}: largest difference {value:.2g} over {len(observation)} rows ({'ok' if value <= limit else 'FAILED'})")
+    good = all(v <= limit for v in found.values())
+    if not good:
+        print(f"golden   FAILED: allowed {limit:g}; this onnxruntime computes otherwise than the exporting machine", file=sys.stderr)
+    return good
+
+
+def _settings(argv: Sequence[str]) -> dict[str, str]:
+    out = {}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if not equals or key not in KEYS:
+            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
+        out[key] = value
+    return out
+
+
+def _whole(given: dict[str, str], key: str, default: int) -> int:
+    text = given.get(key, str(default))
+    if not text.isdigit() or (key == "steps" and int(text) < 2):
+        raise UserError(f"{key}={text}: must be a whole number{' of at least 2' if key == 'steps' else ''}")
+    return int(text)
+
+
+if __name__ == "__main__":
+    from dexsim.cli.ending import guard
+
+    sys.exit(guard(main, sys.argv[1:]))
