@@ -41,7 +41,7 @@ def versions_line() -> str:
 
 
 def describe_env(tables: dict[str, Any]) -> str:
-    """The tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization."""
+    """The tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization; then its notes."""
     parts = []
     for group, rows in tables.get("observations", {}).items():
         total = sum(int(row[1]) for row in rows)
@@ -55,6 +55,8 @@ def describe_env(tables: dict[str, Any]) -> str:
         if rows := tables.get(key):
             rows = [row if isinstance(row, (list, tuple)) else (row,) for row in rows]
             parts.append(table(f"{title} ({len(rows)})", header, _fit(rows, len(header))))
+    if notes := tables.get("notes"):
+        parts.append("\n".join(notes))
     return "\n\n".join(parts)
 
 

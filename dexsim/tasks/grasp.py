@@ -278,6 +278,7 @@ class GraspEnv(HandEnv):
                              ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
             "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],
             "notes": [f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[1].item():.2f} N.m (command 1)"],
+            "headline": ["task/held", "task/force_error"],
         }
 
     def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
