@@ -132,7 +132,8 @@ def _load_friction(s: Scales) -> list[Variant]:
 
 def _backlash(s: Scales) -> list[Variant]:
     top = min(0.5 * s.span, 60 * s.error + 30 * s.sigma)
-    gap = _p("gap", "backlash", "set", 0.0, top, 0.0, "m" if s.slide else "rad")
+    low = min(3.0 * s.sigma, 0.1 * top)  # less cannot be told from the plant's own inaccuracy
+    gap = _p("gap", "backlash", "set", low, top, low, "m" if s.slide else "rad")
     starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 12.0, 40.0, 120.0)})
     rebound = _p("rebound", "rebound", "set", 0.02, 0.7, 0.1)
     params, extra = (gap, rebound), (0.1,)
@@ -144,8 +145,8 @@ def _backlash(s: Scales) -> list[Variant]:
 def _compliance(s: Scales) -> list[Variant]:
     # not stiffer than a tenth of the loop's own spring is softness that leaves no trace
     top = 3.0 / s.stiffness
-    soft = _p("softness", "softness", "set", 0.0, top, 0.0, "rad/N.m")
-    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.03, 0.1, 0.35, 1.0)))]
+    soft = _p("softness", "softness", "set", 0.04 / s.stiffness, top, 0.04 / s.stiffness, "rad/N.m")
+    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.15, 0.4, 1.0)))]
 
 
 def _delay(s: Scales) -> list[Variant]:

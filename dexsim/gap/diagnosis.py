@@ -308,15 +308,22 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             out.curves.append(_curve(case, runs, rows, q0, q1, int(order[0])))
     out.spots = locate.control(all_spots)
     out.untrained = sorted(set(leftover))
-    useless = [f for f in findings if f["effect"] != "current_sensor" and f["held_out"]["after"] > 0.98 * f["held_out"]["before"]]
-    if useless and len(useless) == len(findings):
-        for f in useless:
-            notes.append(f"{f['effect']} on {f['where']['joints'][0]} earned its place on the training conditions but not on what was kept out; not claimed")
-        findings = []
-        squares["after"] = squares["before"]
-        servo, spec, changed_model = copy.deepcopy(m.table), m.spec.copy(), False
-        for v in out.joints.values():
-            v["after"], v["mae_after"] = v["before"], v["mae_before"]
+    # a joint whose findings did not help on what was kept out keeps none of them
+    for k, (case, _, _) in enumerate(outcomes):
+        mine = [f for f in findings if case.joint in f["where"]["joints"] and f["effect"] != "current_sensor"]
+        v = out.joints[case.joint]
+        if not mine or v["after"] < 0.98 * v["before"]:
+            continue
+        for f in mine:
+            notes.append(f"{f['effect']} on {case.joint} earned its place on the training conditions but not on what was kept out; not claimed")
+        findings = [f for f in findings if f not in mine]
+        squares["after"][k] = squares["before"][k]
+        v["after"], v["mae_after"] = v["before"], v["mae_before"]
+        servo.entries.pop(case.joint, None)
+        if case.joint in m.table.entries:
+            servo.entries[case.joint] = copy.deepcopy(m.table.entries[case.joint])
+        if any(f["effect"] in ("inertia", "payload") for f in mine):
+            spec, changed_model = m.spec.copy(), False
     b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
     a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
     slide = all(c.constants.slide for c in cases)

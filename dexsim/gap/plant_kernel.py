@@ -19,6 +19,7 @@ import warp as wp
 from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
 
 f64 = wp.float64
+ONE_BODY_STEPS = 1
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
@@ -250,7 +251,7 @@ def plant_kernel():
                 shown = measured(qm, scale, offset, esin, ecos, round_)
 
             visc = base_damping + params[h, P_VISC] * friction_factor
-            n_sub = int(1)
+            n_sub = int(ONE_BODY_STEPS)
             if two:
                 n_sub = TWO_BODY_STEPS
             dts = dt / f64(n_sub)

@@ -17,10 +17,11 @@ SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
+DOUBT, OFF = 0.015, 0.025  # relative: what a fitted effect, and a refitted belief, is off by whatever the residuals say
 BUDGET = 100.0  # s of a joint's recordings that the search simulates
 BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
-ENOUGH = 1.3  # x the noise: an error within it needs no effect
+ENOUGH = 1.4  # x the noise: an error within it needs no effect
 MOST = 4  # effects on one joint
 
 
@@ -557,19 +558,33 @@ class JointSearch:
         return trial
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
-        """Intervals not narrower than what the fits without one condition each disagree by (a jackknife), nor than half a
-        percent: the plant is not truer than that."""
-        x = trial.fit.x
-        if len(x) == 0:
+        """Intervals that also hold what the residuals do not show, added in squares: the disagreement of the fits without
+        one condition each (a jackknife); the believed figures being off by more than their fit says (OFF each, the
+        effects' parameters answering); and DOUBT of the value itself, the plant being no truer."""
+        f = trial.fit
+        x, P = f.x, len(f.x)
+        if P == 0:
             return bounds
-        half = 0.5 * (bounds[:, 1] - bounds[:, 0])
-        folds = np.array([f for f in trial.folds if len(f) == len(x)])
+        low, high = np.array([p.low for p in f.params]), np.array([p.high for p in f.params])
+        span = high - low
+        square = (0.75 * (bounds[:, 1] - bounds[:, 0])) ** 2
+        folds = np.array([g for g in trial.folds if len(g) == P])
         if len(folds) >= 2:
             n = len(folds)
-            jack = np.sqrt((n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0))
-            half = np.maximum(half, 1.645 * jack)
-        half = np.maximum(half, 0.005 * np.abs(x))
-        low, high = np.array([p.low for p in trial.fit.params]), np.array([p.high for p in trial.fit.params])
+            square += 1.645**2 * (n - 1) / n * ((folds - folds.mean(0)) ** 2).sum(0)
+        mine = np.array([not p.nuisance for p in f.params])
+        J = f.jacobian * span
+        A = J.T @ J
+        i, k = np.flatnonzero(mine), np.flatnonzero(~mine)
+        if len(i) and len(k):
+            M = A[np.ix_(i, i)] + 1e-9 * np.trace(A) * np.eye(len(i))
+            answer = np.linalg.solve(M, A[np.ix_(i, k)]) * span[i][:, None] / span[k][None]  # d effect / d nuisance
+            off = np.array([OFF * abs(v) if p.mode == "factor" else 0.25 * min(p.span, 4 * OFF * abs(v) + 1e-3 * p.span)
+                            for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)])  # fmt: skip
+            square[i] += ((1.645 * answer * off) ** 2).sum(1)
+        itself = np.array([0.03 if p.key.endswith(("kp_factor", "kd_factor")) else DOUBT for p in f.params])
+        square += (1.645 * itself * np.abs(x)) ** 2
+        half = np.sqrt(square)
         return np.stack([np.maximum(x - half, low), np.minimum(x + half, high)], 1)
 
     def _none(self, current: Trial) -> Trial:
