@@ -118,6 +118,8 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
         data["config"] = json.loads(data["config"])
     except (TypeError, ValueError):
         raise UserError(f"{path}: damaged checkpoint, its config is not JSON") from None
+    if not isinstance(data["config"], dict):
+        raise UserError(f"{path}: damaged checkpoint, its config is {type(data['config']).__name__}, not a mapping")
     return data
 
 
