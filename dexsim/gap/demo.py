@@ -44,8 +44,7 @@ def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.nd
         knots = np.arange(0.0, seconds + 1.5, 1.2)
         return t, np.interp(t, knots, np.r_[0.0, rng.uniform(-1.2, 1.2, len(knots) - 1)])
     if kind == 2:
-        steps = np.repeat(rng.uniform(-1.0, 1.0, int(seconds) + 2), 80)[: len(t)]
-        return t, np.where(t < 0.3, 0.0, steps)
+        return t, 0.9 * np.sin(2 * np.pi * 0.25 * t) * (0.4 + 0.6 * np.sin(2 * np.pi * 0.11 * t + rng.uniform(0, 1)))
     f = 0.2 + 2.3 * t / seconds
     return t, 0.4 * np.sin(2 * np.pi * np.cumsum(f) * 0.01)
 

@@ -409,6 +409,13 @@ class JointSearch:
                 current, level = self._swap(current, pool, level)
         current = self._drop(current)
         final = self.rivals(current, pool)
+        if len(current.members) == 1:  # one that only seemed worse before it was fitted in full takes the place
+            others, share, _ = final[current.members[0].id]
+            better = self.fitted.get(frozenset((others[0][0],))) if others and others[0][1] > share + 0.1 else None
+            if better is not None:
+                self.fitted[frozenset(current.ids)] = current
+                current = better
+                final = self.rivals(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned)
@@ -514,6 +521,7 @@ class JointSearch:
                 if known is None and len(others) >= 3 and not confusable(key, member.id):
                     continue
                 trial = known or self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
                 if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
                     self.cross(trial)
