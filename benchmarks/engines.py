@@ -19,6 +19,7 @@ from pathlib import Path
 
 import torch
 
+from dexsim.cli import machine
 from dexsim.cli import start as start_up
 from dexsim.tasks import make_env
 
@@ -56,6 +57,7 @@ def main(argv: list[str]) -> dict:
     if not any(a.startswith("worlds=") for a in given):
         given.append("worlds=64")
     cfg = start_up.for_train([*given, "device=cpu"], Path(__file__).parents[1] / "configs").cfg
+    machine.set_threads("cpu")
     worlds = cfg["worlds"]
     ready = {name: _ready(cfg, name) for name in ENGINES}
     physics, full = {n: [] for n in ENGINES}, {n: [] for n in ENGINES}

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from dexsim.cli import machine
 from dexsim.cli import start as start_up
 from dexsim.tasks import make_env
 
@@ -37,6 +38,7 @@ def main(argv: list[str]) -> dict:
     cfg = start_up.for_train([a for a in argv if not a.startswith("steps=")], Path(__file__).parents[1] / "configs").cfg
     device, worlds = cfg["device"], cfg["worlds"]
     steps = int(steps_given[-1]) if steps_given else (100 if device.startswith("cuda") else 20)
+    machine.set_threads(device)
     start = time.perf_counter()
     env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
     action = torch.zeros(worlds, env.num_actions, device=device)

@@ -40,10 +40,7 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
     for name, value in facts.items():
         print(f"{name:<8} {value}")
     seed_all(cfg["seed"])
-    if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
-        # the batches are small and C MuJoCo has a thread pool of its own: torch's threads would only wait for each other
-        # (twice as fast with one on two busy cores, docs/benchmarks.md)
-        torch.set_num_threads(1)
+    machine.set_threads(where)
     print("compiling kernels (first run only; cached afterwards) ...", flush=True)
     start = time.perf_counter()
     quiet_warp(where)

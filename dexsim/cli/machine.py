@@ -31,6 +31,14 @@ def device(asked: str | None) -> str:
     raise UserError(f"device={asked}: must be cpu, cuda or cuda:<number>")
 
 
+def set_threads(where: str) -> None:
+    """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread pool
+    of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds took
+    150 to 480 ms with two, 37 to 75 with one: docs/benchmarks.md)."""
+    if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
+
+
 def refuse_many_ranks() -> None:
     """Raise UserError under torchrun with more than one process: training on several GPUs is not supported."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
