@@ -1,0 +1,354 @@
+"""The real-time loop: reads at 100 Hz, acts at the policy's rate, and lets go of the hand when something is wrong.
+
+Phases: HOMING (slow, at reduced current, from wherever the hand is) -> SETTLE (taxels are zeroed) -> RUN (the policy) ->
+RELAXED. Nothing moves before the homing, and every way out of `run` relaxes the hand.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dexsim.assets import xhand
+from dexsim.calibration.file import Calibration
+from dexsim.deploy.action import ActionRule
+from dexsim.deploy.bundle import Bundle
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
+from dexsim.deploy.measure import Measure
+from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, HEIGHT, OBSERVATION, Recorder
+from dexsim.deploy.safety import Guard
+from dexsim.deploy.timing import Timing
+from dexsim.deploy.vision import HeightSource
+from dexsim.errors import UserError
+
+HOMING, SETTLE, RUN, RELAXED = "homing", "settle", "run", "relaxed"
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """seconds of policy; command: force 0..1; home: whether to home first (False only for replays).
+
+    home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
+    home_error rad: allowed at its end; settle s. read_hz; stale s: a reading older than this relaxes; late s: so does a turn
+    that is later than this; overruns: so do as many turns in a row that end after the next was due; hang s: so does a loop
+    that does not turn at all (seen by a thread of its own). speed: targets' largest, over the joints' no-load speeds;
+    margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one; kp: its gain.
+    recover: after letting go, home again once readings have been good for recover_s; else the run ends.
+    """
+
+    seconds: float = 10.0
+    command: float = 0.5
+    home: bool = True
+    home_speed: float = 0.5
+    home_current: float = 0.5
+    home_error: float = 0.2
+    settle: float = 0.5
+    read_hz: float = 100.0
+    stale: float = 0.1
+    late: float = 0.1
+    overruns: int = 10
+    hang: float = 0.3
+    speed: float = 0.6
+    margin: float = 0.0
+    tor_max: float | tuple[float, ...] | None = None
+    kp: int = 100
+    recover: bool = False
+    recover_s: float = 1.0
+
+
+@dataclass
+class Report:
+    """What a run was: how it ended (`done`, or why the hand was relaxed), counts, timing; observations, actions and
+    targets of every act if kept."""
+
+    ended: str = ""
+    acts: int = 0
+    counts: Counter = field(default_factory=Counter)
+    timing: Timing = field(default_factory=Timing)
+    observations: list[np.ndarray] = field(default_factory=list)
+    actions: list[np.ndarray] = field(default_factory=list)
+    targets: list[np.ndarray] = field(default_factory=list)
+    forces: list[np.ndarray] = field(default_factory=list)
+
+
+class Loop:
+    """One bundle on one hand. See `LoopSettings` and `run`."""
+
+    def __init__(self, bundle: Bundle, driver: HandDriver, height: HeightSource, calibration: Calibration,
+                 settings: LoopSettings = LoopSettings(), clock: Clock | None = None, recorder: Recorder | None = None, keep: bool = False):
+        m, self.settings = bundle.manifest, settings
+        if not 0 <= settings.command <= 1:
+            raise UserError(f"command={settings.command}: must lie in [0, 1]")
+        if not 20 <= settings.read_hz <= 1000:
+            raise UserError(f"read_hz={settings.read_hz}: must lie in [20, 1000]")
+        self.bundle, self.driver, self.height, self.clock = bundle, driver, height, clock or Clock()
+        self.recorder, self.keep, self.report = recorder, keep, Report()
+        self.period, self.read_period = float(m["rates"]["policy_period_s"]), 1.0 / settings.read_hz
+        self.rule = ActionRule.from_manifest(m["action"])
+        self.home = np.array(m["initial_pose"], float)
+        self.calibration = calibration
+        self.measure = Measure(calibration, m["normalization"]["force_max_N"], self.period)
+        tor_max = 1e3 * calibration.current_max if settings.tor_max is None else settings.tor_max
+        self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (12,)), 1, 32767)
+        self.guard = Guard(
+            self.rule.low + settings.margin, self.rule.high - settings.margin, settings.speed * np.array(m["action"]["speed_limit_rad_s"]),
+            self.tor_max, calibration.current_sign, tuple(m["joints"]))
+        self.state: HandState | None = None
+        self.target: np.ndarray | None = None
+        self.phase = HOMING if settings.home else RUN
+        self.why = ""
+        self.stop = threading.Event()  # set it to end the run
+        self._beat, self._lock = None, threading.Lock()
+        self._tripped: str | None = None
+
+    # -- the run -------------------------------------------------------------------------------------------------------------
+    def run(self) -> Report:
+        """Home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand first."""
+        c = self.clock
+        interval = sys.getswitchinterval()
+        self.driver.open()
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # a collection takes milliseconds; the loop makes no cycles
+        sys.setswitchinterval(5e-4)  # the recorder gives way sooner
+        watch = None
+        try:
+            if type(c) is Clock:
+                watch = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+                self._beat = c.now()
+                watch.start()
+            self._first_reading()
+            self._turns()
+            self.report.ended = self.report.ended or "done"
+        except KeyboardInterrupt:
+            self.report.ended = "stopped by Ctrl-C"
+            self.report.counts["interrupted"] += 1
+        finally:
+            self._relax(self.report.ended or "the loop failed")
+            self.stop.set()
+            gc.enable()
+            gc.unfreeze()
+            sys.setswitchinterval(interval)
+            if watch is not None:
+                watch.join(1.0)
+            if self.recorder is not None:
+                self.recorder.close()
+                if self.recorder.dropped:
+                    self.report.counts["not_recorded"] += self.recorder.dropped
+        self.report.counts.update(self.guard.counts)
+        return self.report
+
+    def _first_reading(self) -> None:
+        limit = self.clock.now() + 2.0
+        while (state := self.driver.read()) is None:
+            if self.clock.now() > limit:
+                raise UserError(f"{self.driver.name}: no reading of the hand within 2 s; check power, cable and bus")
+            self._beat = self.clock.now()
+            self.clock.sleep_until(self.clock.now() + self.read_period)
+        self.state, self._checked = state, state.time
+        self.target = np.asarray(state.position, float).copy()
+        if self.settings.home:
+            self._begin_homing(self.clock.now())
+        else:
+            self.target = np.asarray(state.position, np.float32).copy()
+            self._begin_run(self.clock.now())
+
+    def _turns(self) -> None:
+        """Wake for whatever is due next, a reading or an action."""
+        c, s, timing = self.clock, self.settings, self.report.timing
+        read_at = act_at = c.now()
+        good_since, in_a_row = None, 0
+        while not self.stop.is_set():
+            due = min(read_at, act_at)
+            c.sleep_until(due)
+            now = c.now()
+            self._beat = now
+            timing.start(now - due)
+            act = act_at <= now + 1e-9
+            if read_at <= now + 1e-9:
+                self._read(now)
+                read_at += self.read_period
+            problem = self._tripped or self._problem(now, now - due)
+            if problem and self.phase != RELAXED:
+                self._relax(problem)
+                self.report.ended = problem
+                if not s.recover:
+                    timing.end()
+                    return
+            if act:
+                act_at += self.period
+                if self.phase == RUN and now - self._began > s.seconds - 1e-9:
+                    timing.end()
+                    return
+                self._act(now)
+            timing.end()
+            after = c.now()
+            if after > min(read_at, act_at) + 1e-9 and type(c) is Clock:
+                timing.overruns += 1
+                in_a_row += 1
+                if in_a_row >= s.overruns and self.phase != RELAXED:
+                    self._tripped = f"{in_a_row} turns in a row took longer than their period"
+                # what was missed is left out, not made up for in a burst
+                read_at += max(0.0, np.ceil((after - read_at) / self.read_period)) * self.read_period
+                act_at += max(0.0, np.floor((after - act_at) / self.period)) * self.period
+            else:
+                in_a_row = 0
+            if self.phase == RELAXED:
+                good_since = None if problem else (good_since if good_since is not None else now)
+                self._tripped = None
+                if good_since is not None and now - good_since > s.recover_s:
+                    good_since = None
+                    self.report.counts["recovered"] += 1
+                    self.report.ended = ""
+                    self._begin_homing(now)
+
+    def _problem(self, now: float, late: float) -> str | None:
+        """What forbids going on: an old reading, a late turn, too much current or heat."""
+        s = self.settings
+        age = now - self.state.time
+        if age > s.stale:
+            return f"the hand's state is {1e3 * age:.0f} ms old, allowed {1e3 * s.stale:.0f}"
+        if late > s.late:
+            return f"the loop woke {1e3 * late:.0f} ms late, allowed {1e3 * s.late:.0f}"
+        elapsed, self._checked = min(self.state.time - self._checked, s.stale), self.state.time
+        return self.guard.must_relax(self.state.current, self.state.temperature, elapsed) if elapsed > 0 else None
+
+    # -- parts of a turn -------------------------------------------------------------------------------------------------------
+    def _read(self, now: float) -> None:
+        if not self._take(now):
+            # a driver at about our rate gives the same one twice now and then; `stale` is what matters
+            self.report.counts["no_new_reading"] += 1
+
+    def _take(self, now: float) -> bool:
+        """The newest state becomes ours; whether it is a new one. Recorded once."""
+        state = self.driver.read()
+        if state is None or state.sequence == self.state.sequence:
+            return False
+        self.state, self.fresh_for = state, self.fresh_for + 1
+        if self.recorder is not None:
+            r = self.recorder
+            r.put("state", now, state.position, 1e-3 * np.asarray(state.current, float), state.time)
+            r.put("tactile", now, state.tactile)
+            if self.fresh_for % 100 == 1:
+                r.put("temperature", now, state.temperature)
+            if np.any(state.error):
+                r.put(ERRORS, now, state.error)
+        if np.any(state.error):
+            self.report.counts["error_codes"] += 1
+        return True
+
+    fresh_for = 0
+
+    def _act(self, now: float) -> None:
+        if self.phase == HOMING:
+            share = min(1.0, (now - self._began) / self._home_s)
+            smooth = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk
+            self._send(now, self._from + smooth * (self.home - self._from), self.settings.home_current)
+            if share >= 1.0:
+                self.phase, self._began, self._rest = SETTLE, now, []
+        elif self.phase == SETTLE:
+            self._rest.append(np.asarray(self.state.tactile, float)[..., 2])
+            if now - self._began >= self.settings.settle:
+                self._end_homing(now)
+                self._policy(now)
+            else:
+                self._send(now, self.home, 1.0)
+        elif self.phase == RUN:
+            self._policy(now)
+
+    def _policy(self, now: float) -> None:
+        self._take(now)  # actions come between readings: act on what there is now
+        seen = self.height.place(now)
+        if seen is None:
+            self.report.counts["object_not_seen"] += 1
+            if not self.measure_ready:
+                return self._send(now, self.target, 1.0)
+            seen = self._place, self._place_time
+        self._place, self._place_time = seen
+        self.measure_ready = True
+        if now - self._place_time > 0.5:
+            self.report.counts["object_seen_long_ago"] += 1
+        state, command = self.state, self.settings.command
+        signals = self.measure.signals(state, self._place, command)
+        observation = self.measure.observation(signals)
+        action = self.bundle.act(observation)[0]
+        target = self.rule.target(action, self.target, np.asarray(state.position, np.float32))
+        self._send(now, target, 1.0)
+        self.report.acts += 1
+        if self.recorder is not None:
+            r = self.recorder
+            r.put(OBSERVATION, now, observation[0])
+            r.put(ACTION, now, action)
+            r.put(FORCE_COMMAND, now, command)
+            r.put(HEIGHT, now, np.asarray(self._place, np.float32))
+        if self.keep:
+            self.report.observations.append(observation[0])
+            self.report.actions.append(action)
+            self.report.targets.append(self.target.copy())
+            self.report.forces.append(signals.touch_force[0].numpy())
+
+    def _send(self, now: float, target: np.ndarray, current_share: float) -> None:
+        """Limit, remember, send, record."""
+        safe = self.guard.apply(target, self.target, np.asarray(self.state.position, float), np.asarray(self.state.current, float), self.period)
+        self.target = safe.astype(np.float32)
+        with self._lock:  # the watchdog relaxes from its own thread
+            if self._tripped is None:
+                self.driver.send(HandCommand(self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION))
+        if self.recorder is not None:
+            self.recorder.put("command", now, self.target)
+
+    # -- phases ------------------------------------------------------------------------------------------------------------------
+    def _begin_homing(self, now: float) -> None:
+        self.phase, self._began = HOMING, now
+        self._from = np.asarray(self.state.position, float).copy()
+        self.target = self._from.astype(np.float32)
+        # the peak of a minimum-jerk path is 15/8 of its mean speed
+        self._home_s = max(0.5, 1.875 * float(np.abs(self.home - self._from).max()) / self.settings.home_speed)
+
+    def _end_homing(self, now: float) -> None:
+        error = np.abs(np.asarray(self.state.position, float) - self.home)
+        if error.max() > self.settings.home_error:
+            j = int(error.argmax())
+            raise UserError(f"homing: {xhand.JOINTS[j]} is {error[j]:.2f} rad from its home {self.home[j]:.2f} rad, allowed"
+                            f" {self.settings.home_error:g}; free the hand, or check its zero and the current limit")
+        rest = np.mean(self._rest, 0)
+        if rest.sum() > 0:
+            self.report.counts["taxels_zeroed"] = int((rest > 0.5).sum())
+            self.calibration.bias = self.calibration.bias + np.where(rest > 0.5, rest - self.calibration.bias, 0.0)
+        self._begin_run(now)
+
+    def _begin_run(self, now: float) -> None:
+        self.phase, self._began = RUN, now
+        self.measure.reset()
+        self.measure_ready = False
+        started = getattr(self.driver, "started", None)
+        if started is not None:
+            started()
+
+    def _relax(self, why: str) -> None:
+        with self._lock:
+            self.driver.relax()
+        if self.phase != RELAXED:
+            self.phase, self.why = RELAXED, why
+            self.report.counts["relaxed"] += 1
+
+    def _watch(self) -> None:
+        """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""
+        limit = self.settings.hang
+        while not self.stop.wait(min(0.02, limit / 4)):
+            silent = self.clock.now() - self._beat
+            if silent > limit and self._tripped is None and self.phase != RELAXED:
+                self._tripped = f"the loop did not turn for {1e3 * silent:.0f} ms, allowed {1e3 * limit:.0f}"
+                self.report.counts["watchdog"] += 1
+                self.driver.relax()  # without the lock: whoever holds it hangs
+
+
+def relaxed_command() -> HandCommand:
+    """What `relax` sends: mode 0, no current."""
+    return HandCommand(np.zeros(12), np.zeros(12), kp=0, mode=PASSIVE)

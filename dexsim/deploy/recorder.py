@@ -1,0 +1,80 @@
+"""Everything the loop sees and sends, written to MCAP by a thread of its own: the loop only puts into a queue."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.recording import schema
+from dexsim.recording.writer import Writer
+
+OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = "/policy/observation", "/policy/action", "/policy/force_command", "/object_seen", "/joint_errors"
+LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",), ERRORS: ("joint",)}
+"""Topics beside those of a recording: Float32MultiArray."""
+
+
+class Recorder:
+    """Owns the writer's thread. `put` never waits; samples are dropped and counted once `most` of them are waiting.
+
+    Times given are of the loop's clock; `zero` of it is the recording's start.
+    """
+
+    def __init__(self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any], config: str | None, zero: float,
+                 start_ns: int | None = None, most: int = 4000, chunk_s: float = 0.5):
+        self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s)
+        self.path, self.zero, self.dropped, self.written = self.writer.path, zero, 0, 0
+        self.error: str | None = None
+        self._channels: dict[str, int] = {}
+        self._queue: queue.SimpleQueue = queue.SimpleQueue()
+        self._most = most
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def put(self, kind: str, t: float, *values: Any) -> None:
+        """kind: command, state, tactile, temperature, or a topic of `LABELS`; values are not to be changed afterwards."""
+        if self._queue.qsize() >= self._most or self.error:
+            self.dropped += 1
+        else:
+            self._queue.put((kind, t - self.zero, values))
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Write what waits, and the index."""
+        self._queue.put(None)
+        self._thread.join(timeout)
+        self.writer.close()
+
+    def _run(self) -> None:
+        w = self.writer
+        add = {"command": w.add_command, "tactile": w.add_tactile, "temperature": w.add_temperature, "object": w.add_object_pose}
+        while (item := self._queue.get()) is not None:
+            kind, t, values = item
+            try:
+                if kind == "state":
+                    position, effort, stamp = values
+                    w.add_state(t, position, None, effort, stamp - self.zero)
+                elif kind in add:
+                    add[kind](t, *values)
+                else:
+                    self._array(kind, t, values[0])
+                self.written += 1
+            except OSError as error:  # a full disk must not stop the hand
+                self.error = f"{self.path}: {error.strerror}; nothing is recorded from {t:.1f} s on"
+                return
+            if self._queue.empty():
+                time.sleep(0.002)  # a few samples at a time: fewer turns taken from the loop
+
+    def _array(self, topic: str, t: float, value: Any) -> None:
+        """A topic that recordings do not have: declared on its first message."""
+        w = self.writer
+        if topic not in w._channels:
+            kind = schema.MULTI_ARRAY
+            if kind not in w._schemas:
+                w._schemas[kind] = w._mcap.register_schema(kind, "ros2msg", schema.DEFINITIONS[kind].encode())
+            w._channels[topic] = w._mcap.register_channel(topic, "cdr", w._schemas[kind])
+        w._array(topic, t, np.atleast_1d(np.asarray(value, np.float32)), LABELS[topic])
