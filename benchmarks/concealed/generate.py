@@ -25,8 +25,8 @@ TIERS = {"easy": 10.0, "medium": 3.0, "hard": 1.5, "poor": 1.2}  # poor: a decoy
 SECONDS = 8.0
 START_NS = 1_700_000_000_000_000_000  # the same for every recording: time tells nothing
 RECORDINGS = ("a", "b", "c")
-SIZES = 14
-REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous")
+SIZES = 22
+REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_load_speed")
 BELIEF = 0.05  # how far each may be refitted
 
 
@@ -50,19 +50,19 @@ def _less(name: str):
 
 KINDS: dict[str, Kind] = {
     "coulomb_friction": Kind("coulomb_friction", (0.01, 1.0), lambda p, s: {"coulomb": p["coulomb"] + s * p["weight"]}, lambda n, o: {"torque": n["coulomb"]}),
-    "stribeck_friction": Kind("stribeck_friction", (0.02, 1.2), lambda p, s: {"peak": s * p["weight"], "peak_speed": p["stribeck_speed"]},
+    "stribeck_friction": Kind("stribeck_friction", (0.01, 1.2), lambda p, s: {"peak": s * p["weight"], "peak_speed": p["stribeck_speed"]},
                               lambda n, o: {"peak": n["peak"], "v_s": n["peak_speed"]}),
     "viscous_friction": Kind("viscous_friction", (0.01, 1.0), lambda p, s: {"viscous": p["viscous"] + 0.2 * s * p["weight"]}, lambda n, o: {"coefficient": n["viscous"]}),
     "load_friction": Kind("load_friction", (0.02, 0.8), lambda p, s: {"load": s, "load_back": s}, lambda n, o: {"fraction": n["load"]}),
     "backlash": Kind("backlash", (0.002, 0.4), _plus("play"), lambda n, o: {"gap": n["play"]}),
-    "command_delay": Kind("command_delay", (0.001, 0.1), _plus("delay"), lambda n, o: {"delay": n["delay"] - o["delay"]}),
-    "lag": Kind("lag", (0.001, 0.1), _plus("lag"), lambda n, o: {"time_constant": n["lag"]}),
+    "command_delay": Kind("command_delay", (0.0005, 0.1), _plus("delay"), lambda n, o: {"delay": n["delay"] - o["delay"]}),
+    "lag": Kind("lag", (0.0005, 0.1), _plus("lag"), lambda n, o: {"time_constant": n["lag"]}),
     "torque_limit": Kind("torque_limit", (0.05, 0.9), _less("torque_limit"), lambda n, o: {"torque": n["torque_limit"]}),
-    "torque_speed_limit": Kind("torque_speed_limit", (0.1, 0.95), _less("no_load_speed"), lambda n, o: {"no_load_speed": n["no_load_speed"]}),
+    "torque_speed_limit": Kind("torque_speed_limit", (0.06, 0.95), _less("no_load_speed"), lambda n, o: {"no_load_speed": n["no_load_speed"]}),
     "gain_mismatch": Kind("gain_mismatch", (0.07, 0.7), _less("kp"), lambda n, o: {"kp_factor": n["kp"] / n["kp_believed"]}),
     "inertia": Kind("inertia", (0.05, 8.0), _plus("rotor", "total"), lambda n, o: {"armature": n["rotor"] - n["rotor_believed"]}),
     "payload": Kind("payload", (0.06, 2.0), _plus("mass", "mass"), lambda n, o: {"mass": n["mass"] - n["mass_believed"]}),
-    "position_offset": Kind("position_offset", (0.005, 0.5), _plus("offset"), lambda n, o: {"offset": n["offset"]}),
+    "position_offset": Kind("position_offset", (0.001, 0.5), _plus("offset"), lambda n, o: {"offset": n["offset"]}),
     "deadband": Kind("deadband", (0.002, 0.3), _plus("deadband"), lambda n, o: {"width": n["deadband"]}),
     "dwell_stiction": Kind("", (0.02, 1.5), lambda p, s: {"dwell": s * p["weight"], "dwell_time": 1.5}, lambda n, o: {}),
     "cable_spring": Kind("", (0.02, 1.5), lambda p, s: {"cable": s * p["weight"], "cable_rest": 0.6}, lambda n, o: {}),
@@ -103,11 +103,12 @@ def motions(rng: np.random.Generator, poor: bool) -> np.ndarray:
         if poor:  # slow and small: hardly anything shows
             c = rng.uniform(-0.1, 0.1) + 0.06 * np.sin(2 * np.pi * rng.uniform(0.1, 0.2) * t)
         else:
-            knots = np.cumsum(np.r_[0.0, rng.uniform(0.25, 0.9, 60)])
-            levels = np.r_[0.0, rng.uniform(-1.1, 1.1, len(knots) - 1)]
-            step = levels[np.searchsorted(knots, t, side="right") - 1]
-            f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.5, 3.0), len(t))
-            chirp = rng.uniform(0.25, 0.5) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
+            knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 60)])
+            levels = np.r_[0.0, rng.uniform(-0.8, 0.8, len(knots) - 1)]
+            rise = rng.uniform(0.15, 0.35)  # steps as a planner sends them: a drive that saturates all the time hides the rest
+            step = np.interp(t, np.sort(np.r_[knots[1:], knots[1:] + rise]), np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
+            f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.2, 2.5), len(t))
+            chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
             ramp = np.interp(t, knots[::2], levels[::2])
             parts = [[ramp, step, chirp], [chirp, ramp, step], [step, chirp, ramp]][k]
             third = np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2)
@@ -121,9 +122,9 @@ def _rig(rng: np.random.Generator) -> tuple[dict, dict]:
     b = {"mass": rng.uniform(0.08, 0.3), "length": rng.uniform(0.07, 0.14), "rotor": rng.uniform(2e-4, 8e-4)}
     weight = b["mass"] * 9.81 * b["length"]
     inertia = b["mass"] * b["length"] ** 2 + b["rotor"]
-    b["kp"] = weight * rng.uniform(6, 16)
+    b["kp"] = weight * rng.uniform(6, 14)
     b["kd"] = 2 * rng.uniform(0.3, 0.6) * np.sqrt(b["kp"] * inertia)
-    b |= {"torque_limit": weight * rng.uniform(4, 8), "no_load_speed": rng.uniform(9, 18), "coulomb": weight * rng.uniform(0.04, 0.1),
+    b |= {"torque_limit": weight * rng.uniform(5, 9), "no_load_speed": rng.uniform(9, 18), "coulomb": weight * rng.uniform(0.04, 0.1),
           "viscous": weight * rng.uniform(0.005, 0.02)}  # fmt: skip
     true = {k: v * (1 + rng.uniform(-0.03, 0.03)) for k, v in b.items()}
     true["length"] = b["length"]  # the moment is off with the mass already

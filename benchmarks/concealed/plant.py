@@ -74,8 +74,8 @@ def simulate(p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | flo
         target = command[index, i] * (1 - np.abs(fraction)) + command[index, np.minimum(j, k)] * np.abs(fraction)
         error = target - seen
         ask = np.where(np.abs(error) < p["deadband"], 0.0, p["kp"] * error) - p["kd"] * filtered
-        room = np.maximum(1 - np.sign(ask) * vm / p["no_load_speed"], 0.0)
-        ask = np.clip(ask, -p["torque_limit"] * np.minimum(room, 1.0), p["torque_limit"] * np.minimum(room, 1.0))
+        most = p["torque_limit"] * np.maximum(1 - np.abs(filtered) / p["no_load_speed"], 0.0)  # its own speed, not the true one
+        ask = np.clip(ask, -most, most)
         tau = tau + rate * (ask - tau) if driven else np.zeros(B)
         out_q[:, k], out_tau[:, k] = q, tau
         if has_dwell:
