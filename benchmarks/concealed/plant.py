@@ -63,11 +63,11 @@ def simulate(p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | flo
     has_dwell, tanh_law = bool(p["dwell"].any()), p["bristle"] < 0.5
     index = np.arange(B)
     out_q, out_tau = np.empty((B, M)), np.empty((B, M))
-    unit = 2 * np.pi / 65536  # the loop's own encoder
+    unit = 2 * np.pi / 2**18  # the loop's own encoder
     for k in range(M):
         # firmware: reads its encoder, filters the speed, and asks for a torque that holds one millisecond
         seen = np.floor((np.where(p["motor_side"] > 0.5, motor, q) + p["offset"]) / unit) * unit
-        filtered += 0.4 * ((seen - last) / 1e-3 - filtered) if k else 0.0
+        filtered += 0.8 * ((seen - last) / 1e-3 - filtered) if k else 0.0  # a slower filter would be a lag that nobody drew
         last = seen
         i = np.maximum(k - delay, 0)
         j = np.maximum(k - delay - np.sign(fraction).astype(int), 0)
