@@ -135,7 +135,7 @@ def _rig(rng: np.random.Generator) -> tuple[dict, dict]:
 
 
 def _sized(true: dict, kind: Kind | None, ratio: float, command: np.ndarray, noise: float) -> tuple[dict, dict, np.ndarray, np.ndarray]:
-    """(parameters with the effect, figures of its size, position [3, M], torque [3, M])."""
+    """(parameters with the effect, figures of its size, measured position [3, M], torque [3, M])."""
     base = {k: v for k, v in true.items() if k in plant.DEFAULTS}
     sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
     variants = [base] + [base | kind.apply(true, s) for s in sizes]
@@ -144,7 +144,7 @@ def _sized(true: dict, kind: Kind | None, ratio: float, command: np.ndarray, noi
     R = len(command)
     values = {k: np.repeat([v.get(k, plant.DEFAULTS[k]) for v in variants], R) for k in plant.DEFAULTS}
     run = plant.simulate(plant.rows(R * len(variants), **values), np.tile(command, (len(variants), 1)))
-    q = run["position"].reshape(len(variants), R, -1)
+    q = run["position"].reshape(len(variants), R, -1) + np.array([v.get("offset", 0.0) for v in variants])[:, None, None]  # as measured
     slopes = (q[first:-1] - q[0]).reshape(len(REFIT), -1).T / 0.02
 
     def hidden(d: np.ndarray) -> float:
@@ -186,7 +186,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     where.mkdir(parents=True, exist_ok=True)
     _files(where, believed, true)
     for k, letter in enumerate(RECORDINGS):
-        t, angle = plant.log(q[k] + p.get("offset", 0.0), rng, 100.0, 1e-3)
+        t, angle = plant.log(q[k], rng, 100.0, 1e-3)
         torque = np.interp(t, np.arange(tau.shape[1]) * 1e-3, tau[k]) + rng.normal(0, 0.01 * true["weight"], len(t))
         angle = np.round((angle + rng.normal(0, extra, len(t))) / quantum) * quantum
         torque = np.round(torque / 1e-4) * 1e-4
