@@ -1,0 +1,85 @@
+"""Plots of every fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dexsim.assets import xhand
+from dexsim.calibration.current import Half
+from dexsim.calibration.rubber import Rubber, Stiffness, stress
+from dexsim.calibration.taxels import Pad
+
+
+def lines(half: Half, path: Path, title: str) -> Path:
+    """Force over effort of every joint: loading, unloading, the line and the paper's line through zero."""
+    figure = Figure(figsize=(14, 9), layout="constrained")
+    for ax, joint in zip(figure.subplots(3, 4).flat, xhand.JOINTS, strict=True):
+        ax.set_title(joint, fontsize=9)
+        levels, f = half.levels.get(joint), half.fits.get(joint)
+        if f is None:
+            ax.text(0.5, 0.5, half.left_out.get(joint, ""), ha="center", va="center", fontsize=7, wrap=True, transform=ax.transAxes)
+            continue
+        for way, name, mark in ((True, "loading", "o"), (False, "unloading", "s")):
+            m = levels.up == way
+            ax.plot(levels.effort[m], levels.force[m], mark, ms=4, label=name, fillstyle="full" if way else "none")
+        x = np.array([min(0, levels.effort.min()), levels.effort.max()])
+        ax.plot(x, f.slope * x + f.offset, lw=1, label=f"{f.slope:.3g} x {f.offset:+.2f}")
+        ax.plot(x, f.ratio * x, "--", lw=0.8, label=f"{f.ratio:.3g} x")
+        text = f"R2 {f.r2:.4f}\nheld out {f.held_out:.2f} N\nhysteresis {100 * f.hysteresis:.0f} %" + ("" if f.linear else "\nnot linear")
+        ax.text(0.97, 0.04, text, ha="right", va="bottom", fontsize=7, transform=ax.transAxes, color="black" if f.linear else "tab:red")
+        ax.legend(fontsize=6, loc="upper left")
+        ax.set_xlabel(half.unit, fontsize=8)
+        ax.set_ylabel("N", fontsize=8)
+        ax.grid(alpha=0.25)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def rubber(stretch: np.ndarray, nominal: np.ndarray, fit: Rubber, path: Path) -> Path:
+    """Stress over stretch with the Mooney-Rivlin fit."""
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(stretch, 1e-6 * nominal, "o", ms=4, label="measured")
+    x = np.linspace(*fit.stretch, 200)
+    ax.plot(x, 1e-6 * stress(x, fit.c10, fit.c01), label=f"c10 {fit.c10 / 1e3:.1f} kPa, c01 {fit.c01 / 1e3:.1f} kPa, held out {fit.held_out / 1e3:.1f} kPa")
+    ax.set(xlabel="stretch", ylabel="nominal stress, MPa")
+    ax.legend()
+    ax.grid(alpha=0.25)
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def press(depth: np.ndarray, force: np.ndarray, fit: Stiffness, path: Path) -> Path:
+    """Force over depth with the linear stiffness."""
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(1e3 * depth, force, ".-", lw=0.6, label="measured")
+    ax.plot([0, 1e3 * depth.max()], [0, fit.value * depth.max()], label=f"{fit.value:.0f} N/m, held out {fit.held_out:.2f} N")
+    ax.set(xlabel="depth, mm", ylabel="force, N")
+    ax.legend()
+    ax.grid(alpha=0.25)
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def pads(found: dict[str, Pad], path: Path) -> Path:
+    """Gain maps of the pads, dead and swapped taxels marked; columns across, rows from the joint to the tip."""
+    figure = Figure(figsize=(3.2 * len(found), 4.2), layout="constrained")
+    for ax, (finger, pad) in zip(np.atleast_1d(figure.subplots(1, len(found))), found.items(), strict=True):
+        gain = np.ones(xhand.TAXELS_PER_FINGER) if pad.gain is None else pad.gain.copy()
+        gain[pad.unseen] = np.nan
+        image = ax.imshow(gain.reshape(xhand.COLUMNS, xhand.ROWS).T, origin="lower", vmin=0, vmax=2, cmap="coolwarm")
+        for k in pad.dead:
+            ax.text(*divmod(k, xhand.ROWS), "x", ha="center", va="center", color="black")
+        for n, pair in enumerate(pad.swapped):
+            for k in pair:
+                ax.text(*divmod(k, xhand.ROWS), chr(ord("a") + n % 26), ha="center", va="center", color="black")
+        ax.set_title(f"{finger}: held out {100 * pad.held_out:.1f} % ({100 * pad.held_out_equal:.1f} % equal gains)", fontsize=7)
+        ax.set(xlabel="column", ylabel="row")
+    figure.colorbar(image, ax=figure.axes, shrink=0.6, label="gain (x dead, letters swapped)")
+    figure.savefig(path, dpi=110)
+    return path

@@ -1,0 +1,232 @@
+"""`python calibrate.py`: reads presses, fits, says where a fit fails, writes calibration.yaml and plots."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from dexsim.errors import UserError
+
+CHOICES = {"normalization": ("matched", "paper")}
+
+
+def main(argv: Sequence[str], config_dir: Path) -> int:
+    """Returns the exit status. Raises UserError."""
+    file = config_dir / "calibrate.yaml"
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_help(file), end="")
+        return 0 if argv else 2
+    s, meta = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
+    if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate")):
+        raise UserError("say what to calibrate: real=, sim=, simulate=true, touch= or curve= (--help)")
+    return run(s, meta)
+
+
+def run(s: dict[str, Any], meta: dict[str, str]) -> int:
+    """Everything that the settings ask for."""
+    from dexsim.calibration import charts, current, simulate
+    from dexsim.calibration.file import Calibration, save
+    from dexsim.cli import folder
+    from dexsim.cli.build import quiet_warp
+
+    out = folder.make(Path(str(s["out"])).expanduser(), "out=")
+    report: dict[str, Any] = {"schema": 1, "robot": "xhand_right", "normalization": s["normalization"], "source": {}}
+    real = sim = None
+    if s["simulate"]:
+        quiet_warp("cpu")
+        joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else list(simulate.xhand.JOINTS)
+        where = out / ("presses_realistic" if s["realistic"] else "presses_sim")
+        made = simulate.make(where, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"]))
+        key = "real" if s["realistic"] else "sim"
+        if s[key] is None:
+            s[key] = ",".join(str(p) for p in made)
+    for key, effort_is, symbol in (("real", "current_A", "alpha"), ("sim", "torque_Nm", "beta")):
+        if not s[key]:
+            continue
+        half = current.half(current.files_of(s[key], key), effort_is, meta if key == "real" else None, int(s["seed"]))
+        report["source"][key] = s[key] if len(s[key]) < 200 else str(Path(s[key].split(",")[0]).parent)
+        _print_half(half, key, symbol)
+        print(f"plot     {charts.lines(half, out / f'{key}.png', f'{key}: fingertip force over ' + ('motor current' if key == 'real' else 'joint torque'))}\n")
+        real, sim = (half, sim) if key == "real" else (real, half)
+    if real or sim:
+        report["joints"] = current.combine(real, sim)
+        if real and sim:
+            _print_ratio(report["joints"])
+        elif real:
+            print("note     only the real half: current_per_torque stays unknown; add sim= (or simulate=true) with the same presses\n")
+    touch: dict[str, Any] = {}
+    if real and real.lsb:  # alpha is in the newtons that these counts were taken for
+        touch["lsb"] = real.lsb
+    if s["touch"]:
+        touch |= _touch(s, meta, out, report)
+    if s["curve"]:
+        touch |= _curve(s, out)
+    if touch:
+        report["touch"] = touch
+    path = out / "calibration.yaml"
+    save(path, report)
+    for text in Calibration.from_dict(report).assumed:
+        print(f"note     {text}")
+    print(f"yaml     {path}")
+    return 0
+
+
+def _print_half(half: Any, key: str, symbol: str) -> None:
+    from dexsim.assets import xhand
+    from dexsim.cli.report import table
+
+    rows = []
+    for joint in xhand.JOINTS:
+        f = half.fits.get(joint)
+        if f is None:
+            rows.append((joint, "-", "-", "-", "-", "-", "-", half.left_out.get(joint, "")))
+            continue
+        rows.append((joint, f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]", f"{f.slope:.4g} {f.offset:+.2f}", f"{f.r2:.4f}",
+                     f"{f.held_out:.2f}", f"{100 * f.hysteresis:.0f}", f"{f.effort_max:.3g} / {f.force_max:.3g}", "; ".join(f.why) or "linear"))
+    head = ("joint", f"{symbol} N/{half.unit}, 95 %", "slope, offset", "R2", "held out N", "hysteresis %", f"max {half.unit} / N", "verdict")
+    print(table(f"{key}: fingertip force over effort", head, rows))
+    for note in half.notes:
+        print(f"note     {note}")
+
+
+def _print_ratio(joints: dict[str, Any]) -> None:
+    from dexsim.cli.report import table
+
+    rows = []
+    for joint, e in joints.items():
+        c = e.get("current_per_torque")
+        rows.append((joint, "-" if c is None else f"{c['value']:.4g} [{c['low']:.4g}, {c['high']:.4g}]", f"{e.get('current_max', float('nan')):.3g}",
+                     f"{e.get('torque_seen', float('nan')):.3g}"))
+    print(table("current for torque (equal fingertip force)", ("joint", "A per N.m, 95 %", "I_max A", "tau_max pressed N.m"), rows) + "\n")
+
+
+def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """Threshold, dead and swapped taxels, gains of every pad."""
+    from dexsim.assets import xhand
+    from dexsim.calibration import charts, current, taxels
+    from dexsim.recording.reader import read
+
+    readings: list[np.ndarray] = []
+    loads: list[np.ndarray] = []
+    unit, lsb, measured = "count", None, True
+    for path in current.files_of(s["touch"], "touch"):
+        r = read(path, meta=meta, audit=False)
+        if r.tactile is None:
+            raise UserError(f"{path}: has no /tactile")
+        unit = r.meta["tactile_unit"]
+        lsb = r.tactile_lsb
+        readings.append(r.tactile.value[..., 2] * r.tactile_axis_sign[2])
+        if r.external_force is None:
+            measured = False
+            loads.append(np.full(len(r.tactile), np.nan))
+        else:
+            size = np.linalg.norm(r.external_force.value[:, :3], axis=1)
+            loads.append(np.interp(r.tactile.t, r.external_force.t, size))
+    values, load = np.concatenate(readings), np.concatenate(loads)
+    found: dict[str, Any] = {}
+    pressed = np.abs(values).sum(2)
+    winner = pressed.argmax(1)
+    for f, finger in enumerate(xhand.FINGERS):
+        # a load cell tells of the pad that is pressed; others are at rest then
+        mine = (winner == f) | (pressed.max(1) <= np.percentile(pressed.max(1), 10))
+        found[finger] = taxels.inspect(values[mine, f], load[mine] if measured and (winner == f).sum() > 50 else None)
+    result: dict[str, Any] = {"dead": {}, "swapped": {}, "gain": {}, "bias": {}, "hysteresis": {}}
+    scales = [p.scale for p in found.values() if p.scale]
+    count = lsb if lsb is not None else (float(np.mean(scales)) if scales else None)
+    result["lsb"] = float(f"{np.mean(scales):.6g}") if scales and unit == "count" else (count if unit == "count" else None)
+    for finger, p in found.items():
+        words = [f"threshold {p.threshold:.3g} {unit}", f"{len(p.dead)} dead", f"{len(p.swapped)} swapped pairs", f"{len(p.unseen)} never pressed"]
+        if p.gain is not None:
+            words.append(f"{p.scale:.4g} N a {unit}, load on held-out presses to {100 * p.held_out:.1f} % ({100 * p.held_out_equal:.1f} % with equal gains)"
+                         f", hysteresis {100 * p.hysteresis:.1f} %")  # fmt: skip
+            base = np.mean(scales)
+            result["gain"][finger] = [round(float(g * p.scale / base), 4) for g in p.gain]
+            result["hysteresis"][finger] = round(float(p.hysteresis), 4) if np.isfinite(p.hysteresis) else None
+        if p.dead:
+            result["dead"][finger] = p.dead
+            words.append(f"dead: {p.dead}")
+        if p.swapped:
+            result["swapped"][finger] = [list(pair) for pair in p.swapped]
+            words.append(f"swapped: {p.swapped}")
+        if unit == "count" and np.abs(p.bias).max() > 0.5:
+            result["bias"][finger] = [round(float(b), 2) for b in p.bias]
+        print(f"touch    {finger}: " + "; ".join(words + p.notes))
+    scale = (result["lsb"] or 0.1) if unit == "count" else 1.0
+    result["threshold"] = float(f"{max(p.threshold for p in found.values()) * scale:.4g}")
+    if not measured:
+        print("note     no /external_force: gains and N a count are not known")
+    print(f"plot     {charts.pads(found, out / 'taxels.png')}\n")
+    return {k: v for k, v in result.items() if v not in ({}, None)}
+
+
+def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
+    """Stiffness and rubber constants of a test curve."""
+    from dexsim.calibration import charts, rubber
+
+    kind, a, b = rubber.read_curve(s["curve"])
+    result: dict[str, Any] = {}
+    if kind == "press":
+        k = rubber.fit_linear(a, b)
+        loop = f", hysteresis {100 * k.hysteresis:.1f} %" if np.isfinite(k.hysteresis) else ""
+        print(f"curve    linear stiffness {k.value:.4g} [{k.low:.4g}, {k.high:.4g}] N/m, R2 {k.r2:.4f}, held out {k.held_out:.3g} N{loop}")
+        print(f"plot     {charts.press(a, b, k, out / 'press.png')}")
+        result["stiffness"] = {"value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out}
+        if s["area"] is None:
+            print("note     area= is not given: no rubber constants from force and depth")
+            return result
+        a, b = rubber.from_press(a, b, float(s["area"]), float(s["thickness"]))
+    keep = a <= float(s["stretch_max"])
+    fit = rubber.fit_mooney_rivlin(a[keep], b[keep])
+    print(f"curve    Mooney-Rivlin c10 {fit.c10:.4g} [{fit.c10_range[0]:.4g}, {fit.c10_range[1]:.4g}] Pa, c01 {fit.c01:.4g}"
+          f" [{fit.c01_range[0]:.4g}, {fit.c01_range[1]:.4g}] Pa, R2 {fit.r2:.4f}, held out {fit.held_out:.3g} Pa, stretch"
+          f" {fit.stretch[0]:.2f} to {fit.stretch[1]:.2f}")  # fmt: skip
+    print(f"plot     {charts.rubber(a[keep], b[keep], fit, out / 'rubber.png')}\n")
+    result["rubber"] = {"c10": fit.c10, "c01": fit.c01, "c10_range": list(fit.c10_range), "c01_range": list(fit.c01_range), "r2": fit.r2,
+                        "held_out_Pa": fit.held_out, "thickness": float(s["thickness"]), "shear_modulus": fit.shear_modulus}  # fmt: skip
+    return result
+
+
+def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    out, meta = dict(defaults), {}
+    for argument in argv:
+        key, equals, text = argument.partition("=")
+        if equals and key.startswith("meta."):
+            meta[key[5:]] = text
+            continue
+        if not equals or key not in defaults:
+            near = difflib.get_close_matches(key, defaults, 1)
+            raise UserError(f"'{argument}': no such setting{f'; did you mean {near[0]}=' if near else ''}; settings: {', '.join(defaults)}, meta.KEY")
+        if text == "null":
+            out[key] = None
+        elif isinstance(defaults[key], bool):
+            if text not in ("true", "false"):
+                raise UserError(f"{key}={text}: must be true or false")
+            out[key] = text == "true"
+        elif isinstance(defaults[key], (int, float)) or key in ("area",):
+            try:
+                out[key] = float(text)
+            except ValueError:
+                out[key] = float("nan")
+            least = {"levels": 4, "seed": 0, "stretch_max": 1.01}.get(key, 1e-12)
+            if not least <= out[key] < float("inf") or (key in ("levels", "seed") and out[key] != int(out[key])):
+                raise UserError(f"{key}={text}: must be a{' whole' if key in ('levels', 'seed') else ''} number of at least {least:g}")
+        else:
+            out[key] = text
+        if key in CHOICES and out[key] not in CHOICES[key]:
+            raise UserError(f"{key}={text}: must be one of {', '.join(CHOICES[key])}")
+    return out, meta
+
+
+def _help(file: Path) -> str:
+    lines = ["usage: python calibrate.py key=value ...", "", "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml.", ""]
+    for line in file.read_text(encoding="utf-8").splitlines():
+        if ":" in line and not line.startswith("#"):
+            setting, _, comment = line.partition("  # ")
+            key, _, value = setting.partition(": ")
+            lines.append(f"  {key + '=' + value:<34} {comment}")
+    return "\n".join([*lines, "  meta.KEY=VALUE                     metadata that wins over what real= and touch= recordings say", ""])

@@ -1,0 +1,165 @@
+"""The simulated half: each joint presses its fingertip on a fixed ball at several forces, through its servo, in C MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dexsim.assets import xhand
+from dexsim.calibration.presses import finger_of
+from dexsim.errors import UserError
+from dexsim.recording import mechanism
+from dexsim.recording.schema import COMMANDS, TACTILE, Recording, Series
+from dexsim.sim import ContactPair
+
+RADIUS = 0.012  # m, of the ball
+GAP = 0.0015  # m between skin and ball at the start
+RAMP_S, HOLD_S, RATE = 0.2, 0.4, 100.0
+POSE = {"thumb_bend_joint": 0.9, "thumb_rota_joint1": 0.3, "thumb_rota_joint2": 0.4, "index_bend_joint": 0.0,
+        **{j: 0.4 for j in ("index_joint1", "mid_joint1", "ring_joint1", "pinky_joint1")},
+        **{j: 0.4 for j in ("index_joint2", "mid_joint2", "ring_joint2", "pinky_joint2")}}  # fmt: skip
+"""rad: half bent, so that every joint can turn further."""
+
+
+def press_recording(joint: str, servo: dict | str | Path | None = None, levels: int = 8, most: float = 0.8, stiffness: float = 7000.0,
+                    timestep: float = 0.002) -> Recording:
+    """One joint presses: up a ladder of `levels` torques to the share `most` of its torque limit (less where another joint of the
+    finger could not hold against it), and down again; torque in N.m, touch in N. The finger's other joints lean in by what they
+    carry (arm times force over kp), so that the finger stands still and every lever arm stays what it is."""
+    if joint not in xhand.JOINTS:
+        raise UserError(f"joints={joint}: no such joint; joints: {', '.join(xhand.JOINTS)}")
+    m = mechanism.mechanism(None, servo, gravity=[0.0, 0.0, -9.81])
+    f = finger_of(joint)
+    finger, j = xhand.FINGERS[f], xhand.JOINTS.index(joint)
+    place, arms = _site(m.spec, joint, finger)
+    body = m.spec.worldbody.add_body(name="anvil", pos=list(place))
+    body.add_geom(name="anvil", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], contype=0, conaffinity=0)
+    _pair(m.spec, f"tip_{finger}", stiffness)
+    limit, kp = m.column("torque_limit"), m.column("kp")
+    friction = m.column("coulomb_friction")
+    top = most * limit[j]
+    for other in xhand.JOINTS_OF_FINGER[finger]:
+        if other != j and abs(arms[other]) > 1e-4:  # what this joint can hold, as torque of the pressing one
+            top = min(top, 0.8 * limit[other] * abs(arms[j]) / abs(arms[other]))
+    low, high = xhand.joint_limits()[j]
+    reach = GAP / abs(arms[j])
+    force = top / abs(arms[j]) * np.concatenate([np.arange(1, levels + 1), np.arange(levels - 1, 0, -1)]) / levels
+    pose = np.array([POSE[x] for x in xhand.JOINTS])
+    goals = np.tile(pose, (len(force), 1))
+    goals[:, j] += reach
+    for other in xhand.JOINTS_OF_FINGER[finger]:  # every joint leans in by what it will carry, so that none gives way
+        goals[:, other] += force * arms[other] / kp[other]
+    if goals[:, j].max() > high + 1.0 or goals[:, j].min() < low - 1.0:
+        raise UserError(f"{joint}: pressing to {top:.2f} N.m would need a target of {goals[:, j].max():.2f} rad: kp {kp[j]:g} is too soft")
+    commands = _ladder(pose, goals, (j, pose[j] + reach))
+    run = mechanism.drive(m, commands, xhand.JOINTS, float(commands.t[-1]), pose, timestep, frame_s=0.01,
+                          pairs=[ContactPair("press", ("geom", f"tip_{finger}"), ("geom", "anvil"))])
+    out = mechanism.recorded(run, m, commands, xhand.JOINTS)
+    times = np.minimum((np.arange(len(run.qpos)) + 1) * run.frame_s, run.t[-1])
+    out.tactile = Series(times, _taxels(run, finger, place), TACTILE)
+    out.meta |= {"tactile_unit": "N", "tactile_lsb": "1", "notes": f"press: joint={joint}; ball of {RADIUS * 1e3:g} mm; friction {friction[j]:g} N.m"}
+    return out
+
+
+def make(out: str | Path, joints: Sequence[str] = xhand.JOINTS, servo: dict | str | Path | None = None, levels: int = 8, realistic: bool = False,
+         seed: int = 0, say: Callable[[str], None] = print) -> list[Path]:
+    """Write press_<joint>.mcap of each joint into a folder; realistic: as the hardware would have delivered it (mA, counts)."""
+    from dexsim.cli import folder
+    from dexsim.recording.realistic import realistic as as_hardware
+    from dexsim.recording.writer import write
+
+    out = folder.make(Path(out).expanduser(), "out=")
+    paths = []
+    for k, joint in enumerate(joints):
+        recording = press_recording(joint, servo, levels)
+        if realistic:
+            recording = as_hardware(recording, seed + k)
+        path = out / f"press_{joint}.mcap"
+        write(path, recording)
+        paths.append(path)
+        say(f"mcap     {path}: {recording.duration:.1f} s")
+    return paths
+
+
+def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Series:
+    """Commands [T, 12] at RATE: ramps of RAMP_S between levels [L, 12] held for HOLD_S. touch: (joint, its angle at contact),
+    reached first."""
+    first = pose.copy()
+    first[touch[0]] = touch[1]
+    t, q = [0.0, 0.3], [pose, first]
+    for goal in (*goals, pose):
+        t += [t[-1] + RAMP_S, t[-1] + RAMP_S + HOLD_S]
+        q += [goal, goal]
+    times = np.arange(0, t[-1] + 0.5 / RATE, 1 / RATE)
+    value = np.stack([np.interp(times, t, x) for x in np.array(q).T], 1)
+    return Series(times, value, COMMANDS, times.copy())
+
+
+def _site(spec: mujoco.MjSpec, joint: str, finger: str) -> tuple[np.ndarray, dict[int, float]]:
+    """Where the ball goes: against the taxel whose normal lies most along the joint's motion there. Returns its centre [3] m and
+    the lever arms [m] of the finger's joints about the contact's normal."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for name, q in POSE.items():
+        data.qpos[model.joint(name).qposadr[0]] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    body = data.body(xhand.TIP_BODIES[xhand.FINGERS.index(finger)])
+    rot, table = body.xmat.reshape(3, 3), xhand.taxel_table(finger)
+    point, normal = table["position"] @ rot.T + body.xpos, table["normal"] @ rot.T
+
+    def motion(name: str) -> np.ndarray:
+        i = model.joint(name).id
+        return np.cross(data.xaxis[i], point - data.xanchor[i])
+
+    way = motion(joint)
+    size = np.linalg.norm(way, axis=1)
+    row = np.arange(len(point)) % xhand.ROWS
+    good = (way * normal).sum(1) / size - 10.0 * ((row < 3) | (row > 8))
+    k = int(good.argmax())
+    arms = {i: float(motion(xhand.JOINTS[i])[k] @ normal[k]) for i in xhand.JOINTS_OF_FINGER[finger]}
+    return point[k] + normal[k] * (RADIUS + GAP), arms
+
+
+def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
+    """The ball touches this tip and nothing else, with the tips' stiffness [N/m]."""
+    model = spec.compile()
+    d = 0.95
+    k = stiffness * (1 - d) * model.body_invweight0[model.geom(tip).bodyid[0], 0]
+    spec.add_pair(name="press", geomname1=tip, geomname2="anvil", condim=3, friction=[0.8, 0.8, 0.005, 1e-4, 1e-4],
+                  solref=[-k, -2 * np.sqrt(k)], solimp=[d, d, 1e-3, 0.5, 2])
+
+
+def _taxels(run: mechanism.Run, finger: str, place: np.ndarray) -> np.ndarray:
+    """Taxel forces [F, 5, 120, 3] N of each frame: the physics' contact force, spread by the touch model."""
+    import torch
+
+    from dexsim.assets.objects import library
+    from dexsim.tactile.layout import xhand_layout
+    from dexsim.tactile.posed import PosedEngine
+    from dexsim.tactile.shapes import ShapeSet
+    from dexsim.tactile.tactile import Tactile
+
+    n, pairs = len(run.qpos), [f"tip_{x}" for x in xhand.FINGERS]
+    posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
+    shape = library()["sphere"]
+    touch = Tactile(posed, xhand_layout(), ShapeSet([shape], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
+                    tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])
+    data = mujoco.MjData(run.model)
+    ids = [run.model.body(b).id for b in xhand.TIP_BODIES]
+    for w in range(n):
+        data.qpos[:] = run.qpos[w]
+        mujoco.mj_kinematics(run.model, data)
+        posed.t.xpos[w, :5] = torch.as_tensor(data.xpos[ids], dtype=torch.float32)
+        posed.t.xmat[w, :5] = torch.as_tensor(data.xmat[ids].reshape(5, 3, 3), dtype=torch.float32)
+    posed.t.xpos[:, 5] = torch.as_tensor(place, dtype=torch.float32)
+    posed.t.pair_normal[:, xhand.FINGERS.index(finger)] = torch.as_tensor(run.pair_normal[:, 0], dtype=torch.float32)
+    touch.shape_id.fill_(0)
+    touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
+    touch.launch()
+    out = np.zeros((n, 5, xhand.TAXELS_PER_FINGER, 3))
+    out[..., 2] = touch.raw.numpy()
+    return out
