@@ -616,3 +616,36 @@ def test_real_time_on_the_simulated_hand(made, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "99.9 %" in done.stdout and "overruns" in done.stdout and "relaxed" in done.stdout
     assert len(read(tmp_path / "run.mcap", audit=False).commands) > 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["SIGINT", "SIGKILL"])
+def test_interrupting_the_command(made, tmp_path, how):
+    """Ctrl-C relaxes and ends with 130; kill -9 leaves a readable recording and no process of the simulated hand."""
+    import os
+    import signal
+    import subprocess
+    import sys
+
+    path = tmp_path / "run.mcap"
+    p = subprocess.Popen(
+        [sys.executable, "-m", "dexsim.deploy", f"bundle={made[0]}", "seconds=60", "home_speed=2", "late=2", "stale=2", "hang=3", "overruns=500",
+         f"record={path}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    limit = time.monotonic() + 120
+    while not (path.exists() and path.stat().st_size > 40_000) and time.monotonic() < limit:
+        time.sleep(0.1)
+    children = subprocess.run(["ps", "--ppid", str(p.pid), "-o", "pid="], capture_output=True, text=True).stdout.split()
+    os.kill(p.pid, getattr(signal, how))
+    out, err = p.communicate(timeout=60)
+    if how == "SIGINT":
+        assert p.returncode == 130 and "stopped by Ctrl-C" in out and "the hand is relaxed" in out, err
+    r = read(path, audit=False)
+    assert len(r.states.position) > 100 and len(r.commands) > 50
+    assert any(f.kind == "damage" for f in r.findings) == (how == "SIGKILL")
+    limit = time.monotonic() + 20
+    alive = children
+    while alive and time.monotonic() < limit:  # what is left of a process that nobody waited for does not count
+        time.sleep(0.2)
+        rows = subprocess.run(["ps", "-o", "pid=,stat=", "-p", ",".join(children)], capture_output=True, text=True).stdout.splitlines()
+        alive = [row for row in rows if "Z" not in row.split()[1]]
+    assert children and not alive

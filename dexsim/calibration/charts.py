@@ -29,7 +29,8 @@ def lines(half: Half, path: Path, title: str) -> Path:
         ax.plot(x, f.slope * x + f.offset, lw=1, label=f"{f.slope:.3g} x {f.offset:+.2f}")
         ax.plot(x, f.ratio * x, "--", lw=0.8, label=f"{f.ratio:.3g} x")
         text = f"R2 {f.r2:.4f}\nheld out {f.held_out:.2f} N\nhysteresis {100 * f.hysteresis:.0f} %" + ("" if f.linear else "\nnot linear")
-        ax.text(0.97, 0.04, text, ha="right", va="bottom", fontsize=7, transform=ax.transAxes, color="black" if f.linear else "tab:red")
+        color = "black" if f.linear else "tab:red"
+        ax.text(0.97, 0.04, text, ha="right", va="bottom", fontsize=7, transform=ax.transAxes, color=color)
         ax.legend(fontsize=6, loc="upper left")
         ax.set_xlabel(half.unit, fontsize=8)
         ax.set_ylabel("N", fontsize=8)
@@ -45,7 +46,8 @@ def rubber(stretch: np.ndarray, nominal: np.ndarray, fit: Rubber, path: Path) ->
     ax = figure.subplots()
     ax.plot(stretch, 1e-6 * nominal, "o", ms=4, label="measured")
     x = np.linspace(*fit.stretch, 200)
-    ax.plot(x, 1e-6 * stress(x, fit.c10, fit.c01), label=f"c10 {fit.c10 / 1e3:.1f} kPa, c01 {fit.c01 / 1e3:.1f} kPa, held out {fit.held_out / 1e3:.1f} kPa")
+    label = f"c10 {fit.c10 / 1e3:.1f} kPa, c01 {fit.c01 / 1e3:.1f} kPa, held out {fit.held_out / 1e3:.1f} kPa"
+    ax.plot(x, 1e-6 * stress(x, fit.c10, fit.c01), label=label)
     ax.set(xlabel="stretch", ylabel="nominal stress, MPa")
     ax.legend()
     ax.grid(alpha=0.25)

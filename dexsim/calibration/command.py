@@ -51,7 +51,8 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
         half = current.half(current.files_of(s[key], key), effort_is, meta if key == "real" else None, int(s["seed"]))
         report["source"][key] = s[key] if len(s[key]) < 200 else str(Path(s[key].split(",")[0]).parent)
         _print_half(half, key, symbol)
-        print(f"plot     {charts.lines(half, out / f'{key}.png', f'{key}: fingertip force over ' + ('motor current' if key == 'real' else 'joint torque'))}\n")
+        title = f"{key}: fingertip force over {'motor current' if key == 'real' else 'joint torque'}"
+        print(f"plot     {charts.lines(half, out / f'{key}.png', title)}\n")
         real, sim = (half, sim) if key == "real" else (real, half)
     if real or sim:
         report["joints"] = current.combine(real, sim)
@@ -142,8 +143,8 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
     for finger, p in found.items():
         words = [f"threshold {p.threshold:.3g} {unit}", f"{len(p.dead)} dead", f"{len(p.swapped)} swapped pairs", f"{len(p.unseen)} never pressed"]
         if p.gain is not None:
-            words.append(f"{p.scale:.4g} N a {unit}, load on held-out presses to {100 * p.held_out:.1f} % ({100 * p.held_out_equal:.1f} % with equal gains)"
-                         f", hysteresis {100 * p.hysteresis:.1f} %")  # fmt: skip
+            words.append(f"{p.scale:.4g} N a {unit}, load on held-out presses to {100 * p.held_out:.1f} %"
+                         f" ({100 * p.held_out_equal:.1f} % with equal gains), hysteresis {100 * p.hysteresis:.1f} %")  # fmt: skip
             base = np.mean(scales)
             result["gain"][finger] = [round(float(g * p.scale / base), 4) for g in p.gain]
             result["hysteresis"][finger] = round(float(p.hysteresis), 4) if np.isfinite(p.hysteresis) else None
@@ -200,7 +201,8 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
             continue
         if not equals or key not in defaults:
             near = difflib.get_close_matches(key, defaults, 1)
-            raise UserError(f"'{argument}': no such setting{f'; did you mean {near[0]}=' if near else ''}; settings: {', '.join(defaults)}, meta.KEY")
+            hint = f"; did you mean {near[0]}=" if near else ""
+            raise UserError(f"'{argument}': no such setting{hint}; settings: {', '.join(defaults)}, meta.KEY")
         if text == "null":
             out[key] = None
         elif isinstance(defaults[key], bool):
@@ -223,7 +225,8 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
 
 
 def _help(file: Path) -> str:
-    lines = ["usage: python calibrate.py key=value ...", "", "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml.", ""]
+    what = "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml."
+    lines = ["usage: python calibrate.py key=value ...", "", what, ""]
     for line in file.read_text(encoding="utf-8").splitlines():
         if ":" in line and not line.startswith("#"):
             setting, _, comment = line.partition("  # ")

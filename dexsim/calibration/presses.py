@@ -33,7 +33,8 @@ def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
 
 
 def levels_of(recording: Recording) -> dict[str, Levels]:
-    """Steady presses by joint. A joint presses where its command steps from level to level; where no command moves (the fingertip is pressed from outside), every joint of the finger that is touched counts.
+    """Steady presses by joint. A joint presses where its command steps from level to level; where no command moves
+    (the fingertip is pressed from outside), every joint of the finger that is touched counts.
 
     Raises UserError for a recording without effort, its sign, or touch.
     """

@@ -83,7 +83,8 @@ def main(argv: Sequence[str]) -> int:
     print(report.timing.table())
     print("counts   " + (", ".join(f"{k} {v}" for k, v in sorted(report.counts.items())) or "none"))
     if recorder is not None:
-        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped)" + (f"; {recorder.error}" if recorder.error else ""))
+        lost = f"; {recorder.error}" if recorder.error else ""
+        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}")
     return 0 if report.ended == "done" else 130 if "Ctrl-C" in report.ended else 1
 
 

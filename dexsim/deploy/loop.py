@@ -19,7 +19,7 @@ from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
-from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
+from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.measure import Measure
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, HEIGHT, OBSERVATION, Recorder
 from dexsim.deploy.safety import Guard
@@ -348,7 +348,3 @@ class Loop:
                 self.report.counts["watchdog"] += 1
                 self.driver.relax()  # without the lock: whoever holds it hangs
 
-
-def relaxed_command() -> HandCommand:
-    """What `relax` sends: mode 0, no current."""
-    return HandCommand(np.zeros(12), np.zeros(12), kp=0, mode=PASSIVE)
