@@ -454,7 +454,8 @@ def _sentence(data: dict, d: Diagnosis, floor: float) -> str:
     for f in named[:3]:
         joint = f["where"]["joints"][0]
         size = next(iter(f["parameters"].items()), None)
-        how = f" ({size[0]} {size[1]['value']:.3g} {size[1]['unit']})" if size and size[1]["value"] is not None else ""
+        number = np.atleast_1d(size[1]["value"]) if size and size[1]["value"] is not None else ()  # com and tilt are vectors
+        how = f" ({size[0]} {' '.join(f'{v:.3g}' for v in number)} {size[1]['unit']})" if len(number) else ""
         words = EFFECTS[f["effect"]].words
         if f["indistinguishable"]:
             words += f", or one of {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}, which this recording cannot tell apart"
