@@ -57,11 +57,13 @@ class HeightSource(Protocol):
     def place(self, now: float) -> tuple[np.ndarray, float] | None: ...
 
 
-def centroid(frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 12) -> np.ndarray | None:
+def centroid(frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 12, solid: bool = True) -> np.ndarray | None:
     """The mask's centroid as (x, y, z) m in the palm frame; None where fewer than `least` pixels are the object's.
 
     The centroid is the mean of the mask's pixels; its depth is their median, so that a few pixels of the background (a
-    mask's ragged edge) move nothing. The median lies on the side of the object that faces the camera.
+    mask's ragged edge) move nothing. The median lies on the side of the object that faces the camera; `solid` moves the point to
+    where a ball of the mask's area has its centre (0.71 of its radius behind the median), since training knows the object's
+    middle. Seen from the side this moves x and y, and hardly z.
     """
     if rule not in RULES:
         raise UserError(f"vision rule={rule}: must be one of {', '.join(RULES)}")
@@ -69,7 +71,10 @@ def centroid(frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 
     if int(good.sum()) < least:
         return None
     v, u = np.nonzero(good)
-    p = pose.point(float(u.mean()) + 0.5, float(v.mean()) + 0.5, float(np.median(frame.depth[good])))
+    depth = float(np.median(frame.depth[good]))
+    if solid:
+        depth += np.sqrt(0.5) * np.sqrt(good.sum() / np.pi) * depth / pose.focal
+    p = pose.point(float(u.mean()) + 0.5, float(v.mean()) + 0.5, depth)
     return p if rule == "normal" else np.array([p[0], p[1], np.linalg.norm(p)])
 
 
