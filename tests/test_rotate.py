@@ -123,7 +123,11 @@ def test_actor_slices_hold_what_they_say():
     rel = m.transpose(1, 2) @ g
     assert torch.allclose(actor[:, :12], env.q)
     assert torch.allclose(actor[:, 12:18], torch.cat([rel[:, :, 0], rel[:, :, 1]], 1), atol=1e-5)
-    assert torch.equal(actor[:, 18:30], act)
+    low, high = env.q_low, env.q_high
+    assert torch.allclose(low + (high - low) * (actor[:, 18:30] + 1) / 2, env.target, atol=1e-5)  # in radians again
+    env.task["observe"]["last_action"] = "step"
+    assert torch.equal(env.observe(advance=False)["actor"][:, 18:30], act)
+    env.task["observe"]["last_action"] = "target"
     assert torch.allclose(actor[:, 30:45], env.touch.centre.reshape(4, 15))
     assert torch.allclose(actor[:, 45:50], env.touch.force)
     assert torch.allclose(actor[:, 50:65], env.tips.reshape(4, 15))

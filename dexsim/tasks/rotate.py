@@ -27,7 +27,7 @@ ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 ACTOR = (  # table (b): name, width, unit, what it is on hardware
     ("joint_angle", 12, "rad", "measured"),
     ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
-    ("last_action", 12, "1", "as sent"),
+    ("last_action", 12, "1", "the targets last sent, over each joint's range"),
     ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
     ("contact_force", 5, "N", "sum of a pad's normal forces"),
     ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
@@ -47,7 +47,7 @@ assert (ACTOR_SIZE, CRITIC_SIZE) == (65, 149)
 PROPRIOCEPTION = (  # no object pose; `history` of these, newest first
     ("joint_angle", 12, "rad", "measured"),
     ("joint_velocity", 12, "rad/s", "measured"),
-    ("last_action", 12, "1", "as sent"),
+    ("last_action", 12, "1", "as above"),
     ("contact_centre", 15, "m", "as above"),
     ("contact_force", 5, "N", "as above"),
 )
@@ -124,6 +124,8 @@ class RotateEnv(HandEnv):
         orientation = t["observe"]["orientation"]
         if orientation not in ORIENTATION:
             raise UserError(f"task.observe.orientation={orientation}: must be {', '.join(ORIENTATION)}")
+        if t["observe"].get("last_action", "step") not in ("target", "step"):
+            raise UserError(f"task.observe.last_action={t['observe']['last_action']}: must be target or step")
         if not 1 <= t["history"] <= 32:
             raise UserError(f"task.history={t['history']}: must lie in [1, 32]")
         goal = t["goal"]
@@ -257,17 +259,17 @@ class RotateEnv(HandEnv):
                 self._read_imu(fresh)
         angle = self.q + self.joint_bias + sense["joint_noise"] * s.normal(12)
         centre = self.touch.centre.reshape(n, 15) if self.taxel_point is None else self._plain_centre()
-        tips = self.tips.reshape(n, 15)
+        tips, sent = self.tips.reshape(n, 15), self._last_action()
         if t["perception"] == "imu":
             parts = {
-                "joint_angle": angle, "relative_orientation": self._relative(), "last_action": self.action,
+                "joint_angle": angle, "relative_orientation": self._relative(), "last_action": sent,
                 "contact_centre": centre, "contact_force": self.touch.force, "fingertip_position": tips + sense["tip_noise"] * s.normal(15),
             }  # fmt: skip
             actor = torch.cat([parts[row[0]] for row in self._actor_rows()], 1)
         else:
             parts = {
                 "joint_angle": angle, "joint_velocity": self.qd + sense["velocity_noise"] * s.normal(12),
-                "last_action": self.action, "contact_centre": centre, "contact_force": self.touch.force,
+                "last_action": sent, "contact_centre": centre, "contact_force": self.touch.force,
             }  # fmt: skip
             frame = torch.cat([parts[row[0]] for row in self._actor_rows(frames=1)], 1)
             frame = torch.where(self.nan[:, None], torch.zeros_like(frame), frame)
@@ -277,7 +279,7 @@ class RotateEnv(HandEnv):
             actor = self.past.reshape(n, -1)
         q = self.object_pose[:, 3:]
         critic = [
-            self.q, rotation.six(rotation.multiply(rotation.conjugate(q), self.goal)), self.action,
+            self.q, rotation.six(rotation.multiply(rotation.conjugate(q), self.goal)), sent,
             self.touch.centre_clean.reshape(n, 15), self.touch.force_clean, tips,
             rotation.six(q), self.tip_velocity.reshape(n, 30), rotation.six_of_matrix(self.tip_rot).reshape(n, 30), self.qd,
             self.object_velocity[:, :3], self._spin(),
@@ -289,6 +291,13 @@ class RotateEnv(HandEnv):
         ok = ~self.nan[:, None]
         return {"actor": torch.where(ok, actor, torch.zeros_like(actor)), "critic": torch.nan_to_num(torch.cat(critic, 1))}
 
+    def _last_action(self) -> torch.Tensor:
+        """What was last sent to the drives [N, 12], targets over each joint's range in [-1, 1]: in absolute mode the action
+        itself; in relative mode a step alone would not tell how hard a finger is told to press."""
+        if self.task["observe"].get("last_action", "step") == "step":
+            return self.action
+        return (self.target - self.q_mid) / self.q_half
+
     def _actor_rows(self, frames: int | None = None) -> list[tuple]:
         """Rows of the actor's observation under the settings of `task.observe` and `task.perception`."""
         o = self.task["observe"]
@@ -298,7 +307,7 @@ class RotateEnv(HandEnv):
             if name == "relative_orientation":
                 width = ORIENTATION[o["orientation"]]
                 text = text if width != 4 else "quaternion, sign as it comes"
-            if width and o.get(name, True):
+            if width and o.get(name, True) is not False:
                 count = (frames or self.task["history"]) if proprioception else 1
                 rows.append((name, width * count, unit, text))
         return rows
