@@ -1,85 +1,88 @@
 """What a control step costs beside bare physics of the same scene, in one run.
 
-    python -m benchmarks.step [worlds=8192] [steps=100] [any other setting of train.py]
+    python -m benchmarks.step [worlds=8192] [steps=40] [rounds=3] [any other setting of train.py]
 
-Bare physics: the same number of physics steps of the same worlds in the same states, nothing else. Full step: servo,
-touch with 600 taxels, rewards, terminations, reset, randomization, observations.
+All worlds are driven into a grasp of moderate force. From that state, the same number of control steps is timed as
+  bare    physics steps only, driven by the torques, damping and friction that the servo wrote in the same steps of a
+          run with the servo (recorded, and copied back by one small kernel before each physics step);
+  servo   physics steps with the servo kernel before each;
+  touch   the same with the touch kernel (600 taxels) after the last;
+  full    the environment's step: also actions, terminations, rewards, masked reset, randomization, observations.
+`rounds` times in turns; medians. Prints milliseconds a control step and `overhead`, full over bare minus one.
 """
 
 from __future__ import annotations
 
-import json
+import statistics
 import sys
 import time
-from pathlib import Path
 
 import torch
 
-from dexsim.cli import machine
-from dexsim.cli import start as start_up
+from benchmarks import tools
+from benchmarks.tape import Tape
+from dexsim.errors import UserError
 from dexsim.tasks import make_env
 
-
-def _time(device: str, fn, repeats: int) -> float:
-    """Seconds a call, of `repeats` calls in a row."""
-    sync = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
-    fn()
-    fn()
-    sync()
-    start = time.perf_counter()
-    for _ in range(repeats):
-        fn()
-    sync()
-    return (time.perf_counter() - start) / repeats
-
-
 def main(argv: list[str]) -> dict:
-    steps_given = [a.split("=", 1)[1] for a in argv if a.startswith("steps=")]
-    cfg = start_up.for_train([a for a in argv if not a.startswith("steps=")], Path(__file__).parents[1] / "configs").cfg
+    own, rest = tools.split(argv, {"steps": "", "rounds": "3"})
+    cfg = tools.config(rest)
     device, worlds = cfg["device"], cfg["worlds"]
-    steps = int(steps_given[-1]) if steps_given else (100 if device.startswith("cuda") else 20)
-    machine.set_threads(device)
-    start = time.perf_counter()
+    steps = tools.numbers(own["steps"] or ("40" if device.startswith("cuda") else "20"), "steps")[0]
+    rounds = tools.numbers(own["rounds"], "rounds")[0]
+    begin = time.perf_counter()
     env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
     action = torch.zeros(worlds, env.num_actions, device=device)
-    close = torch.zeros_like(action)
-    close[:, 4:] = 0.5
-    close[:, :3] = 0.4
     env.step(action)
     env.step(action)
-    ready = time.perf_counter() - start
-    for k in range(120):  # into a grasp of moderate force: the contacts of training
-        env.step(torch.where((env.torque / env.effort).abs() > 0.4, action, close) if k > 16 else action)
-    e = env.engine
-    ones = torch.ones(worlds, dtype=torch.bool, device=device)
-    qpos, qvel = e.t.qpos.clone(), e.t.qvel.clone()
+    ready = time.perf_counter() - begin
+    tools.close_hand(env)
+    e, k = env.engine, env.decimation
+    everyone = torch.ones(worlds, dtype=torch.bool, device=device)
+    qpos, qvel, servo, target = e.t.qpos.clone(), e.t.qvel.clone(), env.servo.get_state(), env.target.clone()
+    tape = Tape(e, env.servo, (steps + 2) * k)
 
-    def timed(fn) -> float:
-        """Seconds of fn, all worlds put back into the same grasp first."""
-        e.set_state(ones, qpos, qvel)
-        return _time(device, fn, steps)
+    def back() -> None:
+        """Everything as it was in the grasp; the clock begins at 0, and so do the servo's queues of targets."""
+        e.set_state(everyone, qpos, qvel)
+        env.servo.reset(everyone, target)
+        env.servo.set_state(torch.cat([servo[..., :2], env.servo.get_state()[..., 2:]], -1))
+        env.target.copy_(target)
+        env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
+        tape.rewind()
 
-    # Bare physics: joint friction and damping stay as the servo left them; its last torques go on acting.
-    forces = e.t.qfrc_applied.clone()
-    e.set_state(ones, qpos, qvel)
-    e.t.qfrc_applied.copy_(forces)
-    bare = _time(device, lambda: e.step(env.decimation), 8)
-    driven = timed(lambda: e.step(env.decimation, env.servo.before_each))
-    touched = timed(lambda: e.step(env.decimation, env.servo.before_each, env.touch.launch))
-    full = timed(lambda: env.step(action))
+    back()
+    for _ in range(steps + 2):
+        e.step(k, tape.record)
+    calls = {
+        "bare": lambda: e.step(k, tape.play),
+        "servo": lambda: e.step(k, env.servo.before_each),
+        "touch": lambda: e.step(k, env.servo.before_each, env.touch.launch),
+        "full": lambda: env.step(action),
+    }
+    for call in calls.values():  # compiled and recorded before anything is timed
+        back()
+        for _ in range(3):
+            call()
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            back()
+            times[name].append(tools.seconds(device, call, steps))
+    bare, driven, touched, full = (1e3 * statistics.median(times[name]) for name in calls)
     peaks = e.peaks()
-    out = {
-        "benchmark": "step", "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu", "engine": e.kind,
-        "worlds": worlds, "physics_steps": env.decimation, "ready_s": round(ready, 1), "bare_ms": 1e3 * bare, "servo_ms": 1e3 * (driven - bare),
-        "touch_ms": 1e3 * (touched - driven), "rest_ms": 1e3 * (full - touched), "full_ms": 1e3 * full,
-        "env_steps_per_s": worlds / full, "physics_steps_per_s": worlds * env.decimation / bare, "overhead": full / bare - 1,
-        "contacts": peaks["contacts"], "rows": peaks["rows"],
-    }  # fmt: skip
-    for k, v in out.items():
-        print(f"  {k:20s} {v:.4g}" if isinstance(v, float) else f"  {k:20s} {v}")
-    print(json.dumps(out))
-    return out
+    return tools.report({
+        "benchmark": "step", **tools.about(device), "engine": e.kind, "worlds": worlds, "physics_steps": k, "ready_s": ready,
+        "bare_ms": bare, "servo_ms": driven - bare, "touch_ms": touched - driven, "rest_ms": full - touched, "full_ms": full,
+        "overhead": full / bare - 1, "overhead_over_driven": full / driven - 1, "env_steps_per_s": 1e3 * worlds / full,
+        "physics_steps_per_s": 1e3 * worlds * k / bare, "contacts": peaks["contacts"], "rows": peaks["rows"],
+        "rounds_ms": {name: [round(1e3 * t, 3) for t in ts] for name, ts in times.items()},
+    })  # fmt: skip
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except UserError as e:
+        print(e, file=sys.stderr)
+        sys.exit(2)

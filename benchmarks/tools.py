@@ -1,0 +1,95 @@
+"""What the benchmarks share: their arguments, the environment in a closed grasp, clocks, and the printout."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dexsim.cli import machine
+from dexsim.cli import start as start_up
+from dexsim.errors import UserError
+
+ROOT = Path(__file__).parents[1]
+
+
+def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], list[str]]:
+    """(the benchmark's own settings, `own` being their defaults; what is left for train.py)."""
+    rest, values = [], dict(own)
+    for a in argv:
+        key, equals, value = a.partition("=")
+        if equals and key in own:
+            values[key] = value
+        else:
+            rest.append(a)
+    return values, rest
+
+
+def numbers(text: str, name: str) -> list[int]:
+    """Whole numbers from "8192,16384"; raises UserError naming the setting."""
+    try:
+        found = [int(x) for x in str(text).strip("[]").split(",")]
+    except ValueError:
+        found = []
+    if not found or min(found) < 1:
+        raise UserError(f"{name}={text}: must be whole numbers above 0 with commas between, e.g. {name}=64,128")
+    return found
+
+
+def config(argv: Sequence[str]) -> dict[str, Any]:
+    """The resolved settings of `python train.py ARGV`; torch's threads set as there."""
+    cfg = start_up.for_train(list(argv), ROOT / "configs").cfg
+    machine.set_threads(cfg["device"])
+    return cfg
+
+
+def about(device: str) -> dict[str, Any]:
+    """Hardware and versions, for the JSON line."""
+    cuda = device.startswith("cuda")
+    name = torch.cuda.get_device_name(device) if cuda else f"{platform.machine()} CPU, {len(os.sched_getaffinity(0))} cores"
+    return {"device": name, "versions": machine.versions()}
+
+
+def wait(device: str) -> None:
+    """Until the device has done all that was asked of it."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize(device)
+
+
+def seconds(device: str, call: Callable[[], object], repeats: int, warm: int = 2) -> float:
+    """Seconds a call, of `repeats` calls in a row."""
+    for _ in range(warm):
+        call()
+    wait(device)
+    start = time.perf_counter()
+    for _ in range(repeats):
+        call()
+    wait(device)
+    return (time.perf_counter() - start) / repeats
+
+
+def close_hand(env: Any, steps: int = 120) -> None:
+    """Drive all worlds of a grasp environment into a grasp of moderate force: the contacts of training."""
+    still = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    close = still.clone()
+    close[:, 4:] = 0.5
+    close[:, :3] = 0.4
+    for k in range(steps):  # the object falls first; a joint closes until it meets its torque
+        env.step(torch.where((env.torque / env.effort).abs() > 0.4, still, close) if k > 16 else still)
+
+
+def report(out: dict[str, Any]) -> dict[str, Any]:
+    """Print a table of the plain values, then the JSON line."""
+    for k, v in out.items():
+        if isinstance(v, float):
+            print(f"  {k:28s} {v:.4g}")
+        elif isinstance(v, str | int):
+            print(f"  {k:28s} {v}")
+    print(json.dumps({k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in out.items()}), flush=True)
+    return out
