@@ -139,10 +139,11 @@ def test_hash_binds_the_truth_and_the_salt_hides_it(some, tmp_path):
 
 
 def test_plan_is_fixed_by_its_seed():
-    assert generate.plan(24, 7) == generate.plan(24, 7) != generate.plan(24, 8)
-    plan = generate.plan(24, 7)
+    mix = {"effect": len(generate.INSIDE), "none": 4, "noise": 2, "outside": 2, "decoy": 2}
+    assert generate.plan(mix, 7) == generate.plan(mix, 7) != generate.plan(mix, 8)
+    plan = generate.plan(mix, 7)
     assert {p["kind"] for p in plan if p["group"] == "effect"} == set(generate.INSIDE)
-    assert [sum(p["group"] == g for p in plan) for g in ("effect", "none", "noise", "outside", "decoy")] == [14, 4, 2, 2, 2]
+    assert {g: sum(p["group"] == g for p in plan) for g in mix} == mix
 
 
 def test_scores_by_hand():
@@ -171,8 +172,8 @@ def test_scores_by_hand():
 
 @pytest.mark.slow
 def test_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
-    line = command.main(["cases=1", "seed=2", f"out={tmp_path}"])
+    line = command.main(["mix=effect:1", "seed=2", f"out={tmp_path}"])
     assert line["cases"] == 1 and line["failed"] == 0 and line["lines"]
     assert json.loads(capsys.readouterr().out.strip().splitlines()[-1])["benchmark"] == "concealed"
     monkeypatch.setattr(sys, "executable", "no such program")  # a finished case is not diagnosed again
-    assert command.main(["cases=1", "seed=2", f"out={tmp_path}"])["lines"] == line["lines"]
+    assert command.main(["mix=effect:1", "seed=2", f"out={tmp_path}"])["lines"] == line["lines"]

@@ -1,9 +1,9 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
-    python -m benchmarks.concealed [cases=24] [seed=1] [out=out/concealed] [jobs=1] [first=0] [limit=900]
+    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900]
 
-first: number of the first case, to draw others of the same seed; limit: seconds a diagnosis may take. Resumable: a case
-that is finished is not run again. Prints a table and one JSON line. Rigs have one joint: lines of the judging table that need
+mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take. Resumable: a case that is
+finished is not run again. Prints a table and one JSON line. Rigs have one joint: lines of the judging table that need
 several joints, touch or several effects at once are not scored, nor is the overlap of regimes.
 """
 
@@ -14,13 +14,14 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks.concealed import generate, score
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"cases": 24, "seed": 1, "out": "out/concealed", "jobs": 1, "first": 0, "limit": 900}
+SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900}
 
 
 def parse(argv: list[str]) -> dict:
@@ -30,20 +31,33 @@ def parse(argv: list[str]) -> dict:
         key, equals, text = argument.partition("=")
         if not equals or key not in SETTINGS:
             raise SystemExit(f"'{argument}' is not a setting; valid: {', '.join(SETTINGS)} (key=value)")
-        if key != "out" and not text.isdigit():
+        if key == "mix":
+            pairs = [part.partition(":")[::2] for part in text.split(",")]
+            if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
+                raise SystemExit(f"mix={text}: must read like effect:14,none:4 with groups of {', '.join(generate.MIX)}")
+            given[key] = {group: int(number) for group, number in pairs}
+        elif key == "out":
+            given[key] = text
+        elif text.isdigit():
+            given[key] = int(text)
+        else:
             raise SystemExit(f"{key}={text}: must be a whole number")
-        given[key] = text if key == "out" else int(text)
     return given
 
 
-def _case(entry: dict, number: int, s: dict, root: Path) -> dict:
-    """{name, digest}: the case as it was made before, or made now."""
-    stub = root / "made" / f"{number}.json"
-    if not stub.is_file():
-        made = generate.build(entry, number, s["seed"], root / "cases", root / "truth")
-        stub.parent.mkdir(parents=True, exist_ok=True)
-        stub.write_text(json.dumps(made), encoding="utf-8")
-    return json.loads(stub.read_text(encoding="utf-8"))
+class Progress:
+    """A line now and then: done of all, seconds left."""
+
+    def __init__(self, what: str, total: int):
+        self.what, self.total, self.done, self.start, self.last = what, total, 0, time.perf_counter(), 0.0
+
+    def __call__(self) -> None:
+        """One more is done."""
+        self.done += 1
+        spent = time.perf_counter() - self.start
+        if spent - self.last > 5 or self.done == self.total:
+            self.last = spent
+            print(f"  {self.what} {self.done}/{self.total}, about {spent / self.done * (self.total - self.done):.0f} s left", flush=True)
 
 
 def _diagnose(name: str, s: dict, root: Path) -> float:
@@ -74,21 +88,26 @@ def main(argv: list[str]) -> dict:
     """Runs the benchmark; returns what the JSON line says."""
     s = parse(argv)
     root = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
-    entries = generate.plan(s["first"] + s["cases"], s["seed"])[s["first"] :]
-    made = []
-    for n, entry in enumerate(entries, start=s["first"]):
-        made.append(_case(entry, n, s, root))
+    jobs = [(entry, n, s["seed"], root) for n, entry in enumerate(generate.plan(s["mix"], s["seed"]))]
+    made, tick = [], Progress("made", len(jobs))
+    with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
+        for m in pool.map(generate.once, jobs):
+            made.append(m)
+            tick()
     (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in made), encoding="utf-8")
     print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}", flush=True)
+    tick = Progress("diagnosed", len(made))
     with ThreadPoolExecutor(max(s["jobs"], 1)) as pool:
-        for k, (m, spent) in enumerate(zip(made, pool.map(lambda m: _diagnose(m["name"], s, root), made), strict=True), start=1):
-            print(f"  {k}/{len(made)} {m['name']} {f'{spent:.0f} s' if spent else 'done before'}", flush=True)
+        for done in as_completed([pool.submit(_diagnose, m["name"], s, root) for m in made]):
+            done.result()
+            tick()
     results = []
     for m in made:
         truth = generate.reveal(root / "truth" / f"{m['name']}.json", m["digest"])
         diagnosis = json.loads((root / "diagnoses" / m["name"] / "diagnosis.json").read_text(encoding="utf-8"))
         results.append(score.one(truth, diagnosis))
     lines = score.table(results)
+    (root / "results.json").write_text(json.dumps({"results": results, "lines": lines}), encoding="utf-8")
     print("\n" + score.show(lines, results))
     seconds = [float((root / "diagnoses" / m["name"] / "seconds").read_text()) for m in made]
     line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "failed": sum(r["verdict"] == "failed" for r in results),

@@ -63,6 +63,9 @@ KINDS: dict[str, Kind] = {
     "inertia": Kind("inertia", (0.05, 8.0), _plus("rotor", "total"), lambda n, o: {"armature": n["rotor"] - n["rotor_believed"]}),
     "payload": Kind("payload", (0.06, 2.0), _plus("mass", "mass"), lambda n, o: {"mass": n["mass"] - n["mass_believed"]}),
     "position_offset": Kind("position_offset", (0.001, 0.5), _plus("offset"), lambda n, o: {"offset": n["offset"]}),
+    "compliance": Kind("compliance", (0.02, 1.5), lambda p, s: {"spring": p["kp"] / s}, lambda n, o: {"stiffness": n["spring"]}),
+    "torque_ripple": Kind("torque_ripple", (0.02, 1.5), lambda p, s: {"ripple": s * p["weight"]}, lambda n, o: {"amplitude": n["ripple"], "per_turn": n["per_turn"]}),
+    "position_scale": Kind("position_scale", (0.003, 0.3), _plus("scale"), lambda n, o: {"scale": n["scale"]}),
     "deadband": Kind("deadband", (0.002, 0.3), _plus("deadband"), lambda n, o: {"width": n["deadband"]}),
     "dwell_stiction": Kind("", (0.02, 1.5), lambda p, s: {"dwell": s * p["weight"], "dwell_time": 1.5}, lambda n, o: {}),
     "cable_spring": Kind("", (0.02, 1.5), lambda p, s: {"cable": s * p["weight"], "cable_rest": 0.6}, lambda n, o: {}),
@@ -71,27 +74,27 @@ INSIDE = tuple(k for k, v in KINDS.items() if v.effect)
 OUTSIDE = tuple(k for k, v in KINDS.items() if not v.effect)
 
 
-def plan(count: int, seed: int) -> list[dict]:
-    """What each case holds: {kind, tier, group}, in an order that is itself drawn. Of 24: 14 inside the catalogue,
-    4 with nothing missing, 2 with doubled noise, 2 outside, 2 decoys; other counts in the same proportion."""
+MIX = {"effect": 14, "none": 4, "noise": 2, "outside": 2, "decoy": 2}
+
+
+def plan(mix: dict[str, int], seed: int) -> list[dict]:
+    """What each case holds: {kind, tier, group}, in an order that is itself drawn. mix: number of cases by group: effect (one
+    of the catalogue), none, noise (nothing, the noise doubled), outside (the catalogue), decoy. Kinds and tiers take turns."""
     rng = np.random.default_rng([seed, 1])
     kinds, tiers = list(rng.permutation(INSIDE)), ("easy", "medium", "hard")
-    pattern = ["effect"] * 14 + ["none"] * 4 + ["noise"] * 2 + ["outside"] * 2 + ["decoy"] * 2
-    order = [pattern[i] for i in rng.permutation(len(pattern))]
-    out, seen = [], {"effect": 0, "outside": 0, "decoy": 0}
-    for n in range(count):
-        group = order[n % len(order)]
-        k = seen.get(group, 0)
-        if group in seen:
-            seen[group] += 1
-        if group == "outside":
-            kind, tier = OUTSIDE[k % len(OUTSIDE)], tiers[k // len(OUTSIDE) % 2]
-        elif group in ("effect", "decoy"):
-            kind, tier = str(kinds[k % len(kinds)]), tiers[(k + k // len(kinds)) % 3]
-        else:
+    out = []
+    for group, count in mix.items():
+        if group not in MIX:
+            raise ValueError(f"no group '{group}'; there are {', '.join(MIX)}")
+        for k in range(count):
             kind, tier = "none", "none"
-        out.append({"group": group, "kind": kind, "tier": tier if group != "decoy" else "poor"})
-    return out
+            if group == "outside":
+                kind, tier = OUTSIDE[k % len(OUTSIDE)], tiers[k // len(OUTSIDE) % 2]
+            elif group in ("effect", "decoy"):
+                # all kinds before a kind comes again, then at another tier
+                kind, tier = str(kinds[k % len(kinds)]), tiers[(k + k // len(kinds)) % 3]
+            out.append({"group": group, "kind": kind, "tier": tier if group != "decoy" else "poor"})
+    return [out[i] for i in rng.permutation(len(out))]
 
 
 def motions(rng: np.random.Generator, poor: bool) -> np.ndarray:
@@ -129,7 +132,7 @@ def _rig(rng: np.random.Generator) -> tuple[dict, dict]:
     true = {k: v * (1 + rng.uniform(-0.03, 0.03)) for k, v in b.items()}
     true["length"] = b["length"]  # the moment is off with the mass already
     true |= {"motor_side": float(rng.uniform() < 0.3), "link_inertia": 0.4 * b["mass"] * 0.012**2, "weight": weight, "total": inertia,
-             "stribeck_speed": rng.uniform(0.05, 0.4)}  # fmt: skip
+             "stribeck_speed": rng.uniform(0.05, 0.4), "per_turn": float(rng.integers(6, 40)), "phase": rng.uniform(-3, 3)}  # fmt: skip
     true |= {f"{k}_believed": b[k] for k in ("kp", "rotor", "mass")}
     return plant.DEFAULTS | {k: float(v) for k, v in true.items()}, {k: float(v) for k, v in b.items()}
 
@@ -144,7 +147,8 @@ def _sized(true: dict, kind: Kind | None, ratio: float, command: np.ndarray, noi
     R = len(command)
     values = {k: np.repeat([v.get(k, plant.DEFAULTS[k]) for v in variants], R) for k in plant.DEFAULTS}
     run = plant.simulate(plant.rows(R * len(variants), **values), np.tile(command, (len(variants), 1)))
-    q = run["position"].reshape(len(variants), R, -1) + np.array([v.get("offset", 0.0) for v in variants])[:, None, None]  # as measured
+    get = lambda key: np.array([v[key] for v in variants])[:, None, None]  # noqa: E731
+    q = get("scale") * run["position"].reshape(len(variants), R, -1) + get("offset")  # as measured
     slopes = (q[first:-1] - q[0]).reshape(len(REFIT), -1).T / 0.02
 
     def hidden(d: np.ndarray) -> float:
@@ -202,6 +206,17 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
               "parameters": kind.report(true | p, true) if kind else {}}  # fmt: skip
     answer["parameters"] = {k: float(v) for k, v in answer["parameters"].items()}
     return {"name": name, "digest": commit(answer, truth)}
+
+
+def once(job: tuple[dict, int, int, Path]) -> dict:
+    """{name, digest}: the case as it was made before, or made now. job: entry of the plan, number, seed, folder."""
+    entry, number, seed, root = job
+    stub = root / "made" / f"{number}.json"
+    if not stub.is_file():
+        made = build(entry, number, seed, root / "cases", root / "truth")
+        stub.parent.mkdir(parents=True, exist_ok=True)
+        stub.write_text(json.dumps(made), encoding="utf-8")
+    return json.loads(stub.read_text(encoding="utf-8"))
 
 
 def commit(answer: dict, folder: Path) -> str:

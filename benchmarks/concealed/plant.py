@@ -24,6 +24,7 @@ DEFAULTS: dict[str, float] = {
     "motor_side": 0.0,  # 1: the loop reads the motor, 0: the link
     "coulomb": 0.015, "viscous": 0.003, "peak": 0.0, "peak_speed": 0.1, "load": 0.0, "load_back": 0.0,
     "dwell": 0.0, "dwell_time": 1.0,  # stiction that grows with time at rest [N.m], its time constant [s]
+    "ripple": 0.0, "per_turn": 12.0, "phase": 0.0, "scale": 1.0,  # N.m, per turn of the motor, rad; of both encoders
     "cable": 0.0, "cable_rest": 0.0,  # spring to the world [N.m/rad], the angle where it is slack [rad]
     "bristle": 1.0,  # 1: LuGre; 0: a plain tanh(v) law, to see what the law itself changes
 }  # fmt: skip
@@ -61,12 +62,13 @@ def simulate(p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | flo
     rate = np.where(p["lag"] > 0, 1 - np.exp(-1e-3 / np.maximum(p["lag"], 1e-6)), 1.0)
     filtered, last, carried = np.zeros(B), q.copy(), np.zeros(B)
     has_dwell, tanh_law = bool(p["dwell"].any()), p["bristle"] < 0.5
+    has_ripple = bool(p["ripple"].any())
     index = np.arange(B)
     out_q, out_tau = np.empty((B, M)), np.empty((B, M))
     unit = 2 * np.pi / 2**18  # the loop's own encoder
     for k in range(M):
         # firmware: reads its encoder, filters the speed, and asks for a torque that holds one millisecond
-        seen = np.floor((np.where(p["motor_side"] > 0.5, motor, q) + p["offset"]) / unit) * unit
+        seen = np.floor((p["scale"] * np.where(p["motor_side"] > 0.5, motor, q) + p["offset"]) / unit) * unit
         filtered += 0.8 * ((seen - last) / 1e-3 - filtered) if k else 0.0  # a slower filter would be a lag that nobody drew
         last = seen
         i = np.maximum(k - delay, 0)
@@ -97,6 +99,8 @@ def simulate(p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | flo
             friction = sigma0 * z_next + sigma1 * np.exp(-((speed / 0.05) ** 2)) * (z_next - z) / DT
             z = z_next
             friction = np.where(tanh_law, level * np.tanh(vm / 0.01), friction)
+            if has_ripple:
+                friction = friction - p["ripple"] * np.sin(p["per_turn"] * motor + p["phase"])
             vm = (vm + DT * (tau - push - friction) / p["rotor"]) / (1 + DT * p["viscous"] / p["rotor"])
             pull = -weight * np.sin(q) - p["cable"] * (q - p["cable_rest"])
             v = v + DT * (push + pull) / link
