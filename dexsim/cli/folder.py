@@ -53,31 +53,40 @@ def write_config(folder: Path, cfg: dict[str, Any]) -> None:
 
 
 class ProgressFile:
-    """``progress.csv``: one row an iteration; a column may appear later, earlier rows then have it empty."""
+    """``progress.csv``: one row an iteration; a column may appear later, earlier rows then have it empty.
+
+    Rows stay on disk only: a run of a million iterations must not hold them in memory.
+    """
 
     def __init__(self, path: Path, earlier: Path | None = None, until: int = 0) -> None:
-        self._path, self._names, self._rows = path, [], []
+        self._path: Path = path
+        self._names: list[str] = []
         if earlier is not None and earlier.is_file():  # a resumed run's past
             with open(earlier, newline="") as file:
-                self._rows = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)
-                              if int(row["iteration"]) <= until]
-            self._names = list(dict.fromkeys(k for row in self._rows for k in row))
-            self._write_all()
+                rows = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)
+                        if int(row["iteration"]) <= until]
+            self._names = list(dict.fromkeys(k for row in rows for k in row))
+            self._write(rows)
 
     def add(self, row: dict[str, float]) -> None:
         """Append a row."""
         text = {k: repr(v) for k, v in row.items() if not (isinstance(v, float) and math.isnan(v))}
-        self._rows.append(text)
         new = [k for k in text if k not in self._names]
-        if new:
+        if new:  # rare: the header grows, so the file is written again
             self._names += new
-            self._write_all()
+            self._write([*self._read(), text])
         else:
             with open(self._path, "a", newline="") as file:
                 csv.DictWriter(file, self._names, restval="").writerow(text)
 
-    def _write_all(self) -> None:
+    def _read(self) -> list[dict[str, str]]:
+        if not self._path.is_file():
+            return []
+        with open(self._path, newline="") as file:
+            return list(csv.DictReader(file))
+
+    def _write(self, rows: list[dict[str, str]]) -> None:
         with open(self._path, "w", newline="") as file:
             writer = csv.DictWriter(file, self._names, restval="")
             writer.writeheader()
-            writer.writerows(self._rows)
+            writer.writerows(rows)
