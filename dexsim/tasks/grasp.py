@@ -191,7 +191,7 @@ class GraspEnv(HandEnv):
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
-            "force_error": w["force_error"] * ((force[:, 1:] - self.command[:, None] * self.f_max).abs().mean(1) / self.f_max),
+            "force_near": w.get("force_near", 0.0) * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
@@ -263,7 +263,7 @@ class GraspEnv(HandEnv):
         r = self.task["rewards"]
         notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
                  "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed",
-                 "force_error": "ours: |F_i - F_cmd F_max| / F_max, mean of the fingers", "self": "ours: tips pressing on the hand"}
+                 "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers", "self": "ours: tips pressing on the hand"}
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
         if self.task["critic"] == "privileged":
@@ -273,7 +273,7 @@ class GraspEnv(HandEnv):
         return {
             "observations": groups,
             "action": [(j, float(lo), float(hi), f"rad ({act['mode']})") for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
-            "rewards": [(k, w, notes[k]) for k, w in r.items()],
+            "rewards": [(k, w, notes.get(k, "")) for k, w in r.items()],
             "terminations": [("dropped", f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m away"),
                              ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
             "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],

@@ -89,6 +89,8 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
     qpos, shown_force = [], []
     push_force = (PUSH_WEIGHTS * 9.81 * mass)[:, None] * direction
+    # |m (g + a_push)|, the push where it is drawn to act: what the fingers must carry
+    load = (9.81 * mass[:, None] * down + push_force * pushed[:, None]).norm(dim=1)
     for k in range(steps):
         t = k * dt
         pushing = pushed & (t >= push_at) & (t < push_at + PUSH_S)
@@ -129,7 +131,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     samples = samples.clamp(min=1)
     out = {
         "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held, "held90": held90,
-        "held180": held180, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive, "moved": moved, "untouched": untouched,
+        "held180": held180, "load": load, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive, "moved": moved, "untouched": untouched,
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
     out["frames"] = None
@@ -158,10 +160,14 @@ def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
 
 
 def must_hold(r: dict, f_max: float) -> np.ndarray:
-    """Episodes [E] whose commanded forces can carry the pushed object: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, with the
-    push at its worst, along gravity."""
-    load = r["mass"] * 9.81 * (1 + PUSH_WEIGHTS * r["pushed"])
-    return 4 * r["command"] * f_max >= 2 * load / r["friction"]
+    """Episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, summed over the four
+    fingers, a_push in its drawn direction (zero in episodes without a push)."""
+    return 4 * r["command"] * f_max >= 2 * r["load"] / r["friction"]
+
+
+def can_carry(r: dict, f_max: float) -> np.ndarray:
+    """Episodes [E] whose commanded forces can carry the object's weight alone: sum_i F_cmd F_max >= 2 m g / mu."""
+    return 4 * r["command"] * f_max >= 2 * r["mass"] * 9.81 / r["friction"]
 
 
 def _rate(ok: np.ndarray, among: np.ndarray) -> float | None:
@@ -175,6 +181,7 @@ def _corr(a: np.ndarray, b: np.ndarray) -> float | None:
 def _metrics(r: dict, k: dict, f_max: float) -> dict:
     able, able_k = must_hold(r, f_max), must_hold(k, f_max)
     pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
+    carried = can_carry(r, f_max)
     held = r["held"].astype(bool)
     total = r["force"][:, 1:].sum(1)
     out = {
@@ -184,7 +191,7 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         "hold_rate_kept_out_shapes": _rate(k["held"], k["pushed"].astype(bool) & able_k),
         "hold_rate_kept_out_shapes_unpushed": _rate(k["held"], ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
         "hold_rate_all": float(held.mean()),
-        "hold_rate_turned_90": _rate(r["held90"], able), "hold_rate_turned_180": _rate(r["held180"], able),
+        "hold_rate_turned_90": _rate(r["held90"], carried), "hold_rate_turned_180": _rate(r["held180"], carried),
         "force_command_correlation": _corr(r["command"][held], total[held]),
         "force_max_N": float(f_max),
         # why episodes were not held: they overlap; dropped includes the turned part
@@ -233,8 +240,11 @@ def _tables(r: dict, k: dict, env) -> list:
         for name in dict.fromkeys(names.tolist()):
             m = names == name
             p = part["pushed"].astype(bool)
-            by_shape.append((name + label, int(m.sum()), _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able)))
-    tables.append(("Held % by object", ("object", "episodes", "held %", "held pushed %"), by_shape))
+            h = m & part["held"].astype(bool)
+            missing = [f"{100 * (part['force'][h, i + 1] < 0.1).mean():.0f}" if h.any() else "-" for i in range(4)]
+            by_shape.append((name + label, int(m.sum()), _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able), *missing))
+    tables.append(("Held % by object, and % of held episodes in which a finger does not touch",
+                   ("object", "episodes", "held %", "held pushed %", *FINGERS), by_shape))
     return tables
 
 
