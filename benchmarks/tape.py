@@ -14,7 +14,7 @@ class Tape:
     """
 
     def __init__(self, engine, servo, length: int):
-        self.engine, self.servo = engine, servo
+        self.engine, self._drive = engine, servo.before_each
         with wp.ScopedDevice(engine.device):
             self._tape = wp.zeros((length, 3, engine.n, engine.mjm.nv), dtype=engine.real)
             self._at = wp.zeros(1, dtype=int)
@@ -28,7 +28,7 @@ class Tape:
 
     def record(self) -> None:
         """Run the servo and keep what it wrote."""
-        self.servo.before_each()
+        self._drive()
         self._launch(self._record)
 
     def play(self) -> None:
