@@ -298,7 +298,7 @@ def test_plain_centre_is_the_mean_of_touched_taxels():
 
 
 def test_proprioception_remembers():
-    env = make("task.perception=proprioception", "task.history=3", worlds=2)
+    env = make("task.perception=proprioception", "task.history=3", "task.observe.last_action=step", worlds=2)
     seen = [env.get_observations()["actor"]]
     for k in range(3):
         seen.append(env.step(torch.full((2, 12), 0.1 * (k + 1)))[0]["actor"])

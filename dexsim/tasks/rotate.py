@@ -15,6 +15,8 @@ import math
 import torch
 
 from dexsim.assets import xhand
+from dexsim.deploy import observations_rotate as observations
+from dexsim.deploy.observations_rotate import ACTOR, ORIENTATION
 from dexsim.errors import UserError
 from dexsim.tactile.layout import xhand_layout
 from dexsim.tasks import rotation
@@ -22,16 +24,6 @@ from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import GraspSet
 
-ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
-
-ACTOR = (  # table (b): name, width, unit, what it is on hardware
-    ("joint_angle", 12, "rad", "measured"),
-    ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
-    ("last_action", 12, "1", "the targets last sent, over each joint's range"),
-    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
-    ("contact_force", 5, "N", "sum of a pad's normal forces"),
-    ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
-)
 CRITIC = (  # beyond the actor's rows, which the critic gets clean and whole
     ("object_orientation", 6, "1", "6D, palm frame"),
     ("fingertip_velocity", 30, "m/s, rad/s", "linear and angular of each"),
@@ -44,13 +36,6 @@ ACTOR_SIZE = sum(row[1] for row in ACTOR)
 CRITIC_SIZE = ACTOR_SIZE + sum(row[1] for row in CRITIC)
 assert (ACTOR_SIZE, CRITIC_SIZE) == (65, 149)
 
-PROPRIOCEPTION = (  # no object pose; `history` of these, newest first
-    ("joint_angle", 12, "rad", "measured"),
-    ("joint_velocity", 12, "rad/s", "measured"),
-    ("last_action", 12, "1", "as above"),
-    ("contact_centre", 15, "m", "as above"),
-    ("contact_force", 5, "N", "as above"),
-)
 PRIVILEGED = (  # with task.critic=privileged, ours
     ("drift", 3), ("object_size", 1), ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_damping", 1),
     ("finger_force", 5), ("palm_force", 1), ("torque", 12), ("target_error", 12),
@@ -107,7 +92,7 @@ class RotateEnv(HandEnv):
         self.seen[:, 0] = 1.0
         self.joint_bias = zeros(12)
         observe = t["observe"]
-        frame = sum(row[1] for row in self._actor_rows(frames=1))
+        frame = sum(row[1] for row in observations.rows(t, frames=1))
         self.past = zeros(t["history"], frame) if t["perception"] == "proprioception" else None
         self.taxel_point = None
         if not observe["force_weighted"]:
@@ -186,9 +171,7 @@ class RotateEnv(HandEnv):
     def next_goal(self, q: torch.Tensor) -> torch.Tensor:
         """The goal after orientation q [N, 4] was reached: q turned by the goal's angle about the palm's axis, its tilt
         against that axis removed unless `goal.keep_tilt`."""
-        if not self.task["goal"]["keep_tilt"]:
-            q = rotation.upright(q, self.axis)
-        return rotation.normalize(rotation.multiply(self.turn.expand_as(q), q))
+        return observations.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
 
     # -- terminations --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
@@ -260,23 +243,16 @@ class RotateEnv(HandEnv):
         angle = self.q + self.joint_bias + sense["joint_noise"] * s.normal(12)
         centre = self.touch.centre.reshape(n, 15) if self.taxel_point is None else self._plain_centre()
         tips, sent = self.tips.reshape(n, 15), self._last_action()
-        if t["perception"] == "imu":
-            parts = {
-                "joint_angle": angle, "relative_orientation": self._relative(), "last_action": sent,
-                "contact_centre": centre, "contact_force": self.touch.force, "fingertip_position": tips + sense["tip_noise"] * s.normal(15),
-            }  # fmt: skip
-            actor = torch.cat([parts[row[0]] for row in self._actor_rows()], 1)
-        else:
-            parts = {
-                "joint_angle": angle, "joint_velocity": self.qd + sense["velocity_noise"] * s.normal(12),
-                "last_action": sent, "contact_centre": centre, "contact_force": self.touch.force,
-            }  # fmt: skip
-            frame = torch.cat([parts[row[0]] for row in self._actor_rows(frames=1)], 1)
-            frame = torch.where(self.nan[:, None], torch.zeros_like(frame), frame)
-            if advance:
-                moved = torch.cat([frame[:, None], self.past[:, :-1]], 1)
-                self.past.copy_(torch.where(fresh[:, None, None], frame[:, None].expand_as(moved), moved))
-            actor = self.past.reshape(n, -1)
+        imu = t["perception"] == "imu"
+        past = tips[:, None, :0] if imu else self.past
+        actor = observations.build(observations.Signals(
+            joint_position=angle, joint_velocity=self.qd if imu else self.qd + sense["velocity_noise"] * s.normal(12),
+            orientation=self.seen, goal=self._goal_seen(), sent=sent, touch_force=self.touch.force, touch_centre=centre,
+            fingertip=tips + sense["tip_noise"] * s.normal(15) if imu else tips,
+            past=past, fresh=fresh), t)  # the deployed loop builds its own with the same function
+        actor = torch.where(self.nan[:, None], torch.zeros_like(actor), actor)
+        if advance and not imu:
+            self.past.copy_(actor.view_as(self.past))
         q = self.object_pose[:, 3:]
         critic = [
             self.q, rotation.six(rotation.multiply(rotation.conjugate(q), self.goal)), sent,
@@ -288,29 +264,11 @@ class RotateEnv(HandEnv):
             o = self.objects
             critic += [self.object_pose[:, :3] - self.home, o.size[:, :1], o.mass[:, None], o.com, o.friction[:, None],
                        o.damping_ratio[:, None], self.finger_force, self.palm_force[:, None], self.torque, self.target - self.q]
-        ok = ~self.nan[:, None]
-        return {"actor": torch.where(ok, actor, torch.zeros_like(actor)), "critic": torch.nan_to_num(torch.cat(critic, 1))}
+        return {"actor": actor, "critic": torch.nan_to_num(torch.cat(critic, 1))}
 
     def _last_action(self) -> torch.Tensor:
-        """What was last sent to the drives [N, 12], targets over each joint's range in [-1, 1]: in absolute mode the action
-        itself; in relative mode a step alone would not tell how hard a finger is told to press."""
-        if self.task["observe"].get("last_action", "step") == "step":
-            return self.action
-        return (self.target - self.q_mid) / self.q_half
-
-    def _actor_rows(self, frames: int | None = None) -> list[tuple]:
-        """Rows of the actor's observation under the settings of `task.observe` and `task.perception`."""
-        o = self.task["observe"]
-        proprioception = self.task["perception"] == "proprioception"
-        rows = []
-        for name, width, unit, text in PROPRIOCEPTION if proprioception else ACTOR:
-            if name == "relative_orientation":
-                width = ORIENTATION[o["orientation"]]
-                text = text if width != 4 else "quaternion, sign as it comes"
-            if width and o.get(name, True) is not False:
-                count = (frames or self.task["history"]) if proprioception else 1
-                rows.append((name, width * count, unit, text))
-        return rows
+        """What was last sent to the drives [N, 12]; see `observations_rotate.sent`."""
+        return observations.sent(self.action, self.target, self.q_mid, self.q_half, self.task["observe"].get("last_action", "step"))
 
     def _feel_motion(self, fresh: torch.Tensor) -> None:
         """Fingertip velocities over the last control step: linear, and angular from the rotation between the two."""
@@ -340,20 +298,15 @@ class RotateEnv(HandEnv):
         pick = self.imu_delay[:, None, None].expand(-1, 1, 4)
         self.seen.copy_(rotation.normalize(self.imu_past.gather(1, pick)[:, 0]))
 
-    def _relative(self) -> torch.Tensor:
-        """R_object^T R_goal as the actor sees it. The goal was set from the IMU, so it carries the heading drift of that
-        moment; what drifted since is error.
-
-        As a quaternion: both orientations pass through rotation matrices, whose quaternion has the sign of its largest
-        component, so the sign of the product jumps with the object's attitude. It is left so: the double cover is what
-        this setting studies.
-        """
+    def _goal_seen(self) -> torch.Tensor:
+        """The goal [N, 4] as the actor has it: set from the IMU, so it carries the heading drift of that moment; what drifted
+        since is error."""
         drift = rotation.about(self.up.expand(self.num_envs, 3), self.goal_heading)
-        goal = rotation.multiply(drift, self.goal)
-        if self.task["observe"]["orientation"] == "quaternion":
-            a, b = (rotation.from_matrix(rotation.to_matrix(q)) for q in (self.seen, goal))
-            return rotation.multiply(rotation.conjugate(a), b)
-        return rotation.six(rotation.multiply(rotation.conjugate(self.seen), goal))
+        return rotation.multiply(drift, self.goal)
+
+    def _relative(self) -> torch.Tensor:
+        """R_object^T R_goal as the actor sees it."""
+        return observations.relative(self.seen, self._goal_seen(), self.task["observe"]["orientation"])
 
     def _plain_centre(self) -> torch.Tensor:
         """Contact centres [N, 15] without force weighting: the mean position of the taxels that feel anything."""
@@ -388,7 +341,7 @@ class RotateEnv(HandEnv):
         if t["critic"] == "privileged":
             critic += [(name, width, "privileged") for name, width in PRIVILEGED]
         limit, r = t["termination"], t["reward"]
-        actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in self._actor_rows()]
+        actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in observations.rows(t)]
         edge = 1000 * self.grasps.edge
         return {
             "observations": {"actor": actor, "critic": critic},
