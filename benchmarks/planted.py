@@ -1,0 +1,489 @@
+"""Planted effects: every joint effect of the catalogue, hidden in recordings of our own simulator, and found again.
+
+    python -m benchmarks.planted [cases=0] [first=0] [seed=1] [workers=1] [out=out/planted] [effects=a,b] [limit=600]
+
+One round is every entry of PLANTS once, its size drawn round robin from three tiers, and a few cases with nothing planted;
+`cases` counts along the rounds (0: one round). This is the sanity check of `diagnose`: the data come from the simulator it
+fits, with gains, masses and friction a few percent off, an encoder's quantum, noise and a jittered clock. Effects of the
+servo table and of the model are simulated by C MuJoCo with the servo kernel, the others by the gap's own plant at a quarter
+of its step. Size of an effect: its held-out change, with what a refit of the believed figures hides of it taken away, is
+8, 4 or 2 times the measurement noise. Resumable; prints a table and one JSON line.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing as mp
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+TIERS = {"large": 8.0, "medium": 4.0, "small": 2.0}
+NONE_EACH = 6  # cases with nothing planted in a round
+SECONDS = 7.0
+QUANTUM = 2 * np.pi / 4096
+SETTINGS = {"cases": 0, "first": 0, "seed": 1, "workers": 1, "out": "out/planted", "effects": "", "limit": 600}
+REFIT = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "inertia_scale", "gravity_scale")
+OFF = 0.03  # what every believed figure is off by, at most
+
+
+@dataclass(frozen=True)
+class Plant:
+    """An effect as it is planted. change(rig, size) -> plant columns added to ("+name"), multiplied ("*name") or set;
+    span: smallest and largest size; truth(rig, size) -> {key: value} as the catalogue reports it. needs: what of the
+    rig or the recording it cannot be seen without."""
+
+    effect: str
+    span: tuple[float, float]
+    change: object
+    truth: object
+    needs: str = ""
+
+
+def _less(column: str, key: str):
+    return lambda r, s: {f"*{column}": 1 - s}, lambda r, s: {key: r[column] * (1 - s)}
+
+
+PLANTS: dict[str, Plant] = {
+    "coulomb_friction": Plant("coulomb_friction", (0.01, 1.0), lambda r, s: {"+coulomb_friction": s * r["weight"]},
+                              lambda r, s: {"torque": r["coulomb_friction"] + s * r["weight"]}),
+    "coulomb_friction one way": Plant("coulomb_friction", (0.01, 1.0), lambda r, s: {"+coulomb_friction": s * r["weight"], "friction_asymmetry": 0.8},
+                                      lambda r, s: {"torque": r["coulomb_friction"] + s * r["weight"], "asymmetry": 0.8}),
+    "stribeck_friction": Plant("stribeck_friction", (0.01, 1.2), lambda r, s: {"stribeck_peak": s * r["weight"], "stribeck_speed": 0.25},
+                               lambda r, s: {"peak": s * r["weight"], "v_s": 0.25}),
+    "viscous_friction": Plant("viscous_friction", (0.01, 1.0), lambda r, s: {"+viscous_friction": 0.2 * s * r["weight"]},
+                              lambda r, s: {"coefficient": r["viscous_friction"] + 0.2 * s * r["weight"]}),
+    "load_friction": Plant("load_friction", (0.02, 0.8), lambda r, s: {"load_friction": s, "load_friction_backdriven": 1.4 * s},
+                           lambda r, s: {"fraction": s, "fraction_backdriven": 1.4 * s}),
+    "backlash": Plant("backlash", (0.003, 0.3), lambda r, s: {"backlash": s}, lambda r, s: {"gap": s}),
+    "compliance": Plant("compliance", (0.03, 2.0), lambda r, s: {"softness": s / r["kp"]}, lambda r, s: {"stiffness": r["kp"] / s}),
+    "command_delay": Plant("command_delay", (0.002, 0.1), lambda r, s: {"+delay": s}, lambda r, s: {"delay": s}),
+    "lag": Plant("lag", (0.002, 0.1), lambda r, s: {"lag": s}, lambda r, s: {"time_constant": s}),
+    "lag of the speed": Plant("lag", (0.004, 0.1), lambda r, s: {"speed_lag": s}, lambda r, s: {"time_constant": s}, "damped"),
+    "torque_limit": Plant("torque_limit", (0.05, 0.9), *_less("torque_limit", "torque")),
+    "torque_speed_limit": Plant("torque_speed_limit", (0.06, 0.93), *_less("no_load_speed", "no_load_speed")),
+    "supply_sag": Plant("supply_sag", (0.02, 0.9), lambda r, s: {"sag": s / (2 * r["weight"])}, lambda r, s: {"sag": s / (2 * r["weight"])}, "pair voltage"),
+    "torque_ripple": Plant("torque_ripple", (0.01, 1.0), lambda r, s: {"torque_ripple": s * r["weight"], "ripple_per_turn": r["teeth"], "ripple_phase": 1.0},
+                           lambda r, s: {"amplitude": s * r["weight"], "per_turn": r["teeth"]}),
+    "thermal of the torque constant": Plant("thermal", (0.0006, 0.03), lambda r, s: {"thermal_torque": -s}, lambda r, s: {"per_degree": -s, "of": "torque_constant"},
+                                            "warm"),
+    "thermal of the friction": Plant("thermal", (0.002, 0.04), lambda r, s: {"thermal_friction": -s}, lambda r, s: {"per_degree": -s, "of": "friction"},
+                                     "warm rough"),
+    "joint_coupling": Plant("joint_coupling", (0.002, 0.4), lambda r, s: {"coupling": s}, lambda r, s: {"ratio": s, "from_joint": "other"}, "pair"),
+    "position_offset": Plant("position_offset", (0.002, 0.5), lambda r, s: {"position_offset": s}, lambda r, s: {"offset": s}),
+    "position_scale": Plant("position_scale", (0.005, 0.3), lambda r, s: {"position_scale": 1 + s}, lambda r, s: {"scale": 1 + s}),
+    "eccentric encoder": Plant("position_scale", (0.002, 0.2), lambda r, s: {"eccentric_sin": 0.8 * s, "eccentric_cos": 0.6 * s},
+                               lambda r, s: {"eccentricity": s}),
+    "payload": Plant("payload", (0.06, 2.0), lambda r, s: {"payload": s * r["mass"]}, lambda r, s: {"mass": s * r["mass"]}),
+    "tilted gravity": Plant("payload", (0.005, 0.6), lambda r, s: {"tilt_y": s}, lambda r, s: {"tilt": [0.0, s, 0.0]}),
+    "inertia": Plant("inertia", (0.06, 5.0), lambda r, s: {"+armature": s * r["inertia"]}, lambda r, s: {"armature": s * r["inertia"]}),
+    "gain_mismatch kp": Plant("gain_mismatch", (0.06, 0.7), lambda r, s: {"*kp": 1 - s}, lambda r, s: {"kp_factor": (1 - s) * r["off"]["*kp"]}),
+    "gain_mismatch kd": Plant("gain_mismatch", (0.06, 8.0), lambda r, s: {"*kd": 1 + s}, lambda r, s: {"kd_factor": (1 + s) * r["off"]["*kd"]}, "damped"),
+    "deadband": Plant("deadband", (0.002, 0.3), lambda r, s: {"deadband": s}, lambda r, s: {"width": s}),
+    "current_sensor": Plant("current_sensor", (0.08, 0.6), lambda r, s: {"effort_gain": 1 - s, "effort_offset": 0.3 * s * r["weight"]},
+                            lambda r, s: {"gain": 1 - s, "offset": 0.3 * s * r["weight"]}, "effort"),
+}  # fmt: skip
+SERVO = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction")
+
+
+def plan(seed: int, effects: set[str]) -> list[dict]:
+    """One round after another: {kind, tier}; kind '' has nothing planted."""
+    names = [n for n, p in PLANTS.items() if not effects or p.effect in effects or n in effects]
+    tiers, out = list(TIERS), []
+    for turn in range(40):
+        order = np.random.default_rng([seed, 1, turn]).permutation(len(names) + (0 if effects else NONE_EACH))
+        for k in order:
+            kind = names[k] if k < len(names) else ""
+            out.append({"kind": kind, "tier": tiers[(k + turn) % 3] if kind else "none"})
+    return out
+
+
+def rig(rng: np.random.Generator, needs: str) -> dict:
+    """Believed figures of a pendulum of random size on a servo, of which there are two where `pair` is needed."""
+    b = {"mass": rng.uniform(0.08, 0.3), "length": rng.uniform(0.07, 0.14), "rotor": rng.uniform(2e-4, 8e-4)}
+    b["weight"] = b["mass"] * 9.81 * b["length"]
+    b["inertia"] = b["mass"] * b["length"] ** 2 + b["rotor"]
+    b["voltage"] = "voltage" in needs or (rng.uniform() < 0.25 and "damped" not in needs)
+    b["torque_limit"] = b["weight"] * rng.uniform(4, 8)
+    b["no_load_speed"] = rng.uniform(9, 18)
+    spring = b["weight"] * rng.uniform(6, 14)
+    b["kp"] = spring / (b["torque_limit"] if b["voltage"] else 1.0)
+    b["kd"] = 0.0 if b["voltage"] else 2 * rng.uniform(0.3, 0.6) * np.sqrt(spring * b["inertia"])
+    rough = rng.uniform(0.2, 0.4) if "rough" in needs else rng.uniform(0.04, 0.1)
+    b |= {"coulomb_friction": b["weight"] * rough, "viscous_friction": b["weight"] * rng.uniform(0.005, 0.02)}
+    b["teeth"] = float(rng.integers(3, 24))
+    b["joints"] = ("joint", "other") if "pair" in needs else ("joint",)
+    b["motor_loop"] = bool(rng.uniform() < 0.3)
+    return b
+
+
+def model_xml(b: dict) -> str:
+    """The pendulum(s) as MJCF; a second one hangs beside the first and shares nothing with it but the supply."""
+    bodies = "".join(f"""
+    <body name="link_{j}" pos="0 {0.3 * k:g} 0">
+      <joint name="{j}" type="hinge" axis="0 1 0" armature="{b["rotor"]:.6g}" range="-3 3" solimpfriction="0.999 0.9999 0.001 0.5 2"/>
+      <geom name="bob_{j}" type="sphere" size="0.012" pos="0 0 {-b["length"]:.6g}" mass="{b["mass"]:.6g}" contype="0" conaffinity="0"/>
+    </body>""" for k, j in enumerate(b["joints"]))  # fmt: skip
+    return f"""<mujoco model="rig"><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/><worldbody>{bodies}
+</worldbody></mujoco>
+"""
+
+
+def servo(b: dict) -> dict:
+    """The believed servo table."""
+    return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO}}, "loop_rate": 1000,
+            "loop_encoder": "motor" if b["motor_loop"] else "joint", "position_encoder": "joint"}  # fmt: skip
+
+
+def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
+    """Targets sent at 100 Hz [K]."""
+    t = np.arange(0.0, SECONDS, 0.01)
+    knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 40)])
+    levels = np.r_[0.0, rng.uniform(-0.9, 0.9, len(knots) - 1)]
+    ramp = np.interp(t, knots[::2], levels[::2])
+    rise = rng.uniform(0.12, 0.3)
+    step = np.interp(t, np.sort(np.r_[knots[1:], knots[1:] + rise]), np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
+    f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.5, 3.0), len(t))
+    chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
+    parts = [[ramp, step, chirp], [chirp, ramp, step], [step, chirp, ramp], [ramp, chirp, step]][kind % 4]
+    return np.choose(np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2), parts)
+
+
+def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
+    """Four runs with commands, times and temperature, the measured motion still to be simulated."""
+    from dexsim.actuator.table import ServoTable
+    from dexsim.gap.runs import Run
+
+    out, J = [], len(b["joints"])
+    t_cmd = np.arange(0.0, SECONDS, 0.01)
+    warm = rng.permutation(4)
+    for k in range(4):
+        cmd = np.stack([motion(rng, k + j) for j in range(J)], 1)
+        n = int(SECONDS / 0.01) - 3
+        t = 0.005 + (np.arange(n) + 0.5) * 0.01 + np.clip(rng.normal(0, 6e-4, n), -4e-3, 4e-3)
+        t = t[rng.uniform(size=n) > 0.005]
+        run = Run(f"{'abcd'[k]}.mcap", b["joints"], t_cmd, cmd, t, np.stack([np.interp(t, t_cmd, c) for c in cmd.T], 1), ServoTable.from_dict(servo(b)),
+                  np.array([0.0, 0.0, -9.81]))  # fmt: skip
+        if "warm" in needs or rng.uniform() < 0.2:
+            run.temperature = np.repeat((25 + 8.0 * warm[k] + 6.0 * t / SECONDS)[:, None], J, 1)
+        out.append(run)
+    if any(r.temperature is None for r in out):
+        for r in out:
+            r.temperature = None
+    return out
+
+
+def _apply(params: np.ndarray, change: dict) -> np.ndarray:
+    """Plant parameters [..., C] with the changes made."""
+    from dexsim.gap.plant_columns import INDEX
+
+    out = params.copy()
+    for key, value in change.items():
+        c = INDEX[key.lstrip("+*")]
+        out[..., c] = out[..., c] * value if key[0] == "*" else out[..., c] + value if key[0] == "+" else value
+    return out
+
+
+def _simulate(b: dict, runs: list, changes: list[dict], dt: float, passes: int) -> tuple[list, np.ndarray, np.ndarray]:
+    """(cases, position [H, n], torque [H, n]) of the first joint under each of the changes, all joints moving as the first change
+    of the first joint makes them."""
+    import mujoco
+
+    from dexsim.gap.prepare import build
+
+    model = mujoco.MjModel.from_xml_string(model_xml(b))
+    for _ in range(passes):
+        for r in runs:
+            r.qs = None
+            r.smooth()
+        cases = build(model, runs, dt=dt)
+        for j, case in enumerate(cases):
+            p = _apply(case.plant.base()[None], changes[0] if j == 0 else b["off"])
+            q, tau = case.plant.simulate(p, case.plant.windows(None))
+            for i, r in enumerate(runs):
+                r.q[:, j] = q[0, case.plant.rows(i)]
+                if r.torque is None:
+                    r.torque = np.zeros_like(r.q)
+                r.torque[:, j] = tau[0, case.plant.rows(i)]
+    first = cases[0].plant
+    H = [_apply(first.base(), c) for c in changes]
+    q, tau = first.simulate(np.stack(H), first.windows(None))
+    return cases, q, tau
+
+
+def _by_mujoco(b: dict, runs: list, change: dict) -> bool:
+    """Simulates the runs by C MuJoCo with the servo kernel, where the change is of the servo table or the model; else False."""
+    import mujoco
+
+    from dexsim.actuator.columns import INDEX as SERVO_INDEX
+    from dexsim.actuator.table import ServoTable
+    from dexsim.recording.mechanism import Mechanism, drive
+    from dexsim.recording.schema import COMMANDS, Series
+
+    model_only = {"+armature", "payload", "*inertia_scale", "*gravity_scale"}
+    table = servo(b)
+    values = table["joints"]["*"]
+    if any(k.lstrip("+*") not in SERVO_INDEX and k not in model_only for k in change) or "position_scale" in change or "position_offset" in change:
+        return False
+    if len(b["joints"]) > 1 or b["motor_loop"]:
+        return False
+    true = dict(b)
+    for key, value in change.items():
+        name = key.lstrip("+*")
+        if name in SERVO_INDEX:
+            values[name] = float(values.get(name, 0.0) * value if key[0] == "*" else values.get(name, 0.0) + value if key[0] == "+" else value)
+    scale = change.get("*gravity_scale", 1.0)
+    inertia = b["inertia"] * change.get("*inertia_scale", 1.0) + change.get("+armature", 0.0) + change.get("payload", 0.0) * b["length"] ** 2
+    true["mass"] = b["mass"] * scale + change.get("payload", 0.0)
+    true["rotor"] = inertia - true["mass"] * b["length"] ** 2  # what the links do not have is the rotor's
+    if true["rotor"] <= 0:
+        return False
+    ball = 0.4 * 0.012**2 * (b["mass"] - true["mass"])  # the bob's own inertia, which the believed model has too
+    true["rotor"] += ball
+    spec = mujoco.MjSpec.from_string(model_xml(true))
+    m = Mechanism(spec, b["joints"], ServoTable.from_dict(table), "rig")
+    for r in runs:
+        run = drive(m, Series(r.cmd_t, r.cmd, COMMANDS, r.cmd_t), list(b["joints"]), SECONDS, timestep=5e-4)
+        r.q = np.stack([np.interp(r.t, run.t, x) for x in run.position.T], 1)
+        r.torque = np.stack([np.interp(r.t, run.t, x) for x in run.torque.T], 1)
+    return True
+
+
+def _hidden(change: np.ndarray, slopes: np.ndarray, keep: slice) -> float:
+    """RMS of a change [n] over the held-out rows, what a refit of the believed figures by 5 % takes away taken away."""
+    x = np.clip(np.linalg.lstsq(slopes, change, rcond=None)[0], -0.05, 0.05)
+    return float(np.sqrt(np.mean((change - slopes @ x)[keep] ** 2)))
+
+
+def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
+    """Writes a case's recordings, model and servo to `folder`; returns what is hidden in them."""
+    from dexsim.recording import Writer
+
+    rng = np.random.default_rng([seed, 2, number])
+    kind = PLANTS.get(entry["kind"])
+    needs = kind.needs if kind else ""
+    b = rig(rng, needs)
+    b["off"] = {f"*{k}": 1 + rng.uniform(-OFF, OFF) for k in REFIT}
+    extra = rng.uniform(2e-4, 5e-4)
+    noise = float(np.hypot(QUANTUM / np.sqrt(12), extra))
+    runs = _runs(b, rng, needs)
+    size, ratio, change = 0.0, 1.0, dict(b["off"])
+    if kind:
+        sizes = np.geomspace(*kind.span, 20)
+        tries = [b["off"], *(_joined(b["off"], kind.change(b, s)) for s in sizes)]
+        slopes = [_joined(b["off"], {f"*{k}": 1.02}) for k in REFIT]
+        cases, q, tau = _simulate(b, runs, tries + slopes, 1e-3, 2)
+        keep = cases[0].plant.rows(3)
+        if kind.effect == "current_sensor":  # shows in the effort alone: sized by the noise of that
+            reached = 1 + np.array([np.abs(s) for s in sizes]) * 20
+        else:
+            move = (q[len(tries) :] - q[0]).T / 0.02
+            reached = np.array([np.hypot(_hidden(q[1 + i] - q[0], move, keep), noise) / noise for i in range(len(sizes))])
+        pick = int(np.argmin(np.abs(np.log(reached / TIERS[entry["tier"]]))))
+        size, ratio, change = float(sizes[pick]), float(reached[pick]), tries[1 + pick]
+    engine = "mujoco"
+    if not _by_mujoco(b, runs, change):
+        engine = "plant"
+        motion_only = {k: v for k, v in change.items() if not k.startswith("effort_")}
+        _simulate(b, runs, [motion_only], 2.5e-4, 3 if len(b["joints"]) > 1 else 2)
+    effort = "effort" in needs or bool(rng.uniform() < 0.4)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "rig.xml").write_text(model_xml(b), encoding="utf-8")
+    (folder / "servo.yaml").write_text(yaml.safe_dump(servo(b), sort_keys=False), encoding="utf-8")
+    meta = {"source": "sim", "robot": "rig", "gravity": "0 0 -9.81", "effort_is": "torque_Nm" if effort else "none", "effort_sign": "+1"}
+    for r in runs:
+        q = np.round((r.q + rng.normal(0, extra, r.q.shape)) / QUANTUM) * QUANTUM
+        tau = r.torque + rng.normal(0, 0.01 * b["weight"], r.q.shape)
+        tau = change.get("effort_gain", 1.0) * tau + change.get("effort_offset", 0.0)
+        with Writer(folder / r.name, list(b["joints"]), meta, 1_000_000_000) as w:
+            rows = [(t, 0, c, None, None) for t, c in zip(r.cmd_t, r.cmd, strict=True)]
+            rows += [(t, 1, x, u, None if r.temperature is None else h) for t, x, u, h in
+                     zip(r.t, q, tau, r.temperature if r.temperature is not None else q, strict=True)]  # fmt: skip
+            for t, which, x, u, h in sorted(rows, key=lambda row: row[:2]):
+                if which == 0:
+                    w.add_command(t, x)
+                    continue
+                w.add_state(t, x, None, u if effort else None)
+                if h is not None:
+                    w.add_temperature(t, h)
+    return {**entry, "effect": kind.effect if kind else "none", "joint": "joint", "size": size, "ratio": ratio, "noise": noise, "engine": engine,
+            "truth": kind.truth({**b, **_believed_now(b)}, size) if kind else {}, "voltage": b["voltage"], "effort": effort}  # fmt: skip
+
+
+def _believed_now(b: dict) -> dict:
+    """The true values under the effect, of the figures that are a little off and that an effect adds to."""
+    return {k: b[k] * b["off"][f"*{k}"] for k in ("coulomb_friction", "viscous_friction", "torque_limit", "no_load_speed")}
+
+
+def _joined(off: dict, change: dict) -> dict:
+    """Both changes, factors on the same column multiplied."""
+    out = dict(off)
+    for k, v in change.items():
+        out[k] = out[k] * v if k[0] == "*" and k in out else v
+    return out
+
+
+def score(truth: dict, d: dict) -> dict:
+    """What the table needs of one diagnosis (as diagnosis.json holds it)."""
+    from dexsim.gap.catalogue import confusable
+
+    found = d.get("findings", [])
+    first = found[0] if found else None
+    out = {**{k: truth[k] for k in ("kind", "effect", "tier", "ratio", "size", "engine", "noise")}, "verdict": d["verdict"],
+           "said": [f["effect"] for f in found], "confidence": first["confidence"] if first else None, "set": first["indistinguishable"] if first else []}  # fmt: skip
+    out["wrong_sure"] = any(f["confidence"] >= 0.8 and len(f["indistinguishable"]) < 2 and f["effect"] != truth["effect"] for f in found)
+    h = d.get("held_out") or {}
+    if h.get("after") is not None and h["error"].startswith("position"):
+        out["after"] = h["after"] / truth["noise"]
+    if truth["effect"] == "none":
+        out["false_alarm"] = bool(found) or d["verdict"] not in ("none",)
+        return out
+    group = set(first["indistinguishable"]) | {first["effect"]} if first else set()
+    justified = truth["effect"] in group and len(group) <= 3 and all(confusable(a, b) for a in group for b in group if a != b)
+    out["right"] = bool(first and (first["effect"] == truth["effect"] or justified) and first["where"]["joints"] == [truth["joint"]])
+    out["joint"] = bool(first and first["where"]["joints"] == [truth["joint"]])
+    mine = next((f for f in found if f["effect"] == truth["effect"]), None)
+    out["errors"], out["covered"], out["missing"] = {}, {}, []
+    for key, value in truth["truth"].items():
+        p = (mine or {}).get("parameters", {}).get(key)
+        if mine is None:
+            continue
+        if p is None:
+            out["missing"].append(key)
+            continue
+        if isinstance(value, str):
+            out["errors"][key] = 0.0 if p["value"] == value else 1.0
+            continue
+        got, low, high, true = (np.atleast_1d(np.asarray(x, float)) for x in (p["value"], p["low"], p["high"], value))
+        out["errors"][key] = float(np.linalg.norm(got - true) / max(np.linalg.norm(true), 1e-12))
+        k = int(np.argmax(np.abs(true)))  # of a vector the component that was planted
+        out["covered"][key] = bool(low[k] <= true[k] <= high[k])
+    return out
+
+
+def _one(job: tuple) -> dict:
+    """Makes, diagnoses and scores one case, or reads what was done before."""
+    number, entry, s = job
+    root = Path(s["out"]) / f"seed_{s['seed']}"
+    done = root / "results" / f"{number}.json"
+    if done.is_file():
+        return json.loads(done.read_text(encoding="utf-8"))
+    os.environ["OMP_NUM_THREADS"] = "1"
+    from dexsim.cli.build import quiet_warp
+
+    quiet_warp("cpu")
+    from dexsim.gap import plant
+    from dexsim.gap.diagnosis import Settings, diagnose, save
+
+    if s["workers"] > 1:
+        plant.THREADS = 1
+    folder = root / "cases" / str(number)
+    truth = make(entry, number, s["seed"], folder)
+    start, cpu = time.perf_counter(), time.process_time()
+    try:
+        d = diagnose(Settings([folder / f"{x}.mcap" for x in "abc"], folder / "out", [folder / "d.mcap"], str(folder / "rig.xml"), str(folder / "servo.yaml"),
+                              next_recording=False), say=lambda _: None)  # fmt: skip
+        save(d, folder / "out")
+        data = json.loads((folder / "out" / "diagnosis.json").read_text(encoding="utf-8"))
+        shares = d.shares
+    except Exception as error:  # counted, not dropped: no answer is a wrong one
+        data, shares = {"verdict": f"failed: {type(error).__name__}: {error}", "findings": [], "held_out": None}, {}
+    result = {"number": number, **score(truth, data), "seconds": time.perf_counter() - start, "cpu": time.process_time() - cpu, "shares": shares}
+    done.parent.mkdir(parents=True, exist_ok=True)
+    done.write_text(json.dumps(result), encoding="utf-8")
+    return result
+
+
+def table(results: list[dict]) -> dict:
+    """The figures of the JSON line."""
+    planted = [r for r in results if r["effect"] != "none"]
+    rate = lambda x: round(float(np.mean(x)), 3) if len(x) else None  # noqa: E731
+    covered = [c for r in planted for c in r["covered"].values()]
+    errors = [e for r in planted for e in r["errors"].values()]
+    out = {"right": rate([r["right"] for r in planted])}
+    out |= {f"right_{t}": rate([r["right"] for r in planted if r["tier"] == t]) for t in TIERS}
+    out |= {"joint": rate([r["joint"] for r in planted]), "coverage": rate(covered), "parameter_error_median": round(float(np.median(errors)), 4) if errors else None,
+            "parameters": len(covered), "within_1.3_floor": rate([r["after"] <= 1.3 for r in planted if "after" in r]),
+            "false_alarms": rate([r["false_alarm"] for r in results if r["effect"] == "none"]), "nothing_planted": sum(r["effect"] == "none" for r in results),
+            "confident_and_wrong": rate([r["wrong_sure"] for r in results]), "failed": sum(r["verdict"].startswith("failed") for r in results),
+            "keys_missing": sorted({f"{r['effect']}.{k}" for r in planted for k in r["missing"]}),
+            "seconds_median": round(float(np.median([r["seconds"] for r in results])), 1), "cpu_median": round(float(np.median([r["cpu"] for r in results])), 1)}  # fmt: skip
+    stages: dict[str, float] = {}
+    for r in results:
+        for k, v in r["shares"].items():
+            stages[k] = stages.get(k, 0.0) + v
+    total = sum(stages.values()) or 1.0
+    out["shares"] = {k: round(v / total, 3) for k, v in stages.items()}
+    return out
+
+
+def show(results: list[dict]) -> str:
+    """One line a case."""
+    out = [f"{'no':>4} {'planted':<31}{'tier':<7}{'x noise':>7}  {'verdict':<17}{'found':<42}{'after':>6} {'sizes: error (covered)'}"]
+    for r in sorted(results, key=lambda r: (r["effect"], r["kind"], r["ratio"])):
+        mark = " " if r.get("right", not r.get("false_alarm")) else "*"
+        said = " ".join(r["said"][:3]) + (f" {r['confidence']:.2f}" if r["said"] else "-") + (f" {{{' '.join(r['set'])}}}" if len(r["set"]) > 1 else "")
+        sizes = ", ".join(f"{k} {e:.0%}{'' if r['covered'].get(k, True) else '!'}" for k, e in r.get("errors", {}).items())
+        out.append(f"{r['number']:>4} {r['kind'] or 'nothing':<31}{r['tier']:<7}{r['ratio']:>7.1f} {mark}{r['verdict'][:16]:<17}{said:<42}{r.get('after', 0):>6.2f} {sizes}")
+    return "\n".join(out)
+
+
+def main(argv: list[str]) -> dict:
+    """Runs the sweep; returns what the JSON line says."""
+    s = dict(SETTINGS)
+    for argument in argv:
+        key, equals, text = argument.partition("=")
+        if not equals or key not in s or (key not in ("out", "effects") and not text.isdigit()):
+            raise SystemExit(f"'{argument}' is not a setting; valid: {', '.join(s)} (key=value)")
+        s[key] = text if key in ("out", "effects") else int(text)
+    s["out"] = str(Path(s["out"]).expanduser().resolve())
+    effects = {e for e in s["effects"].split(",") if e}
+    unknown = effects - set(PLANTS) - {p.effect for p in PLANTS.values()}
+    if unknown:
+        raise SystemExit(f"effects={s['effects']}: {', '.join(sorted(unknown))} is not planted; valid: {', '.join(PLANTS)}")
+    entries = plan(s["seed"], effects)
+    count = s["cases"] or sum(not effects or p.effect in effects or n in effects for n, p in PLANTS.items()) + (0 if effects else NONE_EACH)
+    jobs = [(n, entries[n], s) for n in range(s["first"], s["first"] + count)]
+    start = time.perf_counter()
+    results = []
+    if s["workers"] > 1:
+        from dexsim.gap.plant_kernel import plant_kernel  # compiled once, before the workers ask for it all at once
+
+        _warm(plant_kernel)
+        with mp.get_context("spawn").Pool(min(s["workers"], len(jobs)), maxtasksperchild=8) as pool:
+            stream = pool.imap_unordered(_one, jobs)
+            results = _watch(stream, len(jobs), start)
+    else:
+        results = _watch(map(_one, jobs), len(jobs), start)
+    print("\n" + show(results))
+    line = {"benchmark": "planted", "seed": s["seed"], "cases": len(results), "wall": round(time.perf_counter() - start, 1), **table(results)}
+    print(json.dumps(line))
+    return line
+
+
+def _warm(kernel) -> None:
+    import warp as wp
+
+    from dexsim.cli.build import quiet_warp
+
+    quiet_warp("cpu")
+    wp.load_module(module=kernel().module, device="cpu")
+
+
+def _watch(stream, total: int, start: float) -> list[dict]:
+    out = []
+    for r in stream:
+        out.append(r)
+        spent = time.perf_counter() - start
+        print(f"  {len(out)}/{total} {r['kind'] or 'nothing'} ({r['tier']}): {' '.join(r['said']) or '-'}; {r['seconds']:.0f} s;"
+              f" about {spent / len(out) * (total - len(out)):.0f} s left", flush=True)  # fmt: skip
+    return out
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
