@@ -53,6 +53,8 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
         cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
     plain = _finish(cfg, device)
     kind = device.partition(":")[0]
+    if _another_world(plain):
+        raise UserError(f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py")
     plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
     plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
     checks.check(plain)
@@ -89,6 +91,8 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     if data is None:
         cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
     plain = _finish(cfg, device)
+    if _another_world(plain):
+        plain, device = _elsewhere(plain, play), "cpu"
     checks.check(play)
     play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
     plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
@@ -151,6 +155,21 @@ def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
     plain = settings.resolve(cfg)
     plain["device"] = device
     return plain
+
+
+def _another_world(plain: dict[str, Any]) -> bool:
+    return (plain.get("reality") or {}).get("name", "none") != "none"  # checkpoints from before have no such group
+
+
+def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
+    """The config of another world (`reality=`), on the CPU, all its trials at once: C MuJoCo has a thread pool."""
+    if str(play["device"] or "cpu") != "cpu":
+        raise UserError(f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu")
+    play["device"] = plain["device"] = "cpu"
+    play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS["cuda"])
+    from dexsim.tasks.reality import overlay
+
+    return overlay(plain)
 
 
 def _servo_file(cfg: DictConfig, request: settings.Request) -> DictConfig:

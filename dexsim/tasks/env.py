@@ -31,6 +31,7 @@ from dexsim.tactile.tactile import Tactile
 from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
+from dexsim.tasks.reality import Reality, present
 
 FINGER_ROOTS = ("right_hand_thumb_bend_link", "right_hand_index_bend_link", "right_hand_mid_link1", "right_hand_ring_link1",
                 "right_hand_pinky_link1")
@@ -76,6 +77,11 @@ class HandEnv(VecEnv):
                 # needs many more iterations (measured: 99th percentile 9 at 0.9999, 5 here)
                 joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
         _solver_options(spec, sim)
+        self.rng = torch.Generator(device=device)
+        self.rng.manual_seed(seed)
+        self.reality = Reality(cfg["reality"], self.rng) if present(cfg) else None  # another world to be judged in
+        if self.reality is not None:
+            self.reality.change_model(spec)
         self._drawn = None
         self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
         for geom in list(spec.geoms):
@@ -85,10 +91,10 @@ class HandEnv(VecEnv):
             spec, n_worlds, device, engine, fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
             pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"])
         self.scene = scene
-        self.rng = torch.Generator(device=device)
-        self.rng.manual_seed(seed)
         self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt)
         self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
+        if self.reality is not None:
+            self.objects.friction_factor = self.reality.friction_factor(self.engine.mjm, self.objects.hand_geoms.tolist())
         touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
         self.touch = Tactile(self.engine, xhand_layout(), touch_shapes, OBJECT, cfg["tactile"],
                              pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
@@ -151,7 +157,8 @@ class HandEnv(VecEnv):
         `keep_final_obs` also "final_obs", the observations before the reset."""
         self._action_in.copy_(actions)
         self._replay("before", self._before)
-        self.engine.step(self.decimation, self.servo.before_each, self.touch.launch)
+        substeps = self.decimation if self.reality is None else self.reality.substeps(self.decimation)
+        self.engine.step(substeps, self.servo.before_each, self.touch.launch)
         self._replay("after", self._after)
         if self.keep_final_obs:
             final = {k: v.clone() for k, v in self.observe(advance=False).items()}
@@ -219,7 +226,11 @@ class HandEnv(VecEnv):
         else:
             target = self.q_mid + a * self.q_half
         self.target.copy_(torch.maximum(torch.minimum(target, self.q_high), self.q_low))
-        self.servo.send(self.target)
+        if self.reality is None:
+            self.servo.send(self.target)
+        else:
+            late, arrives = self.reality.late(self.num_envs)
+            self.servo.send(self.target, arrives, self.engine.t.time + late)
 
     def reset_all(self) -> None:
         """Begin an episode in every world."""
@@ -281,6 +292,8 @@ class HandEnv(VecEnv):
         self.object_pose.copy_(clean(t.qpos[:, self.object_q]))
         self.object_velocity.copy_(clean(t.qvel[:, self.object_v]))
         self.torque.copy_(clean(self.servo.torque))
+        if self.reality is not None:
+            self.reality.read(self)
         normal = clean(t.pair_normal)
         self.tip_force.copy_(normal[:, 0:5])
         self.finger_force.copy_(normal[:, 5:10])

@@ -53,6 +53,7 @@ class Objects:
         self.com = torch.zeros(n, 3, device=dev)
         self.stiffness, self.damping_ratio = torch.full((n,), 7000.0, device=dev), torch.ones(n, device=dev)
         self.radius = torch.zeros(n, device=dev)
+        self.friction_factor: torch.Tensor | None = None  # [G] of each hand geom over the world's friction
 
     def primitive_size(self, variant: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
         """MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by component)."""
@@ -144,7 +145,8 @@ class Objects:
         solref = e.field("geom_solref")
         solref[:, self.tips] = torch.stack([-k, -b], -1).to(solref.dtype)
         friction = e.field("geom_friction")
-        friction[:, self.hand_geoms, 0] = self.friction[:, None].to(friction.dtype)
+        value = self.friction[:, None] if self.friction_factor is None else self.friction[:, None] * self.friction_factor
+        friction[:, self.hand_geoms, 0] = value.to(friction.dtype)
 
 
 def _primitive_inertia(kind: torch.Tensor, size: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,216 @@
+"""Another world to be judged in: `python play.py checkpoint=... reality=bench`.
+
+A policy can only be as good as the world it is judged in is different from the one it was trained in. `configs/reality/`
+holds worlds that no training sees (`train.py` refuses them): C MuJoCo with its own step, cone, solver and contact
+softness; one hand whose drives have effects that no randomization contains; encoders and currents in whole counts,
+touch in counts and late; control periods that vary and targets that are late or lost. It stands in for hardware: it is
+not hardware, and what it leaves out (soft pads, bending, cables) stays unjudged.
+
+The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121 out=configs/reality/bench.yaml`. The
+ranges below are ours.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import yaml
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.tasks.servos import RELATIVE
+
+CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
+SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+KEYS = {"name", "seed", "sim", "solver", "contact", "servo", "sensors", "timing", "tactile", "tasks"}
+
+
+def present(cfg: dict[str, Any]) -> bool:
+    """Whether a resolved config asks for another world."""
+    return (cfg.get("reality") or {}).get("name", "none") != "none"
+
+
+def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
+    """The config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task draws.
+
+    The world's servo replaces the policy's belief; its ranges replace those of training, name by name; drives are not
+    randomized (it is one hand). Raises UserError for a file with other keys, or without the task that is played.
+    """
+    world, cfg = cfg["reality"], copy.deepcopy(cfg)
+    for key in world:
+        if key not in KEYS:
+            raise UserError(f"reality.{key}: unknown; a file of configs/reality has {', '.join(sorted(KEYS))}")
+    task = cfg["task"]["name"]
+    if task not in world["tasks"]:
+        raise UserError(f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])}")
+    cfg["sim"].update(world["sim"], engine="mujoco")
+    cfg["servo"] = world["servo"]
+    cfg["tactile"].update(world["tactile"])
+    cfg["randomize"]["servo"] = {name: 1.0 if name in RELATIVE else 0.0 for name in cfg["randomize"]["servo"]}
+    own = world["tasks"][task]
+    for part, over in (("randomize", cfg["randomize"]), ("sensors", cfg["task"]["sensors"])):
+        for name, value in own.get(part, {}).items():
+            node, *rest = name.split(".") if part == "randomize" else (name,)
+            if rest:
+                over.setdefault(node, {})[rest[0]] = value
+            else:
+                over[node] = value
+    return cfg
+
+
+class Reality:
+    """What of another world is no setting of the training's: contacts, solver, sensor counts, timing.
+
+    cfg: a file of configs/reality. The environment calls `change_model` before it compiles, and at each control step
+    `substeps`, `late` and `read`. Runs on the CPU.
+    """
+
+    def __init__(self, cfg: dict[str, Any], rng: torch.Generator):
+        self.cfg, self.rng = cfg, rng
+        self.last: torch.Tensor | None = None
+        for key, known in (("cone", CONES), ("solver", SOLVERS)):
+            if cfg["solver"][key] not in known:
+                raise UserError(f"reality.solver.{key}={cfg['solver'][key]}: must be {' or '.join(known)}")
+
+    def change_model(self, spec: mujoco.MjSpec) -> None:
+        """Solver, contact softness, torsional and rolling friction, friction by finger (relative to the world's)."""
+        c, o = self.cfg["contact"], spec.option
+        o.cone, o.solver = CONES[self.cfg["solver"]["cone"]], SOLVERS[self.cfg["solver"]["solver"]]
+        o.tolerance = self.cfg["solver"]["tolerance"]
+        for geom in spec.geoms:
+            if geom.name in xhand.TIP_GEOMS:
+                geom.solimp = c["tip_solimp"]
+                geom.condim = 6
+                geom.friction = [geom.friction[0], c["torsional"], c["rolling"]]
+            elif geom.contype or geom.conaffinity:
+                geom.solref = c["hand_solref"]
+
+    def friction_factor(self, model: mujoco.MjModel, geoms: list[int]) -> torch.Tensor:
+        """Friction of each hand geom over the world's, [G]: by finger, 1 elsewhere."""
+        by = dict(zip(xhand.FINGERS, self.cfg["contact"]["friction_by_finger"], strict=True))
+        names = [model.geom(g).name for g in geoms]
+        return torch.tensor([by.get(n.removeprefix("tip_"), 1.0) if n.startswith("tip_") else 1.0 for n in names])
+
+    def substeps(self, nominal: int) -> int:
+        """Physics steps of this control period: nominal, give or take `timing.jitter` of it, the same on average."""
+        spread = int(round(self.cfg["timing"]["jitter"] * nominal))
+        return nominal + int(torch.randint(-spread, spread + 1, (), generator=self.rng)) if spread else nominal
+
+    def late(self, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """(seconds [N] by which the target of this step is sent late, [N] whether it arrives at all)."""
+        t = self.cfg["timing"]
+        return t["late"] * torch.rand(n, generator=self.rng), torch.rand(n, generator=self.rng) >= t["lost"]
+
+    def read(self, env: Any) -> None:
+        """Replace the environment's joint angles, speeds and torques by what encoders and currents report in counts."""
+        s = self.cfg["sensors"]
+        step = 2 * math.pi / 2 ** s["encoder_bits"]
+        fresh = (env.episode_length_buf <= 1)[:, None]
+        angle = torch.round(env.servo.position().float() / step) * step
+        last = angle if self.last is None else torch.where(fresh, angle, self.last)
+        env.q.copy_(torch.where(env.nan[:, None], env.q, angle))
+        env.qd.copy_((env.q - last) / env.dt)
+        self.last = env.q.clone()
+        env.torque.copy_(torch.round(env.torque * s["torque_scale"] / s["torque_step"]) * s["torque_step"])
+
+
+def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of another world, all from one seed. servo: the nominal table (configs/servo/xhand.yaml)."""
+    rng = np.random.default_rng(seed)
+
+    def u(low: float, high: float, digits: int = 4) -> float:
+        return float(f"{rng.uniform(low, high):.{digits}g}")
+
+    joints = {}
+    for joint in xhand.JOINTS:
+        base = servo["joints"]["*"] | servo["joints"].get(joint, {})
+        dry = base["coulomb_friction"] * rng.uniform(1.0, 2.2)
+        joints[joint] = {
+            "kp": float(f"{base['kp'] * rng.uniform(0.7, 1.2):.4g}"), "kd": float(f"{base['kd'] * rng.uniform(0.6, 1.4):.4g}"),
+            "torque_limit": float(f"{base['torque_limit'] * rng.uniform(0.8, 1.0):.4g}"),
+            "no_load_speed": float(f"{base['no_load_speed'] * rng.uniform(0.75, 1.0):.4g}"),
+            "efficiency": u(0.75, 0.95), "deadband": u(0.002, 0.01), "delay": u(0.012, 0.025), "lag": u(0.003, 0.012),
+            "coulomb_friction": float(f"{dry:.4g}"), "friction_asymmetry": u(-0.4, 0.4),
+            "stribeck_peak": float(f"{dry * rng.uniform(0.5, 1.5):.4g}"), "stribeck_speed": u(0.05, 0.3),
+            "load_friction": u(0.03, 0.12), "load_friction_backdriven": u(0.05, 0.2),
+            "torque_ripple": float(f"{base['torque_limit'] * rng.uniform(0.005, 0.02):.4g}"),
+            "ripple_per_turn": float(rng.integers(8, 30)), "ripple_phase": u(-3.0, 3.0),
+            "position_offset": u(-0.03, 0.03), "position_scale": u(0.985, 1.015),
+        }  # fmt: skip
+    friction = u(0.6, 0.9)
+    size = u(0.049, 0.054, 3)
+    return {
+        "name": "bench", "seed": seed,
+        "sim": {"timestep": 0.003, "iterations": 60, "ls_iterations": 40, "impratio": u(2.0, 4.0, 3), "noslip_iterations": 0},
+        "solver": {"cone": "elliptic", "solver": "cg", "tolerance": 1e-7},
+        "contact": {
+            "tip_solimp": [u(0.85, 0.92), u(0.975, 0.99), u(0.0008, 0.002), 0.5, 2.0], "hand_solref": [u(0.008, 0.015), u(0.8, 1.2)],
+            "torsional": u(0.002, 0.006), "rolling": u(5e-5, 3e-4), "friction_by_finger": [u(0.8, 1.15) for _ in xhand.FINGERS],
+        },
+        "servo": {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint", "position_encoder": "joint"},
+        "sensors": {"encoder_bits": 12, "torque_step": 0.01, "torque_scale": u(0.85, 1.15)},
+        "timing": {"jitter": 0.15, "late": 0.006, "lost": 0.01},
+        "tactile": {
+            "feel_others": True, "stiffness_scale": u(0.7, 1.3), "threshold": u(0.03, 0.07), "noise": u(0.005, 0.015), "gain_spread": u(0.1, 0.25),
+            "dead": u(0.01, 0.04), "lsb": 0.1, "delay": u(0.015, 0.03), "hysteresis": u(0.1, 0.3), "hysteresis_time": u(0.05, 0.4),
+        },
+        "tasks": {
+            "rotate": {
+                "randomize": {
+                    "object.size": [round(size, 4), round(size + 0.002, 4)], "object.mass": u(0.06, 0.12, 3), "object.com": [-0.02, 0.02],
+                    "object.friction": friction, "contact.stiffness": u(6000.0, 8500.0), "contact.damping_ratio": u(0.6, 0.9),
+                    "sensors.joint_bias": 0.0, "imu.delay": u(0.02, 0.05), "imu.tilt": [-0.03, 0.03],
+                },
+                "sensors": {"joint_noise": 0.001},
+            },
+            "grasp": {
+                "randomize": {"object.friction": [0.5, 1.0], "contact.stiffness": u(6000.0, 8500.0), "contact.damping_ratio": u(0.6, 0.9)},
+                "sensors": {"joint_noise": 0.001, "torque_noise": 0.01},
+            },
+        },
+    }  # fmt: skip
+
+
+HEAD = """\
+# Another world to be judged in (`python play.py checkpoint=... reality={name}`): never trained in, standing in for hardware.
+# Drawn once, not tuned: python -m dexsim.tasks.reality seed={seed} out=configs/reality/{name}.yaml. See dexsim/tasks/reality.py.
+"""
+
+
+def text(world: dict[str, Any]) -> str:
+    """The file of a drawn world."""
+    return HEAD.format(**world) + yaml.safe_dump(world, sort_keys=False, width=130, default_flow_style=None)
+
+
+def main(argv: list[str]) -> int:
+    """`seed=N out=PATH`: draw a world and write its file."""
+    own: dict[str, Any] = {"seed": 20261121, "out": None}
+    for item in argv:
+        key, eq, value = item.partition("=")
+        if not eq or key not in own:
+            raise UserError(f"{item!r}: the settings are seed=N and out=PATH")
+        own[key] = yaml.safe_load(value) if key == "seed" else value
+    if not isinstance(own["seed"], int) or own["seed"] < 0:
+        raise UserError(f"seed={own['seed']}: must be a whole number from 0 up")
+    if own["out"] is None:
+        raise UserError("out=PATH: say where to write the world, e.g. out=configs/reality/bench.yaml")
+    servo = yaml.safe_load((Path(__file__).parents[2] / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    out = Path(own["out"]).expanduser()
+    world = draw(own["seed"], servo)
+    world["name"] = out.stem
+    out.write_text(text(world), encoding="utf-8")
+    print(f"world    {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    from dexsim.cli.ending import guard
+
+    sys.exit(guard(main, sys.argv[1:]))
