@@ -177,6 +177,32 @@ def test_goal_is_a_quarter_turn_without_tilt(env):
     assert torch.allclose(rotation.tilt(literal, env.axis), torch.full((4,), 0.3), atol=1e-3)
 
 
+def test_curriculum_widens_what_is_drawn_and_evaluation_gets_it_whole():
+    env = make("task.curriculum.steps=10", "task.curriculum.start=0.2", worlds=64)
+
+    def spread(name: str) -> float:
+        low, high, _ = env.sampler.range(name)
+        x = torch.stack([env.sampler.draw(name) for _ in range(40)])
+        return float((x.max() - x.min()) / (high - low))
+
+    env.step(torch.zeros(64, 12))
+    assert 0.2 < spread("object.friction") < 0.3
+    for _ in range(4):
+        env.step(torch.zeros(64, 12))
+    assert 0.55 < spread("object.friction") < 0.61
+    state = env.state_dict()
+    for _ in range(8):
+        env.step(torch.zeros(64, 12))
+    assert 0.97 < spread("object.friction") <= 1.0
+    env.load_state_dict(state)
+    env.step(torch.zeros(64, 12))
+    assert 0.6 < spread("object.friction") < 0.7
+    env.end_curriculum()
+    assert 0.97 < spread("object.friction") <= 1.0
+    with pytest.raises(UserError, match="task.curriculum"):
+        make("task.curriculum.start=1.5")
+
+
 def test_tilt_does_not_accumulate(env):
     """Forty goals, each reached with a new lean of 0.2 rad."""
     q = rotation.upright(env.object_pose[:1, 3:], env.axis)

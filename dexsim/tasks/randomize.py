@@ -19,6 +19,7 @@ class Sampler:
     def __init__(self, cfg: dict, rng: torch.Generator, n: int, device: str):
         self.cfg, self.rng, self.n, self.device = cfg, rng, n, device
         self.ranges: dict[str, tuple[float, float, bool]] = {}
+        self.width = torch.ones((), device=device)  # share of each range, about its middle, that `draw` uses: a curriculum widens it
         self._read("randomize", cfg)
 
     def _read(self, path: str, node) -> None:
@@ -56,7 +57,7 @@ class Sampler:
     def draw(self, name: str, *shape: int) -> torch.Tensor:
         """[N, *shape] samples of the range `name`, float32."""
         low, high, log = self.range(name)
-        u = self.uniform(*shape)
+        u = 0.5 + self.width * (self.uniform(*shape) - 0.5)
         if log:
             return low * (high / low) ** u
         return low + (high - low) * u

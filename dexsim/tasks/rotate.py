@@ -76,6 +76,7 @@ class RotateEnv(HandEnv):
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self.worlds = torch.arange(n, device=dev)
+        self.learned = torch.zeros((), device=dev)  # control steps of each world while training, for the curriculum
         self.goal, self.home = zeros(4), zeros(3)
         self.goal[:, 0] = 1.0
         self.successes, self.since = zeros(dtype=torch.long), zeros(dtype=torch.long)
@@ -109,6 +110,9 @@ class RotateEnv(HandEnv):
         orientation = t["observe"]["orientation"]
         if orientation not in ORIENTATION:
             raise UserError(f"task.observe.orientation={orientation}: must be {', '.join(ORIENTATION)}")
+        c = t.get("curriculum") or {"steps": 0, "start": 1.0}
+        if not (c["steps"] >= 0 and 0 <= c["start"] <= 1):
+            raise UserError(f"task.curriculum={c}: steps must be 0 (none) or more, start must lie in [0, 1]")
         if t["observe"].get("last_action", "step") not in ("target", "step"):
             raise UserError(f"task.observe.last_action={t['observe']['last_action']}: must be target or step")
         if not 1 <= t["history"] <= 32:
@@ -131,6 +135,25 @@ class RotateEnv(HandEnv):
                                 ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0), ("imu.delay", 0.0, 0.5),
                                 ("imu.heading_rate", -0.2, 0.2), ("imu.tilt", -0.3, 0.3)):
             self.sampler.check(name, low, high)
+
+    # -- randomization, widened as training goes on -------------------------------------------------------------------------
+    def before_physics(self) -> None:
+        c = self.task.get("curriculum") or {"steps": 0}
+        if c["steps"]:
+            self.learned += 1
+            self.sampler.width.copy_((c["start"] + (1 - c["start"]) * self.learned / c["steps"]).clamp(max=1.0))
+
+    def end_curriculum(self) -> None:
+        """From now on all ranges whole (evaluation)."""
+        self.learned.fill_(float((self.task.get("curriculum") or {"steps": 0})["steps"]))
+        self.sampler.width.fill_(1.0)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return super().state_dict() | {"learned": self.learned.clone()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.learned.copy_(state.get("learned", self.learned))
+        super().load_state_dict(state)
 
     # -- episodes ------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:

@@ -24,6 +24,7 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
 
     policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
     """
+    env.end_curriculum()
     env.rng.manual_seed(seed)
     torch.manual_seed(seed)
     cap = float(env.task["evaluation"]["cap_s"])
