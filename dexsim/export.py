@@ -31,6 +31,8 @@ settings (key=default):
 KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed")
 TOLERANCE = 1e-5
 OPSET = 17
+BUILDERS = ("grasp", "rotate")
+"""Tasks whose observation the real-time loop can build."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -61,8 +63,8 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
 
     data = checkpoints.load(checkpoint)
     task = data["config"]["choices"]["task"]
-    if data["config"]["task"].get("name", task) != "grasp":
-        raise UserError(f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of task=grasp only")
+    if data["config"]["task"].get("name", task) not in BUILDERS:
+        raise UserError(f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of {', '.join(BUILDERS)}")
     measured = None if calibration is None else Calibration.load(calibration)
     out = Path(out).expanduser()
     if out.is_dir() and any(out.iterdir()):
@@ -107,15 +109,14 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     import numpy as np
     import torch
 
-    from dexsim.deploy import observations
-
+    observations = builder(env.task["name"])
     seen: list[tuple] = []
     build = observations.build
     kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))}
 
-    def watch(signals: Any, force_max: float) -> Any:
+    def watch(signals: Any, settings: Any) -> Any:
         seen.append(type(signals)(*(x.clone() for x in signals)))  # some are the task's own memory
-        return build(signals, force_max)
+        return build(signals, settings)
 
     env.rng.manual_seed(seed)
     observations.build = watch  # the task calls it by its module
@@ -142,30 +143,33 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
         everything = torch.cat([episode, spread])
         action = model(everything)
     out = {k: torch.stack(v).numpy() for k, v in kept.items() if k != "observation"}
-    out |= {"observation": everything.numpy(), "action": action.numpy(), "force_max": np.float64(env.f_max)}
-    return out
+    return out | {"observation": everything.numpy(), "action": action.numpy()}
+
+
+def builder(task: str) -> Any:
+    """The module that builds a task's observation: `Signals` and `build(signals, settings)`."""
+    from dexsim.deploy import observations, observations_rotate
+
+    return {"grasp": observations, "rotate": observations_rotate}[task]
 
 
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
     """Everything that a robot must know, as plain data."""
     from dexsim.assets import xhand
-    from dexsim.deploy import bundle, observations
+    from dexsim.deploy import bundle
 
     task, cfg = env.task, data["config"]
-    at, table = 0, []
-    for name, width, unit, source in observations.OBSERVATION:
-        scaling = {"tau/tau_max": "torque [N.m] / normalization.tau_max", "F/F_max": "force [N] / normalization.force_max_N"}.get(unit, "none")
-        if name == "force_command":
-            scaling = "the commanded share of normalization.force_max_N"
-        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": observations.FRAME[name],
-                      "order": observations.ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
+    own = _grasp(env) if task["name"] == "grasp" else _rotate(env)
+    table, at = [], 0
+    for name, width, unit, source, scaling in own.pop("rows"):
+        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": builder(task["name"]).FRAME[name],
+                      "order": builder(task["name"]).ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
         at += width
-    floats = lambda x: [round(float(v), 9) for v in x]  # noqa: E731
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]), "lead": float(task["action"]["lead"]),
-              "clip": [-1.0, 1.0], "unit": "rad", "low": floats(env.q_low), "high": floats(env.q_high),
-              "speed_limit_rad_s": floats(xhand.speeds()), "order": "joints"}  # fmt: skip
+              "clip": [-1.0, 1.0], "unit": "rad", "low": _floats(env.q_low), "high": _floats(env.q_high),
+              "speed_limit_rad_s": _floats(xhand.speeds()), "order": "joints"}  # fmt: skip
     return {
-        "format": bundle.FORMAT, "version": bundle.VERSION, "task": "grasp",
+        "format": bundle.FORMAT, "version": bundle.VERSION, "task": task["name"],
         "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",
                    "observation_size": at, "action_size": env.num_actions, "opset": OPSET, "dtype": "float32",
                    "normalization": "inside: feed the observation as the table below states it"},
@@ -173,19 +177,66 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
         "joints": list(xhand.JOINTS), "fingers": list(xhand.FINGERS),
         "taxels": {"per_finger": xhand.TAXELS_PER_FINGER, "index": "column * 12 + row", "layout": "xhand_right"},
         "action": action,
-        "initial_pose": floats(env.pose0),
-        "rates": {"policy_period_s": env.dt, "policy_hz": round(1 / env.dt, 4), "read_hz": 100.0,
-                  "height_delay_s": [float(x) for x in task["sensors"]["vision_delay"]]},
-        "normalization": {"tau_max": floats(env.effort), "force_max_N": float(env.f_max)},
+        "initial_pose": own.pop("initial_pose"),
+        "rates": {"policy_period_s": env.dt, "policy_hz": round(1 / env.dt, 4), "read_hz": 100.0} | own.pop("rates"),
+        "normalization": {"tau_max": _floats(env.effort)} | own.pop("normalization"),
         "calibration": calibration.to_dict(),
-        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the palm's centre,"
-                                        " along the palm's normal", "object_xy": "held at the first value",
-                       "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
+        **own,
         "servo": cfg["servo"],
         "golden": {"file": bundle.GOLDEN, "rows": rows, "tolerance": TOLERANCE},
         "versions": _versions(data),
         "trained": {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "git": data["git"]},
     }  # fmt: skip
+
+
+def _grasp(env: Any) -> dict[str, Any]:
+    """The parts of a manifest that differ between tasks."""
+    from dexsim.deploy import observations
+
+    scaling = {"tau/tau_max": "torque [N.m] / normalization.tau_max", "F/F_max": "force [N] / normalization.force_max_N"}
+    rows = [(name, width, unit, source, "the commanded share of normalization.force_max_N" if name == "force_command" else scaling.get(unit, "none"))
+            for name, width, unit, source in observations.OBSERVATION]  # fmt: skip
+    return {
+        "rows": rows, "initial_pose": _floats(env.pose0),
+        "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
+        "normalization": {"force_max_N": float(env.f_max)},
+        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the palm's centre,"
+                                        " along the palm's normal", "object_xy": "held at the first value",
+                       "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
+    }  # fmt: skip
+
+
+def _rotate(env: Any) -> dict[str, Any]:
+    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose that is
+    most like all others: where the fingers wait for the cube, and the targets they close to."""
+    import copy
+
+    from dexsim.deploy import observations_rotate
+
+    task, g = env.task, env.grasps
+    scaled = {"last_action": "(target - middle) / half of action.low..high" if task["observe"].get("last_action", "step") != "step" else "none"}
+    rows = [(name, width, unit, source, scaled.get(name, "none")) for name, width, unit, source in observations_rotate.rows(task)]
+    imu = task["perception"] == "imu"
+    middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
+    settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")} | {"reward": {"delta_rot": task["reward"]["delta_rot"]}}
+    return {
+        "rows": rows, "initial_pose": _floats(g.hand[middle]),
+        "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
+        "normalization": {},
+        "task_settings": settings,
+        "grip": {"hand": _floats(g.hand[middle]), "target": _floats(g.target[middle]), "object_pose": _floats(g.pose[middle]),
+                 "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
+                 "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
+        "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up; any heading" if imu else "none",
+                       "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the angle left is below"
+                               " reward.delta_rot" if imu else "none: the policy turns without end",
+                       "history": "none" if imu else f"{task['history']} control steps, newest first; the first fills all",
+                       "critic": "not deployed"},
+    }  # fmt: skip
+
+
+def _floats(x: Any) -> list[float]:
+    return [round(float(v), 9) for v in x]
 
 
 def _versions(data: dict[str, Any]) -> dict[str, Any]:
@@ -206,7 +257,7 @@ def check(path: str | Path) -> bool:
     import numpy as np
     import torch
 
-    from dexsim.deploy import bundle, observations
+    from dexsim.deploy import bundle
     from dexsim.deploy.action import ActionRule
 
     b = bundle.load(path)
@@ -218,13 +269,17 @@ def check(path: str | Path) -> bool:
         n = len(rows["q"])
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise UserError(f"{file}: cannot be read ({str(error).splitlines()[0][:100]}); export the bundle again") from None
+    observations, settings = builder(m["task"]), m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"]
     here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
-    ours = [row[:3] for row in observations.OBSERVATION]
+    ours = [tuple(row[:3]) for row in (observations.rows(settings) if m["task"] == "rotate" else observations.OBSERVATION)]
     if here != ours:
         bad = next(i for i in range(len(here) + 1) if here[: i + 1] != ours[: i + 1])
         raise UserError(f"{path}: observation {here[bad:bad + 1]} is not this dexsim's {ours[bad:bad + 1]}: use the dexsim of its versions")
-    built = observations.build(
-        observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields)), float(rows["force_max"]))
+    try:
+        signals = observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields))
+    except KeyError as error:
+        raise UserError(f"{file}: lacks {error}; export the bundle again") from None
+    built = observations.build(signals, settings)
     rule = ActionRule.from_manifest(m["action"])
     targets = np.stack([rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)])
     single = np.concatenate([b.act(row[None]) for row in observation])

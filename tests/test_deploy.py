@@ -363,7 +363,7 @@ rec = recorder_at({path!r})
 rec.zero = time.monotonic()
 print("begun", flush=True)
 for k in range(2000):
-    rec.put("state", time.monotonic(), np.full(12, k * 1e-3), np.zeros(12), time.monotonic())
+    rec.put("state", time.monotonic(), np.full(12, k * 1e-3), None, np.zeros(12), time.monotonic())
     rec.put("command", time.monotonic(), np.zeros(12))
     time.sleep(0.005)
 """

@@ -22,12 +22,13 @@ settings (key=default):
   driver=sim          sim, or xhand (the vendor's package) with port=
   port=               serial port of the hand (/dev/ttyUSB0), or ethercat
   seconds=10          of the policy, after homing
-  command=0.5         commanded force, 0..1 of F_max
+  command=0.5         grasp: commanded force, 0..1 of F_max
   calibration=        calibration.yaml instead of the bundle's
   record=             FILE.mcap of everything seen and sent (default: out/deploy_<date>.mcap; record=none: nothing)
   vision=truth        driver=sim: truth, or camera (a rendered depth image and mask); driver=xhand: place="x y z" [m]
   place=              the object's place in the palm frame where nothing sees it, e.g. place="0.055 0 0.04"
-  shape=              driver=sim: the object's shape
+  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours sends lines "w x y z"
+  shape=              driver=sim, grasp: the object's shape
   seed=0              driver=sim
 safety (key=default):
   tor_max=            firmware current limit [mA] (default: the calibration's current_max)
@@ -35,11 +36,12 @@ safety (key=default):
   speed=0.6           largest speed of targets, over the joints' no-load speed
   margin=0            rad kept free at the joint limits
   home_speed=0.5      rad/s of the homing
+  wait=3              rotate: s that the open hand then waits for the cube; grip=1: s its fingers take to close on it
   stale=0.1           s: a reading older than this relaxes the hand; late=0.1, hang=0.3, overruns=10 likewise
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
-OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "shape", "seed")
+OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "imu", "shape", "seed")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -62,13 +64,15 @@ def main(argv: Sequence[str]) -> int:
     calibration = (Calibration.load(given["calibration"], base) if "calibration" in given
                    else Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base))  # fmt: skip
     settings = LoopSettings(**changes)
-    driver, height = _hand(given, b, calibration)
+    if "command" in changes and b.manifest["task"] != "grasp":
+        raise UserError(f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force")
+    driver, eye = _hand(given, b, calibration)
     for text in calibration.assumed:
         print(f"note     {text}")
     recorder = _recorder(given, b, settings, calibration)
     print(f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g} Hz")
     print(f"driver   {driver.name}; starting ...", flush=True)
-    loop = Loop(b, driver, height, calibration, settings, recorder=recorder)
+    loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -94,7 +98,10 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
     from dexsim.deploy.vision import FixedPlace
     from dexsim.recording.schema import numbers
 
-    kind = given.get("driver", "sim")
+    kind, task = given.get("driver", "sim"), b.manifest["task"]
+    for key in ("vision", "place", "shape") if task == "rotate" else ("imu",):
+        if key in given:
+            raise UserError(f"{key}={given[key]}: the policy in {b.path} is of task={task}, which does not use it")
     place = FixedPlace(np.array(numbers(given["place"], 3, "place", "deploy"))) if "place" in given else None
     if kind == "sim":
         from dexsim.deploy.simulated import SimulatedXHand
@@ -104,22 +111,43 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
             raise UserError(f"vision={vision}: must be truth or camera")
         if not given.get("seed", "0").isdigit():
             raise UserError(f"seed={given['seed']}: must be a whole number")
+        if "imu" in given:
+            raise UserError("imu=: driver=sim has its own")
         config = b.config
         shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
         if given.get("shape", shapes[0]) not in shapes:
             raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
-        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera", shape=given.get("shape"))
+        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera", shape=given.get("shape"),
+                                grip=b.manifest.get("grip"))  # fmt: skip
         return driver, place or driver
     if kind == "xhand":
         from dexsim.deploy.vendor import VendorXHand
 
         if "port" not in given:
             raise UserError("driver=xhand: say port=/dev/ttyUSB0 (or port=ethercat)")
+        if task == "rotate":
+            return VendorXHand(given["port"]), _imu(given, b)
         if place is None:
             raise UserError("driver=xhand: nothing sees the object; state place=\"x y z\" [m, palm frame], or run the Loop with your own"
                             " HeightSource (dexsim.deploy.vision)")
         return VendorXHand(given["port"]), place
     raise UserError(f"driver={kind}: must be sim or xhand")
+
+
+def _imu(given: dict[str, str], b: Any) -> Any:
+    """The IMU in the object; None where the policy does without."""
+    from dexsim.deploy.imu import UdpImu
+
+    if b.manifest["task_settings"]["perception"] != "imu":
+        return None
+    how, _, port = given.get("imu", "").partition(":")
+    if how != "udp" or not port.isdigit():
+        raise UserError(f"imu={given.get('imu', '')}: nothing says how the object is turned; say imu=udp:PORT and send lines \"w x y z\" there, or run"
+                        " the Loop with your own OrientationSource (dexsim.deploy.imu)")
+    imu = UdpImu(int(port))
+    if not imu.wait(5.0):
+        raise UserError(f"imu=udp:{port}: no orientation came within 5 s; send lines of text \"w x y z\" to 127.0.0.1:{port}")
+    return imu
 
 
 def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) -> Any:

@@ -58,6 +58,8 @@ def load(path: str | Path) -> Bundle:
         raise UserError(f"{path}: {POLICY} is missing; export the bundle again")
     if sha256(policy) != manifest["policy"]["sha256"]:
         raise UserError(f"{policy}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
+    if manifest["task"] == "rotate" and not {"task_settings", "grip"} <= set(manifest):
+        raise UserError(f"{path / MANIFEST}: lacks task_settings or grip, which task=rotate needs; export the bundle again")
     return Bundle(path, manifest, session(policy))
 
 

@@ -25,7 +25,8 @@ class HandState:
 
     time: host clock [s] at which it arrived (the SDK has no hardware stamp); sequence: counts readings.
     position [12] rad; current [12] mA, + opening, - closing; temperature [12] degC; error [12] codes (0 ok).
-    tactile [5, 120, 3] counts: fx, fy int8, fz uint8; taxel k = column * 12 + row.
+    tactile [5, 120, 3] counts: fx, fy int8, fz uint8; taxel k = column * 12 + row. velocity [12] rad/s, None where the
+    firmware does not say.
     """
 
     time: float
@@ -35,6 +36,7 @@ class HandState:
     temperature: np.ndarray = field(default_factory=lambda: np.zeros(12))
     error: np.ndarray = field(default_factory=lambda: np.zeros(12, np.int64))
     tactile: np.ndarray = field(default_factory=lambda: np.zeros(TAXELS, np.int16))
+    velocity: np.ndarray | None = None
 
 
 @dataclass
@@ -50,7 +52,9 @@ class HandCommand:
 
 
 class HandDriver(Protocol):
-    """A hand. None of the calls waits for the bus. `started` may be absent: it is told when the policy begins."""
+    """A hand. None of the calls waits for the bus. Two more may be absent, and tell what a person beside the hand does:
+    `present()`, an object is held out and the fingers are about to close on it; `started()`, the policy begins and it is
+    let go."""
 
     name: str
 

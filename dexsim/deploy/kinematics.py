@@ -35,10 +35,12 @@ class HandKinematics:
         mujoco.mj_kinematics(self.model, d)
         return d.site_xpos[self._site].copy(), d.xpos[self._body].copy(), d.xmat[self._body].reshape(5, 3, 3).copy()
 
-    def touch(self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def touch(self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Normal forces [5, 120] N and the pads' poses -> (force [5] N, centre [5, 3] m in the palm frame: the
-        force-weighted mean of the taxels, the pad's centre where nothing is felt)."""
+        force-weighted mean of the taxels, or the mean of those that feel anything; the pad's centre where nothing is felt)."""
         force = normal.sum(1)
-        at = np.einsum("ft,ftk->fk", normal, self.taxels) / np.where(force > 0, force, 1.0)[:, None]
-        at = np.where(force[:, None] > 0, at, self.pad_centre)
+        weight = normal if weighted else (normal > 0).astype(float)
+        total = weight.sum(1)
+        at = np.einsum("ft,ftk->fk", weight, self.taxels) / np.where(total > 0, total, 1.0)[:, None]
+        at = np.where(total[:, None] > 0, at, self.pad_centre)
         return force, np.einsum("fij,fj->fi", rotation, at) + position

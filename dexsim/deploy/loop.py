@@ -1,6 +1,7 @@
 """The real-time loop: reads at 100 Hz, acts at the policy's rate, and lets go of the hand when something is wrong.
 
-Phases: HOMING (slow, at reduced current, from wherever the hand is) -> SETTLE (taxels are zeroed) -> RUN (the policy) ->
+Phases: HOMING (slow, at reduced current, from wherever the hand is) -> SETTLE (taxels are zeroed) -> PLACE (only where the task
+starts with an object in the hand: the hand waits, then its fingers close slowly on what is held out) -> RUN (the policy) ->
 RELAXED. Nothing moves before the homing, and every way out of `run` relaxes the hand.
 """
 
@@ -10,6 +11,7 @@ import gc
 import sys
 import threading
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,14 +22,15 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState
-from dexsim.deploy.measure import Measure
-from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, HEIGHT, OBSERVATION, Recorder
+from dexsim.deploy.measure import ORIENTATION, for_bundle
+from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
+from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.vision import HeightSource
 from dexsim.errors import UserError
 
-HOMING, SETTLE, RUN, RELAXED = "homing", "settle", "run", "relaxed"
+HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class LoopSettings:
     """seconds of policy; command: force 0..1; home: whether to home first (False only for replays).
 
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
-    home_error rad: allowed at its end; settle s. read_hz; stale s: a reading older than this relaxes; late s: so does a turn
+    home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task starts with
+    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: a reading older than this relaxes; late s: so does a turn
     that is later than this; overruns: so do as many turns in a row that end after the next was due; hang s: so does a loop
     that does not turn at all (seen by a thread of its own). speed: targets' largest, over the joints' no-load speeds;
     margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one; kp: its gain.
@@ -49,6 +53,8 @@ class LoopSettings:
     home_current: float = 0.5
     home_error: float = 0.2
     settle: float = 0.5
+    wait: float = 3.0
+    grip: float = 1.0
     read_hz: float = 100.0
     stale: float = 0.1
     late: float = 0.1
@@ -80,20 +86,27 @@ class Report:
 class Loop:
     """One bundle on one hand. See `LoopSettings` and `run`."""
 
-    def __init__(self, bundle: Bundle, driver: HandDriver, height: HeightSource, calibration: Calibration,
-                 settings: LoopSettings = LoopSettings(), clock: Clock | None = None, recorder: Recorder | None = None, keep: bool = False):
+    def __init__(self, bundle: Bundle, driver: HandDriver, eye: HeightSource | OrientationSource | None, calibration: Calibration,
+                 settings: LoopSettings = LoopSettings(), clock: Clock | None = None, recorder: Recorder | None = None, keep: bool = False,
+                 say: Callable[[str], None] | None = None):
+        """eye: what sees the object, as `measure.needs` of the bundle's task has it (None: nothing has to). say: told what a
+        person beside the hand has to do."""
         m, self.settings = bundle.manifest, settings
         if not 0 <= settings.command <= 1:
             raise UserError(f"command={settings.command}: must lie in [0, 1]")
         if not 20 <= settings.read_hz <= 1000:
             raise UserError(f"read_hz={settings.read_hz}: must lie in [20, 1000]")
-        self.bundle, self.driver, self.height, self.clock = bundle, driver, height, clock or Clock()
-        self.recorder, self.keep, self.report = recorder, keep, Report()
+        self.bundle, self.driver, self.eye, self.clock = bundle, driver, eye, clock or Clock()
+        self.recorder, self.keep, self.report, self.say = recorder, keep, Report(), say or (lambda text: None)
         self.period, self.read_period = float(m["rates"]["policy_period_s"]), 1.0 / settings.read_hz
         self.rule = ActionRule.from_manifest(m["action"])
         self.home = np.array(m["initial_pose"], float)
+        self.grip = np.array(m["grip"]["target"], float) if m.get("grip") else None
         self.calibration = calibration
-        self.measure = Measure(calibration, m["normalization"]["force_max_N"], self.period)
+        self.measure = for_bundle(m, calibration)
+        wanted = {None: None, "place": "place", ORIENTATION: "orientation"}[self.measure.needs]
+        if wanted is not None and not hasattr(eye, wanted):
+            raise UserError(f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it (dexsim/deploy/vision.py, imu.py)")
         tor_max = 1e3 * calibration.current_max if settings.tor_max is None else settings.tor_max
         self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (12,)), 1, 32767)
         self.guard = Guard(
@@ -142,6 +155,8 @@ class Loop:
                 if self.recorder.dropped:
                     self.report.counts["not_recorded"] += self.recorder.dropped
         self.report.counts.update(self.guard.counts)
+        if getattr(self.measure, "goals", 0):
+            self.report.counts["goals_reached"] += self.measure.goals
         return self.report
 
     def _first_reading(self) -> None:
@@ -233,7 +248,7 @@ class Loop:
         self.state, self.fresh_for = state, self.fresh_for + 1
         if self.recorder is not None:
             r = self.recorder
-            r.put("state", now, state.position, 1e-3 * np.asarray(state.current, float), state.time)
+            r.put("state", now, state.position, state.velocity, 1e-3 * np.asarray(state.current, float), state.time)
             r.put("tactile", now, state.tactile)
             if self.fresh_for % 100 == 1:
                 r.put("temperature", now, state.temperature)
@@ -248,50 +263,82 @@ class Loop:
     def _act(self, now: float) -> None:
         if self.phase == HOMING:
             share = min(1.0, (now - self._began) / self._home_s)
-            smooth = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk
-            self._send(now, self._from + smooth * (self.home - self._from), self.settings.home_current)
+            self._send(now, self._from + _smooth(share) * (self.home - self._from), self.settings.home_current)
             if share >= 1.0:
                 self.phase, self._began, self._rest = SETTLE, now, []
         elif self.phase == SETTLE:
             self._rest.append(np.asarray(self.state.tactile, float)[..., 2])
-            if now - self._began >= self.settings.settle:
-                self._end_homing(now)
+            if now - self._began < self.settings.settle:
+                self._send(now, self.home, 1.0)
+                return
+            self._end_homing()
+            if self.grip is None:
+                self._begin_run(now)
                 self._policy(now)
             else:
+                self.phase, self._began, self._held_out = PLACE, now, False
+                self.say(f"hold the object out to the hand: the fingers close on it in {self.settings.wait:g} s")
                 self._send(now, self.home, 1.0)
+        elif self.phase == PLACE:
+            self._place(now)
         elif self.phase == RUN:
             self._policy(now)
 
-    def _policy(self, now: float) -> None:
-        self._take(now)  # actions come between readings: act on what there is now
-        seen = self.height.place(now)
+    def _place(self, now: float) -> None:
+        """Wait at home for the object, close the fingers slowly, begin."""
+        since = now - self._began - self.settings.wait
+        if since < 0:
+            return self._send(now, self.home, 1.0)
+        if not self._held_out:
+            self._held_out = True
+            present = getattr(self.driver, "present", None)
+            if present is not None:
+                present()
+        share = min(1.0, since / max(self.settings.grip, 1e-6))
+        self._send(now, self.home + _smooth(share) * (self.grip - self.home), 1.0)
+        if share >= 1.0:
+            self._begin_run(now)
+
+    def _look(self, now: float) -> bool:
+        """The newest of what is seen of the object; False where nothing was seen yet."""
+        if self.measure.needs is None:
+            self._seen, self._seen_at = None, now
+            return True
+        seen = self.eye.orientation(now) if self.measure.needs == ORIENTATION else self.eye.place(now)
         if seen is None:
             self.report.counts["object_not_seen"] += 1
-            if not self.measure_ready:
-                return self._send(now, self.target, 1.0)
-            seen = self._place, self._place_time
-        self._place, self._place_time = seen
-        self.measure_ready = True
-        if now - self._place_time > 0.5:
+            return self._seen_at is not None
+        self._seen, self._seen_at = seen
+        if now - self._seen_at > 0.5:
             self.report.counts["object_seen_long_ago"] += 1
+        return True
+
+    def _policy(self, now: float) -> None:
+        self._take(now)  # actions come between readings: act on what there is now
+        if not self._look(now):
+            return self._send(now, self.target, 1.0)
         state, command = self.state, self.settings.command
-        signals = self.measure.signals(state, self._place, command)
-        observation = self.measure.observation(signals)
+        observation, touch = self.measure.observe(state, self._seen, command, self.target, self._action)
         action = self.bundle.act(observation)[0]
         target = self.rule.target(action, self.target, np.asarray(state.position, np.float32))
         self._send(now, target, 1.0)
+        self._action = action
         self.report.acts += 1
         if self.recorder is not None:
             r = self.recorder
             r.put(OBSERVATION, now, observation[0])
             r.put(ACTION, now, action)
-            r.put(FORCE_COMMAND, now, command)
-            r.put(HEIGHT, now, np.asarray(self._place, np.float32))
+            if self.measure.needs == ORIENTATION:
+                r.put(TURNED, now, np.asarray(self._seen, np.float32))
+                r.put(GOAL, now, self.measure.goal[0].numpy())
+            elif self.measure.needs is not None:
+                r.put(FORCE_COMMAND, now, command)
+                r.put(HEIGHT, now, np.asarray(self._seen, np.float32))
         if self.keep:
             self.report.observations.append(observation[0])
             self.report.actions.append(action)
             self.report.targets.append(self.target.copy())
-            self.report.forces.append(signals.touch_force[0].numpy())
+            self.report.forces.append(touch)
 
     def _send(self, now: float, target: np.ndarray, current_share: float) -> None:
         """Limit, remember, send, record."""
@@ -311,7 +358,8 @@ class Loop:
         # the peak of a minimum-jerk path is 15/8 of its mean speed
         self._home_s = max(0.5, 1.875 * float(np.abs(self.home - self._from).max()) / self.settings.home_speed)
 
-    def _end_homing(self, now: float) -> None:
+    def _end_homing(self) -> None:
+        """The hand must be at home; what the taxels say now is nothing."""
         error = np.abs(np.asarray(self.state.position, float) - self.home)
         if error.max() > self.settings.home_error:
             j = int(error.argmax())
@@ -321,12 +369,11 @@ class Loop:
         if rest.sum() > 0:
             self.report.counts["taxels_zeroed"] = int((rest > 0.5).sum())
             self.calibration.bias = self.calibration.bias + np.where(rest > 0.5, rest - self.calibration.bias, 0.0)
-        self._begin_run(now)
 
     def _begin_run(self, now: float) -> None:
         self.phase, self._began = RUN, now
         self.measure.reset()
-        self.measure_ready = False
+        self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:
             started()
@@ -348,3 +395,7 @@ class Loop:
                 self.report.counts["watchdog"] += 1
                 self.driver.relax()  # without the lock: whoever holds it hangs
 
+
+def _smooth(share: float) -> float:
+    """Minimum jerk from 0 to 1."""
+    return share**3 * (10 - 15 * share + 6 * share**2)

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import torch
 
 from dexsim.calibration.file import Calibration
+from dexsim.deploy import observations, observations_rotate
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
-from dexsim.deploy.observations import Signals, build, height_speed
+from dexsim.tasks import rotation
+
+PLACE, ORIENTATION = "place", "orientation"
+"""What a policy needs to know of the object, beside what the hand reads."""
+
+
+def for_bundle(manifest: dict[str, Any], calibration: Calibration) -> Measure | TurnMeasure:
+    """The measure of a bundle's task."""
+    period = float(manifest["rates"]["policy_period_s"])
+    if manifest["task"] == "rotate":
+        return TurnMeasure(calibration, manifest, period)
+    return Measure(calibration, manifest["normalization"]["force_max_N"], period)
 
 
 class Measure:
-    """Turns readings into observations; keeps what has memory: the first x, y of the object and its last height.
+    """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last height.
 
     period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training.
     """
+
+    needs: str | None = PLACE
 
     def __init__(self, calibration: Calibration, force_max: float, period: float):
         self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
@@ -27,23 +44,102 @@ class Measure:
         self._xy: np.ndarray | None = None
         self._z: torch.Tensor | None = None
 
-    def signals(self, state: HandState, place: np.ndarray, command: float) -> Signals:
-        """One control step. place [3] m: the object as last seen, palm frame; command 0..1."""
+    def observe(self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame; command 0..1."""
+        s = self.signals(state, seen, command)
+        return self.observation(s), s.touch_force[0].numpy()
+
+    def signals(self, state: HandState, place: np.ndarray, command: float) -> observations.Signals:
+        """See `observe`."""
         c = self.calibration
-        tips, position, rotation = self.hand(state.position)
-        force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation)
+        tips, position, rotation_ = self.hand(state.position)
+        force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation_)
         if self._xy is None:
             self._xy = np.array(place[:2], float)
         z = _tensor([place[2]])[0]
-        vz = torch.zeros_like(z) if self._z is None else height_speed(z, self._z, self.period)
+        vz = torch.zeros_like(z) if self._z is None else observations.height_speed(z, self._z, self.period)
         self._z = z
-        return Signals(
+        return observations.Signals(
             _tensor(state.position), _tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)), _tensor(self._xy), z, vz,
             _tensor(force), _tensor(centre), _tensor(tips), _tensor([command])[0])  # fmt: skip
 
-    def observation(self, signals: Signals) -> np.ndarray:
+    def observation(self, signals: observations.Signals) -> np.ndarray:
         """[1, 66] float32, by the builder that training used."""
-        return build(signals, self.force_max).numpy()
+        return observations.build(signals, self.force_max).numpy()
+
+
+class TurnMeasure:
+    """The rotation: turns readings into observations; keeps the goal, the history and the last angles.
+
+    goal [1, 4]: the orientation to reach, in the IMU's frame (None without one); goals: how many were reached. In training a goal
+    is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
+    """
+
+    def __init__(self, calibration: Calibration, manifest: dict[str, Any], period: float):
+        self.calibration, self.period, self.task = calibration, float(period), manifest["task_settings"]
+        self.needs = ORIENTATION if self.task["perception"] == "imu" else None
+        self.hand = HandKinematics()
+        goal = self.task["goal"]
+        axis = torch.tensor([float(x) for x in goal["axis"]])
+        self.axis = axis / axis.norm()
+        self.turn = rotation.about(self.axis, torch.tensor(math.radians(float(goal["angle"]))))
+        low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
+        self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
+        self.frame = sum(row[1] for row in observations_rotate.rows(self.task, frames=1))
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: the next orientation gives the first goal."""
+        self.goal: torch.Tensor | None = None
+        self.goals = 0
+        self._past: torch.Tensor | None = None
+        self._last: tuple[float, np.ndarray] | None = None
+        self._speed = np.zeros(12)
+
+    def observe(self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y z as its
+        IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
+        s = self.signals(state, seen, target, action)
+        out = observations_rotate.build(s, self.task)
+        if self.task["perception"] == "proprioception":
+            self._past = out.view(1, -1, self.frame)
+        return out.numpy(), s.touch_force[0].numpy()
+
+    def signals(self, state: HandState, seen: np.ndarray | None, target: np.ndarray, action: np.ndarray) -> observations_rotate.Signals:
+        """See `observe`; moves the goal on where it is reached."""
+        imu = self.task["perception"] == "imu"
+        q = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        if imu:
+            q = rotation.normalize(_tensor(seen))
+            self._aim(q)
+        normal = self.calibration.normal_force(state.tactile)
+        tips, position, turned = self.hand(state.position)
+        force, centre = self.hand.touch(normal, position, turned, weighted=self.task["observe"]["force_weighted"])
+        fresh = not imu and self._past is None
+        past = torch.zeros(1, 0, 0) if imu else torch.zeros(1, int(self.task["history"]), self.frame) if fresh else self._past
+        sent = observations_rotate.sent(
+            _tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), _tensor(target), self._middle, self._half,
+            self.task["observe"].get("last_action", "step"))  # fmt: skip
+        return observations_rotate.Signals(
+            _tensor(state.position), _tensor(self._velocity(state)), q, self.goal if imu else q, sent, _tensor(force), _tensor(centre),
+            _tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
+
+    def _aim(self, q: torch.Tensor) -> None:
+        """The first goal, or the next where this one is reached."""
+        reached = self.goal is not None and float(rotation.error(q, self.goal)) < float(self.task["reward"]["delta_rot"])
+        self.goals += reached
+        if self.goal is None or reached:
+            self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
+
+    def _velocity(self, state: HandState) -> np.ndarray:
+        """[12] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        if state.velocity is not None and np.isfinite(state.velocity).all():
+            return np.asarray(state.velocity, float)
+        q = np.asarray(state.position, float)
+        if self._last is not None and state.time > self._last[0]:
+            self._speed = (q - self._last[1]) / (state.time - self._last[0])
+        self._last = state.time, q
+        return self._speed
 
 
 def _tensor(x: object) -> torch.Tensor:

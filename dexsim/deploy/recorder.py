@@ -15,7 +15,9 @@ from dexsim.recording import schema
 from dexsim.recording.writer import Writer
 
 OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = "/policy/observation", "/policy/action", "/policy/force_command", "/object_seen", "/joint_errors"
-LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",), ERRORS: ("joint",)}
+TURNED, GOAL = "/object_turned", "/policy/goal"
+LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",), ERRORS: ("joint",),
+          TURNED: ("wxyz",), GOAL: ("wxyz",)}  # fmt: skip
 """Topics beside those of a recording: Float32MultiArray."""
 
 
@@ -56,8 +58,8 @@ class Recorder:
             kind, t, values = item
             try:
                 if kind == "state":
-                    position, effort, stamp = values
-                    w.add_state(t, position, None, effort, stamp - self.zero)
+                    position, velocity, effort, stamp = values
+                    w.add_state(t, position, velocity, effort, stamp - self.zero)
                 elif kind in add:
                     add[kind](t, *values)
                 else:

@@ -8,13 +8,14 @@ from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import Clock, HandCommand, HandState
 from dexsim.errors import UserError
-from dexsim.recording.schema import Recording
+from dexsim.recording.schema import Recording, Series
 
 EPS = 1e-6  # s, of rounding in stored times
 
 
 class ReplayHand:
-    """A HandDriver that gives a recording's samples at the clock's time; also a HeightSource, from its object pose.
+    """A HandDriver that gives a recording's samples at the clock's time; also a HeightSource, from its object pose, and an
+    OrientationSource, from the IMU in the object or else its pose.
 
     Simulated recordings are in N.m and N: they are given as the current and counts that `calibration` makes of them, not
     rounded. A simulated effort stamped t is of the physics step that begins at t, so the newest one *before* the clock is given.
@@ -36,6 +37,8 @@ class ReplayHand:
             value = np.nan_to_num(effort.value[:, self._order])
             amps = calibration.current(value) if recording.effort_is == "torque_Nm" else value * calibration.current_sign
             self._current = effort.t, amps * 1e3
+        speed = recording.states.velocity
+        self._speed = None if speed is None or not np.isfinite(speed.value).any() else speed.value[:, self._order]
         self._counts = None
         if recording.tactile is not None:
             newtons = recording.tactile_newtons()
@@ -57,7 +60,8 @@ class ReplayHand:
         if self._counts is not None:
             k = int(np.searchsorted(self._counts[0], now + EPS, side="right")) - 1
             tactile = self._counts[1][k] if k >= 0 else tactile
-        return HandState(float(q.t[i]), i, q.value[i, self._order], current, tactile=tactile)
+        return HandState(float(q.t[i]), i, q.value[i, self._order], current, tactile=tactile,
+                         velocity=None if self._speed is None else self._speed[i])  # fmt: skip
 
     def send(self, command: HandCommand) -> None:
         self.sent.append((self.clock.now(), command.position.copy()))
@@ -69,8 +73,17 @@ class ReplayHand:
         self.relax()
 
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
-        pose = self.recording.object_pose
-        if pose is None:
-            return None
-        i = int(np.searchsorted(pose.t, now + EPS, side="right")) - 1
-        return None if i < 0 else (pose.value[i, :3], float(pose.t[i]))
+        return _newest(self.recording.object_pose, now, slice(0, 3))
+
+    def orientation(self, now: float) -> tuple[np.ndarray, float] | None:
+        imu = self.recording.imu
+        if imu is not None and np.isfinite(imu.value[:, :4]).any():
+            return _newest(imu, now, slice(0, 4))
+        return _newest(self.recording.object_pose, now, slice(3, 7))
+
+
+def _newest(series: Series | None, now: float, part: slice) -> tuple[np.ndarray, float] | None:
+    if series is None:
+        return None
+    i = int(np.searchsorted(series.t, now + EPS, side="right")) - 1
+    return None if i < 0 else (series.value[i, part], float(series.t[i]))

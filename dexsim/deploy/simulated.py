@@ -25,7 +25,10 @@ KP_NOMINAL = 100.0
 """The firmware's kp that the servo table stands for: what most users send."""
 BUS_PERIOD = 0.010
 """s of a bus cycle: a command goes out and a state comes back (RS485: 9.6 ms measured by users)."""
+SPEED_LSB = 1e-3
+"""rad/s a count of the speed that newer firmware reports."""
 TIMESTEP = 0.0035  # s of physics, about
+AWAY = 0.25  # m above its place, where an object waits to be put into the hand
 VISION_PERIOD = 1 / 30
 
 
@@ -33,10 +36,13 @@ class SimulatedHand:
     """Hand, object and physics of a bundle's training config, one world, spoken to in the SDK's terms.
 
     The object hangs in its place until `release`. camera: see the object through a rendered depth image and its mask, else
-    its height is given with the config's noise. Deterministic for a seed, in simulated time.
+    its height is given with the config's noise. grip: a bundle's `grip`, of a task that starts with the object in the hand: the
+    object is out of reach until `present`, and then held there until `release`; an IMU in it says how it is turned, with the
+    config's noise, drift and delay. Deterministic for a seed, in simulated time.
     """
 
-    def __init__(self, config: dict[str, Any], calibration: Calibration, seed: int = 0, camera: bool = False, shape: str | None = None):
+    def __init__(self, config: dict[str, Any], calibration: Calibration, seed: int = 0, camera: bool = False, shape: str | None = None,
+                 grip: dict[str, Any] | None = None):
         import copy
 
         import torch
@@ -52,13 +58,25 @@ class SimulatedHand:
         if shape is not None:
             cfg["task"]["objects"]["train"] = [shape]
             cfg["task"]["objects"]["held_out"] = [s for s in cfg["task"]["objects"]["held_out"] if s != shape] or ["box"]
+        if grip is not None:
+            cfg["task"]["initial"]["poses"] = None  # the file need not be here: the bundle says which pose
         self.env = make_env(cfg, 1, "cpu", seed, "mujoco")
-        self.calibration, self.noise = calibration, float(config["task"]["sensors"]["vision_z_noise"])
+        self.calibration, self.noise = calibration, float(config["task"]["sensors"].get("vision_z_noise", 0.0))
         self.rng = np.random.default_rng(seed)
         env, self._torch = self.env, torch
+        self.imu = None
+        if grip is not None:
+            from dexsim.tasks.stable_grasps import GraspSet
+
+            rows = (grip["object_edge_m"], grip["hand"], grip["target"], grip["object_pose"])
+            env.grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows))
+            env.reset_all()
+            self.imu = SimulatedImu(config, env, self.rng)
         self.time, self.sequence, self.held = 0.0, 0, True
         self._nominal = env.servo.params.clone()
         self._start = env.object_pose.clone().double(), torch.zeros(1, 6, dtype=torch.float64)
+        self._away = torch.zeros(7, dtype=torch.float64)
+        self._away[2] = AWAY if grip is not None else 0.0
         self.target = env.q[0].double().numpy().copy()
         self.camera = None
         if camera:
@@ -79,11 +97,16 @@ class SimulatedHand:
 
     def _hold(self) -> None:
         t = self.env.engine.t
-        t.qpos[:, self.env.object_q] = self._start[0].to(t.qpos.dtype)
+        t.qpos[:, self.env.object_q] = (self._start[0] + self._away).to(t.qpos.dtype)
         t.qvel[:, self.env.object_v] = 0.0
 
+    def present(self) -> None:
+        """Somebody holds the object where the fingers will close on it."""
+        self._away.zero_()
+
     def release(self) -> None:
-        """The object falls."""
+        """The object is let go."""
+        self.present()
         self.held = False
 
     def command(self, c: HandCommand) -> None:
@@ -123,6 +146,8 @@ class SimulatedHand:
         self.time += steps * self.dt
         env.touch.launch()
         env.read_state()
+        if self.imu is not None:
+            self.imu.measure(self.time)
         if self.time >= self._look_at:
             self._look_at = self.time + VISION_PERIOD
             self._look()
@@ -141,6 +166,10 @@ class SimulatedHand:
         """The object as last seen, [3] m, and when [s]."""
         return self._seen
 
+    def orientation(self) -> tuple[np.ndarray, float] | None:
+        """How the object is turned, [4] w x y z, as its IMU last said, and when [s]; None without one."""
+        return None if self.imu is None else self.imu.newest(self.time)
+
     def state(self, now: float) -> HandState:
         """The state as the SDK would give it, arriving at host time `now`."""
         env = self.env
@@ -153,7 +182,45 @@ class SimulatedHand:
             tactile[:] = np.clip(np.round(counts), [-128, -128, 0], [127, 127, 255])
         else:
             tactile[..., 2] = np.clip(np.round(env.touch.raw[0].double().numpy() / self.calibration.lsb), 0, 255)
-        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(12, 30.0), np.zeros(12, np.int64), tactile)
+        speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
+        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(12, 30.0), np.zeros(12, np.int64), tactile,
+                         np.clip(speed, -32.768, 32.767))  # fmt: skip
+
+
+class SimulatedImu:
+    """An IMU inside the object, 100 readings a second, as training has it: late by `imu.delay`, noisy, a little tilted, its
+    heading drifting (middle of the randomized delay, one draw of the others)."""
+
+    def __init__(self, config: dict[str, Any], env: Any, rng: np.random.Generator):
+        draw = lambda name: float(rng.uniform(*env.sampler.range(name)[:2]))  # noqa: E731
+        sense = config["task"]["sensors"]
+        self._env, self._rng = env, rng
+        self.delay = float(np.mean(env.sampler.range("imu.delay")[:2]))
+        self._noise, self._walk = float(sense["imu_noise"]), float(sense["imu_heading_walk"])
+        self._rate, self._tilt = draw("imu.heading_rate"), np.array([draw("imu.tilt"), draw("imu.tilt"), 0.0])
+        self._heading, self._at = 0.0, 0.0
+        self._past: list[tuple[float, np.ndarray]] = []
+
+    def measure(self, t: float) -> None:
+        """A reading of time t [s]."""
+        import torch
+
+        from dexsim.tasks import rotation
+
+        step = t - self._at
+        self._at = t
+        self._heading += self._rate * step + self._walk * np.sqrt(max(step, 0.0)) * self._rng.standard_normal()
+        off = rotation.from_vector(torch.as_tensor(self._tilt + self._noise * self._rng.standard_normal(3), dtype=torch.float32))
+        drift = rotation.about(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(self._heading, dtype=torch.float32))
+        q = rotation.normalize(rotation.multiply(drift, rotation.multiply(off, self._env.object_pose[0, 3:])))
+        self._past.append((t, q.double().numpy()))
+        if len(self._past) > 200:
+            del self._past[:100]
+
+    def newest(self, t: float) -> tuple[np.ndarray, float] | None:
+        """The newest reading that has arrived by time t."""
+        at, q = next(((at, q) for at, q in reversed(self._past) if at <= t - self.delay + 1e-9), self._past[0] if self._past else (0.0, None))
+        return None if q is None else (q, at)
 
 
 class SimulatedCamera:
@@ -244,8 +311,10 @@ def choose_gl() -> str:
 
 
 # -- the driver -----------------------------------------------------------------------------------------------------------------
-_STATE = 2 + 12 * 4 + 4  # time, sequence, position, current, temperature, error; place, its time
-_COMMAND = 2 + 12 * 2 + 2  # number, mode, position, tor_max, kp, release
+_STATE = 2 + 12 * 5 + 4 + 5  # time, sequence, position, current, temperature, error, speed; place, its time; orientation, its time
+_PLACE, _TURNED = slice(62, 66), slice(66, 71)
+_COMMAND = 2 + 12 * 2 + 2  # number, mode, position, tor_max, kp, what is done with the object
+_PRESENT, _RELEASE = 1.0, 2.0
 
 
 def _shared(context: Any) -> tuple:
@@ -264,9 +333,9 @@ class SimulatedXHand:
     name = "simulated xHand"
 
     def __init__(self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, seed: int = 0,
-                 camera: bool = False, shape: str | None = None, latency: float = 0.002):
+                 camera: bool = False, shape: str | None = None, latency: float = 0.002, grip: dict[str, Any] | None = None):
         self.clock, self.latency = clock or Clock(), latency
-        self._args = (config, calibration, seed, camera, shape)
+        self._args = (config, calibration, seed, camera, shape, grip)
         self._process = None
         self.hand: SimulatedHand | None = None
         self._queue: list[tuple[float, Any]] = []
@@ -284,7 +353,7 @@ class SimulatedXHand:
         context = multiprocessing.get_context("spawn")
         shared = _shared(context)
         self._views = _views(shared)
-        self._number, self._release = 0, 0.0
+        self._number, self._object = 0, 0.0
         process = context.Process(target=_live, args=(self._args, shared, self.latency, os.getpid()), daemon=True)
         process.start()
         self._process = process
@@ -308,18 +377,25 @@ class SimulatedXHand:
             row, touch = v["state"][k % 2].copy(), v["touch"][k % 2].copy()
             if v["newest"].value - k < 2:
                 break  # else the slot was written over while it was copied
-        part = row[2:50].reshape(4, 12)
+        part = row[2:62].reshape(5, 12)
         return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2], part[3].astype(np.int64),
-                         touch.reshape(TAXELS))  # fmt: skip
+                         touch.reshape(TAXELS), part[4])  # fmt: skip
 
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
         """HeightSource: the object as the simulated camera last saw it."""
+        return self._object_seen("place", _PLACE)
+
+    def orientation(self, now: float) -> tuple[np.ndarray, float] | None:
+        """OrientationSource: as the object's IMU last said."""
+        return self._object_seen("orientation", _TURNED)
+
+    def _object_seen(self, what: str, part: slice) -> tuple[np.ndarray, float] | None:
         if self.hand is not None:
-            seen = self.hand.place()
+            seen = getattr(self.hand, what)()
             return None if seen is None else (seen[0], seen[1] + self._zero)
         v = self._views
-        row = v["state"][v["newest"].value % 2].copy()
-        return None if not np.isfinite(row[53]) else (row[50:53], float(row[53]))
+        row = v["state"][v["newest"].value % 2, part].copy()
+        return None if not np.isfinite(row[-1]) else (row[:-1], float(row[-1]))
 
     def send(self, command: HandCommand) -> None:
         if self.hand is not None:
@@ -334,12 +410,19 @@ class SimulatedXHand:
         elif self._process is not None:
             self._post(PASSIVE, np.zeros(12), np.zeros(12), 0)
 
+    def present(self) -> None:
+        """The object is held out."""
+        if self.hand is not None:
+            self.hand.present()
+        else:
+            self._object = _PRESENT
+
     def started(self) -> None:
-        """The policy begins: the object falls."""
+        """The policy begins: the object is let go."""
         if self.hand is not None:
             self.hand.release()
         else:
-            self._release = 1.0
+            self._object = _RELEASE
 
     def close(self) -> None:
         self.relax()
@@ -354,7 +437,7 @@ class SimulatedXHand:
         v = self._views
         self._number += 1
         row = v["command"][self._number % 2]
-        row[0], row[1], row[2:14], row[14:26], row[26], row[27] = self._number, mode, position, tor_max, kp, self._release
+        row[0], row[1], row[2:14], row[14:26], row[26], row[27] = self._number, mode, position, tor_max, kp, self._object
         v["sent"].value = self._number
 
     def _step(self) -> HandState | None:
@@ -406,7 +489,9 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
             row = v["command"][number % 2].copy()
             taken = number
             hand.command(HandCommand(row[2:14], row[14:26], kp=int(row[26]), mode=int(row[1])))
-            if row[27]:
+            if row[27] == _PRESENT:
+                hand.present()
+            elif row[27] == _RELEASE:
                 hand.release()
         now = time.monotonic()
         if now - zero - hand.time > 0.25:  # too slow a machine: simulated time stands still rather than jump
@@ -419,9 +504,9 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
         count += 1
         slot = v["state"][count % 2]
         slot[0], slot[1] = state.time, state.sequence
-        slot[2:50] = np.concatenate([state.position, state.current, state.temperature, state.error])
-        seen = hand.place()
-        slot[50:53], slot[53] = (seen[0], seen[1] + zero) if seen is not None else (0.0, np.nan)
+        slot[2:62] = np.concatenate([state.position, state.current, state.temperature, state.error, state.velocity])
+        for part, seen in ((_PLACE, hand.place()), (_TURNED, hand.orientation())):
+            slot[part] = np.append(seen[0], seen[1] + zero) if seen is not None else np.nan
         v["touch"][count % 2] = state.tactile.reshape(-1)
         v["newest"].value = count
         due = max(due + BUS_PERIOD, time.monotonic() - BUS_PERIOD)

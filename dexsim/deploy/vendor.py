@@ -7,6 +7,7 @@ state waits for `read`.
     theirs                                          ours (`HandState`)
     finger_state[i].position        rad             position
     finger_state[i].torque          mA, + opening   current
+    finger_state[i].default5        1000 rad/s      velocity (newer firmware; older leaves every joint's 0: none then)
     finger_state[i].temperature     low byte degC   temperature
     finger_state[i].commboard_err, jonitboard_err, tipboard_err   error (the first that is not 0)
     sensor_data[f].raw_force[k].fx, fy (int8), fz (uint8)         tactile counts
@@ -117,7 +118,9 @@ def convert(raw: Any, now: float, sequence: int) -> HandState:
     for f in range(TAXELS[0]):
         force = raw.sensor_data[f].raw_force
         tactile[f] = [(force[k].fx, force[k].fy, force[k].fz) for k in range(TAXELS[1])]
+    speed = np.array([getattr(j, "default5", 0) for j in joints], np.float32) * 1e-3
     error = [next((e for e in (j.commboard_err, j.jonitboard_err, j.tipboard_err) if e), 0) for j in joints]
     return HandState(
         now, sequence, np.array([j.position for j in joints], np.float32), np.array([j.torque for j in joints], np.int16),
-        np.array([j.temperature & 0xFF for j in joints], float), np.array(error, np.int64), tactile)
+        np.array([j.temperature & 0xFF for j in joints], float), np.array(error, np.int64), tactile,
+        speed if speed.any() else None)  # fmt: skip
