@@ -206,7 +206,24 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         out["contact_force_range_N"] = [float(x) for x in np.percentile(r["force"][held].sum(1), [5, 95])]
         out["joint_torque_range_Nm"] = [float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])]
         out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
+        out["by_command"] = _by_command(r, held)
     return out
+
+
+def _by_command(r: dict, held: np.ndarray) -> dict:
+    """Held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95 percentile)
+    and the torque of the four flexion joints [N.m], their mean; empty tenths left out."""
+    bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
+    total, torque = r["force"].sum(1), r["torque"][:, [4, 6, 8, 10]].mean(1)
+    rows: dict = {"command": [], "force_N": [], "force_range_N": [], "torque_Nm": []}
+    for b in range(BINS):
+        m = held & (bins == b)
+        if m.any():
+            rows["command"].append(float(r["command"][m].mean()))
+            rows["force_N"].append(float(total[m].mean()))
+            rows["force_range_N"].append([float(x) for x in np.percentile(total[m], [5, 95])])
+            rows["torque_Nm"].append(float(torque[m].mean()))
+    return rows
 
 
 def _tables(r: dict, k: dict, env) -> list:
