@@ -38,17 +38,10 @@ def main(argv: list[str]) -> dict:
     ready = time.perf_counter() - begin
     tools.close_hand(env)
     e, k = env.engine, env.decimation
-    everyone = torch.ones(worlds, dtype=torch.bool, device=device)
-    qpos, qvel, servo, target = e.t.qpos.clone(), e.t.qvel.clone(), env.servo.get_state(), env.target.clone()
-    tape = Tape(e, env.servo, (steps + 2) * k)
+    grasp, tape = tools.Snapshot(env), Tape(e, env.servo, (steps + 2) * k)
 
     def back() -> None:
-        """Everything as it was in the grasp; the clock begins at 0, and so do the servo's queues of targets."""
-        e.set_state(everyone, qpos, qvel)
-        env.servo.reset(everyone, target)
-        env.servo.set_state(torch.cat([servo[..., :2], env.servo.get_state()[..., 2:]], -1))
-        env.target.copy_(target)
-        env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
+        grasp.restore(env)
         tape.rewind()
 
     back()

@@ -12,9 +12,11 @@ from typing import Any
 
 import torch
 
+from dexsim.actuator.kernel import QUEUE
 from dexsim.cli import machine
 from dexsim.cli import start as start_up
 from dexsim.errors import UserError
+from dexsim.sim.scene import OBJECT_FIELDS
 
 ROOT = Path(__file__).parents[1]
 
@@ -82,6 +84,32 @@ def close_hand(env: Any, steps: int = 120) -> None:
     close[:, :3] = 0.4
     for k in range(steps):  # the object falls first; a joint closes until it meets its torque
         env.step(torch.where((env.torque / env.effort).abs() > 0.4, still, close) if k > 16 else still)
+
+
+class Snapshot:
+    """The worlds of a hand environment at one moment: states, targets, drives, and whatever varies by world."""
+
+    FIELDS = (*OBJECT_FIELDS, "dof_armature", "body_subtreemass", "body_invweight0", "dof_invweight0")
+
+    def __init__(self, env: Any):
+        e = env.engine
+        self.qpos, self.qvel, self.target = e.t.qpos.clone(), e.t.qvel.clone(), env.target.clone()
+        self.fields = {name: e.field(name).clone() for name in self.FIELDS}
+        self.params, self.state = env.servo.params.clone(), env.servo.get_state()
+        self.everyone = torch.ones(e.n, dtype=torch.bool, device=e.device)
+
+    def restore(self, env: Any, fields: bool = False) -> None:
+        """Put an environment of the same worlds there. The clock begins at 0, and the targets hold since ever. fields: also
+        what varies by world (for another environment than the one it was taken from)."""
+        if fields:
+            for name, value in self.fields.items():
+                env.engine.field(name).copy_(value)
+            env.servo.params.copy_(self.params)
+        env.engine.set_state(self.everyone, self.qpos, self.qvel)
+        env.servo.reset(self.everyone, self.target)
+        env.servo.set_state(torch.cat([self.state[..., :QUEUE], env.servo.get_state()[..., QUEUE:]], -1))
+        env.target.copy_(self.target)
+        env.episode_length_buf = torch.zeros_like(env.episode_length_buf)
 
 
 def report(out: dict[str, Any]) -> dict[str, Any]:
