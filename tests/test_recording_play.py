@@ -258,7 +258,7 @@ def played(tmp_path_factory):
 
     cfg = start.for_train(["task=grasp", "preset=none", "worlds=4", "device=cpu", "tactile=raw"], CONFIGS).cfg
     env = make_env(cfg, 4, "cpu", 0, "mujoco")
-    recorder = PlayRecorder(env, 2, cfg)
+    recorder = PlayRecorder(env, [0, 1], cfg)
     env.reset_all()
     seen = []
     generator = torch.Generator().manual_seed(0)
@@ -338,27 +338,38 @@ def test_a_play_sampled_like_the_hardware(played):
 def test_recording_ends_with_the_episode(played):
     from dexsim.recording.tap import _Track
 
-    track = _Track()
-    rows, g = np.zeros((2, 5)), np.array([0, 0, -9.81])
-    for k, (turned, done) in enumerate([(g, 0), (g, 0), (g, 1), (g, 0)]):
-        rows = rows.copy()
-        rows[:, 0] = [0.1 * k, 0.1 * k + 0.05]
-        track.add(rows, np.full(2, float(k)), turned, np.array(done), None, 0.1)
-    assert len(track.times) == 3 and [x[0] for x in track.targets] == [0.0, 1.0, 1.0] and track.over
-    track = _Track()
-    for k, turned in enumerate([g, g, np.array([0, 9.81, 0.0])]):
-        rows[:, 0] = [0.1 * k, 0.1 * k + 0.05]
-        track.add(rows.copy(), np.zeros(2), turned, np.array(0), None, 0.1)
-    assert len(track.times) == 2 and track.notes == ["ends where gravity turns"]
+    g, side = np.array([0, 0, -9.81]), np.array([0, 9.81, 0.0])
+
+    def feed(track, steps):
+        clock = 0.0
+        for k, (turned, done) in enumerate(steps):
+            rows = np.zeros((2, 5))
+            rows[:, 0] = clock, clock + 0.05
+            track.add([np.full(1, k)], None, rows, np.full(2, float(k)), turned, np.array(done), None)
+            clock = 0.0 if done else clock + 0.1
+        track.finish()
+        return track.episode
+
+    e = feed(_Track(0, 0.1, 0.2), [(g, 0), (g, 0), (g, 1), (g, 0)])
+    assert len(e.times) == 3 and [x[0] for x in e.targets] == [0.0, 1.0, 1.0] and e.about[0][0] == 0
+    e = feed(_Track(0, 0.1, 0.2), [(g, 0), (g, 0), (side, 0), (side, 0)])
+    assert len(e.times) == 2 and e.notes == ["ends where gravity turns"]
+    # an object that fell at once gives way to the first episode that lasts; a later and longer one is not waited for
+    steps = [(g, 0), (g, 1), *[(g, 0)] * 5, (g, 1), *[(g, 0)] * 9]
+    track = _Track(0, 0.1, 0.5)
+    e = feed(track, steps)
+    assert len(e.times) == 6 and e.about[0][0] == 2 and track.over
+    assert len(feed(_Track(0, 0.1, 9.0), steps).times) == 9, "else the longest"
 
 
 def test_settings_of_a_recorded_play():
-    with pytest.raises(UserError, match="record_worlds=9"):
-        from dexsim.recording.tap import PlayRecorder
+    from dexsim.recording.tap import PlayRecorder
 
-        class Env:
-            engine = servo = touch = objects = target = None
-            num_envs = 4
+    class Env:
+        engine = servo = touch = objects = target = None
+        num_envs = 4
 
-        PlayRecorder(Env(), 9, {})
+    for worlds in (9, 0, [1, 4], [1, 1], [], "some", [0, "x"]):
+        with pytest.raises(UserError, match="record_worlds="):
+            PlayRecorder(Env(), worlds, {})
     assert replay_cli.settings(["replay=a.mcap", "meta.gravity=0 0 1"], CONFIGS)["meta"] == {"gravity": "0 0 1"}

@@ -35,7 +35,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if play["record"] is not None:
         from dexsim.recording.tap import PlayRecorder
 
-        recorder = PlayRecorder(env, int(play["record_worlds"]), cfg)
+        recorder = PlayRecorder(env, play["record_worlds"], cfg)
     try:
         replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
     finally:  # what was recorded until a Ctrl-C is kept

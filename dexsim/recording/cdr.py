@@ -113,12 +113,17 @@ def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
 
 
 def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
-    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0)."""
-    v, unknown = np.asarray(values, dtype="<f8"), np.zeros(9, dtype="<f8")
+    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0). A part that
+    is not a number is not measured, which the message says by -1 as the first entry of its covariance."""
+    v = np.asarray(values, dtype="<f8")
     c = Cdr()
     c.header(stamp_ns, frame)
-    for part in (v[[1, 2, 3, 0]], unknown, v[4:7], unknown, v[7:10], unknown):
-        c.array(part)
+    for part in (v[[1, 2, 3, 0]], v[4:7], v[7:10]):
+        missing = not np.isfinite(part).all()
+        c.array(np.zeros_like(part) if missing else part)
+        covariance = np.zeros(9, dtype="<f8")
+        covariance[0] = -1.0 if missing else 0.0
+        c.array(covariance)
     return c.bytes()
 
 

@@ -186,10 +186,13 @@ def _pose(m: Any) -> np.ndarray:
 
 
 def _imu(m: Any) -> np.ndarray:
-    q, w, a = (get(m, n) for n in ("orientation", "angular_velocity", "linear_acceleration"))
-    return np.array(
-        [_number(get(q, k)) for k in "wxyz"] + [_number(get(w, k)) for k in "xyz"] + [_number(get(a, k)) for k in "xyz"]
-    )
+    """A part whose covariance begins with -1 is not measured (sensor_msgs/Imu): NaN."""
+    out = []
+    for name, axes in (("orientation", "wxyz"), ("angular_velocity", "xyz"), ("linear_acceleration", "xyz")):
+        part, covariance = get(m, name), get(m, f"{name}_covariance")
+        missing = covariance is not None and len(covariance) and covariance[0] == -1
+        out += [np.nan if missing else _number(get(part, k)) for k in axes]
+    return np.array(out)
 
 
 def _number(value: Any) -> float:

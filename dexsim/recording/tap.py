@@ -2,6 +2,8 @@
 
 # No `from __future__ import annotations`: Warp resolves a kernel's annotations from the closure.
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import yaml
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
-from dexsim.recording.schema import COMMANDS, DEFAULTS, OBJECT_POSE, STATES, TACTILE, Recording, Series, States
+from dexsim.recording.schema import COMMANDS, DEFAULTS, IMU, OBJECT_POSE, STATES, TACTILE, Recording, Series, States
 from dexsim.recording.writer import write
 from dexsim.sim.scene import OBJECT
 
@@ -64,28 +66,40 @@ def next_slot(count: int, slot: wp.array(dtype=int)):
     slot[0] = (slot[0] + 1) % count
 
 
-class PlayRecorder:
-    """Records the first whole episode of the first `count` worlds of a hand environment; others are not touched.
+LEAST = 2.0
+"""s: an episode that ends sooner (the object fell at once) gives way to a longer one of the same world."""
+EVERY = 32
+"""Control steps between two copies to the host, which wait for the device."""
 
-    A launch a physics step copies the chosen rows on the device; one copy a control step brings them to the host.
-    Attach before the episodes begin; `save` writes what there is. An episode's recording ends when the world is
-    reset, or when gravity turns (a recording has one direction of gravity).
+
+class PlayRecorder:
+    """Records an episode of chosen worlds of a hand environment; others are not touched.
+
+    worlds: which ones, or how many from the first. The first whole episode that lasts `least` s is kept, else the longest. A
+    launch a physics step copies the chosen rows on the device; they come to the host every `EVERY` control steps, so that no
+    step waits for them. Attach before the episodes begin; `save` writes what there is. An episode's recording ends when the
+    world is reset, or when gravity turns (a recording has one direction of gravity).
     """
 
-    def __init__(self, env: Any, count: int, config: dict[str, Any]):
+    def __init__(self, env: Any, worlds: int | Sequence[int], config: dict[str, Any], least: float = LEAST):
         for name in ("engine", "servo", "touch", "objects", "target"):
             if not hasattr(env, name):
                 raise UserError(f"record=...: this task cannot be recorded (its environment has no {name})")
-        if not 1 <= count <= env.num_envs:
-            raise UserError(f"record_worlds={count}: must lie in [1, {env.num_envs}], the number of worlds")
+        try:
+            chosen = list(range(worlds)) if isinstance(worlds, int) else [int(w) for w in worlds]
+        except (TypeError, ValueError):
+            chosen = []
+        if not chosen or len(set(chosen)) != len(chosen) or min(chosen) < 0 or max(chosen) >= env.num_envs:
+            raise UserError(f"record_worlds={worlds}: must be a number from 1 to {env.num_envs}, the number of worlds, or a list of"
+                            f" different ones, 0 to {env.num_envs - 1}")
         self.env, self.config = env, config
         engine, servo = env.engine, env.servo
-        self.worlds = torch.arange(count, device=env.device)
+        self.worlds = torch.tensor(chosen, device=env.device)
         self.joints = tuple(servo.joints)
-        J, K = len(self.joints), env.decimation
+        J, K, count = len(self.joints), env.decimation, len(chosen)
         with wp.ScopedDevice(engine.device):
             self._args = [
-                wp.array(list(range(count)), dtype=int), wp.array(engine.qpos_index(self.joints), dtype=int),
+                wp.array(chosen, dtype=int), wp.array(engine.qpos_index(self.joints), dtype=int),
                 wp.array(engine.dof_index(self.joints), dtype=int),
                 int(engine.mjm.jnt_qposadr[engine.joint(f"{OBJECT}_free")]),
                 engine.wp.time, engine.wp.qpos, engine.wp.qvel, servo._torque, servo._params,
@@ -95,7 +109,10 @@ class PlayRecorder:
         self._rows_t = wp.to_torch(self._rows)
         self._kernel = copy_kernel(engine.real)
         self._servo_before, self._step = servo.before_each, env.step
-        self.tracks: list[_Track] = [_Track() for _ in range(count)]
+        self._imu = env.task.get("perception") == "imu"  # an IMU in the object
+        self._waiting: list[torch.Tensor] = []
+        self._shapes: list[torch.Size] = []
+        self.tracks: list[_Track] = [_Track(w, env.dt, least) for w in chosen]
         # one object, kept: the engine knows a recorded step by its callbacks
         servo.before_each = self._before_each
         env.step = self._recorded_step
@@ -110,30 +127,46 @@ class PlayRecorder:
         wp.launch(next_slot, dim=1, inputs=[self._rows.shape[0], self._slot], device=self.env.engine.device)
 
     def _recorded_step(self, actions: torch.Tensor):
-        env = self.env
-        if all(track.over for track in self.tracks):
-            return self._step(actions)
+        env, w = self.env, self.worlds
         self._slot.zero_()
-        for k, track in enumerate(self.tracks):
-            if not track.times and not track.over:
-                track.world = _world(env, k)
+        o = env.objects
+        # what an episode is about, as it is before a step may end it; copies
+        about = [env.servo.params[w], o.variant[w], o.size[w], o.mass[w], o.friction[w], o.stiffness[w], o.damping_ratio[w]]
+        about += [env.object_velocity[w, 3:], *([env.seen[w]] if self._imu else [])]
         out = self._step(actions)
-        n = len(self.tracks)
-        parts = [self._rows_t.permute(1, 0, 2), env.target[:n], env.engine.field("opt.gravity")[:n], env.done[:n]]
         raw = env.touch.raw3 if env.touch.raw3 is not None else env.touch.raw
-        if raw is not None:
-            parts.append(raw[:n])
-        shapes = [p.shape[1:] for p in parts]
-        flat = torch.cat([p.reshape(n, -1).double() for p in parts], 1).cpu().numpy()
-        edges = np.cumsum([0, *(int(np.prod(s)) for s in shapes)])
-        for k, track in enumerate(self.tracks):
-            pieces = [flat[k, a:b].reshape(s) for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
-            track.add(*pieces[:4], pieces[4] if raw is not None else None, env.dt)
+        after = [self._rows_t.permute(1, 0, 2), env.target[w], env.engine.field("opt.gravity")[w], env.done[w]]
+        after += [raw[w]] if raw is not None else []
+        parts = [*about, *after]
+        self._shapes = [p.shape[1:] for p in parts]
+        self._waiting.append(torch.cat([p.reshape(len(w), -1).double() for p in parts], 1))
+        if len(self._waiting) >= EVERY:
+            self._fetch()
+            if all(track.over for track in self.tracks):
+                self.detach()
         return out
+
+    def _fetch(self) -> None:
+        """What waits on the device goes to the tracks."""
+        if not self._waiting:
+            return
+        flat = torch.stack(self._waiting).cpu().numpy()
+        self._waiting.clear()
+        edges = np.cumsum([0, *(int(np.prod(s)) for s in self._shapes)])
+        cut = list(zip(edges[:-1], edges[1:], self._shapes, strict=True))
+        for step in flat:
+            for track, row in zip(self.tracks, step, strict=True):
+                pieces = [row[a:b].reshape(s) for a, b, s in cut]
+                about, spin, rest = pieces[:7], pieces[7], pieces[8:]
+                turned = np.concatenate([rest.pop(0), spin]) if self._imu else None
+                track.add(about, turned, *rest[:4], rest[4] if len(rest) > 4 else None)
 
     def recordings(self) -> list[Recording]:
         """What was recorded so far, one a world that has anything."""
-        return [self._recording(track) for track in self.tracks if track.times]
+        self._fetch()
+        for track in self.tracks:
+            track.finish()
+        return [self._recording(track) for track in self.tracks if track.episode.times]
 
     def save(self, path: str | Path, realistic: bool = False, seed: int = 0) -> list[Path]:
         """Write `path` (several worlds: NAME_w0.mcap, ...), like the hardware would have seen it if `realistic`."""
@@ -144,25 +177,26 @@ class PlayRecorder:
         except OSError as error:
             raise UserError(f"record={path}: {error.strerror}") from None
         out = []
-        recordings = self.recordings()
-        for k, recording in enumerate(recordings):
+        for k, recording in enumerate(self.recordings()):
             if realistic:
                 recording = as_hardware(recording, seed + k, self.env.servo.current_per_torque.double().cpu().numpy())
-            to = path if len(self.tracks) == 1 else path.with_name(f"{path.stem}_w{k}.mcap")
+            world = yaml.safe_load(recording.config)["recorded_world"]["index"]
+            to = path if len(self.tracks) == 1 else path.with_name(f"{path.stem}_w{world}.mcap")
             write(to, recording)
             out.append(to)
         return out
 
     def _recording(self, track: "_Track") -> Recording:
-        J = len(self.joints)
-        rows = np.concatenate(track.rows)
-        t = rows[:, 0]
-        command_t = np.array(track.times)
+        J, e = len(self.joints), track.episode
+        rows = np.concatenate(e.rows)
+        t = rows[:, 0] - rows[0, 0]
+        start = float(rows[0, 0])
+        command_t = np.array(e.times) - start
         parts = [Series(t, rows[:, 1 + k * J : 1 + (k + 1) * J], STATES, t.copy()) for k in range(3)]
         pose = Series(t, rows[:, 1 + 3 * J :], OBJECT_POSE, t.copy(), "palm")
-        servo = self.env.servo.table
-        gravity = " ".join(f"{g:g}" for g in track.gravity)
-        notes = f"world {track.world['index']} of a play; object {track.world['object']['shape']}"
+        world, servo = self._world(track.world, e.about)
+        gravity = " ".join(f"{g:g}" for g in e.gravity)
+        notes = f"world {track.world} of a play; object {world['object']['shape']}"
         meta = DEFAULTS | {
             "source": "sim",
             "robot": "xhand_right",
@@ -172,99 +206,116 @@ class PlayRecorder:
             "tactile_unit": "N",
             "tactile_lsb": "1",
             "gravity": gravity,
-            "notes": "; ".join([notes, *track.notes]),
-            "servo": yaml.safe_dump(servo.to_dict() | {"joints": track.servo}, sort_keys=False),
+            "notes": "; ".join([notes, *e.notes]),
+            "servo": yaml.safe_dump(self.env.servo.table.to_dict() | {"joints": servo}, sort_keys=False),
         }
-        tactile = None
-        if track.touch:
-            force = np.stack(track.touch)
+        tactile, imu = None, None
+        if e.touch:
+            force = np.stack(e.touch)
             if force.ndim == 3:  # normal forces only
                 force = np.stack([np.zeros_like(force), np.zeros_like(force), force], -1)
-            tactile = Series(np.array(track.touch_times), force, TACTILE)
-        config = yaml.safe_dump(self.config | {"recorded_world": track.world}, sort_keys=False)
+            tactile = Series(np.array(e.touch_times) - start, force, TACTILE)
+        if e.turned:
+            value = np.stack(e.turned)
+            # no accelerometer is simulated: not a number, as a driver that has none says
+            imu = Series(command_t, np.concatenate([value, np.full((len(value), 3), np.nan)], 1), IMU, command_t.copy(), "object")
+        config = yaml.safe_dump(self.config | {"recorded_world": world}, sort_keys=False)
         return Recording(
             Path("play.mcap"),
             meta,
             self.joints,
-            Series(command_t, np.stack(track.targets), COMMANDS, command_t.copy()),
+            Series(command_t, np.stack(e.targets), COMMANDS, command_t.copy()),
             States(*parts),
             tactile=tactile,
             object_pose=pose,
+            imu=imu,
             config=config,
             start_ns=1_000_000_000,
         )
 
+    def _world(self, index: int, about: list[np.ndarray]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What differs in a world: object and drives, as plain data."""
+        params, variant, size, mass, friction, stiffness, damping = about
+        shape = self.env.scene.variants[int(variant)].shape
+        servo = {
+            joint: {
+                name: float(params[j, c])
+                for c, name in enumerate(NAMES)
+                if np.isfinite(params[j, c]) and params[j, c] != COLUMNS[c].neutral
+            }
+            for j, joint in enumerate(self.joints)
+        }
+        about_object = {"shape": shape.name, "kind": shape.kind, "size": [float(x) for x in size]} | {
+            k: float(v) for k, v in (("mass", mass), ("friction", friction), ("stiffness", stiffness), ("damping_ratio", damping))
+        }
+        return {"index": index, "object": about_object}, servo
+
+
+@dataclass
+class _Episode:
+    """One episode's samples, in the engine's time [s]."""
+
+    about: list[np.ndarray] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    targets: list[np.ndarray] = field(default_factory=list)
+    rows: list[np.ndarray] = field(default_factory=list)
+    touch: list[np.ndarray] = field(default_factory=list)
+    touch_times: list[float] = field(default_factory=list)
+    turned: list[np.ndarray] = field(default_factory=list)
+    gravity: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
 
 class _Track:
-    """The episode of one world."""
+    """One world: the episode that is kept and the one that goes on."""
 
-    def __init__(self) -> None:
-        self.world: dict[str, Any] = {}
-        self.servo: dict[str, Any] = {}
-        self.times: list[float] = []
-        self.targets: list[np.ndarray] = []
-        self.rows: list[np.ndarray] = []
-        self.touch: list[np.ndarray] = []
-        self.touch_times: list[float] = []
-        self.gravity: np.ndarray | None = None
-        self.notes: list[str] = []
-        self.over = False
+    def __init__(self, world: int, dt: float, least: float) -> None:
+        self.world, self.dt, self.least = world, dt, least
+        self.episode, self._now = _Episode(), _Episode()
+        self.over, self._waits = False, False
+
+    def finish(self) -> None:
+        """The episode that goes on ends here; the longer one is kept."""
+        if len(self._now.times) > len(self.episode.times):
+            self.episode = self._now
+        self._now, self._waits = _Episode(), False
+        self.over = self.over or len(self.episode.times) * self.dt >= self.least
 
     def add(
         self,
+        about: list[np.ndarray],
+        turned: np.ndarray | None,
         rows: np.ndarray,
         target: np.ndarray,
         gravity: np.ndarray,
         done: np.ndarray,
         touch: np.ndarray | None,
-        dt: float,
     ) -> None:
-        """One control step: rows [K, W], target [J] and touch as they are after it."""
-        start = float(rows[0, 0])
-        if not self.over and self.times and start <= self.times[-1]:
-            self.over = True  # reset in between
-        if not self.over and self.gravity is not None and np.abs(gravity - self.gravity).max() > 0.05:
-            self.over = True
-            self.notes.append("ends where gravity turns")
+        """One control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows [K, W],
+        target [J] and touch as they are after it."""
         if self.over:
             return
-        self.servo = self.world.pop("servo", self.servo)
-        self.gravity = gravity if self.gravity is None else self.gravity
-        self.over = bool(done)
-        if self.over and not self.times:  # the episode's only step
-            return
-        self.rows.append(rows)
-        self.times.append(start)
-        # a reset has replaced the last target: the one before stands
-        self.targets.append(self.targets[-1] if done else target)
-        if touch is not None and not done:
-            self.touch.append(touch)
-            self.touch_times.append(start + dt)
-
-
-def _world(env: Any, k: int) -> dict[str, Any]:
-    """What differs in this world: object and drives, as plain data."""
-    o = env.objects
-    variant = env.scene.variants[int(o.variant[k])]
-    params = env.servo.params[k].double().cpu().numpy()
-    servo = {
-        joint: {
-            name: float(params[j, c])
-            for c, name in enumerate(NAMES)
-            if np.isfinite(params[j, c]) and params[j, c] != COLUMNS[c].neutral
-        }
-        for j, joint in enumerate(env.servo.joints)
-    }
-    return {
-        "index": k,
-        "servo": servo,
-        "object": {
-            "shape": variant.shape.name,
-            "kind": variant.shape.kind,
-            "size": [float(x) for x in o.size[k]],
-            "mass": float(o.mass[k]),
-            "friction": float(o.friction[k]),
-            "stiffness": float(o.stiffness[k]),
-            "damping_ratio": float(o.damping_ratio[k]),
-        },
-    }
+        e, start = self._now, float(rows[0, 0])
+        if e.times and start <= e.times[-1]:  # reset in between
+            self.finish()
+            if self.over:
+                return
+            e = self._now
+        if e.gravity is not None and not self._waits and np.abs(gravity - e.gravity).max() > 0.05:
+            e.notes.append("ends where gravity turns")
+            self._waits = True  # for the world's next episode
+        if not self._waits:
+            if not e.times:
+                e.about, e.gravity = about, gravity
+            if not (done and not e.times):  # else the episode's only step
+                e.rows.append(rows)
+                e.times.append(start)
+                # a reset has replaced the last target: the one before stands
+                e.targets.append(e.targets[-1] if done else target)
+                if turned is not None:
+                    e.turned.append(turned)
+                if touch is not None and not done:
+                    e.touch.append(touch)
+                    e.touch_times.append(start + self.dt)
+        if done:
+            self.finish()
