@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from worlds import grasp_cfg
+from worlds import task_cfg
 
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import agent_config
@@ -15,14 +15,20 @@ QUIET = ("task.sensors.joint_noise=0", "task.sensors.torque_noise=0", "task.sens
 """Sensors without noise, bias or delay: what a recording of the truth can reproduce."""
 
 
-def make_checkpoint(path: Path, *settings: str, seed: int = 0) -> Path:
-    """A policy checkpoint of the grasp task with random weights."""
+QUIET_TURN = ("task.sensors.joint_noise=0", "task.sensors.velocity_noise=0", "task.sensors.tip_noise=0", "task.sensors.imu_noise=0",
+              "task.sensors.imu_heading_walk=0", "randomize.sensors.joint_bias=0", "randomize.imu.delay=0", "randomize.imu.heading_rate=0",
+              "randomize.imu.tilt=0")
+"""The same for the rotation."""
+
+
+def make_checkpoint(path: Path, *settings: str, seed: int = 0, task: str = "grasp") -> Path:
+    """A policy checkpoint of a task with random weights."""
     from rsl_rl.utils import resolve_class
 
     from dexsim.learning.ppo import agent_errors
     from dexsim.tasks import make_env
 
-    cfg = grasp_cfg("agent.actor.hidden_dims=[32,32]", *settings, worlds=1)
+    cfg = task_cfg("agent.actor.hidden_dims=[32,32]", *settings, worlds=1, task=task)
     env = make_env(cfg, 1, "cpu", seed, "mujoco")
     torch.manual_seed(seed)
     agent = agent_config(cfg, "cpu")

@@ -18,11 +18,16 @@ ALL = ["box", "sphere", "capsule", *(n for n, s in library().items() if s.kind =
 
 def grasp_cfg(*settings: str, worlds: int = 8) -> dict:
     """The resolved configuration of `python train.py task=grasp preset=none SETTINGS`: all objects, on the CPU too."""
+    return task_cfg(*settings, worlds=worlds)
+
+
+def task_cfg(*settings: str, worlds: int = 8, task: str = "grasp") -> dict:
+    """The same of any task."""
     from pathlib import Path
 
     from dexsim.cli import start
 
-    return start.for_train(["task=grasp", "preset=none", f"worlds={worlds}", "device=cpu", *settings], Path(__file__).parents[1] / "configs").cfg
+    return start.for_train([f"task={task}", "preset=none", f"worlds={worlds}", "device=cpu", *settings], Path(__file__).parents[1] / "configs").cfg
 
 
 def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int = 0):
