@@ -116,6 +116,10 @@ class HandEnv(VecEnv):
     def before_physics(self) -> None:
         """Commands, pushes: once a control step, before physics."""
 
+    def feel(self) -> None:
+        """Sensing after the last physics step of a control step: launches only, since it is recorded in the step's graph."""
+        self.touch.launch()
+
     def terminated(self) -> dict[str, torch.Tensor]:
         """Named terminations, bool [N] each."""
         raise NotImplementedError
@@ -158,7 +162,7 @@ class HandEnv(VecEnv):
         self._action_in.copy_(actions)
         self._replay("before", self._before)
         substeps = self.decimation if self.reality is None else self.reality.substeps(self.decimation)
-        self.engine.step(substeps, self.servo.before_each, self.touch.launch)
+        self.engine.step(substeps, self.servo.before_each, self.feel)
         self._replay("after", self._after)
         if self.keep_final_obs:
             final = {k: v.clone() for k, v in self.observe(advance=False).items()}

@@ -12,9 +12,11 @@ import numpy as np
 import torch
 
 from dexsim.assets import xhand
+from dexsim.assets.objects import library
 from dexsim.deploy import observations
 from dexsim.deploy.observations import ACTOR_SIZE, OBSERVATION
 from dexsim.errors import UserError
+from dexsim.tactile.clearance import Clearance
 from dexsim.tasks import rotation, terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
@@ -54,7 +56,13 @@ class GraspEnv(HandEnv):
         self.held_rows = torch.tensor([i for i, s in enumerate(names) if s in held], device=dev)
         # every shape is equally likely, whatever the number of its baked sizes
         self.row_weight = torch.tensor([1.0 / names.count(s) for s in names], device=dev)
-        self.draw_from(self.train_rows)
+        emphasis = t["objects"].get("emphasis", {})
+        for name, times in emphasis.items():
+            if name not in library() or not 0 < times <= 100:
+                raise UserError(f"task.objects.emphasis: {name}: {times}: must name a shape ({', '.join(library())}) and be above 0, at most 100")
+        self.emphasis = torch.tensor([float(emphasis.get(s, 1.0)) for s in names], device=dev)
+        self.draw_from(self.train_rows, self.emphasis)
+        self.clearance = Clearance(self.touch)
         self.kinds = torch.nn.functional.one_hot(self.objects.kind, 4).float()
         for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.scale", 0.3, 3.0),
                                 ("object.com", -0.25, 0.25), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
@@ -86,9 +94,14 @@ class GraspEnv(HandEnv):
         self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
         self.pushes = True
 
-    def draw_from(self, rows: torch.Tensor) -> None:
-        """Objects of new episodes are drawn from these rows of the scene's table [R]."""
-        weight = self.row_weight[rows]
+    def feel(self) -> None:
+        super().feel()
+        self.clearance.launch()
+
+    def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
+        """Objects of new episodes are drawn from these rows of the scene's table [R]: every shape equally often, or by its
+        emphasis (one number a row of the table)."""
+        weight = self.row_weight[rows] if emphasis is None else (self.row_weight * emphasis)[rows]
         self._rows, self._cumulative = rows, (weight / weight.sum()).cumsum(0)
 
     # -- episodes ------------------------------------------------------------------------------------------------------------
@@ -192,6 +205,8 @@ class GraspEnv(HandEnv):
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
             "force_near": w.get("force_near", 0.0) * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
+            # a finger that does not touch has nothing else that says which way the object lies
+            "reach": w.get("reach", 0.0) * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r.get("reach_length", 0.02)).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
@@ -263,7 +278,8 @@ class GraspEnv(HandEnv):
         r = self.task["rewards"]
         notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
                  "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed",
-                 "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers", "self": "ours: tips pressing on the hand"}
+                 "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers", "reach": "ours: pads near the object",
+                 "self": "ours: tips pressing on the hand"}
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
         if self.task["critic"] == "privileged":
