@@ -1,0 +1,1 @@
+"""The paper's two ablation tables, trained and judged again: `python -m benchmarks.reproduce table=rotation|grasp`."""

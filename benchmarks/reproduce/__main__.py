@@ -1,0 +1,94 @@
+"""Train and judge every row of the paper's ablation tables, and write them beside its numbers.
+
+    python -m benchmarks.reproduce table=rotation|grasp [budget=1] [seeds=2] [gpus=0,1,..] [out=out/reproduce_<table>]
+                                   [rows=full,quaternion] [minutes=M] [episodes=128] [cap=120] [any other setting of train.py]
+
+budget=1 is STEPS environment steps a row and seed; every row gets the same. gpus: one training on each at a time; null = all
+there are, or the CPU. Each policy is judged twice: with the physics and ranges it was trained in (episodes trials) and in
+`reality=bench` (half as many); rotation trials end after `cap` seconds. minutes ends a training early (it is judged as it
+is). The same command again goes on where it stopped. report=true only writes the tables from what is there.
+Writes <table>.md, <table>.json, <table>.png into `out`; rotation has one row more than the paper, trained without
+randomization, to show what the other world costs.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import torch
+
+from benchmarks import tools
+from benchmarks.reproduce import jobs, report, rows
+from dexsim.cli.ending import guard
+from dexsim.errors import UserError
+
+STEPS = 150e6
+OWN = {"table": "", "budget": "1", "seeds": "2", "gpus": "null", "out": "null", "rows": "null", "minutes": "null", "episodes": "128",
+       "cap": "120", "reality": "bench", "judge": "auto", "report": "false"}  # fmt: skip
+
+
+def number(own: dict[str, str], key: str, low: float, high: float, whole: bool = False) -> float:
+    """A setting's number; UserError with its range otherwise."""
+    try:
+        value = float(own[key])
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high or (whole and value != int(value)):
+        raise UserError(f"{key}={own[key]}: must be a {'whole ' if whole else ''}number from {low:g} to {high:g}")
+    return value
+
+
+def main(argv: list[str]) -> int:
+    own, extra = tools.split(argv, OWN)
+    table = own["table"]
+    if table not in rows.TABLES:
+        raise UserError(f"table={table or 'null'}: must be {' or '.join(rows.TABLES)}")
+    every = [*rows.TABLES[table], *([rows.UNRANDOMIZED] if table == "rotation" else [])]
+    chosen = every if own["rows"] == "null" else [r for k in own["rows"].split(",") for r in every if r.key == k]
+    if not chosen or (own["rows"] != "null" and len(chosen) != len(own["rows"].split(","))):
+        raise UserError(f"rows={own['rows']}: must be of {', '.join(r.key for r in every)}, with commas between")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    gpus: list[str | None] = [str(i) for i in range(count)] or [None]
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible and count:
+        gpus = [v.strip() for v in visible.split(",")][:count]
+    if own["gpus"] != "null":
+        gpus = [v.strip() for v in own["gpus"].split(",")]
+    task = rows.TASK[table]
+    for row in chosen:  # refuse a slip before hours of training
+        cfg = tools.config([f"task={task}", *extra, *row.settings])
+    per = cfg["worlds"] * cfg["agent"]["num_steps_per_env"]
+    cores = len(os.sched_getaffinity(0))
+    judge = own["judge"] if own["judge"] != "auto" else ("cpu" if cores >= 32 or not count else "cuda")
+    if judge not in ("cpu", "cuda"):
+        raise UserError(f"judge={judge}: must be auto, cpu or cuda")
+    if own["report"] not in ("true", "false"):
+        raise UserError(f"report={own['report']}: must be true or false")
+    episodes = int(number(own, "episodes", 2, 1e6, whole=True))
+    threads = max(1, min(8, cores // 4))
+    plan = jobs.Plan(
+        Path(own["out"] if own["out"] != "null" else f"out/reproduce_{table}").expanduser().absolute(), task,
+        max(1, math.ceil(number(own, "budget", 1e-9, 1e4) * STEPS / per)), None if own["minutes"] == "null" else number(own, "minutes", 0.01, 1e5),
+        {"simulation": episodes, "reality": max(2, episodes // 2)}, number(own, "cap", 1, 1e4), own["reality"], threads, tuple(extra), judge)
+    plan.out.mkdir(parents=True, exist_ok=True)
+    all_jobs = [jobs.Job(row, seed) for seed in range(1, 1 + int(number(own, "seeds", 1, 100, whole=True))) for row in chosen]
+    print(f"{len(chosen)} rows, {len(all_jobs)} trainings of {plan.iterations} iterations ({plan.iterations * per / 1e6:.1f} M steps), "
+          f"on {', '.join('CPU' if g is None else f'GPU {g}' for g in gpus)}; judged on {judge}: {plan.out}", flush=True)
+    about = tools.about("cuda:0" if count else "cpu") | {"command": "python -m benchmarks.reproduce " + " ".join(argv), "gpus": len([g for g in gpus if g])}
+    if own["report"] == "false":
+        jobs.run(all_jobs, plan, gpus, max(1, cores // (2 * threads)))
+    path = report.write(table, plan, all_jobs, about)
+    print(path.read_text())
+    missing = [f"{j.name} in {w}" for j in all_jobs for w in jobs.WORLDS if not j.metrics(plan, w).exists()]
+    if missing:
+        print(f"not judged: {'; '.join(missing)}", file=sys.stderr)
+    print(json.dumps({"benchmark": "reproduce", "table": table, "markdown": str(path), "missing": len(missing)}))
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(guard(main, sys.argv[1:]))

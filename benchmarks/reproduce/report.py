@@ -1,0 +1,213 @@
+"""The tables as Markdown, JSON and a figure, beside the paper's numbers; which of its orderings hold here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.reproduce import jobs, rows
+from benchmarks.reproduce.jobs import Job, Plan
+from benchmarks.reproduce.rows import Row
+
+RESAMPLES = 4000
+WORLD_NAMES = {"simulation": "simulation", "reality": "other world"}
+
+
+def trials(found: list[dict]) -> tuple[list[np.ndarray], float, float]:
+    """(successes of each seed's trials, mean seconds to fall over seeds, share of trials that lasted to the cap)."""
+    successes = [np.array(m["consecutive_successes"]["all"], float) for m in found]
+    fall = float(np.mean([m["seconds_to_fall"] for m in found]))
+    capped = sum(m["capped"] for m in found) / sum(m["episodes"] for m in found)
+    return successes, fall, capped
+
+
+def resampled(successes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """[RESAMPLES] averages: seeds drawn anew with replacement, then trials within each."""
+    out = np.zeros(RESAMPLES)
+    for _ in successes:
+        pick = rng.integers(len(successes), size=RESAMPLES)
+        for k, own in enumerate(successes):
+            chosen = pick == k
+            out[chosen] += own[rng.integers(len(own), size=(int(chosen.sum()), len(own)))].mean(1)
+    return out / len(successes)
+
+
+def rotation_row(row: Row, found: list[dict], rng: np.random.Generator) -> dict[str, Any]:
+    """One row of the rotation table in one world, trials of all seeds together."""
+    successes, fall, capped = trials(found)
+    everything = np.concatenate(successes)
+    draws = resampled(successes, rng)
+    average = float(np.mean([s.mean() for s in successes]))
+    return {
+        "average": average, "interval": [float(x) for x in np.percentile(draws, [2.5, 97.5])], "median": float(np.median(everything)),
+        "by_seed": [float(s.mean()) for s in successes], "seconds_per_success": fall / average if average else None, "seconds_to_fall": fall,
+        "capped": capped, "trials": len(everything), "cap_s": found[0]["cap_s"], "steps": [m["trained_steps"] for m in found],
+        "spread": [int(x) for x in np.percentile(everything, np.linspace(5, 95, 10), method="nearest")], "_draws": draws,
+    }  # fmt: skip
+
+
+def rotation(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
+    """(Markdown, JSON, figure) of what has been judged so far."""
+    rng = np.random.default_rng(0)
+    table: dict[str, dict[str, dict]] = {}
+    order = list(dict.fromkeys(j.row for j in all_jobs))
+    for row in order:
+        for world in jobs.WORLDS:
+            found = [m for j in all_jobs if j.row == row and (m := jobs.read(j, plan, world)) is not None]
+            if found:
+                table.setdefault(row.key, {})[world] = rotation_row(row, found, rng)
+    lines = []
+    for world in jobs.WORLDS:
+        lines += ["", f"**Judged in {WORLD_NAMES[world]}**", "",
+                  "| row | average (95 %) | by seed | median | s a success | s to fall | to the cap | paper: average, median, s, s to fall |",
+                  "|---|---|---|---|---|---|---|---|"]
+        for row in order:
+            r = table.get(row.key, {}).get(world)
+            paper = ", ".join(f"{v:g}" for v in row.paper.values()) or "-"
+            if r is None:
+                lines.append(f"| {row.label} | not judged | | | | | | {paper} |")
+                continue
+            seconds = "-" if r["seconds_per_success"] is None else f"{r['seconds_per_success']:.2f}"
+            lines.append(f"| {row.label} | {r['average']:.1f} ({r['interval'][0]:.1f}-{r['interval'][1]:.1f}) | "
+                         f"{', '.join(f'{x:.1f}' for x in r['by_seed'])} | {r['median']:.1f} | {seconds} | {r['seconds_to_fall']:.1f} | "
+                         f"{100 * r['capped']:.0f} % | {paper} |")
+    claims = {world: orderings(table, world) for world in jobs.WORLDS}
+    lines += ["", "**The paper's orderings** (bootstrap over seeds and trials; undecided: the interval of the difference holds 0)", "",
+              "| the paper says | simulation | other world |", "|---|---|---|"]
+    lines += [f"| {a['says']} | {a['here']} | {b['here']} |" for a, b in zip(claims["simulation"], claims["reality"], strict=True)]
+    lines += ["", *_randomization(table)]
+    plain = {k: {w: {n: v for n, v in r.items() if n != "_draws"} for w, r in by.items()} for k, by in table.items()}
+    return "\n".join(lines) + "\n", {"rows": plain, "orderings": claims}, lambda axes: _rotation_figure(axes, order, table)
+
+
+def orderings(table: dict, world: str) -> list[dict[str, str]]:
+    """Each claim of the paper and whether it holds: by the interval of the difference of averages; times by their order alone."""
+    labels = {r.key: r.label for r in rows.ROTATION}
+    out = []
+    for first, second, quantity, word in rows.ROTATION_CLAIMS:
+        better = "more successes than" if quantity == "average" else "less time a success than"
+        says = f"{labels[first]}: {better} {labels[second]}"
+        a, b = (table.get(k, {}).get(world) for k in (first, second))
+        if a is None or b is None or (quantity != "average" and None in (a[quantity], b[quantity])):
+            here = "not judged"
+        elif quantity == "average":
+            difference = a["_draws"] - b["_draws"]
+            low, high = np.percentile(difference, [2.5, 97.5])
+            here = "holds" if low > 0 else "reversed" if high < 0 else "undecided"
+            here += f" ({a['average'] - b['average']:+.1f}, {low:+.1f} to {high:+.1f})"
+        else:
+            here = f"{'holds' if a[quantity] < b[quantity] else 'reversed'} ({a[quantity]:.2f} and {b[quantity]:.2f} s)"
+        out.append({"says": says, "here": here, "first": first, "second": second, "quantity": quantity, "word": word})
+    return out
+
+
+def _randomization(table: dict) -> list[str]:
+    out = []
+    for key, text in (("full", "trained with randomization"), (rows.UNRANDOMIZED.key, "trained without")):
+        by = table.get(key, {})
+        if set(by) == set(jobs.WORLDS) and by["simulation"]["average"]:
+            kept = by["reality"]["average"] / by["simulation"]["average"]
+            out.append(f"Full observations, {text}: {by['simulation']['average']:.1f} successes in its own simulation, "
+                       f"{by['reality']['average']:.1f} in the other world ({100 * (kept - 1):+.0f} %).")
+    return out
+
+
+def _rotation_figure(axes, order: list[Row], table: dict) -> None:
+    x = np.arange(len(order))
+    for quantity, ax, unit in (("average", axes[0], "consecutive successes"), ("seconds_per_success", axes[1], "s a success")):
+        series = [("paper, real hand", [r.paper.get(quantity, np.nan) for r in order], None)]
+        for world in jobs.WORLDS:
+            found = [table.get(r.key, {}).get(world) for r in order]
+            value = [np.nan if f is None or f[quantity] is None else f[quantity] for f in found]
+            error = None
+            if quantity == "average":
+                error = np.array([[np.nan, np.nan] if f is None else [f["average"] - f["interval"][0], f["interval"][1] - f["average"]] for f in found]).T
+            series.append((WORLD_NAMES[world], value, error))
+        for k, (label, value, error) in enumerate(series):
+            ax.bar(x + 0.27 * (k - 1), value, width=0.25, yerr=error, label=label, capsize=2)
+        ax.set_ylabel(unit)
+        ax.set_xticks(x, [r.key.replace("_", "\n") for r in order], fontsize=7)
+    axes[0].legend(fontsize=7)
+
+
+def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
+    """(Markdown, JSON, figure) of the grasp rows judged so far: means over seeds, each seed in brackets."""
+    quantities = (
+        ("hold_rate", "held", lambda m: m.get("hold_rate")),
+        ("force_low", "force, low (N)", lambda m: m.get("contact_force_range_N", [None] * 2)[0]),
+        ("force_high", "force, high (N)", lambda m: m.get("contact_force_range_N", [None] * 2)[1]),
+        ("torque_low", "torque, low (N m)", lambda m: m.get("joint_torque_range_Nm", [None] * 2)[0]),
+        ("torque_high", "torque, high (N m)", lambda m: m.get("joint_torque_range_Nm", [None] * 2)[1]),
+        ("force_correlation", "force and command", lambda m: m.get("force_command_correlation")),
+        ("torque_correlation", "torque and command", lambda m: m.get("torque_command_correlation")),
+    )  # fmt: skip
+    order = list(dict.fromkeys(j.row for j in all_jobs))
+    table: dict[str, dict[str, dict]] = {}
+    lines = []
+    for world in jobs.WORLDS:
+        lines += ["", f"**Judged in {WORLD_NAMES[world]}** (5 to 95 % of held episodes; correlations over held episodes; in brackets each seed)", "",
+                  "| row | " + " | ".join(q[1] for q in quantities) + " | paper: force, torque (no units) |", "|---" * (len(quantities) + 2) + "|"]
+        for row in order:
+            found = [m for j in all_jobs if j.row == row and (m := jobs.read(j, plan, world)) is not None]
+            p = row.paper
+            paper = f"{p['force_low']:g}-{p['force_high']:g}, {p['torque_low']:g}-{p['torque_high']:g}"
+            cells, entry = [], {"by_command": [m.get("by_command") for m in found], "steps": [m["trained_steps"] for m in found]}
+            for name, _, get in quantities:
+                values = [v for m in found if (v := get(m)) is not None]
+                entry[name] = values
+                cells.append("-" if not values else f"{np.mean(values):.2f} ({', '.join(f'{v:.2f}' for v in values)})")
+            table.setdefault(row.key, {})[world] = entry
+            lines.append(f"| {row.label} | " + " | ".join(cells) + f" | {paper} |")
+    lines += ["", "**Strength of the correlation of force and command** (the paper: both > force only > torque only)", ""]
+    said: dict[str, list] = {}
+    for world in jobs.WORLDS:
+        said[world] = []
+        for first, second in (("both", "force"), ("force", "torque")):
+            a, b = (table.get(k, {}).get(world, {}).get("force_correlation") or [] for k in (first, second))
+            if not a or not b:
+                here = "not judged"
+            elif min(a) > max(b) or max(a) < min(b):
+                here = "holds in every pair of seeds" if min(a) > max(b) else "reversed in every pair of seeds"
+            else:
+                here = "undecided: the seeds overlap"
+            said[world].append({"first": first, "second": second, "here": here})
+            lines.append(f"- {WORLD_NAMES[world]}, {first} > {second}: {here}.")
+    return "\n".join(lines) + "\n", {"rows": table, "orderings": said}, lambda axes: _grasp_figure(axes, order, table)
+
+
+def _grasp_figure(axes, order: list[Row], table: dict) -> None:
+    for k, row in enumerate(order):
+        for world, style in (("simulation", "-"), ("reality", "--")):
+            for i, c in enumerate(table.get(row.key, {}).get(world, {}).get("by_command") or []):
+                if not c:
+                    continue
+                label = f"{row.label}, {WORLD_NAMES[world]}" if i == 0 else None
+                axes[0].plot(c["command"], c["force_N"], style, color=f"C{k}", label=label, linewidth=1.2)
+                axes[1].plot(c["command"], c["torque_Nm"], style, color=f"C{k}", linewidth=1.2)
+    for ax, unit in ((axes[0], "contact force of five fingers [N]"), (axes[1], "torque of a flexion joint [N m]")):
+        ax.set_xlabel("force command")
+        ax.set_ylabel(unit)
+    axes[0].legend(fontsize=6)
+
+
+def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> Path:
+    """<table>.md, .json and .png in the plan's folder; returns the Markdown's path."""
+    from matplotlib.figure import Figure
+
+    text, data, draw = {"rotation": rotation, "grasp": grasp}[table](plan, all_jobs)
+    steps = sorted({s for j in all_jobs for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])})
+    trained = "nothing trained yet" if not steps else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
+    head = (f"# The paper's {table} table\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training, "
+            f"{len({j.seed for j in all_jobs})} seed(s) a row; "
+            + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
+            + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
+    path = plan.out / f"{table}.md"
+    path.write_text(head + text)
+    (plan.out / f"{table}.json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    draw(figure.subplots(1, 2))
+    figure.savefig(plan.out / f"{table}.png", dpi=110)
+    return path
