@@ -50,12 +50,13 @@ def measure(cfg: dict, mode: str) -> dict:
     import torch
 
     from dexsim.cli import build, machine
+    from dexsim.learning.ranks import seed_all
     from dexsim.learning.runner import Runner
     from dexsim.tasks import make_env
 
     device, worlds = cfg["device"], cfg["worlds"]
     machine.set_threads(device)
-    build.seed_all(cfg["seed"])
+    seed_all(cfg["seed"])
     build.quiet_warp(device)
     torch.zeros(1, device=device)
     empty = used(device)

@@ -293,9 +293,12 @@ def test_full_disk_elsewhere(configs, place, capfd, monkeypatch):
     assert "the disk is full at progress.csv" in refused(capfd, configs, *QUICK)
 
 
-def test_several_ranks_are_refused(configs, place, capfd, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    assert "several GPUs" in refused(capfd, configs, *QUICK)
+def test_full_memory_is_one_line(configs, place, capfd, monkeypatch):
+    def add(*_):
+        raise RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(folder.ProgressFile, "add", add)
+    assert "use fewer worlds=" in refused(capfd, configs, *QUICK)
 
 
 # --- Ctrl-C

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import os
-import random
 import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 
 from dexsim.cli import machine
 from dexsim.cli.report import describe_env, versions_line
+from dexsim.learning.ranks import seed_all
 
 MakeEnv = Callable[..., Any]
-
-
-def seed_all(seed: int) -> None:
-    """Seed every global random generator."""
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-    torch.manual_seed(seed)
 
 
 def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, Any]) -> Any:

@@ -17,17 +17,34 @@ def guard(main: Callable[[list[str]], int], argv: list[str]) -> int:
     try:
         return main(argv)
     except UserError as error:
-        return _say(error, 2)
+        return _say(error, 2) if not _silent() else 2
     except KeyboardInterrupt:
-        return _say("stopped by Ctrl-C before there was anything to save", 130, "")
+        return 130 if _silent() else _say("stopped by Ctrl-C before there was anything to save", 130, "")
     except BrokenPipeError:  # e.g. `python train.py --help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (RuntimeError, MemoryError) as error:
+        if not out_of_memory(error):
+            raise
+        return _say(f"the memory of the device is full ({' '.join(str(error).split())[:120]}); use fewer worlds=, or more"
+                    " agent.algorithm.num_mini_batches= where only learning does not fit", 2)
     except OSError as error:
         if error.errno not in FULL:
             raise
         where = f" at {error.filename}" if error.filename else ""
         return _say(f"the disk is full{where}; free some space, then continue with resume=<run folder>/last.pt", 2)
+
+
+def _silent() -> bool:
+    """Whether another process says it: under torchrun every rank of a machine finds the same wrong setting, the first speaks.
+    What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
+    return os.environ.get("WORLD_SIZE", "1") != "1" and os.environ.get("LOCAL_RANK", "0") != "0"
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error of torch, Warp or Python says that memory is full."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or "out of memory" in text or "failed to allocate" in text
 
 
 def _say(message: object, status: int, prefix: str = "error: ") -> int:

@@ -15,7 +15,7 @@ PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 
 def device(asked: str | None) -> str:
     """ "cpu" or "cuda:<k>". None picks the first CUDA device where there is one. Raises UserError for one not here."""
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    count = cuda_devices()
     if asked is None:
         return "cuda:0" if count else "cpu"
     name, _, index = str(asked).partition(":")
@@ -31,18 +31,17 @@ def device(asked: str | None) -> str:
     raise UserError(f"device={asked}: must be cpu, cuda or cuda:<number>")
 
 
+def cuda_devices() -> int:
+    """How many CUDA devices torch sees here."""
+    return torch.cuda.device_count() if torch.cuda.is_available() else 0
+
+
 def set_threads(where: str) -> None:
     """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread pool
     of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds took
     150 to 480 ms with two, 37 to 75 with one: docs/benchmarks.md)."""
     if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
-
-
-def refuse_many_ranks() -> None:
-    """Raise UserError under torchrun with more than one process: training on several GPUs is not supported."""
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise UserError("WORLD_SIZE > 1: training on several GPUs is not supported; start one process without torchrun")
 
 
 def versions() -> dict[str, str]:

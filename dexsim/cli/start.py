@@ -48,7 +48,7 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
         cfg = _from_files(config_dir, request)
     else:
         cfg = _from_checkpoint(data, config_dir, request, {"run": None, "out": None, "device": None})
-    device = _device(cfg)
+    device = _rank_device(cfg)
     if data is None:
         cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
     plain = _finish(cfg, device)
@@ -144,6 +144,14 @@ def _device(cfg: DictConfig) -> str:
     from dexsim.cli import machine
 
     return machine.device(cfg.device)
+
+
+def _rank_device(cfg: DictConfig) -> str:
+    """As `_device`, for one of the processes that torchrun may have started."""
+    from dexsim.cli import machine
+    from dexsim.learning.ranks import Ranks
+
+    return machine.device(Ranks().device(cfg.device, machine.cuda_devices()))
 
 
 def _preset(cfg: DictConfig, device: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import signal
 import time
@@ -16,46 +17,67 @@ from dexsim.cli.report import count, duration
 from dexsim.cli.start import Start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
+from dexsim.learning.ranks import Ranks
 from dexsim.learning.runner import Runner
 
+SAVE_EVERY_S = 60.0  # last.pt and policy.pt, besides what save_interval keeps
+SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to every process already
 TAGS = {"reward": "Train/mean_reward", "length": "Train/mean_episode_length", "step_reward": "Train/step_reward",
         "rate": "Perf/steps_per_second", "collect_s": "Perf/collection_time", "learn_s": "Perf/learning_time"}
 
 
 def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
-    """Train; returns the exit status: 0, 130 after Ctrl-C, 143 after SIGTERM. Raises UserError."""
-    cfg = start.cfg
-    machine.refuse_many_ranks()
+    """Train; returns the exit status: 0, 130 after Ctrl-C, 143 after SIGTERM. Raises UserError.
+
+    Under torchrun this runs in every process (rank): all learn, rank 0 alone prints and writes.
+    """
+    ranks = Ranks()
     _check_resume(start)
-    where = folder.for_run(cfg)
-    folder.write_config(where, cfg)
-    with Stop() as stop:
-        env = build.build_env(cfg, make_env, {"run": where})
-        env.dump_folder = where  # for worlds that were not finite
-        build.print_tables(env)
-        stop.asked()  # Ctrl-C while compiling: nothing to save
-        runner = Runner(env, cfg, machine.versions())
-        if start.data is not None:
-            runner.restore(start.data, str(start.source))
-            print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps")
-        log = Log(runner, where, start)
-        stop.gently = True
-        try:
-            finished = runner.learn(cfg["iterations"], log.iteration, stop.asked)
-        except checkpoint.SaveError:
-            raise
-        except UserError as error:
-            saved = f"; saved until then: {where / 'last.pt'}" if (where / "last.pt").exists() else ""
-            raise UserError(f"{error}{saved}") from error.__cause__
+    with ranks.only_leader_prints(), Stop(together=ranks.size > 1) as stop, ranks.joined(start.cfg["device"]):
+        return _run(start, make_env, ranks, stop)
+
+
+def _run(start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop) -> int:
+    cfg = start.cfg
+    where = Path(ranks.tell(str(folder.for_run(cfg)) if ranks.leader else None))
+    if ranks.leader:
+        folder.write_config(where, cfg)
+    ranks.on_loss("")
+    facts = {"run": where} if ranks.size == 1 else {"ranks": f"{ranks.size}, {cfg['worlds']} worlds each", "run": where}
+    with ranks.one_compiles():
+        env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts)
+    env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
+    build.print_tables(env)
+    stop.asked()  # Ctrl-C while compiling: nothing to save
+    runner = Runner(env, cfg, machine.versions(), ranks)
+    if start.data is not None:
+        runner.restore(start.data, str(start.source))
+        print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps")
+    resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}"
+    ranks.on_loss(f"continue: {resume}")
+    log = Log(runner, where, start) if ranks.leader else None
+    stop.gently = True
+    try:
+        finished = runner.learn(cfg["iterations"], log.iteration if log else lambda row: None, stop.asked)
+    except checkpoint.SaveError:
+        raise
+    except UserError as error:
+        saved = f"; saved until then: {where / 'last.pt'}" if (where / "last.pt").exists() else ""
+        raise UserError(f"{error}{saved}") from error.__cause__
+    if log:
         log.finish()
-        stop.gently = False
-        if not finished:
-            print(f"\nstopped after {runner.iteration} iterations; saved {where / 'last.pt'}\n"
-                  f"continue: python train.py resume={shlex.quote(str(where / 'last.pt'))}")
-            return stop.status
-        status = _final_episodes(runner, cfg, where)
+    stop.gently = False
+    ranks.leave()
+    if not finished:
+        print(f"\nstopped after {runner.iteration} iterations; saved {where / 'last.pt'}\ncontinue: {resume}")
+        return stop.status
+    status = _final_episodes(runner, cfg, where) if ranks.leader else 0
     print(f"\nplay it:  python play.py checkpoint={shlex.quote(str(where / 'policy.pt'))}")
     return status
+
+
+def _command(ranks: Ranks) -> str:
+    return "python train.py" if ranks.size == 1 else f"torchrun --nproc_per_node={ranks.here} train.py"
 
 
 def _check_resume(start: Start) -> None:
@@ -89,7 +111,8 @@ class Log:
 
     def __init__(self, runner: Runner, where: Path, start: Start) -> None:
         self._runner, self._where, self._every = runner, where, start.cfg["save_interval"]
-        self._title = f"{start.cfg['choices']['task']}, {start.cfg['worlds']} worlds, {where}"
+        times = f"{runner.ranks.size} x " if runner.ranks.size > 1 else ""
+        self._title = f"{start.cfg['choices']['task']}, {times}{start.cfg['worlds']} worlds, {where}"
         self._writer = runner.open_writer(where)
         earlier = Path(start.source).parent / "progress.csv" if start.source else None
         self._file = folder.ProgressFile(where / "progress.csv", earlier, runner.iteration)
@@ -97,12 +120,11 @@ class Log:
         self._lines.start(runner.iteration)
         self._began = time.perf_counter()
         self._first_step = runner.steps
-        self._saved_at = -1
+        self._saved_at, self._saved_time = -1, -math.inf
 
     def iteration(self, row: dict[str, float]) -> None:
         """Take one iteration's numbers."""
-        steps = self._runner.cfg["num_steps_per_env"] * self._runner.env.num_envs
-        row["rate"] = steps / (row["collect_s"] + row["learn_s"])
+        row["rate"] = self._runner.steps_per_iteration / (row["collect_s"] + row["learn_s"])
         self._file.add(row)
         for name, value in row.items():
             if name not in ("iteration", "steps", "episodes"):
@@ -110,6 +132,8 @@ class Log:
         self._lines.show(row)
         if self._runner.iteration % self._every == 0:
             self._save(f"model_{self._runner.iteration}.pt")
+        elif time.perf_counter() - self._saved_time > SAVE_EVERY_S:  # so that a killed run loses a minute at most
+            self._save()
 
     def _save(self, *names: str) -> None:
         payload = self._runner.payload()
@@ -117,7 +141,7 @@ class Log:
         for name in (*names, "last.pt"):
             checkpoint.write(self._where / name, data)
         checkpoint.save(self._where / "policy.pt", checkpoint.policy_only(payload))
-        self._saved_at = self._runner.iteration
+        self._saved_at, self._saved_time = self._runner.iteration, time.perf_counter()
 
     def finish(self) -> None:
         """Save what is not saved yet, close the writer, draw the curves, sum up."""
@@ -135,11 +159,14 @@ class Log:
 
 
 class Stop:
-    """Ctrl-C and SIGTERM: at once by default; while ``gently`` is set, the first only asks the loop to end."""
+    """Ctrl-C and SIGTERM: at once by default; while ``gently`` is set, the first only asks the loop to end.
 
-    def __init__(self) -> None:
+    together: one of several processes: signals within SAME_SIGNAL_S count as one.
+    """
+
+    def __init__(self, together: bool = False) -> None:
         self.gently, self.status = False, 130
-        self._asked = False
+        self._asked, self._together, self._last = False, together, -math.inf
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stop:
@@ -155,6 +182,9 @@ class Stop:
             signal.signal(number, handler)
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
+        before, self._last = self._last, time.monotonic()
+        if self._together and self._last - before < SAME_SIGNAL_S:
+            return
         self.status = 128 + number
         if not self.gently or self._asked:
             raise KeyboardInterrupt

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 import torch
 
@@ -42,20 +42,25 @@ class Meter:
             return value if value.ndim == 0 else value.mean()
         return torch.full((), float(value), device=self._device)
 
-    def read(self) -> dict[str, float]:
+    def read(self, over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums) -> dict[str, float]:
         """Means of the iteration, then start the next one. ``reward`` and ``length`` are over the episodes that ended
-        (absent when none did), ``step_reward`` over all steps."""
-        parts, names = [self._sums], []
+        (absent when none did), ``step_reward`` over all steps.
+
+        over_ranks: adds up float64 sums [K] over the processes of a run (all log the same terms).
+        """
+        parts, names = [self._sums, self._sums.new_full((1,), self._steps)], []
         for keys, steps in self._logs.items():
             rows = torch.stack(steps).double()
             there = ~rows.isnan()
-            parts.append(torch.where(there, rows, 0.0).sum(0) / there.sum(0))  # 0/0 = NaN: never reported
-            names += keys
-        returns, lengths, ended, rewards, *values = torch.cat(parts).tolist()
-        found: dict[str, float] = {"step_reward": rewards / max(self._steps, 1)}
+            parts += [torch.where(there, rows, 0.0).sum(0), there.sum(0).double()]
+            names.append(keys)
+        returns, lengths, ended, rewards, steps, *rest = over_ranks(torch.cat(parts)).tolist()
+        found: dict[str, float] = {"step_reward": rewards / max(steps, 1)}
         if ended:
             found |= {"reward": returns / ended, "length": lengths / ended, "episodes": ended}
-        found |= {(k if "/" in k else f"Episode/{k}"): v for k, v in zip(names, values) if not math.isnan(v)}
+        for keys in names:
+            sums, counts, rest = rest[: len(keys)], rest[len(keys): 2 * len(keys)], rest[2 * len(keys):]
+            found |= {(k if "/" in k else f"Episode/{k}"): s / n for k, s, n in zip(keys, sums, counts) if n}
         self._sums.zero_()
         self._logs.clear()
         self._steps = 0

@@ -15,6 +15,7 @@ from typing import Any
 from dexsim.learning import checkpoint
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import agent_config, agent_errors
+from dexsim.learning.ranks import Ranks, seed_all
 
 import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
 from rsl_rl.runners import OnPolicyRunner  # isort: skip
@@ -30,11 +31,13 @@ class Runner(OnPolicyRunner):
         env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``.
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
+        ranks: the processes that learn together, already joined; one alone where not given.
 
-    ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included.
+    ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included; steps are those of all ranks.
     """
 
-    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str]) -> None:
+    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str], ranks: Ranks | None = None) -> None:
+        self.ranks = ranks or Ranks({})
         self.full_cfg, self._versions, self._git = cfg, versions, checkpoint.git_state()
         device = str(env.device)
         with agent_errors():
@@ -43,6 +46,14 @@ class Runner(OnPolicyRunner):
         self._meter = Meter(env.num_envs, device)
         self._layout = checkpoint.layout_of(env)
         self._fresh = True
+
+    def _configure_multi_gpu(self) -> None:
+        """Tell rsl-rl about the other ranks. Its own version also starts the group, for GPUs only; ours runs already."""
+        ranks = self.ranks
+        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.size, ranks.rank, ranks.local
+        self.is_distributed = ranks.size > 1
+        self.cfg["multi_gpu"] = None if ranks.size == 1 else {
+            "global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
 
     def open_writer(self, folder: Path) -> Any:
         """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
@@ -62,21 +73,25 @@ class Runner(OnPolicyRunner):
     ) -> bool:
         """Learn until ``iterations`` are done in all; False when ``stop()`` ended it early.
 
-        ``on_iteration`` gets the iteration's scalars. A rollout that ``stop`` breaks off is dropped, an update never.
-        Raises UserError when learning diverges or the environment's ``check()`` finds something lost.
+        ``on_iteration`` gets the iteration's scalars, over all ranks. A rollout that ``stop`` breaks off is dropped, an update
+        never; several ranks agree on it before the next rollout, so that none waits for another that has left. Raises UserError when learning diverges or the environment's ``check()`` finds something lost.
         """
         if self._fresh and self.cfg.get("init_at_random_ep_len"):
             self.env.episode_length_buf = torch.randint_like(
                 self.env.episode_length_buf, high=max(int(self.env.max_episode_length), 1))
         self._fresh = False
         self.alg.train_mode()
+        if self.is_distributed:  # each rank drew its own initial weights
+            self.alg.broadcast_parameters()
         # The environment may hand out the same buffers at every step; PPO stores them only after the next one.
         obs = self.env.get_observations().clone()
         while self.iteration < iterations:
+            if self.is_distributed and self.ranks.any(stop()):
+                return False
             start = time.perf_counter()
             with torch.no_grad():  # not inference_mode: what the environment keeps from here is changed in place later
                 for _ in range(self.cfg["num_steps_per_env"]):
-                    if stop():
+                    if not self.is_distributed and stop():
                         self.alg.storage.clear()
                         self._meter.drop()
                         return False
@@ -87,14 +102,19 @@ class Runner(OnPolicyRunner):
             losses = self._update()
             self.iteration += 1
             self.current_learning_iteration = self.iteration
-            self.steps += self.cfg["num_steps_per_env"] * self.env.num_envs
-            row = self._meter.read()
+            self.steps += self.steps_per_iteration
+            row = self._meter.read(self.ranks.sum)
             row |= {f"Loss/{k}": float(v) for k, v in losses.items()}
             row |= {"Loss/learning_rate": self.alg.learning_rate,
                     "Policy/mean_std": self.alg.get_policy().output_std.mean().item()}
             row |= {"collect_s": collected - start, "learn_s": time.perf_counter() - collected}
             on_iteration({"iteration": self.iteration, "steps": self.steps} | row)
         return True
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps that all ranks together contribute to one iteration."""
+        return self.cfg["num_steps_per_env"] * self.env.num_envs * self.ranks.size
 
     def _step(self, obs: Any) -> Any:
         actions = self.alg.act(obs)
@@ -137,7 +157,8 @@ class Runner(OnPolicyRunner):
         }
 
     def restore(self, data: dict[str, Any], path: str) -> None:
-        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state.
+        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state. The random state is
+        rank 0's; the others begin streams of their own.
 
         Raises UserError when it holds only a policy or does not fit this environment.
         """
@@ -153,6 +174,11 @@ class Runner(OnPolicyRunner):
         self.iteration, self.steps = int(data["iteration"]), int(data["steps"])
         self.env.load_state_dict(data["env"])
         checkpoint.set_rng_state(data["rng"])
+        if self.ranks.rank:
+            seed = self.ranks.seed(self.full_cfg["seed"], self.iteration)
+            seed_all(seed)
+            self.env.rng.manual_seed(seed)
+            self.env.reset_all()
         self._fresh = False
 
     def policy(self) -> Any:

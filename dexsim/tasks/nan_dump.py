@@ -63,6 +63,7 @@ class NanDump:
         """Write what is kept to folder/nan_<k>.npz; returns the path, None if there is nothing to write (or enough)."""
         if not bool(self._taken) or self._count >= KEEP:
             return None
+        folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"nan_{self._count}.npz"
         while path.exists():
             self._count += 1
