@@ -1,10 +1,12 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
-    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900]
+    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900] [budget=0]
+    python -m benchmarks.concealed ci=true                    # twelve cases of one to three joints
+    python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight of them
 
-mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take. Resumable: a case that is
-finished is not run again. Prints a table and one JSON line. Rigs have one joint: lines of the judging table that need
-several joints, touch or several effects at once are not scored, nor is the overlap of regimes.
+mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take; budget: seconds after which no further
+diagnosis is begun (0: none). Resumable: what is finished is not run again. Writes hashes.txt before any diagnosis,
+results.json and table.txt; prints the table and one JSON line.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from pathlib import Path
 from benchmarks.concealed import generate, score
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900}
+SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0, "baselines": 0, "ci": False, "one_joint": False}
+CI = {"effect": 6, "none": 2, "pair": 1, "outside": 1, "decoy": 2}
 
 
 def parse(argv: list[str]) -> dict:
@@ -38,10 +41,16 @@ def parse(argv: list[str]) -> dict:
             given[key] = {group: int(number) for group, number in pairs}
         elif key == "out":
             given[key] = text
+        elif isinstance(SETTINGS[key], bool):
+            if text not in ("true", "false"):
+                raise SystemExit(f"{key}={text}: must be true or false")
+            given[key] = text == "true"
         elif text.isdigit():
             given[key] = int(text)
         else:
             raise SystemExit(f"{key}={text}: must be a whole number")
+    if given["ci"]:
+        given["mix"] = dict(CI)
     return given
 
 
@@ -60,15 +69,17 @@ class Progress:
             print(f"  {self.what} {self.done}/{self.total}, about {spent / self.done * (self.total - self.done):.0f} s left", flush=True)
 
 
-def _diagnose(name: str, s: dict, root: Path) -> float:
-    """Runs `diagnose.py` on a case as a user would; returns its seconds (0: it was done before)."""
-    case, out = root / "cases" / name, root / "diagnoses" / name
-    if (out / "seconds").is_file():
-        return 0.0
+def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
+    """Runs `diagnose.py` on a case as a user would, unless it was done before or the budget is spent."""
+    case, out = root / "cases" / m["name"], root / "diagnoses" / m["name"]
+    if (out / "seconds").is_file() or (s["budget"] and time.perf_counter() - begun > s["budget"]):
+        return
     out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{case / 'a.mcap'},{case / 'b.mcap'}]", f"held_out=[{case / 'c.mcap'}]",
-            f"model={case / 'rig.xml'}", f"servo={case / 'servo.yaml'}", f"out={out}", "next=false"]  # fmt: skip
+    files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
+    fit, held = files[: -generate.HELD], files[-generate.HELD :]
+    own = [f"model={case / 'rig.xml'}", f"servo={case / 'servo.yaml'}"] if (case / "rig.xml").is_file() else []
+    argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", *own, f"out={out}", "next=false"]
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     with open(out / "log.txt", "w", encoding="utf-8") as log:
         try:
@@ -81,37 +92,49 @@ def _diagnose(name: str, s: dict, root: Path) -> float:
         failed = {"verdict": "failed", "findings": [], "held_out": None, "status": status}
         (out / "diagnosis.json").write_text(json.dumps(failed), encoding="utf-8")
     (out / "seconds").write_text(f"{spent:.1f}", encoding="utf-8")
-    return spent
 
 
 def main(argv: list[str]) -> dict:
     """Runs the benchmark; returns what the JSON line says."""
     s = parse(argv)
+    begun = time.perf_counter()
     root = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
-    jobs = [(entry, n, s["seed"], root) for n, entry in enumerate(generate.plan(s["mix"], s["seed"]))]
+    jobs = [(entry, n, s["seed"], root) for n, entry in enumerate(generate.plan(s["mix"], s["seed"], s["one_joint"]))]
+    # the long ones first, so that none is waited for at the end
+    jobs.sort(key=lambda job: -{"hand": 3, "one": 0}.get(job[0]["shape"], 1))
     made, tick = [], Progress("made", len(jobs))
     with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
         for m in pool.map(generate.once, jobs):
             made.append(m)
             tick()
-    (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in made), encoding="utf-8")
+    (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made, key=lambda m: m["name"])), encoding="utf-8")
     print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}", flush=True)
     tick = Progress("diagnosed", len(made))
     with ThreadPoolExecutor(max(s["jobs"], 1)) as pool:
-        for done in as_completed([pool.submit(_diagnose, m["name"], s, root) for m in made]):
+        for done in as_completed([pool.submit(_diagnose, m, s, root, begun) for m in made]):
             done.result()
             tick()
-    results = []
+    results, seconds = [], []
     for m in made:
+        folder = root / "diagnoses" / m["name"]
+        if not (folder / "seconds").is_file():
+            continue
         truth = generate.reveal(root / "truth" / f"{m['name']}.json", m["digest"])
-        diagnosis = json.loads((root / "diagnoses" / m["name"] / "diagnosis.json").read_text(encoding="utf-8"))
-        results.append(score.one(truth, diagnosis))
+        results.append(score.one(truth, json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))))
+        seconds.append(float((folder / "seconds").read_text()))
     lines = score.table(results)
-    (root / "results.json").write_text(json.dumps({"results": results, "lines": lines}), encoding="utf-8")
-    print("\n" + score.show(lines, results))
-    seconds = [float((root / "diagnoses" / m["name"] / "seconds").read_text()) for m in made]
-    line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "failed": sum(r["verdict"] == "failed" for r in results),
-            "seconds_median": sorted(seconds)[len(seconds) // 2] if seconds else None, "lines": lines}  # fmt: skip
+    others = None
+    if s["baselines"]:
+        from benchmarks.concealed import baselines
+
+        others = baselines.compare(made, results, root, s["baselines"], s["jobs"])
+    (root / "results.json").write_text(json.dumps({"seed": s["seed"], "results": results, "lines": lines, "baselines": others}), encoding="utf-8")
+    text = score.show(lines, results) + ("\n\n" + baselines.show(others) if others else "")
+    (root / "table.txt").write_text(text + "\n", encoding="utf-8")
+    print("\n" + text)
+    line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "left_out": len(made) - len(results),
+            "failed": sum(r["verdict"] == "failed" for r in results), "seconds_median": sorted(seconds)[len(seconds) // 2] if seconds else None,
+            "wall_s": round(time.perf_counter() - begun), "lines": lines}  # fmt: skip
     print(json.dumps(line))
     return line
 

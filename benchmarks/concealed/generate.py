@@ -1,215 +1,309 @@
 """Draws the cases of the concealed benchmark: a rig, motions, an effect of a chosen size, recordings, and the truth apart.
 
-A case folder holds what `diagnose` sees: `a.mcap`, `b.mcap` (to fit), `c.mcap` (held out), `rig.xml`, `servo.yaml`. The truth
-goes to another folder; its SHA-256 with a random salt is published first.
+A case folder holds what `diagnose` sees: `a.mcap`, `b.mcap`, `c.mcap` (to fit), `d.mcap` (held out), `rig.xml`, `servo.yaml` (none
+for the xHand). The truth goes to another folder; its SHA-256 with a random salt is published first.
 
-Size of an effect: d = the held-out change that it makes, with gains, mass, inertia and friction refitted by up to 5 % to hide
-it; f = the floor: measurement noise and what another friction law leaves of the same rig. sqrt(d^2 + f^2) / f is 10, 3 or 1.5
-at easy, medium and hard: the size is read off one batch in which the same rig carries the effect at many sizes.
+Size of an effect: d = the held-out change that it makes in its joint, with gains, mass, inertia and friction refitted by up to 5 %
+to hide it; f = the floor: measurement noise and what another friction law leaves of the same rig. sqrt(d^2 + f^2) / f is 10, 3 or
+1.5 at easy, medium and hard: the size is read off one batch in which the same rig carries the effect at many sizes.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from benchmarks.concealed import plant
+from benchmarks.concealed import plant, rigs
+from benchmarks.concealed.effects import ALL, BY_EFFECT, KINDS, OUTSIDE, Kind, stalled
 from dexsim.recording import Writer
 
 TIERS = {"easy": 10.0, "medium": 3.0, "hard": 1.5, "poor": 1.2}  # poor: a decoy, excited too little to show
-SECONDS = 8.0
+SECONDS = 7.0
 START_NS = 1_700_000_000_000_000_000  # the same for every recording: time tells nothing
-RECORDINGS = ("a", "b", "c")
-SIZES = 22
+RECORDINGS = ("a", "b", "c", "d")
+HELD = 1  # of them held out, at the end
+SIZES = 24
 REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_load_speed")
 BELIEF = 0.05  # how far each may be refitted
+NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
+DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
+MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 0}
+SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
 
-@dataclass(frozen=True)
-class Kind:
-    """An effect as the plant has it. span: its smallest and largest size; apply(true row, size) -> parameters changed."""
+def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
+    """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
-    effect: str  # id of the catalogue, or "" outside it
-    span: tuple[float, float]
-    apply: object
-    report: object  # (parameters with the effect, parameters without) -> {key: value} as the catalogue names them
-
-
-def _plus(name: str, unit: str | None = None):
-    return lambda p, s: {name: p[name] + s * (p[unit] if unit else 1.0)}
-
-
-def _less(name: str):
-    return lambda p, s: {name: p[name] * (1 - s)}
-
-
-KINDS: dict[str, Kind] = {
-    "coulomb_friction": Kind("coulomb_friction", (0.01, 1.0), lambda p, s: {"coulomb": p["coulomb"] + s * p["weight"]}, lambda n, o: {"torque": n["coulomb"]}),
-    "stribeck_friction": Kind("stribeck_friction", (0.01, 1.2), lambda p, s: {"peak": s * p["weight"], "peak_speed": p["stribeck_speed"]},
-                              lambda n, o: {"peak": n["peak"], "v_s": n["peak_speed"]}),
-    "viscous_friction": Kind("viscous_friction", (0.01, 1.0), lambda p, s: {"viscous": p["viscous"] + 0.2 * s * p["weight"]}, lambda n, o: {"coefficient": n["viscous"]}),
-    "load_friction": Kind("load_friction", (0.02, 0.8), lambda p, s: {"load": s, "load_back": s}, lambda n, o: {"fraction": n["load"]}),
-    "backlash": Kind("backlash", (0.002, 0.4), _plus("play"), lambda n, o: {"gap": n["play"]}),
-    "command_delay": Kind("command_delay", (0.0005, 0.1), _plus("delay"), lambda n, o: {"delay": n["delay"] - o["delay"]}),
-    "lag": Kind("lag", (0.0005, 0.1), _plus("lag"), lambda n, o: {"time_constant": n["lag"]}),
-    "torque_limit": Kind("torque_limit", (0.05, 0.9), _less("torque_limit"), lambda n, o: {"torque": n["torque_limit"]}),
-    "torque_speed_limit": Kind("torque_speed_limit", (0.06, 0.95), _less("no_load_speed"), lambda n, o: {"no_load_speed": n["no_load_speed"]}),
-    "gain_mismatch": Kind("gain_mismatch", (0.07, 0.7), _less("kp"), lambda n, o: {"kp_factor": n["kp"] / n["kp_believed"]}),
-    "inertia": Kind("inertia", (0.05, 8.0), _plus("rotor", "total"), lambda n, o: {"armature": n["rotor"] - n["rotor_believed"]}),
-    "payload": Kind("payload", (0.06, 2.0), _plus("mass", "mass"), lambda n, o: {"mass": n["mass"] - n["mass_believed"]}),
-    "position_offset": Kind("position_offset", (0.001, 0.5), _plus("offset"), lambda n, o: {"offset": n["offset"]}),
-    "compliance": Kind("compliance", (0.02, 1.5), lambda p, s: {"spring": p["kp"] / s}, lambda n, o: {"stiffness": n["spring"]}),
-    "torque_ripple": Kind("torque_ripple", (0.02, 1.5), lambda p, s: {"ripple": s * p["weight"]}, lambda n, o: {"amplitude": n["ripple"], "per_turn": n["per_turn"]}),
-    "position_scale": Kind("position_scale", (0.003, 0.3), _plus("scale"), lambda n, o: {"scale": n["scale"]}),
-    "deadband": Kind("deadband", (0.002, 0.3), _plus("deadband"), lambda n, o: {"width": n["deadband"]}),
-    "dwell_stiction": Kind("", (0.02, 1.5), lambda p, s: {"dwell": s * p["weight"], "dwell_time": 1.5}, lambda n, o: {}),
-    "cable_spring": Kind("", (0.02, 1.5), lambda p, s: {"cable": s * p["weight"], "cable_rest": 0.6}, lambda n, o: {}),
-}  # fmt: skip
-INSIDE = tuple(k for k, v in KINDS.items() if v.effect)
-OUTSIDE = tuple(k for k, v in KINDS.items() if not v.effect)
-
-
-MIX = {"effect": 14, "none": 4, "noise": 2, "outside": 2, "decoy": 2}
-
-
-def plan(mix: dict[str, int], seed: int) -> list[dict]:
-    """What each case holds: {kind, tier, group}, in an order that is itself drawn. mix: number of cases by group: effect (one
-    of the catalogue), none, noise (nothing, the noise doubled), outside (the catalogue), decoy. Kinds and tiers take turns."""
+    mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same, noise
+    doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns). Effects, tiers
+    and shapes take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
+    """
     rng = np.random.default_rng([seed, 1])
-    kinds, tiers = list(rng.permutation(INSIDE)), ("easy", "medium", "hard")
+    effects, tiers = [str(e) for e in rng.permutation(list(BY_EFFECT))], ("easy", "medium", "hard")
+    if one_joint:
+        effects = [e for e in effects if any(KINDS[k].joints == 1 for k in BY_EFFECT[e])]
     out = []
     for group, count in mix.items():
         if group not in MIX:
             raise ValueError(f"no group '{group}'; there are {', '.join(MIX)}")
         for k in range(count):
-            kind, tier = "none", "none"
-            if group == "outside":
-                kind, tier = OUTSIDE[k % len(OUTSIDE)], tiers[k // len(OUTSIDE) % 2]
-            elif group in ("effect", "decoy"):
-                # all kinds before a kind comes again, then at another tier
-                kind, tier = str(kinds[k % len(kinds)]), tiers[(k + k // len(kinds)) % 3]
-            out.append({"group": group, "kind": kind, "tier": tier if group != "decoy" else "poor"})
+            entry = {"group": group, "kinds": [], "tier": "none", "shape": "one", "joints": []}
+            turn = k // len(effects)
+            if group in ("effect", "hand", "decoy"):
+                names = BY_EFFECT[effects[k % len(effects)]]
+                kind = names[turn % len(names)]
+                several = not one_joint and (KINDS[kind].joints > 1 or (k + turn) % 5 in (1, 3))
+                entry |= {"kinds": [kind], "tier": tiers[(k + turn) % 3], "shape": str(rng.choice(SEVERAL)) if several else "one"}
+            if group == "hand":
+                entry |= {"shape": "hand", "tier": tiers[k % 2]} if k % 3 else {"shape": "hand", "kinds": [], "tier": "none"}
+            elif group == "none" and not one_joint and k % 10 == 9:
+                entry["shape"] = str(rng.choice(SEVERAL))
+            elif group == "pair":
+                two = rng.choice(len(effects), 2, replace=False)
+                kinds = [str(rng.choice(BY_EFFECT[effects[i]])) for i in two]
+                entry |= {"kinds": kinds, "tier": tiers[k % 2], "shape": str(rng.choice(SEVERAL)) if not one_joint and k % 2 or any(KINDS[x].joints > 1 for x in kinds) else "one"}
+            elif group == "outside":
+                entry |= {"kinds": [list(OUTSIDE)[k % len(OUTSIDE)]], "tier": tiers[k // len(OUTSIDE) % 2]}
+            elif group == "decoy":
+                what = DECOYS[k % len(DECOYS)]
+                entry |= {"decoy": what, "tier": "poor"} if what == "poor" else {"decoy": what, "kinds": [], "tier": "none", "shape": "one"}
+            out.append(entry)
     return [out[i] for i in rng.permutation(len(out))]
 
 
-def motions(rng: np.random.Generator, poor: bool) -> np.ndarray:
-    """Targets of the three recordings in every millisecond, [3, M]; sent at 100 Hz and held between."""
+def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
+    """Targets of the recordings in every millisecond, [R, J, M]; sent at 100 Hz and held between."""
     M = int(SECONDS * 1000)
     t = np.arange(0, SECONDS, 0.01)
-    out = []
+    out = np.zeros((len(RECORDINGS), d.joints, M))
     for k in range(len(RECORDINGS)):
-        if poor:  # slow and small: hardly anything shows
-            c = rng.uniform(-0.1, 0.1) + 0.06 * np.sin(2 * np.pi * rng.uniform(0.1, 0.2) * t)
+        for j in range(d.joints):
+            if poor:  # slow and small: hardly anything shows
+                c = rng.uniform(-0.1, 0.1) + 0.06 * np.sin(2 * np.pi * rng.uniform(0.1, 0.2) * t)
+            else:
+                knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 60)])
+                levels = np.r_[0.0, rng.uniform(-0.8, 0.8, len(knots) - 1)]
+                rise = rng.uniform(0.15, 0.35)  # steps as a planner sends them: a drive that saturates all the time hides the rest
+                step = np.interp(t, np.sort(np.r_[knots[1:], knots[1:] + rise]), np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
+                f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.2, 2.5), len(t))
+                chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
+                ramp = np.interp(t, knots[::2], levels[::2])
+                parts = [ramp, step, chirp]
+                third = np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2)
+                c = np.choose(third, [parts[(k + j + i) % 3] for i in range(3)])
+            middle, half = 0.5 * (d.low[j] + d.high[j]), 0.5 * (d.high[j] - d.low[j])
+            out[k, j] = np.repeat(middle + half * c / 0.8, 10)[:M]
+    return out
+
+
+class Bench:
+    """A rig with its motions: runs variants of its parameters, as measured."""
+
+    def __init__(self, d: rigs.Drawn, command: np.ndarray, warm: np.ndarray, noise: float, source: int):
+        self.d, self.command, self.warm, self.noise, self.source = d, command, warm, noise, source
+        self.base = {k: np.broadcast_to(d.true.get(k, v), (d.joints,)).astype(float).copy() for k, v in plant.DEFAULTS.items()}
+        self.base["couple_from"][:] = source
+
+    def run(self, variants: list[dict[str, np.ndarray]], commands: list[np.ndarray] | None = None, **kw) -> dict[str, np.ndarray]:
+        """Outputs [V, R, J, M] of parameter sets [J]; position is as the encoder reports it. commands: one [R, J, M] a variant."""
+        V, R = len(variants), len(self.command)
+        values = {k: np.repeat(np.stack([v[k] for v in variants]), R, 0) for k in plant.DEFAULTS}
+        values["warm"] = np.tile(self.warm[:, None] + np.zeros(self.d.joints), (V, 1))
+        command = np.tile(self.command, (V, 1, 1)) if commands is None else np.concatenate(commands)
+        # at rest at the first target, so that nothing swings in
+        start = command[:, :, 0]
+        out = plant.simulate(self.d.rig, plant.rows(V * R, self.d.joints, **values), command, q0=start, **kw)
+        out["link"] = out["position"]
+        v = {k: values[k][..., None] for k in ("scale", "offset", "eccentric", "eccentric_at")}
+        out["position"] = v["scale"] * out["link"] + v["offset"] + v["eccentric"] * np.sin(out["link"] + v["eccentric_at"])
+        return {k: x.reshape(V, R, *x.shape[1:]) for k, x in out.items()}
+
+    def changed(self, joint: int, change: dict[str, float], base: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+        """The parameters with one joint's changed."""
+        out = {k: v.copy() for k, v in (base or self.base).items()}
+        for k, x in change.items():
+            out[k][joint] = x
+        return out
+
+    def sized(self, kind: Kind | None, joint: int, ratio: float, seed: int) -> tuple[float, dict]:
+        """(size of the effect, figures): the size at which it changes held-out error in its joint by the ratio."""
+        d, true = self.d, {k: float(v[joint]) for k, v in self.base.items()}
+        sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
+        unit, inertia = float(d.unit[joint]), float(d.inertia[joint])
+        moves = kind is not None and kind.signal == "position"
+        variants = [self.base] + [self.changed(joint, kind.apply(true, s, unit, inertia)) for s in sizes if moves]
+        commands = [self.command] * len(variants)
+        if kind is OUTSIDE["bus_stalls"]:
+            commands[1:] = [self.stalls(s, seed) for s in sizes]
+        first = len(variants)
+        variants += [self.changed(joint, {k: true[k] * 1.02}) for k in REFIT] + [self.changed(joint, {"bristle": 0.0})]
+        run = self.run(variants, commands + [self.command] * (len(variants) - first))
+        signal = "torque" if kind is not None and kind.signal == "effort" else "position"
+        y = run[signal][:, :, joint]
+        slopes = (y[first:-1] - y[0]).reshape(len(REFIT), -1).T / 0.02
+
+        def hidden(x: np.ndarray) -> float:
+            """Held-out RMS of a change [R, M], what a refit on all takes away taken away."""
+            fit = np.clip(np.linalg.lstsq(slopes, x.reshape(-1), rcond=None)[0], -BELIEF, BELIEF)
+            return float(np.sqrt(np.mean((x.reshape(-1) - slopes @ fit).reshape(x.shape)[-HELD:] ** 2)))
+
+        noise = self.noise if signal == "position" else NOISE_OF_EFFORT * unit
+        law = hidden(y[-1] - y[0])
+        floor = float(np.hypot(noise, law))
+        facts = {"floor": floor, "law": law, "noise": noise}
+        if kind is None:
+            return 0.0, facts
+        if moves:
+            change = np.array([hidden(x - y[0]) for x in y[1:first]])
+        elif kind is KINDS["current_gain"]:
+            change = np.array([hidden(s * y[0]) for s in sizes])
         else:
-            knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 60)])
-            levels = np.r_[0.0, rng.uniform(-0.8, 0.8, len(knots) - 1)]
-            rise = rng.uniform(0.15, 0.35)  # steps as a planner sends them: a drive that saturates all the time hides the rest
-            step = np.interp(t, np.sort(np.r_[knots[1:], knots[1:] + rise]), np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
-            f = np.linspace(rng.uniform(0.15, 0.3), rng.uniform(1.2, 2.5), len(t))
-            chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
-            ramp = np.interp(t, knots[::2], levels[::2])
-            parts = [[ramp, step, chirp], [chirp, ramp, step], [step, chirp, ramp]][k]
-            third = np.minimum((3 * np.arange(len(t)) / len(t)).astype(int), 2)
-            c = np.choose(third, parts)
-        out.append(np.repeat(c, 10)[:M])
-    return np.array(out)
+            change = np.array([hidden(np.full_like(y[0], s * unit)) for s in sizes])
+        reached = np.hypot(change, floor) / floor
+        pick = int(np.argmin(np.abs(np.log(reached / ratio))))
+        return float(sizes[pick]), facts | {"ratio": float(reached[pick]), "before": float(np.hypot(change[pick], floor)), "size": float(sizes[pick])}
+
+    def stalls(self, size: float, seed: int) -> np.ndarray:
+        """The commands as they arrive on a bus that stalls; the same stalls whatever their length."""
+        return np.stack([stalled(c, size, np.random.default_rng([seed, 7, k])) for k, c in enumerate(self.command)])
 
 
-def _rig(rng: np.random.Generator) -> tuple[dict, dict]:
-    """(true parameters without the effect, believed ones): every nominal quantity a few percent off."""
-    b = {"mass": rng.uniform(0.08, 0.3), "length": rng.uniform(0.07, 0.14), "rotor": rng.uniform(2e-4, 8e-4)}
-    weight = b["mass"] * 9.81 * b["length"]
-    inertia = b["mass"] * b["length"] ** 2 + b["rotor"]
-    b["kp"] = weight * rng.uniform(6, 14)
-    b["kd"] = 2 * rng.uniform(0.3, 0.6) * np.sqrt(b["kp"] * inertia)
-    b |= {"torque_limit": weight * rng.uniform(5, 9), "no_load_speed": rng.uniform(9, 18), "coulomb": weight * rng.uniform(0.04, 0.1),
-          "viscous": weight * rng.uniform(0.005, 0.02)}  # fmt: skip
-    true = {k: v * (1 + rng.uniform(-0.03, 0.03)) for k, v in b.items()}
-    true["length"] = b["length"]  # the moment is off with the mass already
-    true |= {"motor_side": float(rng.uniform() < 0.3), "link_inertia": 0.4 * b["mass"] * 0.012**2, "weight": weight, "total": inertia,
-             "stribeck_speed": rng.uniform(0.05, 0.4), "per_turn": float(rng.integers(6, 40)), "phase": rng.uniform(-3, 3)}  # fmt: skip
-    true |= {f"{k}_believed": b[k] for k in ("kp", "rotor", "mass")}
-    return plant.DEFAULTS | {k: float(v) for k, v in true.items()}, {k: float(v) for k, v in b.items()}
-
-
-def _sized(true: dict, kind: Kind | None, ratio: float, command: np.ndarray, noise: float) -> tuple[dict, dict, np.ndarray, np.ndarray]:
-    """(parameters with the effect, figures of its size, measured position [3, M], torque [3, M])."""
-    base = {k: v for k, v in true.items() if k in plant.DEFAULTS}
-    sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
-    variants = [base] + [base | kind.apply(true, s) for s in sizes]
-    first = len(variants)
-    variants += [base | {k: base[k] * 1.02} for k in REFIT] + [base | {"bristle": 0.0}]
-    R = len(command)
-    values = {k: np.repeat([v.get(k, plant.DEFAULTS[k]) for v in variants], R) for k in plant.DEFAULTS}
-    run = plant.simulate(plant.rows(R * len(variants), **values), np.tile(command, (len(variants), 1)))
-    get = lambda key: np.array([v[key] for v in variants])[:, None, None]  # noqa: E731
-    q = get("scale") * run["position"].reshape(len(variants), R, -1) + get("offset")  # as measured
-    slopes = (q[first:-1] - q[0]).reshape(len(REFIT), -1).T / 0.02
-
-    def hidden(d: np.ndarray) -> float:
-        """Held-out RMS of a change [3, M], what a refit on all takes away taken away."""
-        x = np.clip(np.linalg.lstsq(slopes, d.reshape(-1), rcond=None)[0], -BELIEF, BELIEF)
-        return float(np.sqrt(np.mean((d.reshape(-1) - slopes @ x).reshape(d.shape)[-1] ** 2)))
-
-    law = hidden(q[-1] - q[0])
-    floor = float(np.hypot(noise, law))
-    facts = {"floor": floor, "law": law, "noise": noise}
-    if kind is None:
-        return base, facts, q[0], run["torque"].reshape(q.shape)[0]
-    change = np.array([hidden(q[1 + i] - q[0]) for i in range(SIZES)])
-    reached = np.hypot(change, floor) / floor
-    pick = int(np.argmin(np.abs(np.log(reached / ratio))))
-    facts |= {"ratio": float(reached[pick]), "size": float(sizes[pick]), "before": float(np.hypot(change[pick], floor))}
-    return variants[1 + pick], facts, q[1 + pick], run["torque"].reshape(q.shape)[1 + pick]
-
-
-def metadata(effort: bool) -> dict[str, str]:
+def metadata(effort: bool, hand: bool) -> dict[str, str]:
     """What every recording states: nothing of it depends on the effect."""
-    return {"source": "real", "robot": "rig", "gravity": "0 0 -9.81", "effort_is": "torque_Nm" if effort else "none", "effort_sign": "+1"}
+    return {"source": "real", "robot": "xhand_right" if hand else "rig", "gravity": "0 0 -9.81", "effort_is": "torque_Nm" if effort else "none",
+            "effort_sign": "+1"}  # fmt: skip
+
+
+def tier_of(ratio: float) -> str:
+    """The tier nearest to a size reached."""
+    return "silent" if ratio < 1.25 else min(("easy", "medium", "hard"), key=lambda t: abs(np.log(ratio / TIERS[t])))
 
 
 def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     """Writes one case to `seen` and its truth to `truth`; returns {name, digest}. The folder's name is drawn too."""
     rng = np.random.default_rng([seed, 2, number])
     name = hashlib.sha256(f"{seed}/{number}".encode()).hexdigest()[:8]
-    true, believed = _rig(rng)
-    poor = entry["group"] == "decoy"
-    command = motions(rng, poor)
-    quantum = 2 * np.pi / 4096
-    extra = rng.uniform(2e-4, 6e-4) * (2 if entry["group"] == "noise" else 1)
+    d = rigs.draw(rng, entry["shape"])
+    group, decoy = entry["group"], entry.get("decoy", "")
+    command = motions(rng, d, decoy == "poor")
+    warm = rng.permutation(np.linspace(25.0, rng.uniform(45.0, 65.0), len(RECORDINGS)))
+    quantum = 2 * np.pi / rng.choice([4096, 16384])
+    extra = rng.uniform(2e-4, 6e-4) * (2 if group == "noise" else 1)
     noise = float(np.hypot(quantum / np.sqrt(12), extra))
-    kind = KINDS.get(entry["kind"])
-    p, facts, q, tau = _sized(true, kind, TIERS.get(entry["tier"], 1.0), command, noise)
-    effort = bool(rng.uniform() < 0.5)
+    kinds = [ALL[k] for k in entry["kinds"]]
+    effort = bool(rng.uniform() < 0.5) | any(k.signal == "effort" for k in kinds)
+    joint, source = (int(x) for x in rng.permutation(d.joints)[:2]) if d.joints > 1 else (0, 0)
+    joints = [joint] * len(kinds)
+    if len(kinds) == 2 and d.joints > 1 and rng.uniform() < 0.7:
+        joints[1] = source
+        source = joint if d.joints == 2 else int(rng.choice([i for i in range(d.joints) if i not in joints]))
+    confounding = decoy == "confounded"
+    if confounding:
+        warm = np.sort(warm)
+    bench = Bench(d, command, warm, noise, source)
+    facts, new, sent, current = [], bench.base, command, {"current_gain": 1.0, "current_offset": 0.0}
+    for kind, label, at in zip(kinds, entry["kinds"], joints, strict=True):
+        size, fact = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number)
+        facts.append(fact)
+        old = {k: float(v[at]) for k, v in bench.base.items()}
+        new = bench.changed(at, kind.apply(old, size, float(d.unit[at]), float(d.inertia[at])), new)
+        if label == "bus_stalls":
+            sent = bench.stalls(size, number)
+        elif label == "current_gain":
+            current["current_gain"] = 1 + size
+        elif label == "current_offset":
+            current["current_offset"] = size * float(d.unit[at])
+    if not kinds:
+        facts.append(bench.sized(None, joint, 1.0, number)[1])
+    hand_touch, wrong = None, {}
+    if decoy == "touched":  # somebody leans on the link for a while, in one recording
+        hand_touch = np.zeros_like(command)
+        k, a = int(rng.integers(len(RECORDINGS) - HELD)), int(rng.uniform(0.2, 0.6) * command.shape[2])
+        hand_touch[k, joint, a : a + 1200] = 2.0 * d.unit[joint] * np.sin(np.pi * np.arange(1200) / 1200)[: command.shape[2] - a]
+    elif decoy == "wrong_mass":
+        wrong = {"mass": float(new["mass"][joint])}
+        d.believed["mass"][joint] *= 1 + float(rng.choice([-0.3, 0.4]))
+        wrong = {"mass": wrong["mass"] - float(d.believed["mass"][joint])}
+    run = bench.run([new], [sent], external=hand_touch)
+    if confounding:  # friction wears up run by run, and the motor happens to be warmer each time
+        parts = [bench.run([bench.changed(joint, {"coulomb": new["coulomb"][joint] * (1 + 1.2 * k)}, new)], [sent]) for k in range(len(RECORDINGS))]
+        run = {key: np.stack([parts[k][key][:, k] for k in range(len(RECORDINGS))], 1) for key in run}
     where = seen / name
     where.mkdir(parents=True, exist_ok=True)
-    _files(where, believed, true)
+    settings = rigs.files(where, d)
+    bad = str(rng.choice(["stale", "degrees", "wrap"])) if decoy == "bad_channel" else ""
+    effort = effort or bad == "wrap"
+    _record(where, d, command, run, rng, quantum, extra, effort, current, joint, bad)
+    told = {}
+    effects = []
+    for kind, label, at, fact in zip(kinds, entry["kinds"], joints, facts, strict=False):
+        n = {k: float(v[at]) for k, v in new.items()} | current
+        o = {k: float(v[at]) for k, v in bench.base.items()}
+        believed = {k: float(v[at]) for k, v in d.believed.items()}
+        told = {k: float(v) for k, v in kind.report(n, o | {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}).items()}
+        if kind.effect == "payload":
+            told = {"mass": n["mass"] + n["extra"] - believed["mass"]}
+        effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told, "facts": fact,
+                        "from_joint": d.rig.names[source] if kind.effect == "joint_coupling" else None,
+                        "when": _when(kind, run, command, d, at, source, n, o)})  # fmt: skip
+    if wrong:
+        effects = [{"effect": "payload", "kind": "payload", "joint": d.rig.names[joint], "parameters": wrong, "facts": facts[0], "from_joint": None, "when": []}]
+    tier = entry["tier"]
+    if group in ("effect", "hand", "pair", "outside") and kinds:
+        tier = min((tier_of(f["ratio"]) for f in facts), key=("silent", "hard", "medium", "easy").index)
+    answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier, "shape": d.shape, "joints": len(d.rig.names),
+              "voltage": d.voltage, "effort": effort, "floor": facts[0]["floor"], "effects": effects}  # fmt: skip
+    return {"name": name, "digest": commit(answer, truth), "settings": settings}
+
+
+def _when(kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, source: int, n: dict, o: dict) -> list[list]:
+    """True samples in the recordings to fit: [recording, start, end] s where the effect exceeds 25 % of its maximum."""
+    strength = []
+    for k in range(len(RECORDINGS) - HELD):
+        L = {key: x[0, k, j].astype(float) for key, x in run.items()}
+        L["position"] = L["link"]
+        L |= {"command": command[k, j], "source": run["link"][0, k, source], "others": np.abs(run["torque"][0, k]).sum(0) - np.abs(run["torque"][0, k, j])}
+        strength.append(np.asarray(kind.own(L, n, o), float))
+    most = max(float(np.percentile(np.concatenate(strength), 99.9)), 1e-12)
+    out = []
+    for letter, x in zip(RECORDINGS, strength, strict=False):
+        edge = np.flatnonzero(np.diff(np.r_[0, (x > 0.25 * most).astype(int), 0]))
+        out += [[letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)] for a, b in zip(edge[::2], edge[1::2], strict=True)]
+    return out
+
+
+def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, quantum, extra, effort, current, joint, bad) -> None:
     for k, letter in enumerate(RECORDINGS):
-        t, angle = plant.log(q[k], rng, 100.0, 1e-3)
-        torque = np.interp(t, np.arange(tau.shape[1]) * 1e-3, tau[k]) + rng.normal(0, 0.01 * true["weight"], len(t))
-        angle = np.round((angle + rng.normal(0, extra, len(t))) / quantum) * quantum
+        tau = run["torque"][0, k].copy()
+        tau[joint] = current["current_gain"] * tau[joint] + current["current_offset"]
+        t, (angle, torque, heat) = plant.log([run["position"][0, k], tau, run["temperature"][0, k].astype(float)], rng, 100.0, 1e-3)
+        torque = torque + rng.normal(0, 1, torque.shape) * (NOISE_OF_EFFORT * d.unit[:, None])
+        angle = np.round((angle + rng.normal(0, extra, angle.shape)) / quantum) * quantum
         torque = np.round(torque / 1e-4) * 1e-4
-        with Writer(where / f"{letter}.mcap", ["joint"], metadata(effort), START_NS) as w:
-            sent = np.arange(0, command.shape[1], 10)
-            samples = [(i * 1e-3, 0, command[k, i], 0.0) for i in sent] + [(x, 1, a, u) for x, a, u in zip(t, angle, torque, strict=True)]
-            for x, which, a, u in sorted(samples, key=lambda s: s[:2]):
-                if which:
-                    w.add_state(x, np.array([a]), None, np.array([u]) if effort else None)
+        if bad == "stale" and k == 0:  # the bus repeats what it read last
+            a = int(0.3 * len(t))
+            angle[joint, a : a + 180] = angle[joint, a]
+        elif bad == "degrees":
+            angle[joint] = np.degrees(angle[joint])
+        elif bad == "wrap":  # a signed register read as unsigned
+            torque[joint] = np.where(torque[joint] < 0, torque[joint] + 6.5536, torque[joint])
+        with Writer(where / f"{letter}.mcap", d.rig.names, metadata(effort, d.shape == "hand"), START_NS) as w:
+            sent = np.arange(0, command.shape[2], 10)
+            order = [(i * 1e-3, 0, i) for i in sent] + [(x, 1, i) for i, x in enumerate(t)] + [(x, 2, i) for i, x in enumerate(t) if i % 10 == 0]
+            for x, which, i in sorted(order):
+                if which == 0:
+                    w.add_command(x, command[k, :, i])
+                elif which == 1:
+                    w.add_state(x, angle[:, i], None, torque[:, i] if effort else None)
                 else:
-                    w.add_command(x, np.array([a]))
-    answer = {"name": name, **entry, "effect": kind.effect if kind else "none", "floor": facts["floor"], "facts": facts,
-              "parameters": kind.report(true | p, true) if kind else {}}  # fmt: skip
-    answer["parameters"] = {k: float(v) for k, v in answer["parameters"].items()}
-    return {"name": name, "digest": commit(answer, truth)}
+                    w.add_temperature(x, np.round(heat[:, i]))
 
 
 def once(job: tuple[dict, int, int, Path]) -> dict:
-    """{name, digest}: the case as it was made before, or made now. job: entry of the plan, number, seed, folder."""
+    """{name, digest, settings}: the case as it was made before, or made now. job: entry of the plan, number, seed, folder."""
     entry, number, seed, root = job
     stub = root / "made" / f"{number}.json"
     if not stub.is_file():
@@ -235,21 +329,3 @@ def reveal(path: Path, digest: str) -> dict:
     if hashlib.sha256(text.encode()).hexdigest() != digest:
         raise ValueError(f"{path}: is not the truth that was published before the diagnosis")
     return json.loads(text)["truth"]
-
-
-def _files(where: Path, b: dict, true: dict) -> None:
-    g = "%.5g"
-    (where / "rig.xml").write_text(f"""<mujoco model="rig">
-  <compiler angle="radian"/>
-  <worldbody>
-    <body name="link">
-      <joint name="joint" type="hinge" axis="0 1 0" armature="{g % b["rotor"]}" range="-3 3"/>
-      <geom name="bob" type="sphere" size="0.012" pos="0 0 {g % -b["length"]}" mass="{g % b["mass"]}" contype="0" conaffinity="0"/>
-    </body>
-  </worldbody>
-</mujoco>
-""", encoding="utf-8")  # fmt: skip
-    names = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_speed": "no_load_speed", "coulomb": "coulomb_friction", "viscous": "viscous_friction"}
-    servo = {"drive": "torque", "joints": {"*": {ours: float(g % b[k]) for k, ours in names.items()}}, "loop_rate": 1000,
-             "loop_encoder": "motor" if true["motor_side"] else "joint", "position_encoder": "joint"}  # fmt: skip
-    (where / "servo.yaml").write_text(yaml.safe_dump(servo, sort_keys=False), encoding="utf-8")

@@ -1,118 +1,327 @@
-"""A one-joint rig for the concealed benchmark: written apart from the simulator it tests, and sharing none of its code.
+"""The concealed rigs' physics: written apart from the simulator they test, sharing no code with it, and not MuJoCo.
 
-Motor and link are two inertias joined by a stiff damped spring with optional play; friction is the LuGre bristle model
-(Canudas de Wit et al. 1995) on the motor side; the firmware runs its own loop at 1 kHz on its own encoder; the whole is
-integrated at 10 kHz, semi-implicit Euler. All rows of a batch run at once: [B] values for every parameter.
-SI units: rad, rad/s, N.m, s, kg.
+A rig is a set of chains of hinges. Every joint has two inertias, the motor's and the link's, joined by a stiff damped spring with
+optional play; the links' coupled dynamics come from Jacobians (mass matrix, gravity and Coriolis terms, refreshed every
+millisecond and extrapolated between). Friction is the LuGre bristle model (Canudas de Wit et al. 1995) on the motor side; the
+firmware runs its own loop at 1 kHz on its own encoder; all is integrated at 10 kHz, semi-implicit Euler.
+All rows of a batch run at once: parameters are [B, J]. SI units: rad, rad/s, N.m, s, kg, degC.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 DT = 1e-4  # s, integration
 LOOP = 10  # integration steps in one firmware period (1 kHz)
-HISTORY = 0.25  # s of commands that the firmware can look back
+TICK = DT * LOOP
+AMBIENT = 25.0  # degC; torque constant and friction are those of here
+REST = 0.02  # rad/s: slower than this a joint dwells
 
-# Every parameter of a row and its value where the effect is absent.
+# Every parameter of a joint and its value where the effect is absent.
 DEFAULTS: dict[str, float] = {
-    "mass": 0.15, "length": 0.1, "link_inertia": 0.0,  # bob [kg], its distance [m], inertia about its own centre [kg.m2]
-    "gravity": 9.81, "rotor": 4e-4,  # m/s2; reflected rotor inertia [kg.m2]
-    "spring": 600.0, "spring_loss": 0.0, "play": 0.0,  # N.m/rad; 0: chosen from the inertias; total play [rad]
-    "kp": 2.0, "kd": 0.04, "torque_limit": 1.0, "no_load_speed": 15.0,
-    "delay": 0.0, "lag": 0.0, "deadband": 0.0, "offset": 0.0,  # s, s, rad (half width), rad
+    "mass": 0.15, "extra": 0.0, "com": 1.0,  # of its link [kg], added at its centre [kg], distance of the centre over nominal
+    "rotor": 4e-4, "spring": 600.0, "play": 0.0,  # reflected rotor inertia [kg.m2], N.m/rad (no stiffer than the step allows), rad
+    "voltage": 0.0, "kp": 2.0, "kd": 0.04, "torque_limit": 1.0, "no_load_speed": 15.0,  # 1: the loop gives a duty, 0: a torque
+    "delay": 0.0, "lag": 0.0, "speed_lag": 0.0, "deadband": 0.0,  # s, s, s (of the loop's speed), rad (half width)
+    "offset": 0.0, "scale": 1.0, "eccentric": 0.0, "eccentric_at": 0.0,  # of both encoders
     "motor_side": 0.0,  # 1: the loop reads the motor, 0: the link
-    "coulomb": 0.015, "viscous": 0.003, "peak": 0.0, "peak_speed": 0.1, "load": 0.0, "load_back": 0.0,
+    "coulomb": 0.015, "asymmetry": 0.0, "viscous": 0.003, "peak": 0.0, "peak_speed": 0.1, "load": 0.0, "load_back": 0.0,
+    "ripple": 0.0, "per_turn": 12.0, "phase": 0.0,  # N.m, per turn of the joint, rad
+    "heat": 60.0, "cooling": 25.0, "warm": AMBIENT,  # degC per (N.m)^2 held, s, degC at the start
+    "thermal_torque": 0.0, "thermal_friction": 0.0,  # 1/degC
+    "sag": 0.0,  # share of the supply lost per N.m of the other joints
+    "couple": 0.0, "couple_from": 0.0,  # joint = motor + couple * joint number couple_from
+    # outside the catalogue
     "dwell": 0.0, "dwell_time": 1.0,  # stiction that grows with time at rest [N.m], its time constant [s]
-    "ripple": 0.0, "per_turn": 12.0, "phase": 0.0, "scale": 1.0,  # N.m, per turn of the motor, rad; of both encoders
-    "cable": 0.0, "cable_rest": 0.0,  # spring to the world [N.m/rad], the angle where it is slack [rad]
-    "bristle": 1.0,  # 1: LuGre; 0: a plain tanh(v) law, to see what the law itself changes
+    "cable": 0.0, "cable_rest": 0.0,  # spring to the world [N.m/rad] that pulls beyond an angle [rad] only
+    "mount": 0.0, "mount_inertia": 1e-3,  # compliance of what the motor is screwed to [rad/N.m], its inertia [kg.m2]
+    "tooth": 0.0, "tooth_at": 0.3, "tooth_width": 0.04,  # a damaged tooth: resistance [N.m] about one angle
+    "bristle": 1.0,  # 1: LuGre; 0: ideal dry friction, to see what the law itself changes
 }  # fmt: skip
 
 
-def rows(count: int, **values) -> dict[str, np.ndarray]:
-    """Parameters of `count` rows [B]: the defaults, with the given scalars or [B] arrays in place."""
+@dataclass(frozen=True)
+class Rig:
+    """Chains of links. names [J]; place [J, 2]: chain and depth of each joint. By chain C and depth D, in the parent link's frame:
+    frame [C, D, 3, 3] rotation at angle 0, offset [C, D, 3] m, axis [C, D, 3] (in the link's own); com [C, D, 3] m,
+    spread [C, D, 3, 3] inertia about the centre over mass [m2]. gravity [3] m/s2."""
+
+    names: tuple[str, ...]
+    place: np.ndarray
+    frame: np.ndarray
+    offset: np.ndarray
+    axis: np.ndarray
+    com: np.ndarray
+    spread: np.ndarray
+    gravity: np.ndarray
+
+    @property
+    def slots(self) -> np.ndarray:
+        """[J] place of each joint among the C * D slots."""
+        return self.place[:, 0] * self.com.shape[1] + self.place[:, 1]
+
+
+def pendulum(length: float = 0.1, radius: float = 0.0, names: tuple[str, ...] = ("joint",), lengths: tuple[float, ...] = ()) -> Rig:
+    """A bench of single pendulums about y that hang along -z: bobs of a radius [m] at their lengths [m]."""
+    lengths = lengths or (length,) * len(names)
+    n = len(names)
+    one = lambda v: np.tile(np.asarray(v, float), (n, 1, 1))  # noqa: E731
+    com = one([0.0, 0.0, 0.0])
+    com[:, 0, 2] = -np.array(lengths)
+    spread = np.tile(0.4 * radius**2 * np.eye(3), (n, 1, 1, 1))
+    place = np.stack([np.arange(n), np.zeros(n, int)], 1)
+    return Rig(names, place, np.tile(np.eye(3), (n, 1, 1, 1)), one([0, 0, 0]), one([0, 1, 0]), com, spread, np.array([0, 0, -9.81]))
+
+
+def rows(count: int, joints: int = 1, **values) -> dict[str, np.ndarray]:
+    """Parameters [count, joints]: the defaults, with the given scalars, [count] or [count, joints] arrays in place."""
     unknown = set(values) - set(DEFAULTS)
     if unknown:
         raise KeyError(f"the plant has no parameter {sorted(unknown)}")
-    return {k: np.broadcast_to(np.asarray(values.get(k, v), float), (count,)).copy() for k, v in DEFAULTS.items()}
+    out = {}
+    for k, v in DEFAULTS.items():
+        x = np.asarray(values.get(k, v), float)
+        out[k] = np.broadcast_to(x[:, None] if x.ndim == 1 else x, (count, joints)).copy()
+    return out
 
 
-def simulate(p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | float = 0.0, driven: bool = True) -> dict[str, np.ndarray]:
-    """Runs all rows. command [B, M]: the target in every millisecond; q0: the link's first angle [rad].
+def _rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """[B, C, 3, 3] about axis [C, 3] by angle [B, C] (Rodrigues)."""
+    K = np.zeros((*axis.shape[:-1], 3, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -axis[..., 2], axis[..., 1], -axis[..., 0]
+    K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = axis[..., 2], -axis[..., 1], axis[..., 0]
+    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    return np.eye(3) + s * K + (1 - c) * (K @ K)
 
-    Returns position (link) and motor torque, each [B, M], at the start of every millisecond.
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a * b).sum(-1)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def dynamics(rig: Rig, mass: np.ndarray, extra: np.ndarray, reach: np.ndarray, q: np.ndarray, v: np.ndarray,
+             gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mass matrix [B, C, D, D] and the torque [B, C, D] that gravity and the motion itself ask of each hinge.
+
+    mass, extra, reach, q, v: [B, C, D]; gravity [B, 3].
     """
-    B, M = command.shape
-    q = np.broadcast_to(np.asarray(q0, float), (B,)).copy()
-    motor, v, vm = q.copy(), np.zeros(B), np.zeros(B)
-    z, rest = np.zeros(B), np.zeros(B)
-    tau = np.zeros(B)
-    link = p["mass"] * p["length"] ** 2 + p["link_inertia"]
-    weight = p["mass"] * p["gravity"] * p["length"]
-    reduced = link * p["rotor"] / (link + p["rotor"])
-    spring = np.minimum(p["spring"], reduced / (16 * DT * DT))  # the mode stays slow beside the step
-    loss = np.where(p["spring_loss"] > 0, p["spring_loss"], 0.6 * np.sqrt(spring * reduced))
-    half = 0.5 * p["play"]
-    strongest = p["coulomb"] + p["peak"] + p["dwell"] + 1e-6
-    sigma0 = np.clip(strongest / 4e-4, 5.0, 0.05 * p["rotor"] / (DT * DT))
-    sigma1 = 0.5 * np.sqrt(sigma0 * p["rotor"])
-    delay = np.clip(np.round(p["delay"] / 1e-3).astype(int), 0, int(HISTORY / 1e-3))
-    fraction = p["delay"] / 1e-3 - delay  # -0.5..0.5 of a millisecond, by mixing two targets
-    rate = np.where(p["lag"] > 0, 1 - np.exp(-1e-3 / np.maximum(p["lag"], 1e-6)), 1.0)
-    filtered, last, carried = np.zeros(B), q.copy(), np.zeros(B)
-    has_dwell, tanh_law = bool(p["dwell"].any()), p["bristle"] < 0.5
-    has_ripple = bool(p["ripple"].any())
-    index = np.arange(B)
-    out_q, out_tau = np.empty((B, M)), np.empty((B, M))
+    B, C, D = q.shape
+    R = np.broadcast_to(np.eye(3), (B, C, 3, 3))
+    p = np.zeros((B, C, 3))
+    w, a, acc = np.zeros((B, C, 3)), np.zeros((B, C, 3)), np.zeros((B, C, 3))
+    z, at = [], []
+    M, h = np.zeros((B, C, D, D)), np.zeros((B, C, D))
+    for d in range(D):
+        step = np.einsum("bcij,cj->bci", R, rig.offset[:, d])
+        if d:
+            acc = acc + _cross(a, step) + _cross(w, _cross(w, step))
+        p = p + step
+        R = R @ rig.frame[:, d] @ _rotation(rig.axis[:, d], q[:, :, d])
+        axis = np.einsum("bcij,cj->bci", R, rig.axis[:, d])
+        spin = axis * v[:, :, d, None]
+        if d:
+            a = a + _cross(w, spin)
+        w = w + spin
+        z.append(axis)
+        at.append(p)
+        arm = np.einsum("bcij,cj->bci", R, rig.com[:, d]) * reach[:, :, d, None]
+        here = p + arm
+        m = (mass + extra)[:, :, d]
+        I = (R @ rig.spread[:, d] @ np.swapaxes(R, -1, -2)) * mass[:, :, d, None, None]  # noqa: E741
+        force = m[..., None] * (acc + _cross(a, arm) + _cross(w, _cross(w, arm)) - gravity[:, None])
+        Iw = np.einsum("bcij,bcj->bci", I, w)
+        moment = np.einsum("bcij,bcj->bci", I, a) + _cross(w, Iw)
+        J = [_cross(z[i], here - at[i]) for i in range(d + 1)]
+        Iz = [np.einsum("bcij,bcj->bci", I, z[i]) for i in range(d + 1)]
+        for i in range(d + 1):
+            h[:, :, i] += _dot(J[i], force) + _dot(z[i], moment)
+            for j in range(i + 1):
+                M[:, :, i, j] += m * _dot(J[i], J[j]) + _dot(z[i], Iz[j])
+                M[:, :, j, i] = M[:, :, i, j]
+    return M, h
+
+
+def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | float = 0.0, driven: bool = True,
+             gravity: np.ndarray | None = None, external: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Runs all rows. command [B, J, M]: the target in every millisecond; q0: first angles, broadcast to [B, J] rad;
+    gravity [B, 3]: None for the rig's; external [B, J, M]: torque on the links from outside.
+
+    Returns, each [B, J, M] at the start of every millisecond: position (link), torque (motor), speed (motor), load (through the
+    transmission), slip (friction over its level), asked (before any limit), free (1 where the teeth do not touch), temperature.
+    """
+    B, J, steps = command.shape
+    C, D = rig.com.shape[:2]
+    S, slots = C * D, rig.slots
+    there = np.zeros(S, bool)
+    there[slots] = True
+
+    def spread(x: np.ndarray, empty: float) -> np.ndarray:
+        out = np.full((B, S), empty)
+        out[:, slots] = x
+        return out
+
+    P = {k: spread(v, DEFAULTS[k]) for k, v in p.items()}
+    grid = lambda x: x.reshape(B, C, D)  # noqa: E731
+    mass, extra, reach = (grid(np.where(there, P[k], 0.0)) for k in ("mass", "extra", "com"))
+    g = np.broadcast_to(rig.gravity if gravity is None else gravity, (B, 3))
+    q = spread(np.broadcast_to(np.asarray(q0, float), (B, J)), 0.0)
+    source = np.zeros((B, S), int)
+    source[:, slots] = slots[p["couple_from"].astype(int)]
+    has = {k: bool((P[k] != DEFAULTS[k]).any()) for k in DEFAULTS}
+    motor = q - P["couple"] * np.take_along_axis(q, source, 1)
+    v, vm, z, rest, tau = (np.zeros((B, S)) for _ in range(5))
+    locked = np.diag((~there).astype(float) * 1.0)
+    base, base_v = np.zeros((B, S)), np.zeros((B, S))
+
+    def terms() -> tuple[np.ndarray, np.ndarray]:
+        M, h = dynamics(rig, mass, extra, reach, grid(q + base), grid(v + base_v), g)
+        for c in range(C):
+            M[:, c] += locked[c * D : (c + 1) * D, c * D : (c + 1) * D]
+        return np.linalg.inv(M) if D > 1 else 1 / M, h.reshape(B, S)
+
+    inverse, bias = terms()
+    link = 1 / np.stack([inverse[:, s // D, s % D, s % D] for s in range(S)], 1)
+    reduced = link * P["rotor"] / (link + P["rotor"])
+    spring = np.minimum(P["spring"], reduced / (16 * DT * DT))  # the mode stays slow beside the step
+    loss = 0.6 * np.sqrt(spring * reduced)
+    half = 0.5 * P["play"]
+    strongest = P["coulomb"] + P["peak"] + P["dwell"] + 1e-6
+    sigma0 = np.clip(strongest / 4e-4, 5.0, 0.05 * P["rotor"] / (DT * DT))
+    sigma1 = 0.5 * np.sqrt(sigma0 * P["rotor"])
+    late = np.maximum(P["delay"] / TICK, 0.0)
+    whole = np.floor(late).astype(int)
+    part = late - whole  # of a millisecond, by mixing two targets
+    settle = lambda T: np.where(T > 0, 1 - np.exp(-TICK / np.maximum(T, 1e-6)), 1.0)  # noqa: E731
+    rate, speed_rate = settle(P["lag"]), np.where(P["speed_lag"] > 0, settle(P["speed_lag"]), 0.8)
+    full = np.zeros((B, S, steps))
+    full[:, slots] = command
+    push_in = None
+    if external is not None:
+        push_in = np.zeros((B, S, steps))
+        push_in[:, slots] = external
+    filtered, carried, last = np.zeros((B, S)), np.zeros((B, S)), None
+    warm, previous = P["warm"].copy(), bias
+    b_index, s_index = np.arange(B)[:, None], np.arange(S)[None]
+    keys = ("position", "torque", "speed", "load", "slip", "asked", "free", "temperature")
+    out = {k: np.empty((B, J, steps), np.float32 if k not in ("position", "torque") else float) for k in keys}
+    ideal = P["bristle"] < 0.5
+    some_ideal = bool(ideal.any())
+    friction = push = np.zeros((B, S))
+    free = np.zeros((B, S))
+    level = strongest
     unit = 2 * np.pi / 2**18  # the loop's own encoder
-    for k in range(M):
+    decay = np.exp(-DT / 5e-3)  # the load that presses the gear's flanks, as its friction feels it
+    for k in range(steps):
         # firmware: reads its encoder, filters the speed, and asks for a torque that holds one millisecond
-        seen = np.floor((p["scale"] * np.where(p["motor_side"] > 0.5, motor, q) + p["offset"]) / unit) * unit
-        filtered += 0.8 * ((seen - last) / 1e-3 - filtered) if k else 0.0  # a slower filter would be a lag that nobody drew
+        true = np.where(P["motor_side"] > 0.5, motor, q)
+        seen = P["scale"] * true + P["offset"]
+        if has["eccentric"]:
+            seen = seen + P["eccentric"] * np.sin(true + P["eccentric_at"])
+        seen = np.floor(seen / unit) * unit
+        if last is not None:
+            filtered = filtered + speed_rate * ((seen - last) / TICK - filtered)
         last = seen
-        i = np.maximum(k - delay, 0)
-        j = np.maximum(k - delay - np.sign(fraction).astype(int), 0)
-        target = command[index, i] * (1 - np.abs(fraction)) + command[index, np.minimum(j, k)] * np.abs(fraction)
+        i = np.maximum(k - whole, 0)
+        target = full[b_index, s_index, i] * (1 - part) + full[b_index, s_index, np.maximum(i - 1, 0)] * part
         error = target - seen
-        ask = np.where(np.abs(error) < p["deadband"], 0.0, p["kp"] * error) - p["kd"] * filtered
-        most = p["torque_limit"] * np.maximum(1 - np.abs(filtered) / p["no_load_speed"], 0.0)  # its own speed, not the true one
-        ask = np.clip(ask, -most, most)
-        tau = tau + rate * (ask - tau) if driven else np.zeros(B)
-        out_q[:, k], out_tau[:, k] = q, tau
-        if has_dwell:
-            rest = np.where(np.abs(v) < 0.02, rest + 1e-3, np.maximum(rest - 0.02 * rest - 1e-3, 0.0))
-            grown = p["dwell"] * (1 - np.exp(-rest / p["dwell_time"]))
-        else:
-            grown = 0.0
-        for _ in range(LOOP):
-            twist = motor - q
+        raw = np.where(np.abs(error) < P["deadband"], 0.0, P["kp"] * error) - P["kd"] * filtered
+        supply = 1.0
+        if has["sag"]:
+            use = np.abs(tau)
+            supply = np.maximum(1 - P["sag"] * (use.sum(1, keepdims=True) - use), 0.05)
+        room = np.maximum(supply - np.abs(filtered) / P["no_load_speed"], 0.0)
+        asked = np.where(P["voltage"] > 0.5, P["torque_limit"] * (np.clip(raw, -1, 1) * supply - vm / P["no_load_speed"]),
+                         np.clip(raw, -P["torque_limit"] * room, P["torque_limit"] * room))  # fmt: skip
+        tau = tau + rate * (asked - tau) if driven else np.zeros((B, S))
+        drive = tau
+        rub = 1.0
+        if has["thermal_torque"]:
+            drive = tau * np.maximum(1 + P["thermal_torque"] * (warm - AMBIENT), 0.05)
+        if has["thermal_friction"]:
+            rub = np.maximum(1 + P["thermal_friction"] * (warm - AMBIENT), 0.05)
+        for name, value in (("position", q), ("torque", tau), ("speed", vm), ("load", push), ("slip", friction / level), ("asked", raw), ("free", free),
+                            ("temperature", warm)):  # fmt: skip
+            out[name][:, :, k] = value[:, slots]
+        warm = warm + TICK * (P["heat"] * tau * tau - (warm - AMBIENT)) / P["cooling"]
+        grown = 0.0
+        if has["dwell"]:
+            rest = np.where(np.abs(v) < REST, rest + TICK, np.maximum(rest - 0.02 * rest - TICK, 0.0))
+            grown = P["dwell"] * (1 - np.exp(-rest / P["dwell_time"]))
+        inverse, now = terms()
+        slope, previous = now - previous, now
+        flat = inverse[..., 0, 0].reshape(B, S) if D == 1 else None
+        for n in range(LOOP):
+            bias = now + slope * ((n + 0.5) / LOOP)
+            twist, rate_of = motor - q, vm - v
+            if has["couple"]:
+                drag, drag_v = np.take_along_axis(q, source, 1), np.take_along_axis(v, source, 1)
+                twist, rate_of = twist + P["couple"] * drag, rate_of + P["couple"] * drag_v
             deep = twist - np.clip(twist, -half, half)
-            push = np.where(deep != 0, spring * deep + loss * (vm - v), 0.0)
+            push = np.where(deep != 0, spring * deep + loss * rate_of, 0.0)
             push = np.where(deep * push < 0, 0.0, push)  # a tooth cannot pull
-            carried += 0.02 * (push - carried)
+            carried = carried * decay + (1 - decay) * push
             speed = np.abs(vm)
-            level = p["coulomb"] + p["peak"] * np.exp(-((speed / p["peak_speed"]) ** 2)) + grown
-            level = level + np.where(carried * vm >= 0, p["load"], p["load_back"]) * np.abs(carried) + 1e-7
+            level = P["coulomb"] + grown
+            if has["asymmetry"]:
+                level = level * (1 + 0.5 * P["asymmetry"] * np.sign(vm))
+            if has["peak"]:
+                level = level + P["peak"] * np.exp(-((speed / P["peak_speed"]) ** 2))
+            if has["load"] or has["load_back"]:
+                level = level + np.where(carried * vm >= 0, P["load"], P["load_back"]) * np.abs(carried)
+            if has["tooth"]:
+                level = level + P["tooth"] * np.exp(-(((motor - P["tooth_at"]) / P["tooth_width"]) ** 2))
+            level = level * rub + 1e-7
             # the bristle's own equation, taken implicitly: stable however fast it settles
             z_next = (z + vm * DT) / (1 + sigma0 * speed * DT / level)
             friction = sigma0 * z_next + sigma1 * np.exp(-((speed / 0.05) ** 2)) * (z_next - z) / DT
             z = z_next
-            friction = np.where(tanh_law, level * np.tanh(vm / 0.01), friction)
-            if has_ripple:
-                friction = friction - p["ripple"] * np.sin(p["per_turn"] * motor + p["phase"])
-            vm = (vm + DT * (tau - push - friction) / p["rotor"]) / (1 + DT * p["viscous"] / p["rotor"])
-            pull = -weight * np.sin(q) - p["cable"] * (q - p["cable_rest"])
-            v = v + DT * (push + pull) / link
+            if some_ideal:
+                held = P["rotor"] * vm / DT + drive - push
+                friction = np.where(ideal, np.clip(held, -level, level), friction)
+            net = drive - push - friction
+            if has["ripple"]:
+                net = net + P["ripple"] * np.sin(P["per_turn"] * motor + P["phase"])
+            vm = (vm + DT * net / P["rotor"]) / (1 + DT * P["viscous"] * rub / P["rotor"])
+            pull = push - bias
+            if has["couple"]:  # what drags is held back
+                reaction = P["couple"] * push
+                for s in slots:
+                    pull[np.arange(B), source[:, s]] -= reaction[:, s]
+            if has["cable"]:
+                pull = pull - P["cable"] * np.maximum(q - P["cable_rest"], 0.0)
+            if push_in is not None:
+                pull = pull + push_in[:, :, k]
+            if D == 1:
+                acc = pull * flat
+            else:
+                acc = (inverse @ pull.reshape(B, C, D, 1)).reshape(B, S)
+            if has["mount"]:
+                soft = np.maximum(P["mount"], 1e-9)
+                base_acc = np.where(P["mount"] > 0, (-push - base / soft - 0.2 * np.sqrt(P["mount_inertia"] / soft) * base_v) / P["mount_inertia"], 0.0)
+                base_v = base_v + DT * base_acc
+                base = base + DT * base_v
+                acc = acc - base_acc
+            v = v + DT * acc
             motor = motor + DT * vm
             q = q + DT * v
-    return {"position": out_q, "torque": out_tau}
+        free = (deep == 0).astype(float)
+    return out
 
 
-def log(signal: np.ndarray, rng: np.random.Generator, rate: float, jitter: float, loss: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """Times [S] s and values [S] of one millisecond-sampled signal [M] as a host reads it: jittered, some samples lost."""
+def log(signals: list[np.ndarray], rng: np.random.Generator, rate: float, jitter: float, loss: float = 0.01) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Times [S] s and values [J, S] of millisecond-sampled signals [J, M] as a host reads them: jittered, some samples lost."""
     period = 1.0 / rate
-    n = int(len(signal) * 1e-3 / period) - 2
+    n = int(signals[0].shape[-1] * TICK / period) - 2
     t = (np.arange(n) + 0.5) * period + np.clip(rng.normal(0, jitter, n), -0.4 * period, 0.4 * period)
     t = t[rng.uniform(size=n) > loss]
-    return t, np.interp(t, np.arange(len(signal)) * 1e-3, signal)
+    grid = np.arange(signals[0].shape[-1]) * TICK
+    return t, [np.stack([np.interp(t, grid, x) for x in s]) for s in signals]

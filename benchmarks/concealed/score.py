@@ -1,9 +1,10 @@
-"""Scores diagnoses against the truth: the lines of the judging table that one-joint rigs allow, each with its interval."""
+"""Scores diagnoses against the truth: the lines of the judging table, each with its interval."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ CLASSES = tuple(
     for c in (
         "backlash stribeck_friction coulomb_friction", "command_delay lag", "viscous_friction torque_speed_limit gain_mismatch",
         "current_sensor payload gain_mismatch", "coulomb_friction load_friction", "supply_sag torque_speed_limit thermal",
-        "position_offset payload",
+        "position_offset payload", "tactile_gain contact_stiffness", "tactile_hysteresis thermal",
     )
 )  # fmt: skip
 """Effects that recordings may fail to separate: a set within one of them, of three at most, may be an answer."""
@@ -52,38 +53,125 @@ def sure(diagnosis: dict) -> list[dict]:
     return [f for f in diagnosis["findings"] if f["confidence"] >= SURE and len(set(f.get("indistinguishable") or [])) < 2]
 
 
+TRAIN = ("a", "b", "c")
+
+
+def _f1(hits: int, said: int, true: int) -> float:
+    return 2 * hits / (said + true) if said + true else 1.0
+
+
+def _holds(f: dict, effect: str) -> bool:
+    """Whether a finding names the effect, alone or in an allowed set."""
+    return named_right(f, effect)
+
+
+def overlap(finding: dict, truth: list[list], step: float = 1e-3, seconds: float = 60.0) -> float:
+    """Intersection over union of the finding's `when` with the true stretches [[recording, start, end]]."""
+    n = int(seconds / step)
+    both = either = 0
+    for letter in TRAIN:
+        a, b = np.zeros(n, bool), np.zeros(n, bool)
+        for r, start, end in truth:
+            if r == letter:
+                a[int(start / step) : int(end / step) + 1] = True
+        for w in finding.get("when") or []:
+            if Path(w["recording"]).stem == letter:
+                b[int(max(w["start"], 0) / step) : int(w["end"] / step) + 1] = True
+        both, either = both + int((a & b).sum()), either + int((a | b).sum())
+    return both / either if either else 0.0
+
+
+def _parameters(finding: dict | None, truth: dict) -> tuple[list[float], list[bool]]:
+    """Relative errors of the sizes, and whether their 90 % intervals hold the truth."""
+    errors, covered = [], []
+    for key, value in truth["parameters"].items():
+        got = ((finding or {}).get("parameters") or {}).get(key)
+        if not got or not isinstance(got.get("value"), (int, float)) or not value:
+            continue
+        v, low, high = got["value"], got.get("low"), got.get("high")
+        if key == "eccentricity":
+            value = abs(value)
+        if key == "scale":  # 1 is right: the error is of what is off
+            errors.append(abs(v - value) / abs(value - 1))
+        else:
+            errors.append(abs(v - value) / abs(value))
+        if low is not None and high is not None:
+            covered.append(bool(low <= value <= high))
+    return errors, covered
+
+
+def _removed(d: dict, effects: list[dict], joints: int) -> float | None:
+    """Share of the explainable held-out error of the effect's joint that is gone; None where there is next to none."""
+    e = effects[0]
+    floor, known = e["facts"]["floor"], e["facts"].get("before")
+    if e["effect"] == "current_sensor" or known is None or known < 1.3 * floor:
+        return None
+    h = d.get("held_out") or {}
+    if joints > 1:  # the joint's own, as its findings have it
+        mine = [f["held_out"] for f in d["findings"] if e["joint"] in f["where"]["joints"] and f.get("held_out")]
+        h = {"before": max(x["before"] for x in mine), "after": min(x["after"] for x in mine)} if mine else {"before": known, "after": known}
+    if h.get("before") is None or h.get("after") is None:
+        return 0.0
+    return float(np.clip((h["before"] - h["after"]) / (h["before"] - floor), -1.0, 1.2)) if h["before"] > 1.3 * floor else None
+
+
 def one(truth: dict, d: dict) -> dict:
-    """What the table needs of one case: truth and `diagnosis.json`. Missing figures are None."""
-    findings = sorted(d["findings"], key=lambda f: -f["confidence"])
-    first, effect = (findings[0] if findings else None), truth["effect"]
-    out = {"name": truth["name"], "group": truth["group"], "kind": truth["kind"], "tier": truth["tier"], "verdict": d["verdict"],
-           "said": first["effect"] if first else "-", "confidence": first["confidence"] if first else None,
-           "set": sorted(set(first.get("indistinguishable") or [])) if first else []}  # fmt: skip
-    confident = sure(d)
-    if truth["group"] == "effect":
-        out["right"] = named_right(first, effect)
-        out["wrong_sure"] = any(f["effect"] != effect for f in confident)
-        mine = next((f for f in findings if f["effect"] == effect), None)
-        errors, covered = [], []
-        for key, value in truth["parameters"].items():
-            got = (mine or {}).get("parameters", {}).get(key)
-            if got and isinstance(got["value"], (int, float)) and value:
-                errors.append(abs(got["value"] - value) / abs(value))
-                covered.append(bool(got["low"] <= value <= got["high"]))
-        out |= {"parameter_errors": errors, "covered": covered}
-        h, oracle = d.get("held_out") or {}, truth["floor"]
-        # only where the effect stands out of the floor is there a gap to remove
-        if h.get("before") is not None and h.get("after") is not None and h["before"] > 1.3 * oracle:
-            out["removed"] = float(np.clip((h["before"] - h["after"]) / (h["before"] - oracle), -1.0, 1.2))
-    elif truth["group"] in ("none", "noise"):
+    """What the table needs of one case: truth and `diagnosis.json`. Missing figures are absent."""
+    findings = list(d["findings"])  # in the tool's own order: its first name counts
+    physics = [f for f in findings if f["effect"] != "bad_channel"]
+    effects = truth["effects"]
+    first = physics[0] if physics else (findings[0] if findings else None)
+    out = {"name": truth["name"], "group": truth["group"], "decoy": truth["decoy"], "shape": truth["shape"], "tier": truth["tier"],
+           "hidden": [(e["effect"] or e["kind"], e["joint"]) for e in effects], "kinds": [e["kind"] for e in effects], "verdict": d["verdict"],
+           "said": [(f["effect"], (f["where"]["joints"] or f["where"]["topics"] or ["-"])[0], round(f["confidence"], 2), sorted(set(f.get("indistinguishable") or [])))
+                    for f in findings], "ratio": effects[0]["facts"].get("ratio") if effects else None}  # fmt: skip
+    confident = sure({"findings": physics})
+    true_ids = {e["effect"] for e in effects if e["effect"]}
+
+    def right_here(f: dict, e: dict) -> bool:
+        return _holds(f, e["effect"]) and (not f["where"]["joints"] or e["joint"] in f["where"]["joints"])
+
+    group = truth["group"]
+    inside = group in ("effect", "pair", "touch") or (group == "hand" and effects)
+    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and e["joint"] in (f["where"]["joints"] or [e["joint"]]) for e in effects)
+                            for f in confident)  # fmt: skip
+    if inside:
+        if len(effects) == 1:
+            e = effects[0]
+            out["right"] = named_right(first, e["effect"])
+            out["alone"] = bool(first and first["effect"] == e["effect"] and len(set(first.get("indistinguishable") or [])) < 2)
+            mine = next((f for f in physics if f["effect"] == e["effect"] and right_here(f, e)), None)
+            out["parameter_errors"], out["covered"] = _parameters(mine, e)
+            if mine is not None and e["when"]:
+                out["overlap"] = overlap(mine, e["when"])
+            elif e["when"]:
+                out["overlap"] = 0.0
+        hit = [e for e in effects if any(right_here(f, e) for f in physics)]
+        out["f1"] = [len(hit), len(physics), len(effects)]
+        said_joints = {j for f in physics for j in f["where"]["joints"]}
+        true_joints = {e["joint"] for e in effects}
+        if truth["joints"] > 1:
+            out["joint_f1"] = [len(said_joints & true_joints), len(said_joints), len(true_joints)]
+        out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None
+    elif group in ("none", "noise") or (group == "hand" and not effects):
         out["false_alarm"] = bool(findings) or d["verdict"] == "failed"
-        out["wrong_sure"] = bool(confident)
-    elif truth["group"] == "outside":
+    elif group == "outside":
         out["humble"] = d["verdict"] not in ("explained", "failed") and not confident
         out["wrong_sure"] = bool(confident)
-    else:  # a decoy: the effect is there and hardly shows; naming it is fine, another one is not
-        out["wrong_sure"] = any(f["effect"] != effect for f in confident)
-        out["right"] = named_right(first, effect) if first else None
+    else:
+        decoy = truth["decoy"]
+        if decoy == "bad_channel":
+            out["caught"] = d["verdict"] == "unusable" or any(f["effect"] == "bad_channel" for f in findings)
+            out["wrong_sure"] = bool(confident)
+        elif decoy == "confounded":  # friction really grows: what is wrong is to put it down to temperature
+            out["caught"] = out["wrong_sure"] = False
+            out["wrong_sure"] = any(f["effect"] != "coulomb_friction" for f in confident)
+            out["caught"] = not any(f["effect"] == "thermal" and f["confidence"] >= SURE for f in physics)
+        elif decoy == "wrong_mass":  # mass and inertia of the believed model are off together
+            out["caught"] = any(f["effect"] in ("payload", "inertia") for f in physics)
+            out["wrong_sure"] = any(f["effect"] not in ("payload", "inertia") for f in confident)
+        else:  # hardly excited, or touched by hand: not to be taken for something else
+            out["caught"] = not out["wrong_sure"]
     return out
 
 
@@ -102,23 +190,61 @@ def table(results: list[dict]) -> dict[str, dict]:
             low, high = bootstrap(values, statistic)
             lines[line] = {"value": float(statistic(values)), "low": low, "high": high, "n": len(values)}
 
-    hidden = [r for r in results if r["group"] == "effect"]
+    def f1(line: str, counts: list) -> None:
+        if counts:
+            middle(line, counts, lambda x: _f1(*np.sum(np.asarray(x), 0)))
+
+    hidden = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "touch")]
     for tier in ("easy", "medium", "hard"):
         rate(f"right effect first, {tier}", [r["right"] for r in hidden if r["tier"] == tier])
+    for tier in ("easy", "medium", "hard"):
+        rate(f"  of them named alone, {tier}", [r["alone"] for r in hidden if r["tier"] == tier])
+    f1("right joint (F1), rigs of several", [r["joint_f1"] for r in hidden if r.get("joint_f1")])
+    rate("regime: overlap >= 0.5, where named right", [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None and r["alone"]])
+    rate("regime: overlap >= 0.5, all", [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None])
+    f1("several effects at once (F1)", [r["f1"] for r in results if r["group"] == "pair"])
     middle("parameter error, median", [e for r in hidden for e in r["parameter_errors"]], np.median)
     rate("90 % interval covers the truth", [c for r in hidden for c in r["covered"]])
     middle("held-out error removed, mean", [r["removed"] for r in hidden if r.get("removed") is not None], np.mean)
-    rate("false alarm, nothing missing", [r["false_alarm"] for r in results if r["group"] in ("none", "noise")])
+    middle("held-out error removed, median", [r["removed"] for r in hidden if r.get("removed") is not None], np.median)
+    rate("false alarm, nothing missing", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] != "hand"])
+    rate("  with doubled noise", [r["false_alarm"] for r in results if r["group"] == "noise"])
+    rate("false alarm, xHand", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "hand"])
     rate("outside the catalogue: not claimed", [r["humble"] for r in results if r["group"] == "outside"])
+    rate("decoys seen through", [r["caught"] for r in results if r["group"] == "decoy"])
     rate("confident and wrong, all cases", [r["wrong_sure"] for r in results])
     return lines
 
 
-def show(lines: dict[str, dict], results: list[dict]) -> str:
-    """Both as text."""
-    out = [f"{'case':<10}{'group':<9}{'hidden':<20}{'tier':<8}{'verdict':<18}{'named first':<20}{'set'}"]
-    for r in results:
-        out.append(f"{r['name']:<10}{r['group']:<9}{r['kind']:<20}{r['tier']:<8}{r['verdict']:<18}{r['said']:<20}{' '.join(r['set']) or '-'}")
-    out += ["", f"{'figure':<38}{'value':>8}   {'95 % interval':<18}{'n':>4}"]
-    out += [f"{k:<38}{v['value']:>8.3f}   {v['low']:.3f} .. {v['high']:<10.3f}{v['n']:>4}" for k, v in lines.items()]
+def by_effect(results: list[dict]) -> list[tuple[str, str]]:
+    """Of each effect: right of all at each tier, and what it was taken for."""
+    out = []
+    for effect in sorted({r["hidden"][0][0] for r in results if "right" in r}):
+        mine = [r for r in results if "right" in r and r["hidden"][0][0] == effect]
+        parts = []
+        for tier in ("easy", "medium", "hard"):
+            these = [r for r in mine if r["tier"] == tier]
+            parts.append(f"{sum(r['right'] for r in these)}/{len(these)}" if these else "-")
+        taken: dict[str, int] = {}
+        for r in mine:
+            if not r["right"]:
+                name = r["said"][0][0] if r["said"] else "nothing"
+                taken[name] = taken.get(name, 0) + 1
+        out.append((effect, f"{parts[0]:>6}{parts[1]:>8}{parts[2]:>7}   " + ", ".join(f"{k} {v}" for k, v in sorted(taken.items(), key=lambda x: -x[1]))))
+    return out
+
+
+def show(lines: dict[str, dict], results: list[dict], cases: bool = True) -> str:
+    """All as text."""
+    out = []
+    if cases:
+        out.append(f"{'case':<10}{'group':<9}{'rig':<8}{'tier':<8}{'hidden':<44}{'verdict':<18}said")
+        for r in results:
+            hidden = " + ".join(f"{k}@{j}" for k, (_, j) in zip(r["kinds"], r["hidden"], strict=True)) or r["decoy"] or "-"
+            said = "; ".join(f"{e}@{j} {c:.2f}" + (f" {{{' '.join(g)}}}" if g else "") for e, j, c, g in r["said"][:3]) or "-"
+            out.append(f"{r['name']:<10}{r['group']:<9}{r['shape']:<8}{r['tier']:<8}{hidden:<44}{r['verdict']:<18}{said}")
+    out += ["", f"{'effect hidden':<22}{'easy':>6}{'medium':>8}{'hard':>7}   taken for"]
+    out += [f"{e:<22}{text}" for e, text in by_effect(results)]
+    out += ["", f"{'figure':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}"]
+    out += [f"{k:<44}{v['value']:>8.3f}   {v['low']:.3f} .. {v['high']:<10.3f}{v['n']:>4}" for k, v in lines.items()]
     return "\n".join(out)
