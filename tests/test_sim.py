@@ -479,3 +479,36 @@ def _write_time(real):
 def _count(n: wp.array(dtype=int)):
     w = wp.tid()
     n[w] = n[w] + 1
+
+
+def test_poses_of_the_c_engine_follow_mujoco_for_every_kind_of_joint():
+    """Its own kinematics against mj_kinematics: free, ball, slide and hinge joints, several on a body, offset anchors."""
+    spec = mujoco.MjSpec.from_string("""
+<mujoco>
+  <worldbody>
+    <body name="free" pos="0.1 0 0"><freejoint/><geom size="0.1"/>
+      <body name="ball" pos="0 0.2 0.1" quat="0.9 0.1 0.3 0.2"><joint type="ball" pos="0.05 0.02 -0.03"/><geom size="0.05"/>
+        <body name="two" pos="0.1 0 0.3"><joint type="slide" axis="1 2 0"/><joint type="hinge" axis="0 1 1" pos="0 0.03 0.01" ref="0.4"/><geom size="0.05"/></body>
+      </body>
+      <body name="fixed" pos="-0.1 0.2 0" euler="10 20 30"><geom size="0.05"/></body>
+    </body>
+  </worldbody>
+</mujoco>""")
+    e = make_engine(spec, 6, "cpu", "mujoco", fields=("body_pos",))
+    rng = np.random.default_rng(0)
+    e.field("body_pos").add_(torch.from_numpy(0.02 * rng.normal(size=e.field("body_pos").shape)))
+    e.t.qpos.copy_(torch.from_numpy(rng.normal(size=(6, e.mjm.nq))))  # quaternions of any length: MuJoCo normalizes them
+    e.refresh()
+    data = mujoco.MjData(e.mjm)
+    for w in range(6):
+        model = e.batch.get_model(w)
+        data.qpos[:] = e.t.qpos[w].numpy()
+        mujoco.mj_kinematics(model, data)
+        assert np.abs(e.t.xpos[w].numpy() - data.xpos).max() < 1e-6
+        assert np.abs(e.t.xmat[w].numpy() - data.xmat.reshape(-1, 3, 3)).max() < 1e-6
+
+
+def test_the_c_engine_refuses_what_it_cannot_place():
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>')
+    with pytest.raises(UserError, match="mocap"):
+        make_engine(spec, 1, "cpu", "mujoco")

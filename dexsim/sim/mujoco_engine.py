@@ -11,10 +11,10 @@ import torch
 import warp as wp
 
 from dexsim.errors import UserError
+from dexsim.sim import mujoco_kernels as kernels
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 
 _SLOTS = 12  # contacts of one pair that are summed; more are counted, and fail in `check_overflow`
-_ROW = 10  # numbers a slot: found, force, normal, tangent
 _LOST = 1 << 6  # bit of `Engine.t.overflow`
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 
@@ -52,7 +52,6 @@ class MujocoEngine(Engine):
         self.batch = mujoco.batch.Batch(model, worlds, threads)
         b = self.batch
         b.forward()
-        self._xpos64, self._xmat64 = b.bind("xpos"), b.bind("xmat")
         self._sensordata = b.bind("sensordata") if self.pairs else None
         self._nefc, self._ncon = b.bind("nefc"), b.bind("ncon")
         w, P, N = self.wp, len(self.pairs), worlds
@@ -68,15 +67,21 @@ class MujocoEngine(Engine):
         w.flags = wp.zeros(N, dtype=int, device="cpu")
         for name in ("xpos", "xmat", "pair_normal", "pair_force", "flags"):
             setattr(self.t, name, wp.to_torch(getattr(w, name)))
-        self.t.overflow = torch.zeros(N, dtype=torch.int32)
+        self._overflow, self._most = wp.zeros(N, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
+        self.t.overflow = wp.to_torch(self._overflow)
         if P:
-            adr = np.array([model.sensor_adr[model.sensor(f"pair_{p.name}").id] for p in self.pairs])
-            self._sensor_cols = adr[:, None] + np.arange(_ROW * _SLOTS)
+            first = [model.sensor_adr[model.sensor(f"pair_{p.name}").id] for p in self.pairs]
+            self._contact_args = [wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False), wp.array(first, dtype=int, device="cpu")]
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
         self._flags, self._disabled = int(model.opt.disableflags), b.expand("opt.disableflags")
         self._fields_wp: dict[str, wp.array] = {}
-        self._peak = np.zeros(3)
+        if model.nmocap:
+            raise UserError("sim.engine=mujoco: the model has mocap bodies, which it does not place; use sim.engine=warp")
+        self._tree = kernels.tree(model, self._fields)
+        self._pos = wp.zeros((N, model.nbody), dtype=wp.vec3d, device="cpu")
+        self._quat = wp.zeros((N, model.nbody), dtype=wp.vec4d, device="cpu")
+        self._peak = np.zeros(2)
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:
@@ -93,7 +98,9 @@ class MujocoEngine(Engine):
             if before_each is None:
                 b.step(nstep=substeps)
             else:
-                for _ in range(substeps):
+                for k in range(substeps):
+                    # the sensors' contact forces are read after the last step only
+                    self._disabled[:] = self._flags if k == substeps - 1 else self._flags | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
                     before_each()
                     b.step()
             self._contacts()
@@ -125,35 +132,23 @@ class MujocoEngine(Engine):
 
     def check_overflow(self) -> None:
         if bool((self.t.overflow & _LOST).any()):
-            raise UserError(f"contact overflow: a contact pair had {self._peak[2]:.0f} contacts, sim.engine=mujoco sums {_SLOTS}; "
+            raise UserError(f"contact overflow: a contact pair had {self._most.numpy()[0]} contacts, sim.engine=mujoco sums {_SLOTS}; "
                             f"use sim.engine=warp, or pairs of fewer geoms")
         self.t.overflow.zero_()
 
     def _kinematics(self) -> None:
-        """Poses of the present qpos. The batch offers whole stages only: without contacts this one costs a tenth."""
-        self._disabled[:] = self._flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
-        self._disabled[:] = self._flags
-        n, nb = self.n, self.mjm.nbody
-        self.t.xpos.numpy()[:] = self._xpos64
-        self.t.xmat.numpy()[:] = self._xmat64.reshape(n, nb, 3, 3)
+        """Poses of the present qpos. The batch offers whole stages only, and each of its calls waits for all its threads."""
+        args = [self._tree, self.wp.qpos, self._pos, self._quat, self.wp.xpos, self.wp.xmat]
+        wp.launch(kernels.poses, dim=self.n, inputs=args, device="cpu")
 
     def _contacts(self) -> None:
         if not self.pairs:
             return
-        s = self._sensordata[:, self._sensor_cols].reshape(self.n, len(self.pairs), _SLOTS, _ROW)
-        found, force, normal, tangent = s[..., 0, 0], s[..., 1:4], s[..., 4:7], s[..., 7:10]
-        other = np.cross(normal, tangent)
-        # force is what the first member exerts on the second, in the frame (normal, tangent, other); on the first: minus
-        world = force[..., :1] * normal + force[..., 1:2] * tangent + force[..., 2:3] * other
-        self.t.pair_normal.copy_(torch.from_numpy(force[..., 0].sum(-1)))
-        self.t.pair_force.copy_(torch.from_numpy(-world.sum(-2)))
-        self._peak[2] = max(self._peak[2], found.max())
-        self.t.overflow |= torch.from_numpy((found > _SLOTS).any(1) * np.int32(_LOST))
+        args = [*self._contact_args, _SLOTS, _LOST, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
+        wp.launch(kernels.read_contacts, dim=(self.n, len(self.pairs)), inputs=args, device="cpu")
         self._peak[0] = max(self._peak[0], self._ncon.max())
         self._peak[1] = max(self._peak[1], self._nefc.max())
 
     def _check(self) -> None:
-        q, v = self.t.qpos, self.t.qvel
-        bad = ~torch.isfinite(q).all(1) | ~(v.abs() < 1.0e4).all(1)  # NaN compares false
-        self.t.flags.copy_(bad.to(torch.int32) * FLAG_NAN)
+        args = [self.wp.qpos, self.wp.qvel, FLAG_NAN, self.wp.flags]
+        wp.launch(kernels.check_worlds, dim=self.n, inputs=args, device="cpu")
