@@ -135,16 +135,18 @@ class Progress:
     def __call__(self, done: int, total: int, name: str) -> None:
         spent = time.perf_counter() - self.start
         left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
-        text = f"  searching {name} ({done + 1}/{total}){left}" if done < total else f"  searched {total} joint{'s' * (total > 1)} in {spent:.0f} s"
+        text = f"  searching {name} ({done + 1}/{total}){left}" if done < total else f"  searched {total} in {spent:.0f} s"
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 
 def verdict(d) -> str:
     """The verdict in at most ten lines."""
+    from dexsim.gap.diagnosis import place
+
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]
     for f in data["findings"][:4]:
-        where = ", ".join(f["where"]["joints"] or f["where"]["topics"])
+        where = place(f)
         sizes = ", ".join(
             f"{k} {p['value']:.4g} ({p['low']:.3g} to {p['high']:.3g}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
         )

@@ -23,6 +23,7 @@ from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch, Outcome
+from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
@@ -77,6 +78,8 @@ class Diagnosis:
     stages: list[str] = field(default_factory=list)
     shares: dict[str, float] = field(default_factory=dict)
     spans: dict[str, float] = field(default_factory=dict)
+    touch: touch.TouchResult | None = None
+    lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
 
@@ -109,7 +112,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
 
     clock = Clock()
     notes: list[str] = []
-    m = mechanism(s.model, s.servo)
+    try:
+        m = mechanism(s.model, s.servo)
+    except UserError as error:
+        raise UserError(f"{error}{_still(s)}") from None
     overlap = {p.resolve() for p in s.recordings} & {p.resolve() for p in s.held_out or []}
     if overlap:
         raise UserError(f"held_out: {', '.join(sorted(p.name for p in overlap))} is also in recordings; what is held out must not be fitted")
@@ -126,6 +132,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
             failures.append(str(error))
             recordings.append(None)
     clock.lap("reading and audit")
+    lengths = {r.path.name: r.duration for r in recordings if r is not None}
     runs: list[Run] = []
     held: list[int] = []
     used: list[Any] = []
@@ -142,16 +149,34 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         runs.append(run)
         used.append(r)
     channel = inputs.channel_findings([r for r in recordings if r is not None], m.joints)
-    channel += touch.findings([r for r in recordings if r is not None])
     notes += failures
     if failures and runs and len(held) < len(runs):
         say(f"  left out: {'; '.join(failures)}")
+    held_names = {names[p] for p in s.held_out or []}
+    felt = touch.diagnose([r for r in recordings if r is not None], m, held_names, s.seed, s.allowed, progress)
+    notes += felt.notes
+    clock.lap("touch")
+
+    def alone(reason: str) -> Diagnosis:
+        """What is left when no joint can be judged: touch, or the reason why nothing can be said."""
+        if felt.before is None and not felt.findings:
+            return _unusable(reason, channel, notes, m)
+        notes.append(f"no joint is judged: {reason}")
+        out = _touch_only(channel, felt, notes, m)
+        out.lengths = lengths
+        out.shares = clock.shares
+        return out
+
     if not runs or (s.held_out and len(held) == len(runs)):
-        return _unusable("No recording can be used: " + "; ".join(failures), channel, notes, m)
+        return alone("No recording can be used: " + "; ".join(failures))
+    if felt.contact:
+        runs, held = inputs.free_air(runs, held, felt.contact, notes)
+        if not runs or (s.held_out and len(held) == len(runs)):
+            return alone("every joint moves only while something is touched")
     try:
         runs = inputs.common_joints(runs, notes)
     except inputs.Unusable as error:
-        return _unusable(str(error), channel, notes, m)
+        return alone(str(error))
     if s.held_out and not held:
         notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
     model = m.spec.compile()
@@ -161,7 +186,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     moving = [j for j, name in enumerate(runs[0].joints) if max(float(np.ptp(r.q[:, j])) for r in runs) > 2e-3]
     commanded = [j for j in range(len(runs[0].joints)) if max(float(np.ptp(r.cmd[:, j])) for r in runs) > 1e-4]
     if not moving and not commanded:
-        return _unusable("Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged", channel, notes, m)
+        return alone("Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged")
 
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
@@ -195,6 +220,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("search")
     result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
     result.stages = [x.text for x in stages]
+    _with_touch(result, felt)
+    result.lengths = lengths
     clock.lap("judging on held-out data")
     if s.next_recording:
         _next(result, s, m)
@@ -437,33 +464,138 @@ def _unusable(reason: str, channel, notes, m) -> Diagnosis:
     return Diagnosis(data, f"{reason.rstrip('.')}.", notes, mechanism=m)
 
 
-def _sentence(data: dict, d: Diagnosis, floor: float) -> str:
-    unit = "mm" if data["held_out"]["error"].endswith("_m") else "mrad"
+def _still(s: Settings) -> str:
+    """What can be said although the model or the servo cannot be used: of the recordings alone, in one line."""
+    from dexsim.recording import read
+
+    said = []
+    for path in [*s.recordings, *(s.held_out or [])][:6]:
+        try:
+            r = read(path, s.remap, s.meta)
+        except UserError as error:
+            said.append(str(error))
+            continue
+        bad = [f.text for f in r.findings if f.severity == "error"]
+        said.append(f"{path.name}: {r.duration:.1f} s of {len(r.joints)} joint{'s' * (len(r.joints) != 1)}, {'; '.join(bad[:2]) if bad else 'no fault'}")
+    return f" (of the recordings themselves: {' | '.join(said)})" if said else ""
+
+
+def _touch_verdict(felt: touch.TouchResult) -> str | None:
+    """The word for touch alone; None where it was not judged."""
+    if felt.before is None:
+        return "explained" if felt.findings else None
+    named = [{"held_out": True} for f in felt.findings]
+    word = judge.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    return "partly_explained" if word == "explained" and felt.structured else word
+
+
+def _with_touch(d: Diagnosis, felt: touch.TouchResult) -> None:
+    """Touch into the diagnosis of the joints: findings, the verdict of both, the metric of what was found."""
+    d.touch = felt
+    word = _touch_verdict(felt)
+    if word is None:
+        return
+    data = d.data
+    joints = data["verdict"]
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    rest = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] |= felt.nuisance
+    if felt.floor is not None:
+        data["noise_floor"]["tactile_N"] = felt.floor
+    if "none" in (joints, word):
+        data["verdict"] = word if joints == "none" else joints
+    elif joints != word:
+        data["verdict"] = "partly_explained"
+    if not rest and (felt.findings or joints == "none") and felt.before is not None and word != "none":
+        _touch_metric(data, felt)
+    data["unexplained"]["depends_on"] += felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    d.sentence = _sentence(data, d, data["noise_floor"]["position_rad"])
+
+
+def _touch_metric(data: dict, felt: touch.TouchResult) -> None:
+    (b, bl, bh), (a, al, ah) = felt.before, felt.after
+    data["held_out"] = {"recordings": felt.recordings, "error": "tactile_rmse_N", "before": b, "after": a, "before_low": bl, "before_high": bh,
+                        "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
+    gap = b**2 - felt.floor**2
+    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
+
+
+def _touch_only(channel, felt: touch.TouchResult, notes, m) -> Diagnosis:
+    """A diagnosis of touch where no joint could be judged."""
+    data = empty(_touch_verdict(felt) or "unusable")
+    data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
+    data["findings"] = channel + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] = dict(felt.nuisance)
+    if felt.before is not None:
+        _touch_metric(data, felt)
+    else:
+        data["held_out"]["error"] = "tactile_rmse_N"
+    data["unexplained"]["depends_on"] = felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    out = Diagnosis(data, "", notes, mechanism=m, touch=felt)
+    out.sentence = _sentence(data, out, felt.floor or 0.0)
+    return out
+
+
+def _sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
+    """The verdict in one or two sentences."""
     h = data["held_out"]
+    metric = h["error"]
+    unit = "mN.m" if metric.startswith("effort") else "mN" if metric.startswith("tactile") else "mm" if metric.endswith("_m") else "mrad"
+    if unit == "mN":
+        floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
-    named = [f for f in data["findings"] if f["effect"] in EFFECTS]
+    limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and unit != "mN.m" else ""
+    named = [f for f in data["findings"] if entry(f) is not None]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
     prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
     if data["verdict"] == "none":
-        return prefix + (f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; "
-                         f"the floor is {1e3 * floor:.2g}.")  # fmt: skip
+        return prefix + f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
     if not named:
         depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
-        return prefix + f"Something is missing that no effect of the catalogue explains: {before:.3g} {unit} are left where the floor is {1e3 * floor:.2g}{depends}."
+        return prefix + f"Something is missing that no effect of the catalogue explains: {before:.3g} {unit} are left where {limit}{depends}."
     parts = []
     for f in named[:3]:
-        joint = f["where"]["joints"][0]
-        size = next(iter(f["parameters"].items()), None)
-        number = np.atleast_1d(size[1]["value"]) if size and size[1]["value"] is not None else ()  # com and tilt are vectors
-        how = f" ({size[0]} {' '.join(f'{v:.3g}' for v in number)} {size[1]['unit']})" if len(number) else ""
-        words = EFFECTS[f["effect"]].words
+        words = entry(f).words
         if f["indistinguishable"]:
             words += f", or one of {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}, which this recording cannot tell apart"
-        parts.append(f"{joint} {words}{how}")
-    effort = data["held_out"]["error"].startswith("effort")
-    unit = "mN.m" if effort else unit
-    tail = f" Without {'it' if len(named) == 1 else 'them'} simulation is wrong by {before:.3g} {unit}; with {'it' if len(named) == 1 else 'them'}, by {after:.3g} on recordings not used for the fit"
-    return prefix + "; ".join(parts) + "." + tail + ("." if effort else f"; the floor is {1e3 * floor:.2g}.")
+        parts.append(f"{place(f)} {words}{_size(f)}")
+    parts[0] = parts[0][:1].upper() + parts[0][1:] if not named[0]["where"]["joints"] else parts[0]
+    more = f" ({len(named) - 3} more below)" if len(named) > 3 else ""
+    it = "it" if len(named) == 1 else "them"
+    if h["before"] is None:
+        return prefix + "; ".join(parts) + more + "."
+    tail = f" Without {it} simulation is wrong by {before:.3g} {unit}; with {it}, by {after:.3g} on recordings not used for the fit"
+    return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
+
+
+def place(f: dict) -> str:
+    """Where a finding sits, in words."""
+    if f["where"]["joints"]:
+        return ", ".join(f["where"]["joints"])
+    if f["where"]["taxels"]:
+        from dexsim.assets import xhand
+
+        pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
+        count = len(f["where"]["taxels"])
+        fingers = " and ".join(xhand.FINGERS[p] for p in pads)
+        return f"the {fingers}'s pad" if count > 12 or f["effect"] != "tactile_gain" else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+    return ", ".join(f["where"]["topics"])
+
+
+def _size(f: dict) -> str:
+    """The first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
+    name, p = next(iter(f["parameters"].items()), (None, None))
+    if p is None or p["value"] is None or isinstance(p["value"], str):
+        return ""
+    number = np.atleast_1d(p["value"])  # com and tilt are vectors, gains one a taxel
+    if len(number) > 4:
+        return f" ({name} {number.min():.2g} to {number.max():.2g})"
+    if p["unit"] == "rad" and len(number) == 1:
+        return f" ({name} {np.degrees(number[0]):.3g} degrees)"
+    if p["unit"] == "s" and len(number) == 1:
+        return f" ({name.replace('_', ' ')} {1e3 * number[0]:.3g} ms)"
+    return f" ({name.replace('_', ' ')} {' '.join(f'{v:.3g}' for v in number)}{' ' + p['unit'] if p['unit'] not in ('1', '') else ''})"
 
 
 def _next(d: Diagnosis, s: Settings, m: Mechanism) -> None:

@@ -134,6 +134,41 @@ def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool
     return None if np.isnan(out).all() else out
 
 
+def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[float, float]]], notes: list[str]) -> tuple[list[Run], list[int]]:
+    """The runs without the stretches in which something is touched (by recording: start, end in s), and which are held out.
+
+    A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in between
+    becomes several of the same name, on its own clock.
+    """
+    out, kept = [], []
+    for i, run in enumerate(runs):
+        spans = touched.get(run.name, [])
+        if not spans:
+            kept += [len(out)] if i in held else []
+            out.append(run)
+            continue
+        edges = [float(run.t[0])]
+        for a, b in spans:
+            edges += [a - 0.1, b + 0.3]
+        edges.append(float(run.t[-1]))
+        pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2.0]
+        pieces = [p for p in pieces if len(p.t) >= 20 and (np.ptp(p.q, axis=0) > 2e-3).any()]
+        share = sum(p.duration for p in pieces) / max(run.duration, 1e-9)
+        notes.append(f"{run.name}: something is touched; joints are judged by the {100 * share:.0f} % of its time in free air" if pieces
+                     else f"{run.name}: something is touched nearly all the time; its joints are not judged")  # fmt: skip
+        kept += range(len(out), len(out) + len(pieces)) if i in held else []
+        out += pieces
+    return out, kept
+
+
+def cut(run: Run, start: float, end: float) -> Run:
+    """The run between two times [s]; commands stay, for what was sent before still acts."""
+    on = (run.t >= start) & (run.t <= end)
+    part = lambda x: None if x is None else x[on]  # noqa: E731
+    return Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[on], run.q[on], run.servo, run.gravity, part(run.v), part(run.torque), run.torque_unit,
+               part(run.duty), part(run.temperature), part(run.enabled), part(run.supply), notes=list(run.notes))  # fmt: skip
+
+
 def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
     """The runs with the joints that all of them have, in one order."""
     shared = [j for j in runs[0].joints if all(j in r.joints for r in runs)]

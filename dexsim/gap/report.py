@@ -5,9 +5,11 @@ from __future__ import annotations
 import html
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 
 from dexsim.gap import charts
-from dexsim.gap.catalogue import EFFECTS
+from dexsim.gap.picture import mechanism, pad
+from dexsim.gap.touch_effects import entry
 
 if TYPE_CHECKING:
     from dexsim.gap.diagnosis import Diagnosis
@@ -17,35 +19,34 @@ VERDICTS = {
     "none": ("Nothing missing", "good"), "unusable": ("Cannot be judged", "bad"),
 }  # fmt: skip
 STYLE = """
-:root{--ink:#1c2430;--soft:#5d6b7c;--line:#dfe4ea;--bg:#f6f7f9;--card:#fff;--good:#1a7f52;--warn:#b26a00;--bad:#b3261e;--before:#d1495b;--after:#1f77b4}
-*{box-sizing:border-box}body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,Segoe UI,Roboto,sans-serif}
-main{max-width:1060px;margin:0 auto;padding:28px 22px 60px}h1{font-size:25px;line-height:1.32;margin:8px 0 14px;font-weight:650}
-h2{font-size:17px;margin:0 0 10px}section{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:18px 20px;margin:16px 0}
-.tag{display:inline-block;padding:3px 11px;border-radius:99px;color:#fff;font-weight:600;font-size:13px}.good{background:var(--good)}.warn{background:var(--warn)}.bad{background:var(--bad)}
-.soft{color:var(--soft)}.big{display:flex;gap:34px;flex-wrap:wrap;margin-top:6px}.big div{min-width:120px}.big b{display:block;font-size:26px;font-weight:650}
-table{border-collapse:collapse;width:100%;font-size:14px}th{text-align:left;color:var(--soft);font-weight:500;border-bottom:1px solid var(--line);padding:5px 8px 5px 0}
-td{border-bottom:1px solid var(--line);padding:6px 8px 6px 0;vertical-align:top}td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}
-svg{max-width:100%;height:auto;display:block}.two{display:grid;grid-template-columns:300px 1fr;gap:22px}@media(max-width:760px){.two{grid-template-columns:1fr}}
-figure{margin:0 0 18px}figcaption{color:var(--soft);font-size:13px;margin-top:4px}code{background:#eef1f4;padding:1px 5px;border-radius:4px;font-size:13px}
-.key{display:inline-block;width:18px;height:3px;vertical-align:middle;margin:0 5px 0 12px}details summary{cursor:pointer;color:var(--soft)}
+:root{--ink:#1c2430;--soft:#5d6b7c;--line:#e1e5ea;--bg:#f3f4f6;--card:#fff;--good:#1a7f52;--warn:#a86200;--bad:#b3261e;--before:#d1495b;--after:#1768ac}
+*{box-sizing:border-box}body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
+main{max-width:1080px;margin:0 auto;padding:26px 20px 60px}h1{font-size:24px;line-height:1.36;margin:12px 0 6px;font-weight:650;letter-spacing:-.005em}
+h2{font-size:16px;margin:0 0 12px;font-weight:650}h3{font-size:17px;margin:0;font-weight:650}
+section{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:18px 22px;margin:14px 0}
+section.hero{border-top:5px solid var(--tone);padding-top:20px}.tag{display:inline-block;padding:3px 12px;border-radius:99px;color:#fff;font-weight:600;font-size:13px;background:var(--tone)}
+.t-good{--tone:var(--good)}.t-warn{--tone:var(--warn)}.t-bad{--tone:var(--bad)}.soft{color:var(--soft)}.small{font-size:13px}
+.two{display:grid;grid-template-columns:370px 1fr;gap:26px}.half{display:grid;grid-template-columns:1fr 1fr;gap:26px}
+@media(max-width:820px){.two,.half{grid-template-columns:1fr}}
+.finding{border:1px solid var(--line);border-radius:10px;padding:14px 18px;margin:0 0 12px;border-left:5px solid var(--after)}.finding.bad{border-left-color:var(--bad)}.finding.set{border-left-color:var(--warn)}
+.finding header{display:flex;justify-content:space-between;gap:14px;align-items:baseline;flex-wrap:wrap}.finding p{margin:6px 0}
+.pads{display:flex;gap:16px;flex-wrap:wrap;margin-top:10px}.pads figure{margin:0}.conf{font-size:13px;color:var(--soft);white-space:nowrap}.conf b{color:var(--ink);font-size:15px}
+table{border-collapse:collapse;width:100%;font-size:14px}th{text-align:left;color:var(--soft);font-weight:500;border-bottom:1px solid var(--line);padding:4px 8px 4px 0}
+td{border-bottom:1px solid #eef0f3;padding:5px 8px 5px 0;vertical-align:middle}tr:last-child td{border-bottom:0}td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}
+td.n:last-child,th.n:last-child{padding-right:0}
+svg{max-width:100%;height:auto;display:block;font-family:inherit}svg.iv{display:inline-block;vertical-align:middle}figure{margin:0 0 18px}figure:last-child{margin-bottom:0}figcaption{color:var(--soft);font-size:13px;margin-top:4px}
+code{background:#eef1f4;padding:1px 6px;border-radius:4px;font-size:13px}.key{display:inline-block;width:20px;height:4px;border-radius:2px;vertical-align:middle;margin:0 6px 0 14px}.key:first-child{margin-left:0}
+section.next{background:#eef5fb;border-color:#cfe0ef}details{margin:4px 0}details summary{cursor:pointer;font-weight:600;font-size:14px;padding:4px 0}ul{margin:6px 0;padding-left:20px}li{margin:3px 0}
 """
 
 
 def page(d: Diagnosis) -> str:
     """The page as HTML text."""
     word, tone = VERDICTS[d.data["verdict"]]
-    parts = [f'<span class="tag {tone}">{word}</span>', f"<h1>{_t(d.sentence)}</h1>", _numbers(d)]
-    if d.mechanism is not None and d.joints:
+    parts = [_hero(d, word, tone)]
+    if d.mechanism is not None and (d.joints or d.touch is not None):
         parts.append(_where(d))
-    parts.append(_findings(d))
-    if d.curves:
-        parts.append(_curves(d))
-    parts.append(_when(d))
-    parts.append(_map(d))
-    if d.stages:
-        parts.append("<section><h2>Stage by stage</h2><ul>" + "".join(f"<li>{_t(x)}</li>" for x in d.stages) + "</ul></section>")
-    parts.append(_next(d))
-    parts.append(_notes(d))
+    parts += [_findings(d), _curves(d), _next(d), _details(d)]
     body = "\n".join(p for p in parts if p)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/><meta name="viewport" content="width=device-width, initial-scale=1"/>'
@@ -57,121 +58,207 @@ def _t(x: Any) -> str:
     return html.escape(str(x))
 
 
-def _unit(d: Diagnosis) -> tuple[str, float]:
-    e = d.data["held_out"]["error"]
-    if e.startswith("effort"):
-        return ("mA" if e.endswith("_A") else "mN.m"), 1e3
-    return ("mm" if e.endswith("_m") else "mrad"), 1e3
+def _name(effect: str) -> str:
+    return effect.replace("_", " ")
 
 
-def _numbers(d: Diagnosis) -> str:
+def unit_of(metric: str) -> tuple[str, float]:
+    """(unit in which a metric of `diagnosis.json` is shown, factor)."""
+    if metric.startswith("effort"):
+        return ("mA" if metric.endswith("_A") else "mN.m"), 1e3
+    if metric.endswith("_N"):
+        return "mN", 1e3
+    return ("mm" if metric.endswith("_m") else "mrad"), 1e3
+
+
+def _hero(d: Diagnosis, word: str, tone: str) -> str:
+    h = d.data["held_out"]
+    kept = _t(h.get("how") or ", ".join(h["recordings"]))
+    line = ""
+    if h["before"] is not None:
+        line = f'<p class="soft small">Simulated freely from the first sample of what was kept out of the fit: {kept}.</p>'
+    return f'<section class="hero t-{tone}"><span class="tag">{word}</span><h1>{_t(d.sentence)}</h1>{line}</section>'
+
+
+def _bars(d: Diagnosis) -> str:
     h = d.data["held_out"]
     if h["before"] is None:
         return ""
-    unit, k = _unit(d)
-    cell = lambda name, value, low, high: (  # noqa: E731
-        f'<div><span class="soft">{name}</span><b>{k * value:.3g} {unit}</b><span class="soft">{k * low:.3g} to {k * high:.3g}</span></div>'
-    )
+    unit, k = unit_of(h["error"])
+    scaled = lambda *x: tuple(None if v is None else k * v for v in x)  # noqa: E731
+    found = any(f["effect"] != "bad_channel" for f in d.data["findings"])
+    rows = [("before", *scaled(h["before"], h["before_low"], h["before_high"]), charts.BEFORE)]
+    if found:
+        rows.append(("after", *scaled(h["after"], h["after_low"], h["after_high"]), charts.AFTER))
     floor = d.data["noise_floor"]
-    out = [cell("error before", h["before"], h["before_low"], h["before_high"])]
-    if d.data["findings"]:
-        out.append(cell("error after", h["after"], h["after_low"], h["after_high"]))
-    if not h["error"].startswith("effort"):
-        out.append(f'<div><span class="soft">noise floor</span><b>{k * floor["position_rad"]:.2g} {unit}</b><span class="soft">from {floor["how"]}</span></div>')
-    kept = _t(h.get("how") or ", ".join(h["recordings"]))
-    return f'<section><div class="big">{"".join(out)}</div><p class="soft">Free run from the first sample, on what was kept out of the fit: {kept}. Before: the believed machine, its figures refitted within 5 %.</p></section>'
+    value = floor.get("tactile_N") if unit == "mN" else floor["position_rad"] if unit in ("mrad", "mm") else None
+    if value is not None:
+        rows.append(("noise floor", k * value, None, None, charts.FLOOR))
+    how = {"repeats": "repeats of the same commands", "split": "the scatter of single samples", "quantum": "the encoder's step"}[floor["how"]]
+    note = "the counts of the taxels" if unit == "mN" else how
+    return (f'<h2>Error on held-out data</h2>{charts.bars(rows, unit)}<p class="soft small">Root mean square, 90 % intervals. Before: the machine as it is believed, its '
+            f"figures refitted within 5 %. Floor: from {note}.</p>")  # fmt: skip
 
 
 def _where(d: Diagnosis) -> str:
     named = {j for f in d.data["findings"] for j in f["where"]["joints"]}
-    picture = charts.mechanism(d.mechanism.spec.compile(), {j: v["before"] for j, v in d.joints.items()}, named)
-    unit, k = _unit(d)
-    if unit.startswith("mN") or unit == "mA":
-        unit, k = "mrad", 1e3
+    marked = {t for f in d.data["findings"] if f["effect"] == "tactile_gain" and "taxels" in f["parameters"] for t in f["where"]["taxels"]
+              if len(f["where"]["taxels"]) <= 40}
+    taxels = d.touch.error if d.touch is not None else None
+    unit = "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad"
+    picture = mechanism(d.mechanism.spec.compile(), {j: v["before"] for j, v in d.joints.items()}, named, taxels, marked, unit, height=400 if d.joints else 240)
+    words = []
+    if d.joints:
+        words.append("Joints coloured by their error before: pale is small, red is large; ringed where something was found.")
+    maps = ""
+    if taxels is not None:
+        from dexsim.assets import xhand
+
+        shown = "".join(f'<figure>{pad(taxels[xhand.FINGERS.index(p)], {int(t.split(":")[1]) for t in marked if int(t.split(":")[0]) == xhand.FINGERS.index(p)})}'
+                        f"<figcaption>{_t(p)}</figcaption></figure>" for p in list(d.touch.pads)[:3])  # fmt: skip
+        maps = f'<div class="pads">{shown}</div>'
+        words.append("The lattices are the pads' taxels, tip above, coloured by their error before; ringed where they are named.")
+    return (f'<section><div class="two"><figure>{picture}{maps}<figcaption>{" ".join(words)}</figcaption></figure><div>{_bars(d)}{_table(d, unit)}</div></div></section>')
+
+
+def _table(d: Diagnosis, unit: str) -> str:
+    """The joints and pads with the largest errors; the rest is in the details."""
+    if len(d.joints) + (len(d.touch.pads) if d.touch else 0) < 2:
+        return ""
+    return _rows(d, unit, 6)
+
+
+def _rows(d: Diagnosis, unit: str, most: int | None = None) -> str:
     rows = []
-    for j, v in d.joints.items():
-        effects = ", ".join(f["effect"].replace("_", " ") for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
-        rows.append(f'<tr><td>{_t(j)}</td><td class="n">{k * v["before"]:.3g}</td><td class="n">{k * v["after"]:.3g}</td>'
-                    f'<td class="n">{k * v["sigma"]:.2g}</td><td>{effects}</td></tr>')  # fmt: skip
-    table = f'<table><tr><th>joint</th><th class="n">before, {unit}</th><th class="n">after</th><th class="n">noise</th><th>found</th></tr>{"".join(rows)}</table>'
-    return f'<section><h2>Where</h2><div class="two"><figure>{picture}<figcaption>Joints by their error before: pale is small, red is large; ringed where something was found.</figcaption></figure><div>{table}</div></div></section>'
+    order = sorted(d.joints.items(), key=lambda x: -x[1]["before"])
+    for j, v in order[:most]:
+        effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
+        rows.append(f'<tr><td>{_t(j)}</td><td>{effects}</td><td class="n">{1e3 * v["before"]:.3g}</td><td class="n">{1e3 * v["after"]:.3g}</td>'
+                    f'<td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
+    from dexsim.assets import xhand
+
+    for pad, v in (d.touch.pads if d.touch else {}).items():
+        f_ = xhand.FINGERS.index(pad)
+        effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if any(t.startswith(f"{f_}:") for t in f["where"]["taxels"])) or "&#8211;"
+        rows.append(f'<tr><td>pad of the {_t(pad)}</td><td>{effects}</td><td class="n">{1e3 * v["before"]:.3g}</td><td class="n">{1e3 * v["after"]:.3g}</td>'
+                    f'<td class="n">{1e3 * v["noise"]:.2g} mN</td></tr>')  # fmt: skip
+    more = f'<p class="soft small">and {len(order) - most} more joints with less, in the details</p>' if most is not None and len(order) > most else ""
+    return f'<table><tr><th>where</th><th>found</th><th class="n">before</th><th class="n">after</th><th class="n">noise</th></tr>{"".join(rows)}</table>{more}'
 
 
 def _parameters(f: dict) -> str:
     out = []
     for key, p in f["parameters"].items():
-        value, unit = p["value"], p["unit"]
+        value, unit = p["value"], "" if p["unit"] == "1" else p["unit"]
+        label = _t(key.replace("_", " "))
         if isinstance(value, list):
-            out.append(f"{key} ({', '.join(f'{v:.3g}' for v in value)}) {unit}")
+            text = ", ".join(f"{v:.3g}" for v in value[:8]) + (" ..." if len(value) > 8 else "")
+            out.append(f'<tr><td>{label}</td><td class="n">{text} {unit}</td><td></td></tr>')
         elif isinstance(value, str):
-            out.append(f"{key} {_t(value)}")
-        else:
-            out.append(f"{key} <b>{value:.4g}</b> {unit} <span class='soft'>({p['low']:.3g} to {p['high']:.3g})</span>")
-    return "<br/>".join(out)
+            out.append(f'<tr><td>{label}</td><td class="n">{_t(value if len(value) < 60 else value[:57] + "...")}</td><td></td></tr>')
+        elif value is not None:
+            out.append(f'<tr><td>{label}</td><td class="n"><b>{value:.4g}</b> {unit}<br/><span class="soft small">{p["low"]:.3g} to {p["high"]:.3g}</span></td>'
+                       f'<td>{charts.interval(value, p["low"], p["high"])}</td></tr>')  # fmt: skip
+    return f"<table>{''.join(out)}</table>" if out else ""
+
+
+def _lost(f: dict) -> str:
+    """The runner-up and why it lost, or the set that cannot be told apart."""
+    if f["indistinguishable"]:
+        names = _t(" and ".join(_name(x) for x in f["indistinguishable"]))
+        return f"<p><b>These recordings cannot tell {names} apart.</b> To separate them: {_t(f['separating_experiment'])}.</p>"
+    if f["effect"] == "bad_channel":
+        return ""
+    rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
+    if not rivals:
+        return "<p class='soft'>Runner-up: none; nothing else in the catalogue follows the left-out stretches nearly as well.</p>"
+    r = rivals[0]
+    rest = f" (then {', '.join(_name(a['effect']) for a in rivals[1:])})" if len(rivals) > 1 else ""
+    return (f"<p class='soft'>Runner-up: {_t(_name(r['effect']))}{_t(rest)}. Fitted in its place, it wins only {100 * r['confidence']:.0f} of 100 redraws of the "
+            "stretches left out of the fit.</p>")  # fmt: skip
 
 
 def _findings(d: Diagnosis) -> str:
-    if not d.data["findings"]:
-        scanned = sorted((r for o in d.outcomes for r in ((o.joint, *x) for x in o.scanned)), key=lambda r: -r[2])[:5]
-        rows = "".join(f'<tr><td>{_t(j)}</td><td>{_t(e.replace("_", " "))}</td><td class="n">{100 * g:.1f} %</td><td class="n">{p:.2f}</td></tr>' for j, e, g, p in scanned)
-        if not rows:
-            return ""
-        return ('<section><h2>What came nearest</h2><table><tr><th>joint</th><th>effect</th><th class="n">squared error it would remove</th>'
-                f'<th class="n">chance of as much by accident</th></tr>{rows}</table></section>')  # fmt: skip
-    rows = []
+    findings = d.data["findings"]
+    if not findings:
+        return _nearest(d)
+    cards = []
+    ends = _ends(d)
+    for f in findings:
+        e, h = entry(f), f["held_out"]
+        bad = f["effect"] == "bad_channel"
+        where = _t(_place(f))
+        words = f"{where} {_t(e.words)}; it shows {_t(f['regime'])}." if e is not None else f"{where}: {_t(f['regime'])}."
+        unit, k = unit_of(_metric(d, f)) if h else ("", 1.0)
+        error = f'<p>Held-out error with everything else but this: <b>{k * h["before"]:.3g}</b>; with it: <b>{k * h["after"]:.3g} {unit}</b>.</p>' if h else ""
+        strip = ""
+        if f["when"]:
+            names = list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]
+            rows = [(n, ends.get(n, max(w["end"] for w in f["when"] if w["recording"] == n)), [(w["start"], w["end"]) for w in f["when"] if w["recording"] == n]) for n in names]
+            strip = f"<figure>{charts.strips(rows)}<figcaption>when it acts: above a quarter of its most</figcaption></figure>"
+        kind = "bad" if bad else "set" if f["indistinguishable"] else ""
+        left = _parameters(f)
+        body = f'<div class="half"><div>{left}</div><div>{strip}</div></div>' if left and strip else f"{left}{strip}"
+        cards.append(f'<div class="finding {kind}"><header><h3>{_t(_name(f["effect"]))} &#8212; {where}</h3><span class="conf">confidence <b>{100 * f["confidence"]:.0f} %</b></span></header>'
+                     f"<p>{words}</p>{body}{error}{_lost(f)}</div>")  # fmt: skip
+    return f'<section><h2>What is missing</h2>{"".join(cards)}</section>'
+
+
+def _metric(d: Diagnosis, f: dict) -> str:
+    """The metric of a finding's held-out error."""
+    if not f["where"]["joints"]:
+        return "tactile_rmse_N"
+    if f["effect"] == "current_sensor":
+        return "effort_rmse_Nm"
+    h = d.data["held_out"]["error"]
+    return h if not h.startswith("tactile") else "position_rmse_rad"
+
+
+def _place(f: dict) -> str:
+    from dexsim.gap.diagnosis import place
+
+    return place(f)
+
+
+def _ends(d: Diagnosis) -> dict[str, float]:
+    out: dict[str, float] = dict(d.lengths)
     for f in d.data["findings"]:
-        h = f["held_out"]
-        k = 1e3
-        error = f"{k * h['before']:.3g} &#8594; {k * h['after']:.3g}" if h else "&#8211;"
-        name = f["effect"].replace("_", " ")
-        words = EFFECTS[f["effect"]].words if f["effect"] in EFFECTS else "is not what it says"
-        rivals = ", ".join(f"{a['effect'].replace('_', ' ')} ({100 * a['confidence']:.0f} %)" for a in f["alternatives"] if a["confidence"] >= 0.005)
-        lost = f"<br/><span class='soft'>Runner-up: {_t(rivals)}; it follows the left-out stretches less well.</span>" if rivals else (
-            "<br/><span class='soft'>No other effect of the catalogue comes near.</span>" if f["effect"] in EFFECTS else "")
-        if f["indistinguishable"]:
-            lost = f"<br/><b>Cannot be told apart here:</b> {_t(', '.join(x.replace('_', ' ') for x in f['indistinguishable']))}. To separate them: {_t(f['separating_experiment'])}."
-        where = ", ".join(f["where"]["joints"] or f["where"]["taxels"] or f["where"]["topics"])
-        rows.append(f'<tr><td><b>{_t(name)}</b><br/><span class="soft">{_t(where)} {_t(words)}; it shows {_t(f["regime"])}.</span>{lost}</td>'
-                    f'<td>{_parameters(f)}</td><td class="n">{100 * f["confidence"]:.0f} %</td><td class="n">{error}</td></tr>')  # fmt: skip
-    return ('<section><h2>What is missing</h2><table><tr><th>effect</th><th>parameters (90 % interval)</th><th class="n">confidence</th>'
-            f'<th class="n">held-out error, 10&#8315;&#179;</th></tr>{"".join(rows)}</table></section>')  # fmt: skip
+        for w in f["when"]:
+            out[w["recording"]] = max(out.get(w["recording"], 0.0), w["end"])
+    return out
+
+
+def _nearest(d: Diagnosis) -> str:
+    scanned = sorted((r for o in d.outcomes for r in ((o.joint, *x) for x in o.scanned)), key=lambda r: -r[2])[:5]
+    if not scanned:
+        return ""
+    rows = "".join(f'<tr><td>{_t(j)}</td><td>{_t(_name(e))}</td><td class="n">{100 * g:.1f} %</td><td class="n">{p:.2f}</td></tr>' for j, e, g, p in scanned)
+    return ('<section><h2>What came nearest</h2><table><tr><th>joint</th><th>effect</th><th class="n">squared error it would remove</th>'
+            f'<th class="n">chance of as much by accident</th></tr>{rows}</table></section>')  # fmt: skip
 
 
 def _curves(d: Diagnosis) -> str:
     found = {j for f in d.data["findings"] for j in f["where"]["joints"]}
-    order = sorted(d.curves, key=lambda c: (c.joint not in found, -d.joints[c.joint]["before"]))[:4]
+    order = sorted(d.curves, key=lambda c: (c.joint not in found, -d.joints[c.joint]["before"]))
+    shown = order[: max(1, min(3, len(found)))] if order else []
     figures = []
-    for c in order:
-        svg = charts.curves(c.t, c.measured, c.before, c.after if c.joint in found else None, c.command)
+    slide = "m" if d.data["held_out"]["error"].endswith("_m") else "rad"
+    for c in shown:
+        spans = [(w["start"], w["end"]) for f in d.data["findings"] if c.joint in f["where"]["joints"] for w in f["when"] if w["recording"] == c.recording]
+        svg = charts.curves(c.t, c.measured, c.before, c.after if c.joint in found else None, c.command, slide, spans)
         v = d.joints[c.joint]
-        figures.append(f"<figure>{svg}<figcaption>{_t(c.joint)} in {_t(c.recording)}, where the error before is largest. All held-out time: "
-                       f"{1e3 * v['before']:.3g} before, {1e3 * v['after']:.3g} after (10&#8315;&#179; rad or m).</figcaption></figure>")  # fmt: skip
-    legend = ('<p class="soft"><span class="key" style="background:#333"></span>measured<span class="key" style="background:var(--before)"></span>simulated before'
-              '<span class="key" style="background:var(--after)"></span>simulated after<span class="key" style="background:#b8c0ca"></span>command</p>')  # fmt: skip
+        figures.append(f"<figure>{svg}<figcaption><b>{_t(c.joint)}</b>, {_t(c.recording)}, the stretch with the largest error before. Over all held-out time: "
+                       f"{1e3 * v['before']:.3g} m{slide} before, {1e3 * v['after']:.3g} after.</figcaption></figure>")  # fmt: skip
+    for c in (d.touch.curves if d.touch is not None else [])[:3]:
+        after = c.after if np.abs(c.after - c.before).max() > 1e-9 else None
+        svg = charts.curves(c.t, c.measured, c.before, after, c.load, "N")
+        figures.append(f"<figure>{svg}<figcaption><b>pad of the {_t(c.pad)}</b>, {_t(c.recording)}: sum of its taxels"
+                       f"{', grey: the load cell' if c.load is not None and shown else ''}.</figcaption></figure>")  # fmt: skip
+    if not figures:
+        return ""
+    legend = ('<p class="soft small"><span class="key" style="background:#333"></span>measured<span class="key" style="background:var(--before)"></span>simulated before'
+              '<span class="key" style="background:var(--after)"></span>simulated after<span class="key" style="background:#b8c0ca"></span>' + ("command" if shown else "load cell") + "</p>")  # fmt: skip
     return f"<section><h2>Before and after, on data kept out of the fit</h2>{legend}{''.join(figures)}</section>"
-
-
-def _when(d: Diagnosis) -> str:
-    strips = []
-    for f in d.data["findings"]:
-        names = list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]
-        for name in names:
-            spans = [(w["start"], w["end"]) for w in f["when"] if w["recording"] == name]
-            strips.append((f"{f['effect'].replace('_', ' ')}, {', '.join(f['where']['joints'])}, {name}", spans))
-    if not strips:
-        return ""
-    return f"<section><h2>When it acts</h2>{charts.strips(strips[:12])}</section>"
-
-
-def _map(d: Diagnosis) -> str:
-    if not d.spots:
-        return ""
-    best: dict[tuple[str, str], Any] = {}
-    for s in d.spots:
-        best.setdefault((s.joint, s.regime), s)
-    rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in list(best.values())[:10]]
-    return ("<section><h2>Where the error before lives</h2><p class='soft'>Error inside a regime over the error outside it, with 90 % intervals; only what stands after "
-            f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}</section>")  # fmt: skip
 
 
 def _next(d: Diagnosis) -> str:
@@ -179,25 +266,39 @@ def _next(d: Diagnosis) -> str:
     if not n:
         return ""
     send = f" The commands are ready to send: <code>{_t(n['commands'])}</code>." if n["commands"] else ""
-    return f"<section><h2>What to record next</h2><p>{_t(n['why'])}.{send}</p></section>"
+    return f'<section class="next"><h2>What to record next</h2><p>{_t(n["why"][:1].upper() + n["why"][1:])}.{send}</p></section>'
 
 
-def _notes(d: Diagnosis) -> str:
-    notes = list(d.notes)
-    if d.untrained:
-        notes.append("fitted, but not a column of the servo table yet, so training does not carry it: " + ", ".join(d.untrained))
-    left = d.data["unexplained"]
-    if left["depends_on"]:
-        notes.append(f"{100 * (left['fraction_of_gap'] or 0):.0f} % of the gap is left; it depends on " + "; ".join(left["depends_on"]))
-    if not notes and not d.shares:
-        return ""
-    items = "".join(f"<li>{_t(n)}</li>" for n in dict.fromkeys(notes))
-    total = sum(d.shares.values())
-    clock = f'<p class="soft">Took {total:.0f} s: ' + ", ".join(f"{_t(k)} {v:.0f} s" for k, v in d.shares.items()) + ".</p>" if total else ""
+def _details(d: Diagnosis) -> str:
+    """What a second minute is for, folded away."""
+    folded = []
+    if len(d.joints) > 6:
+        folded.append(("Every joint", _rows(d, "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")))
+    if d.spots:
+        best: dict[tuple[str, str], Any] = {}
+        for s in d.spots:
+            best.setdefault((s.joint, s.regime), s)
+        rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in list(best.values())[:10]]
+        folded.append(("Where the error before lives", "<p class='soft small'>Error inside a regime over the error outside it, with 90 % intervals; only what stands after "
+                       f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}"))  # fmt: skip
+    if d.stages:
+        folded.append(("Stage by stage", "<ul>" + "".join(f"<li>{_t(x)}</li>" for x in d.stages) + "</ul>"))
     nuisance = ", ".join(f"{_t(k)} {v:.4g}" for k, v in d.data["nuisance"].items())
     if nuisance:
-        clock += f"<details><summary>Believed figures as refitted</summary><p>{nuisance}</p></details>"
-    return f"<section><h2>Notes</h2>{'<ul>' + items + '</ul>' if items else ''}{clock}</section>"
+        folded.append(("Believed figures as refitted", f'<p class="small">{nuisance}</p>'))
+    notes = list(d.notes)
+    if d.untrained:
+        notes.append("fitted, but not a column of the servo table, so training does not carry it: " + ", ".join(d.untrained))
+    left = d.data["unexplained"]
+    if left["depends_on"]:
+        notes.insert(0, f"{100 * (left['fraction_of_gap'] or 0):.0f} % of the gap is left; it depends on " + "; ".join(left["depends_on"]))
+    items = "".join(f"<li>{_t(n)}</li>" for n in dict.fromkeys(notes))
+    total = sum(d.shares.values())
+    clock = f'<p class="soft small">Took {total:.0f} s: ' + ", ".join(f"{_t(k)} {v:.1f} s" for k, v in d.shares.items()) + ".</p>" if total else ""
+    inner = "".join(f"<details><summary>{title}</summary>{text}</details>" for title, text in folded)
+    if not (items or inner or clock):
+        return ""
+    return f"<section><h2>Notes and details</h2>{'<ul>' + items + '</ul>' if items else ''}{inner}{clock}</section>"
 
 
-__all__ = ["page"]
+__all__ = ["page", "unit_of"]
