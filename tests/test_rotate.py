@@ -142,7 +142,7 @@ def test_fingertip_velocity_is_that_of_the_link():
     """Linear and angular velocity against MuJoCo's own."""
     import mujoco
 
-    env = make("sim.control_period=0.021", worlds=1)
+    env = make("sim.control_period=0.021", "task.action.scale=0.06", worlds=1)
     for _ in range(6):
         env.step(torch.full((1, 12), 0.5))
     d = mujoco.MjData(env.engine.mjm)
