@@ -278,7 +278,9 @@ def _gain(s: Scales) -> list[Variant]:
 def _deadband(s: Scales) -> list[Variant]:
     top = max(2.5 * s.error, 6 * s.sigma)
     p = _p("width", "deadband", "set", 0.0, top, 0.0, "m" if s.slide else "rad")
-    return [Variant((p,), tuple((f * top,) for f in (0.05, 0.15, 0.35, 0.6)))]
+    starts = tuple((f * top,) for f in (0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3, 0.45, 0.65))
+    kinds = (("no torque inside", 0.0), ("damped inside", 1.0), ("counted from its edge", 2.0))
+    return [Variant((p,), starts, label, (("deadband_kind", k),)) for label, k in kinds if k != 1.0 or s.nominal["kd"] > 0]
 
 
 def _current(s: Scales) -> list[Variant]:

@@ -9,6 +9,8 @@ import numpy as np
 from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX
 
+PRIOR = 10.0  # samples that one belief weighs: neighbouring residuals are not independent
+
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
 
 
@@ -28,6 +30,7 @@ class Param:
     start: float
     unit: str = "1"
     nuisance: bool = False
+    sd: float = 0.0  # what is believed of it beforehand: its start to this standard deviation; 0: nothing inside the bounds
 
     @property
     def span(self) -> float:
@@ -45,6 +48,11 @@ class Param:
                 params[:, :, c] = 1.0 / np.maximum(x[:, None], 1e-12)
             else:
                 params[:, :, c] = x[:, None]
+
+
+def prior_weight(params: list[Param]) -> np.ndarray:
+    """[P] weight of each belief on the sum of squares, per squared unit of its parameter."""
+    return np.array([PRIOR / p.sd**2 if p.sd > 0 else 0.0 for p in params])
 
 
 def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
@@ -182,6 +190,7 @@ class Fitter:
         span = high - low
         damping = 1e-2
         P = len(params)
+        believed, centre = prior_weight(params), np.array([p.start for p in params], float)
         res = jac = s = None
         fresh = True
         it = 0
@@ -199,13 +208,14 @@ class Fitter:
                 clean = self.eliminated(raw[: P + 1], s)
                 res = clean[0]
                 jac = (clean[1:] - res).T / (delta / span)  # per span
-                loss = float(self.loss(res))
+                loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             if it == iterations or P == 0:
                 break
             k = self.r.knee
             weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
             A = (jac * weight[:, None]).T @ jac
-            b = -(jac * weight[:, None]).T @ res
+            b = -(jac * weight[:, None]).T @ res - believed * (x - centre) * span
+            A[np.diag_indices(P)] += believed * span**2
             at_low, at_high = x <= low + 1e-12, x >= high - 1e-12
             free = ~((at_low & (b < 0)) | (at_high & (b > 0)))
             scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
@@ -222,7 +232,7 @@ class Fitter:
                     steps[i, f] = np.linalg.lstsq(M, b[f], rcond=None)[0]
             steps = np.clip(steps, -0.5, 0.5)
             trial = np.clip(x + steps * span, low, high)
-            tried = self.loss(self.eliminated(self.residuals(params, trial), s))
+            tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
             best = int(np.argmin(tried))
             if not tried[best] < loss * (1 - 1e-6):
                 if damping > 1e2:

@@ -59,6 +59,7 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
 XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
+P_PRESLIDE, P_BRAKE, P_DEADKIND = INDEX["presliding"], INDEX["brake"], INDEX["deadband_kind"]
 
 
 @lru_cache(maxsize=None)
@@ -68,7 +69,7 @@ def plant_kernel():
     @wp.func
     def law(
         e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
-        dt: f64, voltage: f64, gain: f64, drift: f64,
+        dt: f64, voltage: f64, gain: f64, drift: f64, brake: f64, kind: f64,
     ):  # fmt: skip
         """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
         motor's speed). gain, drift: the change of speed in this step is gain * torque + drift.
@@ -76,13 +77,23 @@ def plant_kernel():
         At its limit the torque keeps to the limit for the whole step, unless the step's end is within the limits."""
         zero = f64(0.0)
         one = f64(1.0)
+        half = f64(0.5)
         now = kp * e - kd * v_m
         pd = now - kp * dt * v_m
         slope = scale * (kp * dt + kd)
+        if kind > f64(1.5):  # a dead zone: the error counts from its edge on
+            cut = kp * wp.clamp(e, -deadband, deadband)
+            now -= cut
+            pd -= cut
         if wp.abs(e) < deadband:
-            now = zero
-            pd = zero
-            slope = zero
+            if kind < half:  # no torque at all
+                now = zero
+                pd = zero
+                slope = zero
+            else:  # the error is taken for zero, the speed still counts
+                now = -kd * v_m
+                pd = now
+                slope = scale * kd
         motor_now = zero
         motor = zero
         line = zero
@@ -99,6 +110,8 @@ def plant_kernel():
             slope = tau0 * supply * slope
         else:
             x = wp.abs(v) / (nls * supply)
+            if pd * v < zero:  # what a drive gives while it brakes differs between makes
+                x = x * brake
             limit = zero
             if x < one:
                 limit = tau0 * (one - x)
@@ -121,6 +134,24 @@ def plant_kernel():
         if round_:
             m += esin * wp.sin(q) + ecos * (wp.cos(q) - f64(1.0))
         return m
+
+    @wp.func
+    def giving(free: f64, a: f64, level: f64, z: f64, w: f64):
+        """Speed v at the end of a step under Dahl's friction level * z', z' = (z + v / w) / (1 + |v| / w), which gives way
+        elastically before it slides (P. Dahl 1968, taken implicitly): a (v - free) + level z' = 0. z: share of the level
+        that is taken up, w: the speed that takes it all up in one step."""
+        one = f64(1.0)
+        turn = wp.sign(a * free - level * z)
+        f = turn * free
+        y = turn * z
+        A = a * w
+        B = A - a * f + level
+        C = level * y - a * f
+        root = wp.sqrt(wp.max(B * B - f64(4.0) * A * C, f64(0.0)))
+        u = (root - B) / (f64(2.0) * A)
+        if B > f64(0.0):
+            u = -f64(2.0) * C / (B + root)
+        return turn * w * wp.max(u, f64(0.0))
 
     @wp.kernel(module="unique", enable_backward=False)
     def plant(
@@ -189,8 +220,9 @@ def plant_kernel():
         last = zero
         v_f = v
         fresh = int(1)
-        prev_q = zero
         prev_tau = zero
+        preslide = params[h, P_PRESLIDE]
+        z = zero  # share of the friction that is taken up
 
         for i in range(steps):
             g = g0 + i
@@ -290,7 +322,7 @@ def plant_kernel():
                 step = theta * dts
                 torque = law(
                     e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
-                    eff * step / body, -load * step / body,
+                    eff * step / body, -load * step / body, params[h, P_BRAKE], params[h, P_DEADKIND],
                 )
                 now = torque[0]
                 motor = torque[1]
@@ -353,8 +385,18 @@ def plant_kernel():
                     damping += slope_m
                     a = inertia / (theta * dts) + damping + visc + stop_d
                     free = (inertia / (theta * dts) * v + applied + damping * v - load) / a
-                    if i >= warm:
-                        if wp.abs(free) * a <= level:
+                    if i < warm:
+                        if preslide > zero:
+                            z = (z + v * dts / preslide) / (one + wp.abs(v) * dts / preslide)
+                    else:
+                        if preslide > zero:
+                            free = giving(free, a, level, z, preslide / dts)
+                            z = (z + free * dts / preslide) / (one + wp.abs(free) * dts / preslide)
+                            q += dts * free
+                            v = v + (free - v) / theta
+                            if v * free < zero:
+                                v = zero
+                        elif wp.abs(free) * a <= level:
                             v = zero
                         else:
                             free -= wp.sign(free) * level / a
@@ -401,18 +443,22 @@ def plant_kernel():
                     det = a11 * a22 - a12 * a21
                     x1 = (b1 * a22 - a12 * b2) / det
                     gain = a22 / det
-                    if wp.abs(x1) <= gain * level:
+                    if preslide > zero:
+                        x1 = giving(x1, one / gain, level, z, preslide / dts)
+                        z = (z + x1 * dts / preslide) / (one + wp.abs(x1) * dts / preslide)
+                        x2 = (b2 - a21 * x1) / a22
+                    elif wp.abs(x1) <= gain * level:
                         x1 = zero
                         x2 = b2 / a22
                     else:
                         x1 -= wp.sign(x1) * gain * level
                         x2 = (b2 - a21 * x1) / a22
                     if base_friction > zero and i >= warm:
-                        push = base_friction / a22
-                        if wp.abs(x2) <= push:
+                        still = base_friction / a22
+                        if wp.abs(x2) <= still:
                             x2 = zero
                         else:
-                            x2 -= wp.sign(x2) * push
+                            x2 -= wp.sign(x2) * still
                     vm = x1
                     qm += dts * vm
                     if i >= warm:

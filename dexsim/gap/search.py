@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Variant, confusable
-from dexsim.gap.fit import Fitted, Fitter, Param, Residuals
+from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, prior_weight
 from dexsim.gap.plant import Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
@@ -23,6 +23,8 @@ BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.4  # x the noise: an error within it needs no effect
 MOST = 4  # effects on one joint
+FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
+GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ class JointSearch:
                     out.append(Param(name, (name,), "set", low, high, value, nuisance=True))
             elif name in ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "load_friction",
                           "load_friction_backdriven", "stribeck_peak") and 0 < value < 1e8:
-                out.append(Param(name, (name,), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+                out.append(Param(name, (name,), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         rate = c.loop_rate or 1000.0
         taken = {p.columns[0] for p in out}
         # a sampled loop acts half a period late and a clock is read when it is read
@@ -138,14 +140,22 @@ class JointSearch:
             out.append(Param("delay", ("delay",), "add", -min(d, 0.002), 0.002, 0.0, "s", nuisance=True))
         if "lag" not in taken:
             out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True))
-        out.append(Param("inertia", ("inertia_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+        # a drive tells its speed from its encoder through some filter
+        if s.nominal["kd"] > 0:
+            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 0.5 / rate, "s", nuisance=True))
+        # what holds a joint gives a little before it slides
+        give = GIVE_SLIDE if s.slide else GIVE
+        out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
+        if not s.voltage and s.nominal["no_load_speed"] < 1e8:
+            out.append(Param("brake", ("brake",), "set", -1.0, 1.0, 1.0, nuisance=True))
+        out.append(Param("inertia", ("inertia_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         if s.gravity > 0.01 * s.tau:
-            out.append(Param("gravity", ("gravity_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+            out.append(Param("gravity", ("gravity_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         if c.constants.damping > 0:
             d = BELIEF * c.constants.damping
             out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
         if c.sigma_torque > 0:
-            out.append(Param("effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True))
+            out.append(Param("effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         return out
 
     def _unknown(self, name: str) -> Param | None:
@@ -325,6 +335,7 @@ class JointSearch:
         k = self.r.knee
         weight = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
         guesses = [f.x]
+        believed, centre = prior_weight(f.params), np.array([p.start for p in f.params], float)
         lengths = (0.35, 1.0)
         for number in folds:
             on = fold != number if len(folds) > 1 else fold == number
@@ -332,7 +343,8 @@ class JointSearch:
                 continue
             J = f.jacobian[on] * span
             w = weight[on]
-            A, b = (J * w[:, None]).T @ J, -(J * w[:, None]).T @ f.residual[on]
+            A, b = (J * w[:, None]).T @ J, -(J * w[:, None]).T @ f.residual[on] - believed * (f.x - centre) * span
+            A[np.diag_indices(P)] += believed * span**2
             free = ~(((f.x <= low + 1e-12) & (b < 0)) | ((f.x >= high - 1e-12) & (b > 0)))
             step = np.zeros(P)
             i = np.flatnonzero(free)
