@@ -29,6 +29,7 @@ class Twin:
     def __init__(self):
         settings = ("task.objects.baked_scales=[1.25]",)
         self.c, self.w = grasp_env(*settings, worlds=N, engine="mujoco"), grasp_env(*settings, worlds=N, engine="warp")
+        self.c.skip_idle_resets = False  # the same random numbers for both
         self.copy()
 
     def copy(self) -> None:

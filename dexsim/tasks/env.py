@@ -194,6 +194,9 @@ class HandEnv(VecEnv):
         self._log(terms, ends, reward)
 
     def _reset_done(self) -> None:
+        if self.skip_idle_resets and not bool(self.done.any()):
+            self._observe_all()
+            return
         self.reset(self.done)
 
     def _replay(self, name: str, part: Callable[[], None]) -> None:
@@ -250,6 +253,9 @@ class HandEnv(VecEnv):
         self.action.masked_fill_(mask[:, None], 0.0)
         self.last_action.masked_fill_(mask[:, None], 0.0)
         self.read_state()
+        self._observe_all()
+
+    def _observe_all(self) -> None:
         for group, value in self.observe(advance=True).items():
             if group not in self.obs:
                 self.obs[group] = torch.zeros_like(value)
@@ -346,6 +352,9 @@ class HandEnv(VecEnv):
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
         self.graphs, self.keep_final_obs = True, False
+        # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step. (The
+        # random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
+        self.skip_idle_resets = self.engine.kind == "mujoco"
         self._runs: dict[str, int] = {}
         self._recorded: dict[str, torch.cuda.CUDAGraph] = {}
         self.obs: dict[str, torch.Tensor] = {}
