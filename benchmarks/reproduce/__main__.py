@@ -69,7 +69,8 @@ def main(argv: list[str]) -> int:
     if own["report"] not in ("true", "false"):
         raise UserError(f"report={own['report']}: must be true or false")
     episodes = int(number(own, "episodes", 2, 1e6, whole=True))
-    threads = max(1, min(8, cores // 4))
+    threads = max(1, min(6, cores // 4))
+    judges = max(1, (cores - 4 * count) // threads)  # a training keeps a few cores busy
     plan = jobs.Plan(
         Path(own["out"] if own["out"] != "null" else f"out/reproduce_{table}").expanduser().absolute(), task,
         max(1, math.ceil(number(own, "budget", 1e-9, 1e4) * STEPS / per)), None if own["minutes"] == "null" else number(own, "minutes", 0.01, 1e5),
@@ -80,7 +81,7 @@ def main(argv: list[str]) -> int:
           f"on {', '.join('CPU' if g is None else f'GPU {g}' for g in gpus)}; judged on {judge}: {plan.out}", flush=True)
     about = tools.about("cuda:0" if count else "cpu") | {"command": "python -m benchmarks.reproduce " + " ".join(argv), "gpus": len([g for g in gpus if g])}
     if own["report"] == "false":
-        jobs.run(all_jobs, plan, gpus, max(1, cores // (2 * threads)))
+        jobs.run(all_jobs, plan, gpus, judges)
     path = report.write(table, plan, all_jobs, about)
     print(path.read_text())
     missing = [f"{j.name} in {w}" for j in all_jobs for w in jobs.WORLDS if not j.metrics(plan, w).exists()]
