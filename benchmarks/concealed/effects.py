@@ -59,7 +59,7 @@ def _late(L, n, o):
 
 
 def _acceleration(L):
-    return np.abs(np.gradient(np.convolve(L["speed"], np.ones(9) / 9, "same")))
+    return np.abs(np.gradient(np.convolve(L["speed"], np.ones(31) / 31, "same")))  # commands come in steps of 10 ms
 
 
 KINDS: dict[str, Kind] = {

@@ -112,7 +112,7 @@ def _removed(d: dict, effects: list[dict], joints: int) -> float | None:
         h = {"before": max(x["before"] for x in mine), "after": min(x["after"] for x in mine)} if mine else {"before": known, "after": known}
     if h.get("before") is None or h.get("after") is None:
         return 0.0
-    return float(np.clip((h["before"] - h["after"]) / (h["before"] - floor), -1.0, 1.2)) if h["before"] > 1.3 * floor else None
+    return float(np.clip((h["before"] - h["after"]) / (h["before"] - floor), -1.0, 1.0)) if h["before"] > 1.3 * floor else None
 
 
 def one(truth: dict, d: dict) -> dict:
