@@ -58,6 +58,11 @@ def about(device: str) -> dict[str, Any]:
     return {"device": name, "versions": machine.versions()}
 
 
+def load() -> float | None:
+    """Programs that wanted a processor in the last minute, on average; None where the system does not say."""
+    return round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
+
+
 def wait(device: str) -> None:
     """Until the device has done all that was asked of it."""
     if device.startswith("cuda"):
