@@ -164,6 +164,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         notes.append(f"no joint is judged: {reason}")
         out = _touch_only(channel, felt, notes, m)
         out.lengths = lengths
+        if s.next_recording:
+            _next(out, s, m, (), [r for r in recordings if r is not None])
         out.shares = clock.shares
         return out
 
@@ -224,7 +226,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     result.lengths = lengths
     clock.lap("judging on held-out data")
     if s.next_recording:
-        _next(result, s, m)
+        _next(result, s, m, outcomes, [r for r in recordings if r is not None])
         clock.lap("next recording")
     result.shares = clock.shares
     return result
@@ -295,6 +297,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             effort_only = mm.id == "current_sensor"
             earned = 1.0 if effort_only else float(np.clip((rms((measured - qw) ** 2) - rms(after)) / (0.1 * rms((measured - qw) ** 2) + 1e-12), 0.0, 1.0))
             confidence *= 0.3 + 0.7 * earned  # what did not help on the data kept out is not to be relied on
+            confidence *= trusted(rms(before), rms(after), case.sigma)
             confounded = confounds(case, train) if mm.id == "thermal" else ""
             if confounded:
                 confidence = min(confidence, 0.7)
@@ -373,6 +376,14 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     out.model_spec = spec if changed_model else None
     out.sentence = _sentence(data, out, floor)
     return out
+
+
+def trusted(before: float, after: float, noise: float) -> float:
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a twentieth,
+    half from a third on. What follows only half of a gap may be another effect's likeness."""
+    base = (1.3 * noise) ** 2
+    left = max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
+    return 1.0 - 0.5 * float(np.clip((left - 0.05) / 0.28, 0.0, 1.0))
 
 
 def confounds(case: Case, train: list[int]) -> str:
@@ -598,22 +609,33 @@ def _size(f: dict) -> str:
     return f" ({name.replace('_', ' ')} {' '.join(f'{v:.3g}' for v in number)}{' ' + p['unit'] if p['unit'] not in ('1', '') else ''})"
 
 
-def _next(d: Diagnosis, s: Settings, m: Mechanism) -> None:
+TABLE = {"coulomb_friction": ["triangles", "steps"], "stribeck_friction": ["triangles", "ladder"], "backlash": ["triangles", "chirp"],
+         "load_friction": ["triangles", "holds"], "command_delay": ["steps", "chirp"], "lag": ["steps", "chirp"], "viscous_friction": ["ladder"],
+         "torque_speed_limit": ["ladder", "steps"], "gain_mismatch": ["steps", "holds"], "inertia": ["chirp"], "payload": ["holds"],
+         "position_offset": ["holds"]}  # fmt: skip
+"""Motions that show an effect, where its hypotheses cannot be simulated over candidates."""
+
+
+def _next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (), recordings: Sequence[Any] = ()) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
-    named = [f for f in data["findings"] if f["effect"] in EFFECTS]
+    named = [f for f in data["findings"] if entry(f) is not None]
     unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < 0.8]
     kinds, joints, why = None, None, ""
-    table = {"coulomb_friction": ["triangles", "steps"], "stribeck_friction": ["triangles", "ladder"], "backlash": ["triangles", "chirp"],
-             "load_friction": ["triangles", "holds"], "command_delay": ["steps", "chirp"], "lag": ["steps", "chirp"],
-             "viscous_friction": ["ladder"], "torque_speed_limit": ["ladder", "steps"], "gain_mismatch": ["steps", "holds"],
-             "inertia": ["chirp"], "payload": ["holds"], "position_offset": ["holds"]}  # fmt: skip
+    if unsure and not unsure[0]["where"]["joints"]:
+        _next_touch(d, s, m, unsure[0], recordings)
+        return
     if unsure:
         f = unsure[0]
-        rivals = f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])]
+        rivals = list(dict.fromkeys(f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])]))
         joints = f["where"]["joints"]
-        kinds = sorted({k for e in rivals for k in table.get(e, ["steps", "chirp", "triangles"])})
-        why = f"to tell {' from '.join(dict.fromkeys(rivals))} on {joints[0]}: {EFFECTS[f['effect']].experiment}"
+        kinds = sorted({k for e in rivals for k in TABLE.get(e, ["steps", "chirp", "triangles"])})
+        head = f"to tell {' from '.join(rivals)} on {joints[0]}" if len(rivals) > 1 else f"to make sure of {rivals[0]} on {joints[0]}"
+        why = f"{head}: {EFFECTS[f['effect']].experiment}"
+        choice = _choice(d, s, m, outcomes, f, rivals)
+        if choice is not None:
+            kinds = choice.chosen
+            why = f"{head}: {' and '.join(kinds)}, because {choice.text}"
     elif data["verdict"] in ("unknown", "partly_explained"):
         worst = max(d.joints, key=lambda j: d.joints[j]["after"]) if d.joints else None
         joints, kinds = ([worst] if worst else None), ["triangles", "ladder", "chirp", "steps", "holds"]
@@ -629,6 +651,46 @@ def _next(d: Diagnosis, s: Settings, m: Mechanism) -> None:
         data["next_recording"]["commands"] = "next_recording.mcap"
     except UserError as error:
         d.notes.append(f"no commands for the next recording: {error}")
+
+
+def _choice(d: Diagnosis, s: Settings, m: Mechanism, outcomes, f: dict, rivals: list[str]):
+    """The motions on which the finding's hypotheses disagree most; None where they cannot be simulated or planned."""
+    from dexsim.gap import next_experiment
+
+    for case, search, outcome in outcomes:
+        if case.joint not in f["where"]["joints"] or not outcome.best.members:
+            continue
+        other = next_experiment.rival_of(search, outcome, f["effect"], rivals[1] if len(rivals) > 1 else None)
+        if other is None:
+            return None
+        try:
+            choice = next_experiment.choose(m, search, outcome.best, other, s.seed)
+        except UserError as error:
+            d.notes.append(f"no motion could be planned: {error}")
+            return None
+        return choice if choice.scores else None
+    return None
+
+
+def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Sequence[Any]) -> None:
+    """The presses again, as they were sent, with what was missing: nothing else is known to be safe against the object."""
+    names = " from ".join(dict.fromkeys(f["indistinguishable"] or [f["effect"]]))
+    why = f"to tell {names} on {place(f)}: {entry(f).experiment}; the same commands, with /external_force of a load cell recorded beside /tactile"
+    d.data["next_recording"] = {"why": why, "commands": None}
+    pads = {w["recording"] for w in f["when"]}
+    sent = [r for r in recordings if r.path.name in pads and len(r.commands)]
+    if not sent:
+        return
+    from dexsim.recording.writer import Writer
+
+    best = max(sent, key=lambda r: sum(w["end"] - w["start"] for w in f["when"] if w["recording"] == r.path.name))
+    meta = {k: v for k, v in best.meta.items() if k in ("robot", "gravity")} | {
+        "source": "sim", "effort_is": "none", "effort_sign": "+1", "notes": f"commands to send, not a measurement: those of {best.path.name}"}  # fmt: skip
+    s.out.mkdir(parents=True, exist_ok=True)
+    with Writer(s.out / "next_recording.mcap", best.joints, meta, start_ns=1_000_000_000) as w:
+        for t, row in zip(best.commands.t, best.commands.value, strict=True):
+            w.add_command(float(t), row)
+    d.data["next_recording"]["commands"] = "next_recording.mcap"
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
@@ -650,6 +712,8 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             written.append(out / "model.xml")
         except (ValueError, mujoco.FatalError) as error:
             d.notes.append(f"model.xml could not be written: {error}")
+    if (d.data["next_recording"] or {}).get("commands"):
+        written.append(out / d.data["next_recording"]["commands"])
     path = out / "report.html"
     path.write_text(page(d), encoding="utf-8")
     written.append(path)

@@ -57,13 +57,14 @@ class PadRun:
     lsb: float
     stiffness: float = STIFFNESS
     friction: float = FRICTION
+    doubt: float = 1.5e-4  # m by which the object may be elsewhere over the pad than the joints say
     memory: dict = field(default_factory=dict)  # contacts that were computed
 
     @property
     def near(self) -> np.ndarray:
         """[n] grid points at which the object may touch."""
         if "near" not in self.__dict__:
-            close = self.dist.min(1) < 2e-3
+            close = self.dist.min(1) < 2e-3 + 2 * self.doubt
             self.__dict__["near"] = np.flatnonzero(close if self.load is None else close | (self.load > 0.02 * self.load.max()))
         return self.__dict__["near"]
 
@@ -226,7 +227,21 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
         o = yaml.safe_load(r.config)["recorded_world"]["object"]
         stiffness, friction = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
     return PadRun(r.path.name, f, grid, dist, along, across, depth, slide, layout.area[f, :K], t, z, shear, load, full, warm, lsb,
-                  stiffness, friction)  # fmt: skip
+                  stiffness, friction, _doubt(model, layout.bodies[f], thing))  # fmt: skip
+
+
+def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
+    """m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5 mrad times its arm."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    body, out = model.body(pad).id, 1.5e-4
+    at, b = data.xpos[body], body
+    while b > 0:
+        for i in range(int(model.body_jntadr[b]), int(model.body_jntadr[b]) + int(model.body_jntnum[b])):
+            if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE:
+                out += 5e-3 * float(np.linalg.norm(at - data.xanchor[i]) + 0.02)
+        b = int(model.body_parentid[b])
+    return out
 
 
 def _stretch(t: np.ndarray, total: np.ndarray) -> tuple[float, float]:

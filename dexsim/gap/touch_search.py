@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import least_squares
 
+from dexsim.calibration.taxels import neighbours
 from dexsim.gap.touch_data import PadRun
 from dexsim.gap.touch_effects import BY_ID, EXCLUDES, TOUCH, TouchEffect, confusable
 from dexsim.gap.touch_plant import PARAMS, cell, neutral, readings, shear
@@ -18,6 +19,7 @@ BLOCK = 0.5  # s
 MODEL = 0.02  # of a reading: finer than that the plant is not to be trusted
 TIMING = 3e-3  # s by which a reading's time is uncertain: between two positions of the joints the contact is a guess
 PRIOR = 0.3  # standard deviation of a taxel's gain, before anything is seen
+PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
 GAIN_OFF = 0.08  # a taxel whose gain is less than this off is not listed
 
 
@@ -72,6 +74,7 @@ class PadSearch:
                 r.load = None
         self.shear = all(r.shear is not None for r in runs) and self._slid()
         self.noise = self._noise()
+        self.doubt = max(r.doubt for r in runs)
         self.load_noise = 0.0
         if self.load:
             from dexsim.gap.prepare import noise
@@ -114,6 +117,9 @@ class PadSearch:
         step = max(r.lsb for r in self.runs)
         still = np.ptp(z, axis=0) <= max(0.5 * step, 1e-9)
         pressed = p.max(0) > max(8 * self.noise, 4 * step)
+        # the object may touch beside where the joints say: neighbours on both sides must feel it
+        near = [sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside)) for beside in neighbours()[: z.shape[1]]]
+        pressed &= np.array(near)
         stuck = still & (z[0] > 2 * step)
         return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
 
@@ -176,6 +182,8 @@ class PadSearch:
         p = PARAMS[key]
         if key == "scale" and not self.scale_known:
             return 0.05, 20.0
+        if key in PLACE:  # how well the joints know where the object is
+            return -PLACE[key] * self.doubt, PLACE[key] * self.doubt
         if key == "drift":
             return -0.7 / self.warm, 0.7 / self.warm
         return p.low, p.high
@@ -185,7 +193,7 @@ class PadSearch:
         keys = self._keys(ids, gains is not None)
         where = self.train if where is None else where
         low, high = np.array([self._bounds(k) for k in keys]).T
-        scale = np.array([PARAMS[k].scale for k in keys])
+        scale = np.array([PLACE[k] * self.doubt / 3 if k in PLACE else PARAMS[k].scale for k in keys])
         if "drift" in keys:
             scale[keys.index("drift")] = 0.1 / self.warm
         free = {k for k in keys if PARAMS[k].nuisance and not (k == "scale" and not self.scale_known)}
@@ -338,7 +346,8 @@ class PadSearch:
             gains = self.gain_map(base, self.train)
             tries.append(TouchTrial(ids, base.values, gains, base.order, base.keys, None, self.residual(base.values, gains, base.order)))
             if self.scale_known:
-                tries.append(self.fit(ids, current.values | {"gain": 1.0}, None, current.gains, current.order, 60))
+                ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
+                tries.append(self.fit(ids, current.values | {"gain": ratio}, None, current.gains, current.order, 60))
             # a map where one number does not: a third less error, beside the price of its 120 numbers
             if len(tries) == 2 and self._size(tries[0].res) > 0.7 * self._size(tries[1].res):
                 tries = tries[1:]
@@ -423,6 +432,9 @@ class PadSearch:
             if x.id in current.ids or not (x in tried or confusable(x.id, e)):
                 continue
             t = trials.get(frozenset((*base.ids, x.id))) or self._try(base, x)
+            if x.id == "tactile_gain" and t is not None and t.gains is not None and e != "tactile_gain" and self.scale_known:
+                one = self.fit((*base.ids, x.id), base.values | {"gain": current.values["stiffness"]}, None, base.gains, base.order, 60)
+                t = one if self._size(one.res) < 1.5 * self._size(t.res) else t
             if t is not None and (self._size(t.res) < 2.5 * self._size(current.res) or confusable(x.id, e)):
                 self.cross(t)
                 others.append((x.id, t))
@@ -437,9 +449,28 @@ class PadSearch:
         rows = sorted(((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1])
         return rows, float(shares[0])
 
+    def _rounding(self, trial: TouchTrial) -> np.ndarray:
+        """[P] rms by which the numbers come back wrong from their own readings in whole counts, at three slightly different
+        levels: a held force rounds to the same side for as long as it is held, which no scatter shows."""
+        if not trial.keys or not any(r.lsb for r in self.runs):
+            return np.zeros(len(trial.keys))
+        kept = [r.z for r in self.runs]
+        off = []
+        try:
+            for level in (0.985, 1.0, 1.015):
+                for r in self.runs:
+                    exact = level * readings(r, trial.values, trial.gains, trial.order)
+                    r.z = np.round(exact / r.lsb) * r.lsb if r.lsb else exact
+                again = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 18)
+                off.append([(again.values[k] - trial.values[k]) if k not in ("gain", "scale", "stiffness") else 0.0 for k in trial.keys])
+        finally:
+            for r, z in zip(self.runs, kept, strict=True):
+                r.z = z
+        return np.sqrt(np.mean(np.square(off), 0))
+
     def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
-        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds and 1.5 % of the
-        value added in squares."""
+        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what whole counts do
+        to the fit and 1.5 % of the value added in squares."""
         keys = trial.keys
         fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
         J, r = fitted.jac, np.clip(fitted.res[self.train], -3, 3)
@@ -457,6 +488,7 @@ class PadSearch:
         folds = np.array([[f[k] for k in fitted.keys] for f in trial.folds]) if len(trial.folds) > 1 else np.zeros((1, len(fitted.keys)))
         m = len(folds)
         variance += (m - 1) / max(m, 1) * ((folds - folds.mean(0)) ** 2).sum(0)
+        variance += self._rounding(fitted) ** 2
         out = {}
         for k, s in zip(fitted.keys, variance, strict=True):
             x = trial.values[k]

@@ -1,0 +1,199 @@
+"""Touch in the diagnosis: its own plant against the taxel kernels, effects planted on a press rig, sets, what is not known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dexsim.gap import inputs, touch, touch_data, touch_plant, touch_rig
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.runs import Run
+from dexsim.gap.touch_effects import TOUCH, confusable
+from dexsim.recording import read, write
+from dexsim.recording.mechanism import mechanism
+from dexsim.tactile import reference as ref
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return touch_rig.record(tmp_path_factory.mktemp("plain"), 3, 6.0, seed=1)
+
+
+def collected(paths, model, servo):
+    m = mechanism(model, servo)
+    recordings = [read(p, joints=m.joints, audit=False) for p in paths]
+    return touch_data.collect(recordings, m), recordings, m
+
+
+def found(folder, seconds=7.0, **planted):
+    """The touch of three rig recordings with what was planted."""
+    paths, model, servo = touch_rig.record(folder, 3, seconds, seed=4, **planted)
+    m = mechanism(model, servo)
+    return touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set())
+
+
+def test_catalogue_of_touch_is_that_of_the_specification():
+    assert {e.id for e in TOUCH} == {"tactile_gain", "tactile_stiffening", "tactile_hysteresis", "tactile_crosstalk", "tactile_delay", "contact_friction",
+                                     "contact_stiffness", "thermal"}  # fmt: skip
+    assert confusable("tactile_gain", "contact_stiffness") and confusable("thermal", "tactile_hysteresis") and not confusable("tactile_gain", "tactile_delay")
+    for e in TOUCH:
+        assert all(len(s) == len(e.fits) for s in e.starts) and {k for k, _ in e.report} <= set(e.fits)
+
+
+def test_the_plant_reads_what_the_rig_reads(plain):
+    """The rig's contact is MuJoCo's and its taxels are the kernels': readings agree to the counts, with and without the load cell."""
+    data, _, _ = collected(*plain)
+    assert len(data.runs) == 3 and not data.blind and data.scale_known
+    for run in data.runs:
+        on = run.z.max(1) > 0
+        for load in (run.load, None):
+            run.load, run.memory = load, {}
+            error = touch_plant.readings(run, touch_plant.neutral())[on] - run.z[on]
+            felt = run.z.max(0) > 0.3
+            assert np.sqrt(np.mean(error[:, felt] ** 2)) < (0.05 if load is not None else 0.12)
+
+
+def test_rubber_relaxes_as_the_standard_linear_solid():
+    x = np.r_[np.zeros(10), np.ones(400)][:, None]
+    y = touch_plant.relaxed(x, 0.01, 0.4, 0.5)[:, 0]
+    t = np.arange(400) * 0.01
+    assert np.allclose(y[10:], 1 + 0.4 * np.exp(-(t + 0.01) / 0.5), atol=2e-3)
+    assert touch_plant.relaxed(1 - x, 0.01, 0.4, 0.5).min() == 0.0  # rubber does not pull
+
+
+def test_foundation_and_neighbours_keep_their_sums(plain):
+    run = collected(*plain)[0].runs[0]
+    run.load = None
+    v = touch_plant.neutral() | {"c10": 8e4, "c01": 1e4}
+    force, share = touch_plant.contact(run, v)
+    g = int(np.argmax(run.depth))
+    expected = ref.mooney_rivlin_force(np.maximum(-run.dist[g], 0), run.area, touch_plant.THICKNESS, 8e4, 1e4)
+    assert force[g] == pytest.approx(expected.sum(), rel=1e-9) and share[g].sum() == pytest.approx(1.0)
+    assert np.allclose(touch_plant.BESIDE.sum(0), 1.0)  # what a taxel gives its neighbours is what it loses
+
+
+def test_a_slipping_bristle_stops_at_friction_times_force(plain):
+    run = collected(*plain)[0].runs[0]
+    run.slide = np.stack([np.linspace(0, 5e-3, len(run.grid)), np.zeros(len(run.grid))], 1)
+    out = touch_plant.shear(run, touch_plant.neutral() | {"mu": 0.5}, np.full(len(run.t), 3.0))
+    assert out[-1, 0] == pytest.approx(0.5 * touch_data.FRICTION * 3.0) and out[-1, 1] == 0
+
+
+QUICK = [
+    ("tactile_hysteresis", {"sensor": {"hysteresis": 0.3, "hysteresis_time": 0.4}}, {"fraction": 0.3, "time_constant": 0.4}),
+]
+MORE = [
+    ("contact_stiffness", {"stiffness": 4500.0}, {"stiffness": 4500.0}),
+    ("tactile_gain", {"gains": dict.fromkeys(range(120), 0.7)}, {"gain": 0.7}),
+    ("tactile_crosstalk", {"crosstalk": 0.25}, {"fraction": 0.25}),
+    # the sensor reports its last reading that is older than the delay: half a period of 11 ms on top
+    ("tactile_delay", {"sensor": {"delay": 0.04}}, {"delay": 0.0455}),
+    ("tactile_stiffening", {"rubber": (1e5, 2e4)}, {"c10": 1e5}),
+    ("thermal", {"drift": -0.01}, {"per_degree": -0.01}),
+    ("contact_friction", {"slides": True, "friction": 0.4}, {"mu": 0.4}),
+]
+
+
+def check(folder, effect, planted, values):
+    out = found(folder, **planted)
+    assert [f["effect"] for f in out.findings] == [effect], out.findings
+    f = out.findings[0]
+    assert f["confidence"] > 0.8 and not f["indistinguishable"] and f["where"]["taxels"] and f["when"]
+    for key, value in values.items():
+        p = f["parameters"][key]
+        assert p["value"] == pytest.approx(value, rel=0.15) and p["low"] < p["value"] < p["high"]
+    assert f["held_out"]["after"] < 0.6 * f["held_out"]["before"]
+
+
+@pytest.mark.parametrize(("effect", "planted", "values"), QUICK, ids=[q[0] for q in QUICK])
+def test_planted_touch_effect_is_named_and_sized(tmp_path, effect, planted, values):
+    check(tmp_path, effect, planted, values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "planted", "values"), MORE, ids=[q[0] for q in MORE])
+def test_more_planted_touch_effects(tmp_path, effect, planted, values):
+    check(tmp_path, effect, planted, values)
+
+
+def test_nothing_planted_nothing_found(plain):
+    paths, model, servo = plain
+    m = mechanism(model, servo)
+    out = touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set())
+    assert not out.findings and not out.structured and out.before[0] < 1.3 * out.floor
+
+
+@pytest.mark.slow
+def test_two_effects_at_once(tmp_path):
+    out = found(tmp_path, sensor={"hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 0.03})
+    assert {f["effect"] for f in out.findings} == {"tactile_delay", "tactile_hysteresis"}
+
+
+def test_gains_dead_stuck_and_exchanged_taxels(tmp_path):
+    out = found(tmp_path, gains={54: 0.5, 66: 1.5, 67: 0.0}, stuck={80: 2.0}, swapped=[(55, 65)])
+    (f,) = out.findings
+    assert f["effect"] == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(f["where"]["taxels"])
+    gain = dict(zip(f["where"]["taxels"], f["parameters"]["gain"]["value"], strict=True))
+    assert gain["1:54"] == pytest.approx(0.5, abs=0.1) and gain["1:66"] == pytest.approx(1.5, abs=0.2) and gain["1:67"] == 0 == gain["1:80"]
+    assert f["parameters"]["taxels"]["swapped"] == [["1:55", "1:65"]]
+
+
+@pytest.mark.slow
+def test_without_a_load_cell_gain_and_stiffness_are_a_set(tmp_path):
+    (f,) = found(tmp_path, load_cell=False, stiffness=4500.0).findings
+    assert set(f["indistinguishable"]) == {"tactile_gain", "contact_stiffness"} and "load cell" in f["separating_experiment"] and f["confidence"] < 0.8
+
+
+# -- the whole diagnosis ---------------------------------------------------------------------------------------------------
+
+
+def test_the_rig_is_diagnosed_from_end_to_end(tmp_path):
+    paths, model, servo = touch_rig.record(tmp_path / "rig", 3, 7.0, seed=5, sensor={"delay": 0.06})
+    d = diagnose(Settings(paths, tmp_path / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None)
+    save(d, tmp_path / "out")
+    data = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert data["verdict"] == "explained" and data["findings"][0]["effect"] == "tactile_delay"
+    assert data["held_out"]["error"] == "tactile_rmse_N" and data["held_out"]["after"] < 0.5 * data["held_out"]["before"]
+    assert "index's pad" in d.sentence and any("joints are not judged" in n for n in d.notes)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "taxel 66" in page and "tactile delay" in page
+
+
+def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
+    """The same readings with the xHand's model: no object in it, so forces cannot be predicted; a dead taxel can be told."""
+    paths, model, servo = plain
+    r = read(paths[0], audit=False)
+    r.tactile.value[:, 1, 66] = 0
+    write(tmp_path / "a.mcap", r)
+    bare = tmp_path / "bare.xml"
+    bare.write_text(model.read_text().replace('<geom name="ball"', '<geom name="ball" group="1"').replace('type="sphere" ', 'type="ellipsoid" ').replace('"0.012"', '"0.012 0.012 0.012"'))
+    m = mechanism(model, servo)
+    from dexsim.gap import touch_data as td
+
+    kinds, td.KINDS = td.KINDS, {}
+    try:
+        out = touch.diagnose([read(tmp_path / "a.mcap", joints=m.joints, audit=False)], m, set())
+    finally:
+        td.KINDS = kinds
+    assert out.before is None and any("not what was touched" in n for n in out.notes)
+    assert [f["where"]["taxels"] for f in out.findings] == [["1:66"]]
+
+
+def test_unknown_counts_leave_the_common_gain_open(tmp_path):
+    paths, model, servo = touch_rig.record(tmp_path, 3, 6.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
+    m = mechanism(model, servo)
+    out = touch.diagnose([read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set())
+    assert not out.findings and any("tactile_lsb is unknown" in n for n in out.notes)
+
+
+def test_joints_are_judged_in_free_air_alone():
+    t = np.arange(0, 12, 0.01)
+    q = np.sin(t)[:, None]
+    run = Run("a", ("j",), t, q, t, q, None, np.zeros(3), torque=q.copy())
+    notes: list[str] = []
+    pieces, held = inputs.free_air([run], [0], {"a": [(4.0, 5.0), (5.9, 6.5)]}, notes)
+    assert [(round(p.t[0], 1), round(p.t[-1], 1)) for p in pieces] == [(0.0, 3.9), (6.8, 12.0)]
+    assert held == [0, 1] and all(len(p.torque) == len(p.t) and p.name == "a" for p in pieces) and "free air" in notes[0]
+    assert inputs.free_air([run], [], {"a": [(0.5, 11.5)]}, notes) == ([], []) and "not judged" in notes[1]
