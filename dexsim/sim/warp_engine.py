@@ -17,6 +17,17 @@ from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 
 
+_STREAMS: dict[int, wp.Stream] = {}
+
+
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """Warp's view of a torch stream: one for each, kept. A second view of the same stream would, when the first is collected,
+    be unknown to Warp."""
+    if stream.cuda_stream not in _STREAMS:
+        _STREAMS[stream.cuda_stream] = wp.stream_from_torch(stream)
+    return _STREAMS[stream.cuda_stream]
+
+
 class WarpEngine(Engine):
     """N worlds on MuJoCo-Warp, float32, CPU or CUDA. See `Engine` for the interface."""
 
@@ -45,7 +56,7 @@ class WarpEngine(Engine):
             if stream.cuda_stream == 0:
                 stream = torch.cuda.Stream()
                 torch.cuda.set_stream(stream)
-            wp.set_stream(wp.stream_from_torch(stream), device)
+            wp.set_stream(_warp_stream(stream), device)
         with wp.ScopedDevice(device):
             batched = {f for f in fields if not f.startswith("opt.")} | set(_DERIVED)
             self.m = mjw.put_model(model, batch_sizes=dict.fromkeys(batched, worlds))
