@@ -11,6 +11,16 @@ GRID, INK, SOFT = "#e6e9ee", "#333", "#8a94a3"
 BEFORE, AFTER, COMMAND, FLOOR = "#d1495b", "#1768ac", "#b8c0ca", "#9aa5b1"
 
 
+def number(v: float, digits: int = 3) -> str:
+    """v with so many digits, without an exponent where a person would not write one."""
+    v = float(v)
+    if v != 0 and not 1e-4 <= abs(v) < 1e6:
+        return f"{v:.{digits}g}"
+    if abs(v) >= 10 ** (digits - 1):
+        return f"{round(v):,}"
+    return f"{v:.{digits}g}"
+
+
 def _ticks(low: float, high: float, count: int = 5) -> np.ndarray:
     span = max(high - low, 1e-12)
     step = 10 ** np.floor(np.log10(span / count))
@@ -52,7 +62,7 @@ def curves(t: np.ndarray, measured: np.ndarray, before: np.ndarray, after: np.nd
             out.append(f'<rect x="{float(at(a)):.1f}" y="8" width="{max(float(at(b) - at(a)), 0.8):.1f}" height="{height - 34}" fill="#f3e9d2"/>')
     for v in _ticks(low, high):
         out.append(f'<line x1="{left}" x2="{width - right}" y1="{y(v):.1f}" y2="{y(v):.1f}" stroke="{GRID}"/>')
-        out.append(text(left - 6, float(y(v)) + 4, f"{v:.3g}", "end"))
+        out.append(text(left - 6, float(y(v)) + 4, number(v if abs(v) > 1e-12 else 0.0), "end"))
     if command is not None:
         out.append(_line(x, y(command), COMMAND, 1.2))
     out.append(_line(x, y(measured), INK, 2.0))
@@ -66,7 +76,7 @@ def curves(t: np.ndarray, measured: np.ndarray, before: np.ndarray, after: np.nd
     z = lambda v: base + (1 - np.clip(v / size, -1, 1)) * bottom / 2  # noqa: E731
     for v in (-size / 1.1, 0.0, size / 1.1):
         out.append(f'<line x1="{left}" x2="{width - right}" y1="{z(v):.1f}" y2="{z(v):.1f}" stroke="{GRID}"/>')
-        out.append(text(left - 6, float(z(v)) + 4, f"{v:.2g}", "end"))
+        out.append(text(left - 6, float(z(v)) + 4, number(v, 2), "end"))
     out.append(_line(x, z(e0), BEFORE, 1.5))
     if e1 is not None:
         out.append(_line(x, z(e1), AFTER, 1.5))
@@ -79,7 +89,7 @@ def curves(t: np.ndarray, measured: np.ndarray, before: np.ndarray, after: np.nd
 
 def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], unit: str, width: int = 560) -> str:
     """Horizontal bars: (name, value, low, high, colour); values share one scale."""
-    left, right, step = 118, 96, 38
+    left, right, step = 118, 118, 38
     height = step * len(rows) + 6
     top = max([*(max(r[1], r[3] or 0.0) for r in rows), 1e-12])
     x = lambda v: left + v / top * (width - left - right)  # noqa: E731
@@ -93,7 +103,7 @@ def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], uni
             out.append(f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 16}" y2="{y + 16}" stroke="{INK}" stroke-width="1.4"/>')
             out += [f'<line x1="{x(v):.1f}" x2="{x(v):.1f}" y1="{y + 12}" y2="{y + 20}" stroke="{INK}" stroke-width="1.4"/>' for v in (low, high)]
             end = max(end, x(high))
-        out.append(text(end + 8, y + 21, f"{value:.3g} {unit}", "start", 14, INK, 600))
+        out.append(text(end + 8, y + 21, f"{number(value)} {unit}", "start", 14, INK, 600))
     return "".join(out) + "</svg>"
 
 
@@ -132,9 +142,9 @@ def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]], width: 
     return "".join(out) + "</svg>"
 
 
-def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980) -> str:
+def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, left: int = 400) -> str:
     """Bars with intervals, 1 marked."""
-    left, right, step = 400, 50, 26
+    right, step = 50, 26
     height = step * len(rows) + 22
     top = max([2.0, *(min(r[3], 8.0) for r in rows)])
     x = lambda v: left + min(max(v, 0.0), top) / top * (width - left - right)  # noqa: E731

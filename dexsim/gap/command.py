@@ -102,7 +102,7 @@ def main(argv: list[str]) -> int:
         from dexsim.gap import demo as maker
 
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
-        paths, model, servo, demo = maker.make(out / "recordings", seed=given.get("seed", 0))
+        paths, model, servo, demo = maker.make(out / "recordings", seed=given.get("seed", 0), joint="knuckle")
         given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
@@ -141,6 +141,7 @@ class Progress:
 
 def verdict(d) -> str:
     """The verdict in at most ten lines."""
+    from dexsim.gap.charts import number
     from dexsim.gap.diagnosis import place
 
     data = d.data
@@ -148,7 +149,7 @@ def verdict(d) -> str:
     for f in data["findings"][:4]:
         where = place(f)
         sizes = ", ".join(
-            f"{k} {p['value']:.4g} ({p['low']:.3g} to {p['high']:.3g}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
+            f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
         )
         lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}: {sizes or f['regime']}")
         if f["indistinguishable"]:

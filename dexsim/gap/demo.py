@@ -13,6 +13,8 @@ from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import Hardware, realistic
 from dexsim.recording.schema import COMMANDS, Series
 
+DRAWN = """<geom name="base" type="box" size="0.016 0.022 0.012" pos="0 0 0.016" contype="0" conaffinity="0" mass="0" group="2"/>"""
+LINK = """<geom name="link" type="capsule" size="0.009" fromto="0 0 -0.012 0 0 -0.088" contype="0" conaffinity="0" mass="0" group="2"/>"""
 MODEL = """<mujoco model="pendulum">
   <compiler angle="radian"/>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -49,12 +51,13 @@ def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.nd
     return t, 0.4 * np.sin(2 * np.pi * np.cumsum(f) * 0.01)
 
 
-def make(folder: Path, effect: str = "stribeck_friction", seed: int = 0, seconds: float = 6.0) -> tuple[list[Path], Path, Path, dict]:
-    """Writes four recordings, the model and the believed servo; returns their paths and the hidden columns."""
+def make(folder: Path, effect: str = "stribeck_friction", seed: int = 0, seconds: float = 6.0, joint: str = "joint") -> tuple[list[Path], Path, Path, dict]:
+    """Writes four recordings of one joint, the model and the believed servo; returns their paths and the hidden columns."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     model, servo = folder / "rig.xml", folder / "rig.yaml"
-    model.write_text(MODEL, encoding="utf-8")
+    drawn = MODEL.replace("<worldbody>", f"<worldbody>{DRAWN}").replace('name="joint"', f'name="{joint}"').replace('<geom name="bob"', f'{LINK}<geom name="bob"')
+    model.write_text(drawn, encoding="utf-8")
     servo.write_text(yaml.safe_dump(BELIEVED, sort_keys=False), encoding="utf-8")
     true = yaml.safe_load(yaml.safe_dump(BELIEVED))
     for name in ("kp", "kd", "torque_limit", "coulomb_friction", "viscous_friction"):  # as real machines are: a little off
@@ -67,8 +70,8 @@ def make(folder: Path, effect: str = "stribeck_friction", seed: int = 0, seconds
     for k in range(4):
         t, value = commands(k, seconds, rng)
         series = Series(t, value[:, None], COMMANDS, t.copy())
-        run = drive(m, series, ["joint"], seconds, timestep=0.001)
-        recording = realistic(recorded(run, m, series, ["joint"]), seed=seed * 10 + k, hardware=Hardware())
+        run = drive(m, series, [joint], seconds, timestep=0.001)
+        recording = realistic(recorded(run, m, series, [joint]), seed=seed * 10 + k, hardware=Hardware())
         recording.meta["servo"] = ""  # what is hidden is not told
         path = folder / f"motion_{k + 1}.mcap"
         write(path, recording)

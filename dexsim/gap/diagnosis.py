@@ -18,6 +18,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import inputs, judge, locate, stage, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
+from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, servo_changes
 from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.prepare import Case, build
@@ -27,6 +28,7 @@ from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
+WEAK = 0.3  # confidence below which a finding is not in the first sentence
 SET_SHARE = 0.12  # of the bootstraps: a rival of the same class with as much belongs to the set
 
 
@@ -564,19 +566,21 @@ def _sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         return prefix + f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
     if not named:
         depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
-        return prefix + f"Something is missing that no effect of the catalogue explains: {before:.3g} {unit} are left where {limit}{depends}."
+        return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
     parts = []
-    for f in named[:3]:
+    strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
+    for f in strong[:3]:
         words = entry(f).words
         if f["indistinguishable"]:
             words += f", or one of {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}, which this recording cannot tell apart"
         parts.append(f"{place(f)} {words}{_size(f)}")
-    parts[0] = parts[0][:1].upper() + parts[0][1:] if not named[0]["where"]["joints"] else parts[0]
-    more = f" ({len(named) - 3} more below)" if len(named) > 3 else ""
+    parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] else parts[0]
+    left_out = len(named) - len(parts)
+    more = f" ({left_out} more, {'smaller or less sure, ' if len(strong) < len(named) else ''}below)" if left_out else ""
     it = "it" if len(named) == 1 else "them"
     if h["before"] is None:
         return prefix + "; ".join(parts) + more + "."
-    tail = f" Without {it} simulation is wrong by {before:.3g} {unit}; with {it}, by {after:.3g} on recordings not used for the fit"
+    tail = f" Without {it} simulation is wrong by {number(before)} {unit}; with {it}, by {number(after)} on recordings not used for the fit"
     return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
 
 
@@ -699,6 +703,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
 
     out.mkdir(parents=True, exist_ok=True)
     written = []
+    d.notes = grouped(d.notes)
     path = out / "diagnosis.json"
     path.write_text(json.dumps(_plain(d.data), indent=1, allow_nan=False), encoding="utf-8")
     written.append(path)
@@ -718,6 +723,19 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     path.write_text(page(d), encoding="utf-8")
     written.append(path)
     return written
+
+
+def grouped(notes: Sequence[str]) -> list[str]:
+    """Notes that several recordings share, said once: "a.mcap, b.mcap: ..." with at most three names."""
+    out: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        if colon and name.endswith((".mcap", ".bag")) and " " not in name:
+            out.setdefault(text, []).append(name)
+        else:
+            out.setdefault(note, [])
+    join = lambda names: ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")  # noqa: E731
+    return [f"{join(list(dict.fromkeys(names)))}: {text}" if names else text for text, names in out.items()]
 
 
 def _plain(x: Any) -> Any:

@@ -118,7 +118,22 @@ def _where(d: Diagnosis) -> str:
                         f"<figcaption>{_t(p)}</figcaption></figure>" for p in list(d.touch.pads)[:3])  # fmt: skip
         maps = f'<div class="pads">{shown}</div>'
         words.append("The lattices are the pads' taxels, tip above, coloured by their error before; ringed where they are named.")
-    return (f'<section><div class="two"><figure>{picture}{maps}<figcaption>{" ".join(words)}</figcaption></figure><div>{_bars(d)}{_table(d, unit)}</div></div></section>')
+    return (f'<section><div class="two"><figure>{picture}{maps}<figcaption>{" ".join(words)}</figcaption></figure><div>{_bars(d)}{_table(d, unit)}{_spots(d)}</div></div></section>')
+
+
+def _spots(d: Diagnosis) -> str:
+    """Where the error before lives, beside the picture where there is room for it."""
+    if len(d.joints) > 2 or not d.spots:
+        return ""
+    rows = [(s.text if len(d.joints) == 1 else f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in _best(d)[:4]]
+    return f'<h2>Where the error before lives</h2>{charts.ratios(rows, 560, 250)}<p class="soft small">Error inside over error outside, 90 % intervals.</p>'
+
+
+def _best(d: Diagnosis) -> list[Any]:
+    best: dict[tuple[str, str], Any] = {}
+    for s in d.spots:
+        best.setdefault((s.joint, s.regime), s)
+    return list(best.values())
 
 
 def _table(d: Diagnosis, unit: str) -> str:
@@ -133,14 +148,14 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> str:
     order = sorted(d.joints.items(), key=lambda x: -x[1]["before"])
     for j, v in order[:most]:
         effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
-        rows.append(f'<tr><td>{_t(j)}</td><td>{effects}</td><td class="n">{1e3 * v["before"]:.3g}</td><td class="n">{1e3 * v["after"]:.3g}</td>'
+        rows.append(f'<tr><td>{_t(j)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
                     f'<td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
     from dexsim.assets import xhand
 
     for pad, v in (d.touch.pads if d.touch else {}).items():
         f_ = xhand.FINGERS.index(pad)
         effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if any(t.startswith(f"{f_}:") for t in f["where"]["taxels"])) or "&#8211;"
-        rows.append(f'<tr><td>pad of the {_t(pad)}</td><td>{effects}</td><td class="n">{1e3 * v["before"]:.3g}</td><td class="n">{1e3 * v["after"]:.3g}</td>'
+        rows.append(f'<tr><td>pad of the {_t(pad)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
                     f'<td class="n">{1e3 * v["noise"]:.2g} mN</td></tr>')  # fmt: skip
     more = f'<p class="soft small">and {len(order) - most} more joints with less, in the details</p>' if most is not None and len(order) > most else ""
     return f'<table><tr><th>where</th><th>found</th><th class="n">before</th><th class="n">after</th><th class="n">noise</th></tr>{"".join(rows)}</table>{more}'
@@ -157,7 +172,7 @@ def _parameters(f: dict) -> str:
         elif isinstance(value, str):
             out.append(f'<tr><td>{label}</td><td class="n">{_t(value if len(value) < 60 else value[:57] + "...")}</td><td></td></tr>')
         elif value is not None:
-            out.append(f'<tr><td>{label}</td><td class="n"><b>{value:.4g}</b> {unit}<br/><span class="soft small">{p["low"]:.3g} to {p["high"]:.3g}</span></td>'
+            out.append(f'<tr><td>{label}</td><td class="n"><b>{charts.number(value, 4)}</b> {unit}<br/><span class="soft small">{charts.number(p["low"])} to {charts.number(p["high"])}</span></td>'
                        f'<td>{charts.interval(value, p["low"], p["high"])}</td></tr>')  # fmt: skip
     return f"<table>{''.join(out)}</table>" if out else ""
 
@@ -173,6 +188,9 @@ def _lost(f: dict) -> str:
     if not rivals:
         return "<p class='soft'>Runner-up: none; nothing else in the catalogue follows the left-out stretches nearly as well.</p>"
     r = rivals[0]
+    if r["confidence"] > f["confidence"]:
+        return (f"<p><b>Something acts here, but which is open:</b> {_t(_name(r['effect']))} fitted in its place follows the stretches left out as well or better, in "
+                f"{100 * r['confidence']:.0f} of 100 redraws.</p>")  # fmt: skip
     rest = f" (then {', '.join(_name(a['effect']) for a in rivals[1:])})" if len(rivals) > 1 else ""
     return (f"<p class='soft'>Runner-up: {_t(_name(r['effect']))}{_t(rest)}. Fitted in its place, it wins only {100 * r['confidence']:.0f} of 100 redraws of the "
             "stretches left out of the fit.</p>")  # fmt: skip
@@ -190,13 +208,15 @@ def _findings(d: Diagnosis) -> str:
         where = _t(_place(f))
         words = f"{where} {_t(e.words)}; it shows {_t(f['regime'])}." if e is not None else f"{where}: {_t(f['regime'])}."
         unit, k = unit_of(_metric(d, f)) if h else ("", 1.0)
-        error = f'<p>Held-out error with everything else but this: <b>{k * h["before"]:.3g}</b>; with it: <b>{k * h["after"]:.3g} {unit}</b>.</p>' if h else ""
+        error = f'<p>Held-out error with everything else but this: <b>{charts.number(k * h["before"])}</b>; with it: <b>{charts.number(k * h["after"])} {unit}</b>.</p>' if h else ""
         strip = ""
         if f["when"]:
             names = list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]
             rows = [(n, ends.get(n, max(w["end"] for w in f["when"] if w["recording"] == n)), [(w["start"], w["end"]) for w in f["when"] if w["recording"] == n]) for n in names]
             strip = f"<figure>{charts.strips(rows)}<figcaption>when it acts: above a quarter of its most</figcaption></figure>"
-        kind = "bad" if bad else "set" if f["indistinguishable"] else ""
+        from dexsim.gap.diagnosis import WEAK
+
+        kind = "bad" if bad else "set" if f["indistinguishable"] or f["confidence"] < WEAK else ""
         left = _parameters(f)
         body = f'<div class="half"><div>{left}</div><div>{strip}</div></div>' if left and strip else f"{left}{strip}"
         cards.append(f'<div class="finding {kind}"><header><h3>{_t(_name(f["effect"]))} &#8212; {where}</h3><span class="conf">confidence <b>{100 * f["confidence"]:.0f} %</b></span></header>'
@@ -275,10 +295,7 @@ def _details(d: Diagnosis) -> str:
     if len(d.joints) > 6:
         folded.append(("Every joint", _rows(d, "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")))
     if d.spots:
-        best: dict[tuple[str, str], Any] = {}
-        for s in d.spots:
-            best.setdefault((s.joint, s.regime), s)
-        rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in list(best.values())[:10]]
+        rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in _best(d)[:10]]
         folded.append(("Where the error before lives", "<p class='soft small'>Error inside a regime over the error outside it, with 90 % intervals; only what stands after "
                        f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}"))  # fmt: skip
     if d.stages:
