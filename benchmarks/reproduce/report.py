@@ -201,7 +201,7 @@ def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) ->
     steps = sorted({s for j in all_jobs for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])})
     trained = "nothing trained yet" if not steps else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
     head = (f"# The paper's {table} table\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training, "
-            f"{len({j.seed for j in all_jobs})} seed(s) a row; "
+            f"{len({j.seed for j in all_jobs})} seed(s) a row of the paper's, one for ours; "
             + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
             + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
     path = plan.out / f"{table}.md"
