@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.optimize import lsq_linear
 
 TIERS = {"large": 8.0, "medium": 4.0, "small": 2.0}
 NONE_EACH = 6  # cases with nothing planted in a round
@@ -256,7 +257,9 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> bool:
 
 def _hidden(change: np.ndarray, slopes: np.ndarray, keep: slice) -> float:
     """RMS of a change [n] over the held-out rows, what a refit of the believed figures by 5 % takes away taken away."""
-    x = np.clip(np.linalg.lstsq(slopes, change, rcond=None)[0], -0.05, 0.05)
+    q, r = np.linalg.qr(slopes)
+    scale = max(float(np.abs(r).max()), 1e-30)
+    x = lsq_linear(r / scale, q.T @ change / scale, (-0.05, 0.05)).x
     return float(np.sqrt(np.mean((change - slopes @ x)[keep] ** 2)))
 
 

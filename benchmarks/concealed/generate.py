@@ -15,6 +15,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from benchmarks.concealed import plant, rigs
 from benchmarks.concealed.effects import ALL, BY_EFFECT, KINDS, OUTSIDE, Kind, stalled
@@ -99,6 +100,13 @@ def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
     return out
 
 
+def bounded(slopes: np.ndarray, x: np.ndarray, most: float) -> np.ndarray:
+    """Least squares of x [n] on slopes [n, P] with every coefficient within +-most: what clipping the free solution is not."""
+    q, r = np.linalg.qr(slopes)
+    scale = np.maximum(np.abs(r).max(), 1e-30)
+    return lsq_linear(r / scale, q.T @ x / scale, (-most, most)).x
+
+
 class Bench:
     """A rig with its motions: runs variants of its parameters, as measured."""
 
@@ -147,7 +155,7 @@ class Bench:
 
         def hidden(x: np.ndarray) -> float:
             """Held-out RMS of a change [R, M], what a refit on all takes away taken away."""
-            fit = np.clip(np.linalg.lstsq(slopes, x.reshape(-1), rcond=None)[0], -BELIEF, BELIEF)
+            fit = bounded(slopes, x.reshape(-1), BELIEF)
             return float(np.sqrt(np.mean((x.reshape(-1) - slopes @ fit).reshape(x.shape)[-HELD:] ** 2)))
 
         noise = self.noise if signal == "position" else NOISE_OF_EFFORT * unit
