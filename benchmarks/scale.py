@@ -16,7 +16,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
 COUNTS = {"cuda": (1, 16, 256, 1024, 4096, 8192, 16384, 32768, 65536, 131072), "cpu": (1, 4, 16, 64, 256)}
-OWN = ("counts", "seconds", "limit", "out", "mode")
+OWN = ("counts", "seconds", "limit", "out", "mode", "prior")
 TIMED_S = 3.0  # how long control steps are timed, about
 CLOSING = 48  # control steps in which the hands close, one second
 STEEP = 1024  # counts from which memory grows in proportion
@@ -148,22 +147,9 @@ def reason(stderr: str, status: int) -> str:
     return f"status {status}: {lines[-1][:160] if lines else 'no message'}"
 
 
-def bisect(fits: Callable[[int], bool | None], low: int, high: int, ratio: float = 1.05) -> tuple[int, int]:
-    """Largest count known to fit and smallest known not to, from low (fits) and high (does not), until high/low <= ratio
-    or `fits` answers None (no time left). Counts are multiples of 256."""
-    while high / low > ratio:
-        middle = int(round((low * high) ** 0.5 / 256)) * 256
-        if middle in (low, high):
-            break
-        answer = fits(middle)
-        if answer is None:
-            break
-        low, high = (middle, high) if answer else (low, middle)
-    return low, high
-
-
 def search(bench: Bench, mode: str, start: int, guess: int) -> dict:
-    """The limit of one mode: from `start`, which fits, over `guess` (from the bytes a world)."""
+    """The limit of one mode: `start` fits, `guess` is what the bytes a world promise. {"fits", "fails" (None: not reached), "why"}."""
+
     def fits(n: int) -> bool | None:
         if bench.left() < 20:
             return None
@@ -171,13 +157,19 @@ def search(bench: Bench, mode: str, start: int, guess: int) -> dict:
         return None if row.get("error") == "out of time" else "error" not in row
 
     low, high, n = start, None, max(int(0.97 * guess) // 256 * 256, start)
-    while high is None and n > low:
-        answer = fits(n)
-        if answer is None:
-            return {"fits": low, "fails": None}
-        low, high = (n, None) if answer else (low, n)
-        n = int(1.06 * n) // 256 * 256
-    low, high = bisect(fits, low, high)
+    answer: bool | None = True
+    if n > low and not (answer := fits(n)):
+        while answer is not None and not answer:  # downwards in small steps: the guess is near
+            high, n = n, max(int(0.93 * n) // 256 * 256, start)
+            if n == start:
+                break
+            answer = fits(n)
+        low = n if answer else low
+    elif n > low:
+        while answer:
+            low, n = n, int(1.07 * n) // 256 * 256
+            answer = fits(n)
+        high = n if answer is not None else None
     return {"fits": low, "fails": high, "why": next((r["error"] for r in bench.rows if r["worlds"] == high and "error" in r), None)}
 
 
@@ -251,6 +243,9 @@ def main(argv: list[str]) -> int:
     about = {"device": machine.describe(device), "memory": machine.memory(device), "versions": machine.versions()}
     bench = Bench(rest, out, float(own.get("seconds", 400)), about)
     print(f"{about['device']}, {about['memory']}")
+    if "prior" in own:
+        bench.rows = [r for r in json.loads(Path(own["prior"]).read_text())["rows"] if r.get("error") != "out of time"]
+        counts = [n for n in counts if n not in [r["worlds"] for r in bench.rows]]
     for n in sorted(counts):
         if bench.left() > 20 and "error" in bench.run(n, "cost"):
             break
@@ -262,8 +257,8 @@ def main(argv: list[str]) -> int:
         total = torch.cuda.mem_get_info(device)[1] if kind == "cuda" else 0
         if not total:
             raise UserError("limit=true: the limit is looked for on a CUDA device only; a CPU would swap")
-        for mode, key in zip(("train", "simulate"), keys[::-1], strict=True):
-            good = [r["worlds"] for r in bench.rows if "error" not in r]
+        for mode, key in zip(("simulate", "train"), keys, strict=True):
+            good = [r["worlds"] for r in bench.rows if "error" not in r and key in r]
             if good and (fit := line(bench.rows, key)):
                 limits[mode] = search(bench, mode, max(good), int((total - fit["fixed_bytes"]) / fit["bytes_per_world"]))
                 bench.save({"limits": limits})
