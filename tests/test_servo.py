@@ -89,6 +89,7 @@ def random_params(rng, shape) -> np.ndarray:
         "stribeck_peak": 0.02, "stribeck_speed": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
         "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0,
         "position_offset": 0.05, "position_scale": 0.1,
+        "standin_constant": 0.05, "standin_position": -0.2, "standin_speed": -0.01, "standin_drag": -0.002,
     }  # fmt: skip
     around = ("efficiency", "supply", "position_scale")
     out = np.empty((*shape, len(COLUMNS)))
@@ -407,6 +408,16 @@ def test_ripple_is_periodic_in_position():
         engine.t.qpos[:] = q
         servo.before_each()
         assert engine.t.qfrc_applied[0, 0].item() == pytest.approx(0.1 * math.sin(4 * q + 0.3), abs=1e-12)
+
+
+def test_stand_in_is_the_torque_it_states():
+    engine, servo = drive({"kp": 0.0, "standin_constant": 0.02, "standin_position": 0.3, "standin_speed": -0.01, "standin_drag": -0.005})
+    for q, v in ((0.0, 0.0), (0.5, 2.0), (-0.4, -3.0)):
+        engine.t.qpos[:], engine.t.qvel[:] = q, v
+        servo.before_each()
+        expected = 0.02 + 0.3 * q - 0.01 * v - 0.005 * v * abs(v)
+        got = engine.t.qfrc_applied[0, 0].item() - engine.field("dof_damping")[0, 0].item() * v  # before the step, v' = v
+        assert got == pytest.approx(expected, abs=1e-9)
 
 
 def test_send_and_reset_touch_masked_worlds_only():

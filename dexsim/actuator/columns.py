@@ -54,6 +54,11 @@ COLUMNS: tuple[Column, ...] = (
     # Encoder of the loop and of the reported position: measured = scale * position + offset.
     Column("position_offset", "rad", 0.0, -7.0, 7.0, "encoder zero error, added to the measured position"),
     Column("position_scale", "1", 1.0, 0.5, 2.0, "encoder scale: measured over true position"),
+    # Torque of nothing that is known: a regression of what a diagnosis could not name, marked as such (gap/standin.py).
+    Column("standin_constant", "N.m", 0.0, -1e3, 1e3, "stand-in: constant torque on the joint"),
+    Column("standin_position", "N.m/rad", 0.0, -1e3, 1e3, "stand-in: torque per position"),
+    Column("standin_speed", "N.m.s/rad", 0.0, -1e3, 1e3, "stand-in: torque per speed (negative brakes)"),
+    Column("standin_drag", "N.m.s2/rad2", 0.0, -1e3, 1e3, "stand-in: torque per speed times |speed| (negative brakes)"),
 )  # fmt: skip
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)

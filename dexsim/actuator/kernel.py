@@ -55,6 +55,8 @@ VISCOUS = INDEX["viscous_friction"]
 LOAD, LOAD_BACK = INDEX["load_friction"], INDEX["load_friction_backdriven"]
 RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE = INDEX["torque_ripple"], INDEX["ripple_per_turn"], INDEX["ripple_phase"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
+REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
+REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
 @lru_cache(maxsize=None)
@@ -180,6 +182,15 @@ def servo_kernel(real, voltage: bool):
         applied -= stiffness * dt * v
         damping += stiffness * dt
 
+        # The stand-in for what is not known; what of it brakes, or pulls like a spring, is taken at the end of the step.
+        pull = params[w, j, REST_POSITION]
+        brake = params[w, j, REST_SPEED] + params[w, j, REST_DRAG] * wp.abs(v)
+        applied += params[w, j, REST] + pull * qpos[w, dof_q[j]] + brake * v
+        spring = wp.max(zero, -pull)
+        applied -= spring * dt * v
+        brake = wp.max(zero, -brake)
+        damping += spring * dt
+
         # Dry friction: an interval of torques [-level (1 + a/2), +level (1 - a/2)], as a symmetric one and a constant.
         ratio_v = v / params[w, j, STRIBECK_SPEED]
         fraction = params[w, j, LOAD]
@@ -189,6 +200,7 @@ def servo_kernel(real, voltage: bool):
         level += params[w, j, STRIBECK_PEAK] * wp.exp(-ratio_v * ratio_v) + fraction * wp.abs(last)
         applied -= real(0.5) * params[w, j, ASYMMETRY] * level
 
+        damping += brake
         qfrc_applied[w, d] = applied + damping * v
         dof_damping[w, d] = base_damping[w, j] + params[w, j, VISCOUS] + damping
         dof_frictionloss[w, d] = level

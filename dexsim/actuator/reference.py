@@ -101,6 +101,12 @@ def servo(
     applied = applied - stiffness * dt * v
     damping = damping + stiffness * dt
 
+    pull = p["standin_position"]
+    brake = p["standin_speed"] + p["standin_drag"] * np.abs(v)
+    spring = np.maximum(0.0, -pull)
+    applied = applied + p["standin_constant"] + pull * q + brake * v - spring * dt * v
+    damping = damping + spring * dt + np.maximum(0.0, -brake)
+
     fraction = np.where(last * v < 0.0, p["load_friction_backdriven"], p["load_friction"])
     level = base_frictionloss + p["coulomb_friction"]
     level = level + p["stribeck_peak"] * np.exp(-((v / p["stribeck_speed"]) ** 2)) + fraction * np.abs(last)

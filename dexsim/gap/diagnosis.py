@@ -16,10 +16,10 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import inputs, judge, locate, stage, touch
+from dexsim.gap import inputs, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
-from dexsim.gap.findings import finding_parameters, model_changes, servo_changes
+from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
 from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
@@ -82,6 +82,7 @@ class Diagnosis:
     spans: dict[str, float] = field(default_factory=dict)
     touch: touch.TouchResult | None = None
     lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
+    standins: list[standin.StandIn] = field(default_factory=list)
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
 
@@ -227,6 +228,9 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     _with_touch(result, felt)
     result.lengths = lengths
     clock.lap("judging on held-out data")
+    if result.data["verdict"] in ("unknown", "partly_explained"):
+        _stand_in(result, outcomes, runs, train, test, span_train, span_test, floor, s.seed)
+        clock.lap("stand-in")
     if s.next_recording:
         _next(result, s, m, outcomes, [r for r in recordings if r is not None])
         clock.lap("next recording")
@@ -386,6 +390,19 @@ def trusted(before: float, after: float, noise: float) -> float:
     base = (1.3 * noise) ** 2
     left = max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
     return 1.0 - 0.5 * float(np.clip((left - 0.05) / 0.28, 0.0, 1.0))
+
+
+def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, floor: float, seed: int) -> None:
+    """Stand-ins for joints of which something is left that no effect explains."""
+    for case, search, outcome in outcomes:
+        if d.joints[case.joint]["after"] < 1.5 * floor:
+            continue
+        claimed = any(case.joint in f["where"]["joints"] and entry(f) is not None for f in d.data["findings"])
+        trial = search.polish(outcome.best if claimed else outcome.none)
+        found = standin.fit(case, runs, trial, train, test, span_train, span_test, seed)
+        if found is not None:
+            d.standins.append(found)
+            d.notes.append(found.text)
 
 
 def confounds(case: Case, train: list[int]) -> str:
@@ -710,12 +727,15 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     if d.servo is not None:
         d.servo.save(out / "servo.yaml")
         written.append(out / "servo.yaml")
+    if d.standins:
+        standin.write(d.servo, d.standins, out / "servo_standin.yaml")
+        written.append(out / "servo_standin.yaml")
     if d.model_spec is not None:
         try:
             d.model_spec.compile()
-            (out / "model.xml").write_text(d.model_spec.to_xml(), encoding="utf-8")
+            save_model(d.model_spec, out / "model.xml")
             written.append(out / "model.xml")
-        except (ValueError, mujoco.FatalError) as error:
+        except (ValueError, OSError, mujoco.FatalError) as error:
             d.notes.append(f"model.xml could not be written: {error}")
     if (d.data["next_recording"] or {}).get("commands"):
         written.append(out / d.data["next_recording"]["commands"])

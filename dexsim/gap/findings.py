@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,9 +130,27 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
 
         model = spec.compile()
         body = leaf_of(model, int(model.jnt_bodyid[model.joint(case.joint).id]))
-        if mass > 0:
-            name = model.body(body).name
+        name = model.body(body).name
+        if mass > 0 and spec.body(name).explicitinertial:  # geoms do not count there
+            spec.body(name).mass += mass
+            said.append(f"model.xml: {mass:.3g} kg added to {name}")
+        elif mass > 0:
             spec.body(name).add_geom(name=f"payload_{case.joint}", type=2, size=[0.004, 0, 0], mass=mass,
                                      pos=model.body_ipos[body].tolist(), contype=0, conaffinity=0, group=3)  # fmt: skip
             said.append(f"model.xml: {mass:.3g} kg added to {name}")
     return said
+
+
+def save_model(spec, path: Path) -> None:
+    """The model as `path`, with the mesh files that it names by relative paths copied beside it, so that it loads from there."""
+    import shutil
+
+    folder = Path(spec.modelfiledir or ".")
+    for mesh in spec.meshes:
+        if mesh.file and not Path(mesh.file).is_absolute():
+            name = Path(spec.meshdir or ".") / mesh.file
+            target = path.parent / name
+            if (folder / name).is_file() and (folder / name).resolve() != target.resolve():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / name, target)
+    path.write_text(spec.to_xml(), encoding="utf-8")

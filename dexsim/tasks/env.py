@@ -62,7 +62,7 @@ class HandEnv(VecEnv):
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
         shapes = library()
         self.shape_names = [_known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])]
-        spec = xhand.hand_spec()
+        spec = hand(cfg.get("model_file"))  # a checkpoint from before has none
         contact = self.task["contact"]
         d = contact["impedance"]
         if not 0.5 <= d < 1.0:
@@ -423,6 +423,26 @@ def _periods(sim: dict, task: dict) -> tuple[int, float]:
     if task["episode_s"] < control:
         raise UserError(f"task.episode_s={task['episode_s']}: must be at least one control period, {control} s")
     return k, control
+
+
+def hand(path: str | None) -> mujoco.MjSpec:
+    """The xHand, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
+
+    Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the hand."""
+    if path is None:
+        return xhand.hand_spec()
+    if not Path(path).expanduser().is_file():
+        raise UserError(f"model_file={path}: no such file")
+    try:
+        spec = mujoco.MjSpec.from_file(str(Path(path).expanduser()))
+        spec.compile()
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"model_file={path}: {' '.join(str(error).split())}") from None
+    has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
+    missing = [n for n in (*xhand.JOINTS, *xhand.TIP_BODIES, *xhand.TIP_GEOMS) if n not in has]
+    if missing:
+        raise UserError(f"model_file={path}: is not the xHand: it lacks {', '.join(missing[:4])}; tasks are for this hand")
+    return spec
 
 
 def _known_shape(name: str, shapes: dict) -> str:

@@ -1,0 +1,148 @@
+"""What a diagnosis hands on: servo.yaml as the centre and width of randomization, model.xml as the hand, the stand-in."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_gap import demo, motion, plant_run
+from worlds import grasp_cfg, grasp_env
+
+from dexsim.actuator.columns import INDEX
+from dexsim.actuator.table import ServoTable
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.gap import standin
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.prepare import build
+from dexsim.gap.runs import conditions
+from dexsim.gap.search import JointSearch
+from dexsim.recording import write
+from dexsim.recording.mechanism import drive, mechanism, recorded
+from dexsim.recording.realistic import realistic
+from dexsim.recording.schema import COMMANDS, Series
+
+JOINT = "index_joint2"
+
+
+@pytest.fixture(scope="module")
+def hand_servo(tmp_path_factory):
+    """The servo.yaml of a diagnosis of one xHand joint that hides dry friction, and the folder."""
+    folder = tmp_path_factory.mktemp("handed")
+    m = mechanism()
+    m.table.set(JOINT, "coulomb_friction", 0.06)
+    paths = []
+    for k in range(3):
+        t, value = motion(k, 5.0, k)
+        q = 0.8 + 0.5 * value / np.abs(value).max()
+        value = np.tile(q, (1, 1)).T
+        initial = np.full(12, 0.1)
+        initial[xhand.JOINTS.index(JOINT)] = q[0]
+        series = Series(t, value, COMMANDS, t.copy())
+        run = drive(m, series, [JOINT], 5.0, initial, timestep=0.002)
+        r = realistic(recorded(run, m, series, [JOINT]), seed=k)
+        r.meta["servo"] = ""
+        j = r.joints.index(JOINT)
+        r.joints = (JOINT,)
+        r.meta["joint_names"] = JOINT
+        for s in (r.commands, r.states.position):
+            s.value = s.value[:, j : j + 1]
+        r.states.effort = r.states.velocity = None
+        path = folder / f"{k}.mcap"
+        write(path, r)
+        paths.append(path)
+    d = diagnose(Settings(paths, folder / "out", next_recording=False), say=lambda _: None)
+    save(d, folder / "out")
+    return d, folder / "out"
+
+
+@pytest.mark.slow
+def test_fit_becomes_centre_and_width_of_randomization(hand_servo):
+    """Recording -> diagnosis -> `train.py servo_file=`: the fitted column of that joint is drawn from its interval, in every world."""
+    d, out = hand_servo
+    assert any(f["effect"] == "coulomb_friction" and f["where"]["joints"] == [JOINT] for f in d.data["findings"]), d.data["findings"]
+    value = ServoTable.load(out / "servo.yaml").value(JOINT, "coulomb_friction")
+    assert value.low < value.value < value.high and value.value == pytest.approx(0.06, rel=0.2)
+    env = grasp_env(f"servo_file={out / 'servo.yaml'}", worlds=64)
+    j, c = xhand.JOINTS.index(JOINT), INDEX["coulomb_friction"]
+    drawn = env.servo.params[:, j, c].double()
+    wide = value.high - value.low
+    assert float(drawn.min()) >= value.low - 1e-9 and float(drawn.max()) <= value.high + 1e-9
+    assert float(drawn.max() - drawn.min()) > 0.8 * wide and float(drawn.mean()) == pytest.approx(0.5 * (value.low + value.high), abs=0.2 * wide)
+    first = drawn.clone()
+    env.reset_all()
+    assert not torch.equal(first, env.servo.params[:, j, c].double())  # anew at each episode
+    other = env.servo.params[:, xhand.JOINTS.index("mid_joint2"), c].double()  # not diagnosed: the configured randomization
+    assert not ((other >= value.low) & (other <= value.high)).all()
+
+
+def test_model_file_is_the_hand_that_trains(tmp_path):
+    from types import SimpleNamespace
+
+    from dexsim.gap.findings import model_changes, save_model
+
+    spec = xhand.hand_spec()
+    case = SimpleNamespace(joint=JOINT)
+    said = model_changes(spec, case, None, {"inertia": {"armature": 3e-4}, "payload": {"mass": 0.015}})
+    assert len(said) == 2
+    path = tmp_path / "model.xml"
+    save_model(spec, path)
+    plain, changed = xhand.hand_spec().compile(), mujoco.MjModel.from_xml_path(str(path))
+    assert changed.body_mass.sum() == pytest.approx(plain.body_mass.sum() + 0.015)
+    env = grasp_env(f"model_file={path}", worlds=2)
+    e = env.engine
+    dof = e.dof_index([JOINT])[0]
+    base = grasp_env(worlds=2).engine
+    assert e.mjm.dof_armature[dof] == pytest.approx(base.mjm.dof_armature[base.dof_index([JOINT])[0]] + 3e-4)
+    assert e.mjm.body_mass.sum() == pytest.approx(base.mjm.body_mass.sum() + 0.015, rel=1e-6)
+    env.step(torch.zeros(2, 12))
+    for text, word in (("nowhere.xml", "no such file"), (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not the xHand")):
+        with pytest.raises(UserError, match=word):
+            grasp_env(f"model_file={text}", worlds=2)
+
+
+def _write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
+    """A drag that the catalogue has not (torque against speed times |speed|): regressed, judged, written, loaded by training."""
+    drag = -3e-2
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.005}}})
+    true = copy.deepcopy(table)
+    true.set("joint", "standin_drag", drag)
+    spec = mujoco.MjSpec.from_string(demo.MODEL)
+    from dexsim.gap.runs import Run
+    from dexsim.recording.mechanism import Mechanism
+
+    runs = []
+    for k in (0, 1, 3):
+        t, cmd = motion(k, 6.0, k)
+        full = drive(Mechanism(spec, ("joint",), true, "pendulum"), Series(t, cmd[:, None], COMMANDS, t), ["joint"], 6.0, timestep=1e-3)
+        pick = slice(0, None, 10)
+        runs.append(Run(f"r{k}", ("joint",), t, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81])))
+        runs[-1].smooth()
+    case = build(spec.compile(), runs)[0]
+    none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
+    found = standin.fit(case, runs, none, [0, 2], [1])
+    assert found is not None and found.after < 0.5 * found.before
+    assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
+    hand = ServoTable.from_dict(grasp_cfg()["servo"])
+    found.joint = JOINT
+    standin.write(hand, [found], tmp_path / "servo_standin.yaml")
+    env = grasp_env(f"servo_file={tmp_path / 'servo_standin.yaml'}", worlds=32)
+    drawn = env.servo.params[:, xhand.JOINTS.index(JOINT), INDEX["standin_drag"]]
+    assert float(drawn.min()) >= found.low[3] - 1e-6 and float(drawn.max()) <= found.high[3] + 1e-6 and float(drawn.std()) > 0
+
+
+def test_no_stand_in_where_nothing_is_left():
+    runs = [plant_run(f"r{k}", k, 4.0, {}, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
+    none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
+    assert standin.fit(case, runs, none, [0, 2], [1]) is None
