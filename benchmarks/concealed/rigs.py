@@ -76,6 +76,8 @@ def draw(rng: np.random.Generator, shape: str) -> Drawn:
     b |= {"torque_limit": weight * rng.uniform(5, 9, n), "no_load_speed": rng.uniform(9, 18, n), "coulomb": weight * rng.uniform(0.04, 0.1, n),
           "viscous": weight * rng.uniform(0.005, 0.02, n)}  # fmt: skip
     kd = 2 * rng.uniform(0.3, 0.6, n) * np.sqrt(kp * inertia)
+    if rig.com.shape[1] > 1:  # links shake one another
+        b["no_load_speed"] = 1.5 * b["no_load_speed"]
     voltage = bool(rng.uniform() < 0.25)
     if voltage:  # the motor's own back-EMF is the damping, as in a small hobby servo
         b["no_load_speed"] = np.maximum(b["no_load_speed"], b["torque_limit"] / (1.6 * np.sqrt(kp * inertia)))
@@ -96,7 +98,7 @@ def _scales(rig: Rig, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     M, h = dynamics(rig, tile(m), 0 * q, 0 * q + 1, q, 0 * q, np.tile(rig.gravity, (64, 1)))
     weight = np.abs(h.reshape(64, -1)).max(0)[rig.slots]
     inertia = np.einsum("bcdd->bcd", M).reshape(64, -1).mean(0)[rig.slots]
-    return np.maximum(weight, 0.25 * weight.max()), inertia
+    return np.maximum(weight, 0.4 * weight.max()), inertia
 
 
 def _finish(rng, rig, shape, b, unit, inertia, low, high, voltage, motor_side) -> Drawn:

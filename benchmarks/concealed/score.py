@@ -212,6 +212,8 @@ def table(results: list[dict]) -> dict[str, dict]:
     rate("false alarm, xHand", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "hand"])
     rate("outside the catalogue: not claimed", [r["humble"] for r in results if r["group"] == "outside"])
     rate("decoys seen through", [r["caught"] for r in results if r["group"] == "decoy"])
+    for decoy in sorted({r["decoy"] for r in results if r["decoy"]}):
+        rate(f"  {decoy.replace('_', ' ')}", [r["caught"] for r in results if r["decoy"] == decoy])
     rate("confident and wrong, all cases", [r["wrong_sure"] for r in results])
     return lines
 

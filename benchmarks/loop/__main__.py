@@ -1,0 +1,389 @@
+"""The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
+
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=dry,late] [seeds=3] [naive_s=150] [tune_s=120] [gpus=0,1,...]
+                              [cpus=N] [episodes=grasp:256,rotate:64] [out=out/loop] [stop_s=0] [report=false]
+
+For each task and seed: the included policy goes on in the believed simulator without randomization of the drives (naive). Then three
+fine-tunes of the naive checkpoint at the same number of iterations: with the servo table that `diagnose` fitted to recordings made in
+the reality (its intervals are the randomization), with wide randomization of the believed drives alone, and with the true drives and
+touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
+training, as many at a time as there are GPUs; judging, recording and diagnosing use the CPUs meanwhile. Resumable: a step that is
+done is not repeated. stop_s: seconds after which nothing more is begun. Writes loop.json, table.md, loop.png.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).parents[2]
+SETTINGS = {"tasks": "grasp,rotate", "worlds": "dry,late", "seeds": "3", "naive_s": "150", "tune_s": "120", "gpus": "", "cpus": str(os.cpu_count() or 1),
+            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60"}  # fmt: skip
+# what is judged: file key, larger is better
+METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
+           "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
+FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "efficiency": 1.0, "deadband": 0.0, "delay": 0.0, "coulomb_friction": 1.0,
+         "torque_ripple": 0.0}  # fmt: skip
+WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
+        "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
+VARIANTS = ("naive", "wide", "fitted", "truth")
+
+
+@dataclass
+class Job:
+    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or the CPU threads."""
+
+    name: str
+    mark: Path
+    run: object
+    gpu: bool
+    after: list[str] = field(default_factory=list)
+    rank: int = 0
+
+
+class Queue:
+    """Runs jobs on GPUs and CPU slots as their predecessors finish."""
+
+    def __init__(self, jobs: list[Job], gpus: list[str], cpu_slots: int, stop_s: float):
+        self.jobs = {j.name: j for j in jobs}
+        self.gpus, self.cpu_slots, self.stop_s = list(gpus), cpu_slots, stop_s
+        self.state = {j.name: "done" if j.mark.is_file() else "waits" for j in jobs}
+        self.lock, self.begun = threading.Condition(), time.perf_counter()
+
+    def go(self) -> None:
+        """Until nothing can be begun any more."""
+        threads: list[threading.Thread] = []
+        with self.lock:
+            while True:
+                out_of_time = self.stop_s and time.perf_counter() - self.begun > self.stop_s
+                for job in sorted(self.jobs.values(), key=lambda j: j.rank):
+                    if self.state[job.name] != "waits" or out_of_time:
+                        continue
+                    before = [self.state[a] for a in job.after]
+                    if "failed" in before:
+                        self.state[job.name] = "failed"
+                        print(f"  {job.name}: left out, what it needs failed", flush=True)
+                        continue
+                    if any(s != "done" for s in before):
+                        continue
+                    if job.gpu and not self.gpus or not job.gpu and not self.cpu_slots:
+                        continue
+                    slot = self.gpus.pop(0) if job.gpu else "cpu"
+                    self.cpu_slots -= 0 if job.gpu else 1
+                    self.state[job.name] = "runs"
+                    threads.append(threading.Thread(target=self._one, args=(job, slot), daemon=True))
+                    threads[-1].start()
+                if not any(s == "runs" for s in self.state.values()):
+                    break
+                self.lock.wait(1.0)
+
+    def _one(self, job: Job, slot: str) -> None:
+        start = time.perf_counter()
+        try:
+            good = bool(job.run(slot))
+        except Exception as error:  # the others go on
+            print(f"  {job.name}: {type(error).__name__}: {error}", flush=True)
+            good = False
+        if good:
+            job.mark.parent.mkdir(parents=True, exist_ok=True)
+            job.mark.write_text(f"{time.perf_counter() - start:.1f}\n", encoding="utf-8")
+        with self.lock:
+            self.state[job.name] = "done" if good else "failed"
+            if job.gpu:
+                self.gpus.append(slot)
+            else:
+                self.cpu_slots += 1
+            done = sum(s in ("done", "failed") for s in self.state.values())
+            spent = time.perf_counter() - self.begun
+            print(f"  {done}/{len(self.state)} {job.name} {'done' if good else 'FAILED'} {time.perf_counter() - start:.0f} s; {spent:.0f} s spent", flush=True)
+            self.lock.notify_all()
+
+
+class Loop:
+    """The jobs and where their results are."""
+
+    def __init__(self, s: dict[str, str]):
+        self.s, self.out = s, Path(s["out"]).expanduser().resolve()
+        self.tasks, self.worlds = s["tasks"].split(","), s["worlds"].split(",")
+        self.seeds = list(range(1, int(s["seeds"]) + 1))
+        self.gpus = [g for g in s["gpus"].split(",") if g] or ["cpu"]
+        self.episodes = {k: int(v) for k, v in (part.split(":") for part in s["episodes"].split(","))}
+        self.extra = [x for x in s["train"].split(" ") if x]
+        cores = int(s["cpus"])
+        self.slots = max(cores // 8, 1)
+        self.threads = max(cores // self.slots, 1)
+
+    def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 1200.0, on_poll=None) -> int:
+        """A command of the product, its output in a file. gpu: the one that it sees."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        env = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
+        with open(log, "w", encoding="utf-8") as file:
+            process = subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
+            begun = time.perf_counter()
+            while True:
+                try:
+                    return process.wait(0.5)
+                except subprocess.TimeoutExpired:
+                    if on_poll is not None and on_poll():
+                        process.send_signal(signal.SIGINT)
+                        on_poll = None
+                    if time.perf_counter() - begun > limit:
+                        process.kill()
+                        return 124
+
+    def folder(self, task: str, seed: int, world: str = "") -> Path:
+        return self.out / f"{task}_{seed}" / world
+
+    def device(self, slot: str) -> str:
+        return "cpu" if slot == "cpu" else "cuda"
+
+    def naive(self, task: str, seed: int):
+        def run(slot: str) -> bool:
+            where = self.folder(task, seed)
+            shutil.rmtree(where / "naive", ignore_errors=True)
+            device = self.device(slot)
+            if not (where / "start.pt").is_file():
+                fixed = [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, FIXED).items()]
+                status = self.call(["-m", "benchmarks.loop.steps", "start", f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"out={where / 'start.pt'}",
+                                    f"device={device}", f"seed={seed}", *fixed], where / "start.log", slot)  # fmt: skip
+                if status:
+                    return False
+            progress = where / "naive" / "progress.csv"
+            first: list[float] = []
+
+            def enough() -> bool:
+                if progress.is_file() and not first:
+                    first.append(time.perf_counter())
+                return bool(first) and time.perf_counter() - first[0] > float(self.s["naive_s"])
+
+            worlds = [] if device == "cpu" else ["worlds=8192"]
+            self.call(["train.py", f"resume={where / 'start.pt'}", "iterations=1000000", f"out={where / 'naive'}", f"device={device}", "final_episodes=0",
+                       "save_interval=100000", *worlds, *self.extra], where / "naive.log", slot, on_poll=enough)  # fmt: skip
+            return (where / "naive" / "last.pt").is_file()
+
+        return run
+
+    def _ranges(self, task: str, values: dict) -> dict:
+        """Those that the task's randomization has."""
+        own = yaml.safe_load((ROOT / "configs" / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(encoding="utf-8"))["servo"]
+        return {k: v for k, v in values.items() if k in own}
+
+    def tune(self, task: str, seed: int, variant: str, world: str):
+        def run(slot: str) -> bool:
+            base = self.folder(task, seed)
+            where = base / (f"tune_{variant}" if variant == "wide" else f"{world}/tune_{variant}")
+            shutil.rmtree(where, ignore_errors=True)
+            with open(base / "naive" / "progress.csv", newline="", encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+            each = float(np.median([float(r["collect_s"]) + float(r["learn_s"]) for r in rows]))
+            # the same for all variants and seeds of a task whose naive ran as fast; rounded so that it is the same number
+            more = max(int(round(float(self.s["tune_s"]) / each, -1)), 5)
+            argv = ["train.py", f"resume={base / 'naive' / 'last.pt'}", f"iterations={int(float(rows[-1]['iteration'])) + more}", f"out={where}",
+                    f"device={self.device(slot)}", "final_episodes=0", "save_interval=100000", *self.extra]  # fmt: skip
+            if variant == "wide":
+                argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
+            elif variant == "fitted":
+                argv.append(f"servo_file={base / world / 'diagnosis' / 'servo.yaml'}")
+            else:
+                true = yaml.safe_load((ROOT / "configs" / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
+                (base / world).mkdir(parents=True, exist_ok=True)
+                (base / world / "true.yaml").write_text(yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8")
+                argv.append(f"servo_file={base / world / 'true.yaml'}")
+                argv += [f"tactile.{k}={str(v).lower() if isinstance(v, bool) else v}" for k, v in true["tactile"].items()]
+            self.call(argv, where.parent / f"{where.name}.log", slot, limit=5 * float(self.s["tune_s"]) + 120)
+            return (where / "policy.pt").is_file()
+
+        return run
+
+    def policy(self, task: str, seed: int, variant: str, world: str) -> Path:
+        base = self.folder(task, seed)
+        return base / {"naive": "naive", "wide": "tune_wide"}.get(variant, f"{world}/tune_{variant}") / "policy.pt"
+
+    def judge(self, task: str, seed: int, variant: str, world: str):
+        def run(slot: str) -> bool:
+            where = self.folder(task, seed, world) / f"judged_{variant}"
+            cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
+            # the first run of the naive policy is recorded as well: its own motion in the reality
+            own = [f"record={self.folder(task, seed, world) / 'recordings' / 'policy.mcap'}", "record_worlds=2", "realistic=true"] if variant == "naive" else []
+            if own:
+                (self.folder(task, seed, world) / "recordings").mkdir(parents=True, exist_ok=True)
+            status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}", f"episodes={self.episodes[task]}",
+                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.threads}", *cap, *own], where / "log.txt", limit=400)  # fmt: skip
+            return status == 0 and (where / "metrics.json").is_file()
+
+        return run
+
+    def excite(self, world: str):
+        def run(slot: str) -> bool:
+            where = self.out / f"excited_{world}"
+            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=4"], where / "log.txt") == 0
+
+        return run
+
+    def diagnose(self, task: str, seed: int, world: str):
+        def run(slot: str) -> bool:
+            where = self.folder(task, seed, world)
+            excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
+            own = sorted((where / "recordings").glob("policy*.mcap"))
+            fit, held = [*excited[:-1], *own[:1]], excited[-1:]
+            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", f"out={where / 'diagnosis'}", "next=false"]
+            if self.call(argv, where / "diagnosis.log", limit=300) == 0 and (where / "diagnosis" / "servo.yaml").is_file():
+                return True
+            # a policy's run that cannot be used must not cost the loop: what was excited alone
+            argv[1] = f"recordings=[{','.join(map(str, excited[:-1]))}]"
+            return self.call(argv, where / "diagnosis_again.log", limit=300) == 0 and (where / "diagnosis" / "servo.yaml").is_file()
+
+        return run
+
+    def jobs(self) -> list[Job]:
+        """All steps; those that others wait for come first."""
+        out = [Job(f"excite {w}", self.out / f"excited_{w}" / "done", self.excite(w), False, [], 0) for w in self.worlds]
+        for task in self.tasks:
+            for seed in self.seeds:
+                base, name = self.folder(task, seed), f"{task} {seed}"
+                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1))
+                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5 + seed))
+                for w in self.worlds:
+                    here = self.folder(task, seed, w)
+                    add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
+                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank))
+                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 1)
+                    add("diagnose", self.diagnose(task, seed, w), False, [f"judge naive {name} {w}", f"excite {w}"], 1)
+                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {name} {w}"], 2 + seed)
+                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 3 + seed)
+                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
+                    for variant in ("fitted", "truth"):
+                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], 8)
+        return out
+
+    def report(self) -> dict:
+        """The table: by task, world and measure, the mean of each variant over seeds, and the share of the loss recovered."""
+        lines = []
+        for task in self.tasks:
+            for world in self.worlds:
+                for key, larger, label, unit in METRICS[task]:
+                    values: dict[str, list[float]] = {v: [] for v in VARIANTS}
+                    for seed in self.seeds:
+                        row = {v: self._metric(task, seed, world, v, key) for v in VARIANTS}
+                        for v in VARIANTS:
+                            values[v].append(math.nan if row[v] is None else row[v] * unit)
+                    x = {v: np.array(values[v]) for v in VARIANTS}
+                    line = {"task": task, "world": world, "measure": label, "larger_is_better": larger, "values": values}
+                    for other in ("fitted", "wide"):
+                        both = np.isfinite(x["naive"]) & np.isfinite(x["truth"]) & np.isfinite(x[other])
+                        if both.any():
+                            line[f"recovered_{other}"] = _ratio(x["naive"][both], x[other][both], x["truth"][both])
+                    lines.append(line)
+        found = {}
+        for task in self.tasks:
+            for seed in self.seeds:
+                for world in self.worlds:
+                    path = self.folder(task, seed, world) / "diagnosis" / "diagnosis.json"
+                    if path.is_file():
+                        d = json.loads(path.read_text(encoding="utf-8"))
+                        found[f"{task} {seed} {world}"] = {"verdict": d["verdict"], "before": d["held_out"]["before"], "after": d["held_out"]["after"],
+                                                          "findings": [[f["effect"], f["where"]["joints"], round(f["confidence"], 2)] for f in d["findings"]]}  # fmt: skip
+        return {"benchmark": "loop", "settings": self.s, "lines": lines, "diagnoses": found}
+
+    def _metric(self, task: str, seed: int, world: str, variant: str, key: str) -> float | None:
+        path = self.folder(task, seed, world) / f"judged_{variant}" / "metrics.json"
+        if not path.is_file():
+            return None
+        node = json.loads(path.read_text(encoding="utf-8"))
+        for part in key.split("."):
+            node = (node or {}).get(part)
+        return None if node is None else float(node)
+
+
+def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
+    """(mean other - mean naive) / (mean truth - mean naive), with a 95 % interval by resampling seeds."""
+    rng = np.random.default_rng(0)
+    draws = []
+    for _ in range(2000):
+        i = rng.integers(0, len(naive), len(naive))
+        gap = truth[i].mean() - naive[i].mean()
+        if abs(gap) > 1e-9:
+            draws.append((other[i].mean() - naive[i].mean()) / gap)
+    gap = truth.mean() - naive.mean()
+    value = float((other.mean() - naive.mean()) / gap) if abs(gap) > 1e-9 else math.nan
+    low, high = (float(v) for v in np.percentile(draws, (2.5, 97.5))) if draws else (math.nan, math.nan)
+    return {"value": value, "low": low, "high": high, "seeds": len(naive)}
+
+
+def markdown(data: dict) -> str:
+    """The table as Markdown."""
+    text = ["| task, reality | measure | naive | wide | fitted | true physics | recovered by fitted | by wide |", "|---|---|---|---|---|---|---|---|"]
+    for line in data["lines"]:
+        cells = []
+        for v in VARIANTS:
+            x = np.array([a for a in line["values"][v] if a == a])
+            cells.append("-" if not len(x) else f"{x.mean():.3g}" + (f" ± {x.std(ddof=1) / math.sqrt(len(x)):.2g}" if len(x) > 1 else ""))
+        shares = [f"{r['value']:.2f} ({r['low']:.2f} to {r['high']:.2f})" if (r := line.get(f"recovered_{o}")) else "-" for o in ("fitted", "wide")]
+        text.append(f"| {line['task']}, {line['world']} | {line['measure']} | " + " | ".join(cells + shares) + " |")
+    return "\n".join(text) + "\n"
+
+
+def figure(data: dict, path: Path) -> None:
+    """Each policy in each reality, a point a seed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    lines = [x for x in data["lines"] if any(a == a for v in x["values"].values() for a in v)]
+    if not lines:
+        return
+    fig, axes = plt.subplots(1, len(lines), figsize=(3.0 * len(lines), 3.2), squeeze=False)
+    for ax, line in zip(axes[0], lines, strict=True):
+        for k, v in enumerate(VARIANTS):
+            y = [a for a in line["values"][v] if a == a]
+            ax.plot([k] * len(y), y, "o", color=("#888888", "#c98f2b", "#2b6cb0", "#2f855a")[k], alpha=0.8)
+            if y:
+                ax.plot([k - 0.25, k + 0.25], [np.mean(y)] * 2, color="black", lw=1.5)
+        ax.set_xticks(range(len(VARIANTS)), ["naive", "wide", "fitted", "true"], fontsize=8)
+        ax.set_title(f"{line['task']} in {line['world']}\n{line['measure']}", fontsize=9)
+        ax.set_xlim(-0.5, len(VARIANTS) - 0.5)
+        ax.grid(axis="y", alpha=0.3)
+    fig.tight_layout()
+    fig.savefig(path, dpi=130)
+    plt.close(fig)
+
+
+def main(argv: list[str]) -> dict:
+    """Runs what is not done yet and reports; returns what the JSON line says."""
+    s = dict(SETTINGS)
+    for item in argv:
+        key, equals, value = item.partition("=")
+        if not equals or key not in s:
+            raise SystemExit(f"'{item}' is not a setting; valid: {', '.join(s)} (key=value)")
+        s[key] = value
+    loop = Loop(s)
+    loop.out.mkdir(parents=True, exist_ok=True)
+    if s["report"] != "true":
+        queue = Queue(loop.jobs(), loop.gpus, loop.slots, float(s["stop_s"]))
+        queue.go()
+    data = loop.report()
+    (loop.out / "loop.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
+    (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")
+    figure(data, loop.out / "loop.png")
+    print("\n" + markdown(data))
+    print(json.dumps({"benchmark": "loop", "lines": [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]}))
+    return data
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,64 @@
+"""The concealed realities of the loop: other contacts, solver, timing and touch, and drives with effects that the belief lacks.
+
+    python -m benchmarks.loop.worlds        # writes configs/reality/dry.yaml and late.yaml, drawn once
+
+Built as `dexsim.tasks.reality` builds its own, but the drives are the believed ones, each quantity off by up to 3 %, with
+two or three effects of the catalogue in every joint. dry: less gain, more dry friction, friction that grows with load. late:
+a delay, a lag, a lower no-load speed.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+SEEDS = {"dry": 4101, "late": 4102}
+ROOT = Path(__file__).parents[2]
+
+
+def draw(name: str) -> dict:
+    """The numbers of a world."""
+    from dexsim.assets import xhand
+    from dexsim.tasks.reality import draw as other
+
+    nominal = yaml.safe_load((ROOT / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    world = other(SEEDS[name], nominal)
+    rng = np.random.default_rng(SEEDS[name])
+    joints = {}
+    for joint in xhand.JOINTS:
+        b = nominal["joints"]["*"] | nominal["joints"].get(joint, {})
+        p = {k: b[k] * rng.uniform(0.97, 1.03) for k in ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction")}
+        p["delay"] = b["delay"]
+        if name == "dry":
+            p["kp"] *= rng.uniform(0.45, 0.6)
+            p["coulomb_friction"] *= rng.uniform(2.5, 4.0)
+            p["load_friction"], p["load_friction_backdriven"] = rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.5)
+        else:
+            p["delay"] += rng.uniform(0.025, 0.035)
+            p["lag"] = rng.uniform(0.015, 0.025)
+            p["no_load_speed"] *= rng.uniform(0.4, 0.55)
+        joints[joint] = {k: float(f"{v:.4g}") for k, v in p.items()}
+    world["name"], world["seed"], world["servo"]["joints"] = name, SEEDS[name], joints
+    return world
+
+
+def main() -> int:
+    """Writes the files."""
+    from dexsim.tasks.reality import text
+
+    for name in SEEDS:
+        path = ROOT / "configs" / "reality" / f"{name}.yaml"
+        body = text(draw(name)).split("\n")
+        kept = [line for line in body if not line.startswith("#")]
+        head = [f"# A concealed reality of the closed loop (`python -m benchmarks.loop`), standing in for hardware: never trained in.",  # noqa: F541
+                "# Drawn once, not tuned: python -m benchmarks.loop.worlds. What it hides is in its servo; see benchmarks/loop/worlds.py."]
+        path.write_text("\n".join(head + kept), encoding="utf-8")
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
