@@ -250,6 +250,7 @@ def test_a_healthy_pad_has_no_findings():
     assert not p.dead and not p.swapped and not p.unseen
     assert p.scale == pytest.approx(0.1, rel=0.05) and 0.5 < p.threshold <= 1.0
     assert p.held_out <= p.held_out_equal and p.hysteresis < 0.03
+    assert rubber.read_curve("treloar")[0] == "stress"
 
 
 @pytest.mark.parametrize("with_load", [True, False])
@@ -264,6 +265,44 @@ def test_gains_are_found_and_tell_held_out_loads_better():
     x, load = rolled(n=300, gains=gains, seed=1)
     p = taxels.inspect(x, load)
     assert np.corrcoef(p.gain, gains)[0, 1] > 0.9 and p.held_out < p.held_out_equal
+
+
+@pytest.fixture(scope="module")
+def pads():
+    """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp edges."""
+    return simulate.delivered(simulate.rolled_recording(160, seed=3, frames=12), 3)
+
+
+def of_pad(r, f):
+    load = r.external_force.value[:, 2]
+    total = r.tactile.value[..., 2].sum(2)
+    mine = (total.argmax(1) == f) | (total.max(1) <= np.percentile(total.max(1), 10))
+    return r.tactile.value[mine, f, :, 2], load[mine]
+
+
+def test_healthy_simulated_pads_have_no_findings(pads):
+    """Beyond a contact's edge a healthy taxel feels nothing, and is not called dead for it."""
+    for f in range(5):
+        p = taxels.inspect(*of_pad(pads, f))
+        assert not p.dead and not p.swapped and len(p.unseen) <= 5, xhand.FINGERS[f]
+        assert p.scale == pytest.approx(0.1, rel=0.02) and p.held_out < 0.05 and p.hysteresis < 0.01
+        assert taxels.inspect(of_pad(pads, f)[0], None).dead == []
+
+
+def test_faults_of_a_simulated_pad_are_found(pads):
+    x, load = of_pad(pads, 1)
+    rng = np.random.default_rng(0)
+    gains = np.exp(0.15 * rng.standard_normal(120))
+    x = np.round(x / gains)
+    x[:, [20, 90]] = x[:, [90, 20]]
+    x[:, [53, 54, 77]] = 0
+    p = taxels.inspect(x, load)
+    assert set(p.dead) <= {53, 54, 77} and set(p.dead) | set(p.unseen) >= {53, 54, 77} and len(p.dead) >= 2, "silent, and nothing else is dead"
+    assert p.swapped == [(20, 90)] and p.held_out < 0.95 * p.held_out_equal
+    x, load = of_pad(pads, 2)  # a pad without dead taxels, whose neighbours make up for what they miss
+    p = taxels.inspect(np.round(x / gains), load)
+    rest = np.setdiff1d(np.arange(120), p.unseen)
+    assert np.corrcoef(p.gain[rest], gains[rest])[0, 1] > 0.7 and p.held_out < 0.5 * p.held_out_equal
 
 
 def test_an_untouched_pad_says_so():

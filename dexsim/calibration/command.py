@@ -12,6 +12,7 @@ import yaml
 
 from dexsim.errors import UserError
 
+LINEAR_R2 = 0.97  # a press curve under this is not called linear
 CHOICES = {"normalization": ("matched", "paper")}
 
 
@@ -22,8 +23,8 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
         print(_help(file), end="")
         return 0 if argv else 2
     s, meta = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
-    if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate")):
-        raise UserError("say what to calibrate: real=, sim=, simulate=true, touch= or curve= (--help)")
+    if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate", "simulate_touch")):
+        raise UserError("say what to calibrate: real=, sim=, simulate=true, touch=, simulate_touch=true or curve= (--help)")
     return run(s, meta)
 
 
@@ -45,6 +46,10 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
         key = "real" if s["realistic"] else "sim"
         if s[key] is None:
             s[key] = ",".join(str(p) for p in made)
+    if s["simulate_touch"]:
+        quiet_warp("cpu")
+        made = simulate.make_rolled(out / "pads", True, int(s["seed"]), s["faults"])
+        s["touch"] = s["touch"] or str(made)
     for key, effort_is, symbol in (("real", "current_A", "alpha"), ("sim", "torque_Nm", "beta")):
         if not s[key]:
             continue
@@ -141,7 +146,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
     count = lsb if lsb is not None else (float(np.mean(scales)) if scales else None)
     result["lsb"] = float(f"{np.mean(scales):.6g}") if scales and unit == "count" else (count if unit == "count" else None)
     for finger, p in found.items():
-        words = [f"threshold {p.threshold:.3g} {unit}", f"{len(p.dead)} dead", f"{len(p.swapped)} swapped pairs", f"{len(p.unseen)} never pressed"]
+        words = [f"threshold {p.threshold:.3g} {unit}", f"{len(p.dead)} dead", f"{len(p.swapped)} swapped pairs", f"{len(p.unseen)} not pressed enough to tell"]
         if p.gain is not None:
             words.append(f"{p.scale:.4g} N a {unit}, load on held-out presses to {100 * p.held_out:.1f} %"
                          f" ({100 * p.held_out_equal:.1f} % with equal gains), hysteresis {100 * p.hysteresis:.1f} %")  # fmt: skip
@@ -176,7 +181,9 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
         loop = f", hysteresis {100 * k.hysteresis:.1f} %" if np.isfinite(k.hysteresis) else ""
         print(f"curve    linear stiffness {k.value:.4g} [{k.low:.4g}, {k.high:.4g}] N/m, R2 {k.r2:.4f}, held out {k.held_out:.3g} N{loop}")
         print(f"plot     {charts.press(a, b, k, out / 'press.png')}")
-        result["stiffness"] = {"value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out}
+        result["stiffness"] = {"value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out, "linear": k.r2 >= LINEAR_R2}
+        if k.r2 < LINEAR_R2:
+            print(f"note     R2 under {LINEAR_R2}: the force does not grow in proportion to depth; the Mooney-Rivlin fit (area=) may hold")
         if s["area"] is None:
             print("note     area= is not given: no rubber constants from force and depth")
             return result

@@ -130,7 +130,10 @@ def fit_linear(depth: np.ndarray, force: np.ndarray) -> Stiffness:
 
 
 def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
-    """A CSV with columns depth_m, force_N or stretch, stress_Pa: ("press" | "stress", first, second). Raises UserError."""
+    """A CSV with columns depth_m, force_N or stretch, stress_Pa, or "treloar": ("press" | "stress", first, second). Raises
+    UserError."""
+    if str(path) == "treloar":
+        return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()
     try:
         with open(path, newline="", encoding="utf-8") as file:

@@ -12,10 +12,12 @@ from dexsim.assets import xhand
 from dexsim.calibration.presses import finger_of
 from dexsim.errors import UserError
 from dexsim.recording import mechanism
-from dexsim.recording.schema import COMMANDS, TACTILE, Recording, Series
+from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
 from dexsim.sim import ContactPair
 
 RADIUS = 0.012  # m, of the ball
+STIFFNESS = 7000.0  # N/m of a fingertip, as in training
+PLANTED_DEAD, PLANTED_SWAP = (42, 43, 77), (30, 66)
 GAP = 0.0015  # m between skin and ball at the start
 RAMP_S, HOLD_S, RATE = 0.2, 0.4, 100.0
 POSE = {"thumb_bend_joint": 0.9, "thumb_rota_joint1": 0.3, "thumb_rota_joint2": 0.4, "index_bend_joint": 0.0,
@@ -24,7 +26,7 @@ POSE = {"thumb_bend_joint": 0.9, "thumb_rota_joint1": 0.3, "thumb_rota_joint2": 
 """rad: half bent, so that every joint can turn further."""
 
 
-def press_recording(joint: str, servo: dict | str | Path | None = None, levels: int = 8, most: float = 0.8, stiffness: float = 7000.0,
+def press_recording(joint: str, servo: dict | str | Path | None = None, levels: int = 8, most: float = 0.8, stiffness: float = STIFFNESS,
                     timestep: float = 0.002) -> Recording:
     """One joint presses: up a ladder of `levels` torques to the share `most` of its torque limit (less where another joint of the
     finger could not hold against it), and down again; torque in N.m, touch in N. The finger's other joints lean in by what they
@@ -82,6 +84,91 @@ def make(out: str | Path, joints: Sequence[str] = xhand.JOINTS, servo: dict | st
         paths.append(path)
         say(f"mcap     {path}: {recording.duration:.1f} s")
     return paths
+
+
+def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Recording:
+    """A ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and /external_force [N], the hand at
+    rest. Each of `presses` places a finger is pressed to 2..8 N and let go within `frames` samples, and followed by a rest."""
+    import torch
+
+    from dexsim.assets.objects import library
+    from dexsim.tactile.layout import xhand_layout
+    from dexsim.tactile.posed import PosedEngine
+    from dexsim.tactile.shapes import ShapeSet
+    from dexsim.tactile.tactile import Tactile
+
+    rng = np.random.default_rng(seed)
+    rest = 6
+    n, pairs = len(xhand.FINGERS) * presses * (frames + rest), [f"tip_{x}" for x in xhand.FINGERS]
+    centre, force = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, 5))
+    row = 0
+    for f, finger in enumerate(xhand.FINGERS):
+        table = xhand.taxel_table(finger)
+        for _ in range(presses):
+            k = int(rng.integers(xhand.TAXELS_PER_FINGER))
+            point = table["position"][k] + 1e-3 * rng.uniform(-1, 1, 3)
+            size = rng.uniform(2.0, 8.0) * np.sin(np.pi * (np.arange(frames) + 0.5) / frames) ** 2
+            force[row : row + frames, f] = size
+            centre[row : row + frames] = point + np.outer(RADIUS - size / STIFFNESS, table["normal"][k])
+            row += frames + rest
+    posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
+    touch = Tactile(posed, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
+                    tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])
+    posed.t.xpos[:, :5] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(5)])  # the pads, far apart
+    posed.t.xmat[:] = torch.eye(3)
+    active = force.argmax(1)
+    posed.t.xpos[:, 5] = torch.as_tensor(centre + np.where(force.max(1, keepdims=True) > 0, 10.0 * (active[:, None] + 1) * [[1.0, 0, 0]], 0),
+                                         dtype=torch.float32)  # fmt: skip
+    posed.t.pair_normal[:, :5] = torch.as_tensor(force, dtype=torch.float32)
+    touch.shape_id.fill_(0)
+    touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
+    touch.launch()
+    felt = np.zeros((n, 5, xhand.TAXELS_PER_FINGER, 3))
+    felt[..., 2] = touch.raw.numpy()
+    t = np.arange(n) * 2 / RATE
+    load = np.zeros((n, 6))
+    load[:, 2] = felt[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
+    pose = np.tile([POSE[x] for x in xhand.JOINTS], (n, 1))
+    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS), "effort_is": "torque_Nm", "effort_sign": "+1",
+                       "tactile_unit": "N", "tactile_lsb": "1", "notes": f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"}
+    series = lambda x, topic: Series(t, x, topic, t.copy())  # noqa: E731
+    return Recording(Path("rolled.mcap"), meta, xhand.JOINTS, Series.empty(COMMANDS, 12), States(series(pose, STATES), None, series(0 * pose, STATES)),
+                     tactile=Series(t, felt, TACTILE), external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
+                     start_ns=1_000_000_000)  # fmt: skip
+
+
+def delivered(recording: Recording, seed: int = 0) -> Recording:
+    """A press recording as the hardware would have delivered it. The load cell is read with the taxels, which hold their last
+    value: else that delay would look like hysteresis."""
+    from dexsim.recording.realistic import realistic
+
+    dense, out = recording.external_force, realistic(recording, seed)
+    t = out.tactile.t
+    held = dense.value[np.clip(np.searchsorted(dense.t, t, side="right") - 1, 0, None)]
+    out.external_force = Series(t, held, dense.topic, t.copy(), dense.frame)
+    return out
+
+
+def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: bool = False, say: Callable[[str], None] = print) -> Path:
+    """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on the index finger, as a
+    rehearsal; what was planted is said."""
+    from dexsim.cli import folder
+    from dexsim.recording.writer import write
+
+    recording = rolled_recording(seed=seed)
+    if faults:
+        rng = np.random.default_rng([seed, 1])
+        z = recording.tactile.value[..., 2]
+        z /= np.exp(0.15 * rng.standard_normal((5, xhand.TAXELS_PER_FINGER)))
+        z[:, 1, list(PLANTED_DEAD)] = 0.0
+        z[:, 1, list(PLANTED_SWAP)] = z[:, 1, list(PLANTED_SWAP[::-1])]
+        say(f"planted  index finger: dead {list(PLANTED_DEAD)}, swapped {PLANTED_SWAP}; every pad: gains of 15 % spread")
+    if realistic:
+        recording = delivered(recording, seed)
+    path = folder.make(Path(out).expanduser(), "out=") / "rolled.mcap"
+    write(path, recording)
+    say(f"mcap     {path}: {recording.duration:.1f} s")
+    return path
 
 
 def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Series:

@@ -5,6 +5,7 @@ Readings of one pad are [T, 120]; taxel k = column * 12 + row, neighbours are th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -77,68 +78,135 @@ def inspect(readings: np.ndarray, load: np.ndarray | None = None) -> Pad:
 
 
 def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[list[int], list[int]]:
-    """(dead, unseen): taxels that stay under a tenth of their neighbours' mean whenever that is well over the threshold,
-    and taxels whose neighbourhood was never pressed that hard."""
+    """(dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the presses do not tell.
+
+    One pressed side is not enough: a contact has an edge, and beyond it a healthy taxel feels nothing. A taxel must feel
+    something between two pressed ones, on opposite sides of it; and in most of the presses whose strongest taxel lies beside it,
+    as the pad's other taxels do: it is dead where such silence had a chance under 1e-4.
+    """
     strong = max(4 * threshold, 0.1 * np.percentile(clean.max(0), 90))
+    silent = clean.max(0) <= 2 * threshold
+    surprise = _surprise(clean, strong, 2 * threshold, silent, near)
     dead: list[int] = []
     unseen: list[int] = []
-    for _ in range(2):  # twice, so that a dead neighbour does not lower the mean
+    for _ in range(2):  # twice, so that dead neighbours are looked past
         gone, dead, unseen = set(dead), [], []
         for k in range(clean.shape[1]):
-            beside = [n for n in near[k] if n not in gone] or near[k]
-            around = clean[:, beside].mean(1)
-            pressed = around > strong
-            if pressed.sum() < 5:
-                if clean[:, k].max() <= 2 * threshold:
-                    unseen.append(k)
-            elif clean[pressed, k].mean() < 0.1 * around[pressed].mean():
+            between = np.zeros(len(clean))  # the weaker of two opposite sides, in the best of the four directions
+            for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
+                sides = [_beside(k, step, way, gone) for way in (1, -1)]
+                if None not in sides:
+                    between = np.maximum(between, clean[:, sides].min(1))
+            pressed = between > strong
+            if pressed.sum() >= 5 and clean[pressed, k].mean() < 0.1 * between[pressed].mean() or silent[k] and surprise[k] < 1e-4:
                 dead.append(k)
+            elif silent[k]:
+                unseen.append(k)
     return dead, unseen
 
 
-def _swapped(clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15) -> list[tuple[int, int]]:
-    """Pairs that each fit the other's neighbours clearly better than their own: wires exchanged."""
+def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray, near: list[list[int]]) -> np.ndarray:
+    """[120]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is what lies
+    between two rests, at most 200 frames."""
+    on = clean.max(1) > strong
+    press = np.cumsum(np.diff(on, prepend=False) & on) * 1000 + np.arange(len(on)) // 200
+    top = clean.argmax(1)
+    visits: dict[tuple[int, int], np.ndarray] = {}  # (press, its strongest taxel) -> largest reading of each taxel then
+    for key in np.unique(np.stack([press[on], top[on]], 1), axis=0):
+        rows = on & (press == key[0]) & (top == key[1])
+        visits[int(key[0]), int(key[1])] = clean[rows].max(0)
+    heard, asked = np.zeros(2), np.zeros(2)  # beside it in column, in row: pitches differ
+    trials = np.zeros((clean.shape[1], 2))
+    for (_, at), reading in visits.items():
+        for k in near[at]:
+            way = int(abs(k - at) == 1)
+            trials[k, way] += 1
+            if not silent[k]:
+                asked[way] += 1
+                heard[way] += reading[k] > floor
+    rate = np.clip(heard / np.maximum(asked, 1), 0.0, 0.99)
+    return np.prod((1 - rate) ** trials, axis=1)
+
+
+def _beside(k: int, step: tuple[int, int], way: int, gone: set[int], far: int = 3) -> int | None:
+    """The nearest taxel that is not `gone`, at most `far` steps from k; None at the pad's edge."""
+    c, r = divmod(k, ROWS)
+    for n in range(1, far + 1):
+        a, b = c + way * n * step[0], r + way * n * step[1]
+        if not (0 <= a < COLUMNS and 0 <= b < ROWS):
+            return None
+        if a * ROWS + b not in gone:
+            return a * ROWS + b
+    return None
+
+
+def _swapped(clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15, sure: float = 2.5, beside: float = 5.0) -> list[tuple[int, int]]:
+    """Pairs that each fit the other's neighbours better than their own by `least` (correlation), and by `sure` standard
+    deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies much. Taxels
+    side by side feel nearly the same, and a contact's edge between them looks like an exchange: `beside` deviations."""
+    fit, own_std = _fits(clean, near, skip)
     live = [k for k in range(clean.shape[1]) if k not in skip]
-    std = clean.std(0)
-    z = (clean - clean.mean(0)) / np.where(std > 0, std, 1.0)
-    around = np.zeros_like(clean)
-    for k in live:
-        beside = [n for n in near[k] if n not in skip]
-        if beside:
-            around[:, k] = clean[:, beside].mean(1)
-    s = around.std(0)
-    around = (around - around.mean(0)) / np.where(s > 0, s, 1.0)
-    fit = z.T @ around / len(z)  # [taxel, place]
     own = np.diag(fit)
+    better = np.minimum(fit - own[:, None], (fit - own[:, None]).T)  # [a, b]: the less convinced of the two
+    gains = [(better[a, b], a, b) for i, a in enumerate(live) for b in live[i + 1:]
+             if better[a, b] >= max(least, (beside if b in near[a] else sure) * own_std[a, b])]  # fmt: skip
     out, used = [], set()
-    gains = [(min(fit[a, b] - own[a], fit[b, a] - own[b]), a, b) for i, a in enumerate(live) for b in live[i + 1:]]
-    for gain, a, b in sorted(gains, reverse=True):
-        if gain < least:
-            break
+    for _, a, b in sorted(gains, reverse=True):
         if a not in used and b not in used:
             out.append((int(a), int(b)))
             used |= {a, b}
     return out
 
 
+def _fits(clean: np.ndarray, near: list[list[int]], skip: set[int], blocks: int = 20, draws: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """(correlation [taxel, place] of each taxel with the mean of the neighbours of each place; standard deviation [a, b] of what a
+    swap of a and b would better, by bootstrap over blocks of the recording)."""
+    around = np.zeros_like(clean)
+    for k in range(clean.shape[1]):
+        beside = [n for n in near[k] if n not in skip]
+        if beside and k not in skip:
+            around[:, k] = clean[:, beside].mean(1)
+    parts = [p for p in zip(np.array_split(clean, blocks), np.array_split(around, blocks), strict=True) if len(p[0])]
+    # sums from which any choice of blocks gives its correlations
+    sums = [(len(x), x.sum(0), y.sum(0), (x**2).sum(0), (y**2).sum(0), x.T @ y) for x, y in parts]
+
+    def correlation(weight: np.ndarray) -> np.ndarray:
+        n, sx, sy, xx, yy, xy = (sum(w * s[i] for w, s in zip(weight, sums, strict=True)) for i in range(6))
+        spread = np.sqrt(np.outer(np.maximum(xx - sx**2 / n, 0), np.maximum(yy - sy**2 / n, 0)))
+        return np.where(spread > 1e-12, (xy - np.outer(sx, sy) / n) / np.maximum(spread, 1e-12), 0.0)
+
+    rng = np.random.default_rng(0)
+    tried = []
+    for _ in range(draws):
+        c = correlation(np.bincount(rng.integers(len(sums), size=len(sums)), minlength=len(sums)))
+        d = c - np.diag(c)[:, None]
+        tried.append(np.minimum(d, d.T))
+    return correlation(np.ones(len(sums))), np.std(tried, axis=0)
+
+
 def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
-    """One common scale from the load; each taxel's gain from its neighbours, kept only if it tells the load of presses that
-    were not fitted better than equal gains do."""
+    """One common scale from the load; each taxel's gain from its neighbours, or else from the load alone with gains believed to
+    lie near one: only if it tells the load of presses that were not fitted (five folds of the recording) better than equal gains
+    do."""
     live = np.array([k for k in range(clean.shape[1]) if k not in out.dead and k not in out.unseen])
     pressed = load > 0.05 * load.max()
     x, y = clean[pressed], load[pressed]
-    test = np.isin(np.arange(len(y)) * 10 // max(1, len(y)), (2, 5, 8))
+    fold = np.arange(len(y)) * 20 // max(1, len(y)) % 5
     floor = max(3 * out.threshold, 1e-9)
 
     def scale(gain: np.ndarray, rows: np.ndarray) -> float:
         total = x[rows][:, live] @ gain[live]
         return float(total @ y[rows] / (total @ total))
 
-    def error(gain: np.ndarray) -> float:
-        rest = scale(gain, ~test) * (x[test][:, live] @ gain[live]) - y[test]
-        return float(np.sqrt(np.mean(rest**2)) / y[test].mean())
+    def error(way: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Of the load on presses that were not fitted, over the mean load."""
+        rest = []
+        for k in range(5):
+            gain = way(fold != k)
+            rest.append(scale(gain, fold != k) * (x[fold == k][:, live] @ gain[live]) - y[fold == k])
+        return float(np.sqrt(np.mean(np.concatenate(rest) ** 2)) / y.mean())
 
-    def both(rows: np.ndarray) -> np.ndarray:
+    def neighbours_and_load(rows: np.ndarray) -> np.ndarray:
         """Neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a surface of degree 3."""
         local = smooth_gains(x[rows], set(live.tolist()), floor)
         basis = _surface()[live]
@@ -148,13 +216,28 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         broad[live] = basis @ c
         return local * np.maximum(broad, 0.0)
 
-    equal, gain = np.ones(clean.shape[1]), both(~test)
-    out.held_out_equal, out.held_out = error(equal), error(gain)
-    if out.held_out < out.held_out_equal:
-        gain = both(np.ones(len(y), bool))
-    else:
-        out.notes.append(f"gains by taxel would not tell the load better ({100 * out.held_out:.1f} % on held-out presses): equal ones are kept")
-        gain, out.held_out = equal, out.held_out_equal
+    def from_load(rows: np.ndarray, prior: float) -> np.ndarray:
+        """y = s x (1 + d), d believed to be N(0, prior^2)."""
+        gain = np.ones(clean.shape[1])
+        a = scale(gain, rows) * x[rows][:, live]
+        rest = y[rows] - a.sum(1)
+        noise = max(float(rest @ rest) / len(rest), 1e-12)
+        d = np.linalg.solve(a.T @ a + noise / prior**2 * np.eye(len(live)), a.T @ rest)
+        gain[live] = np.maximum(1 + d, 0.0)
+        return gain
+
+    ways = {"equal": lambda rows: np.ones(clean.shape[1]), "neighbours": neighbours_and_load} | {
+        f"load {p:g}": (lambda rows, p=p: from_load(rows, p)) for p in (0.05, 0.1, 0.2, 0.4)
+    }
+    tried = {name: error(way) for name, way in ways.items()}
+    best = min(tried, key=tried.get)
+    if tried["neighbours"] < tried["equal"]:
+        best = "neighbours"  # wide contacts: sums over many taxels hardly tell one from the next
+    out.held_out_equal, out.held_out = tried["equal"], tried[best]
+    if best == "equal":
+        others = min(v for k, v in tried.items() if k != "equal")
+        out.notes.append(f"gains by taxel would not tell the load better ({100 * others:.1f} % on held-out presses): equal ones are kept")
+    gain = ways[best](np.ones(len(y), bool))
     gain = gain / gain[live].mean()
     out.scale = scale(gain, np.ones(len(y), bool))
     out.gain = gain.copy()
