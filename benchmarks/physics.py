@@ -51,6 +51,16 @@ def _pyramidal(spec: mujoco.MjSpec) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
+def _ccd(**options: float) -> Callable[[mujoco.MjSpec], None]:
+    """Options of convex collision: ccd_tolerance [m], ccd_iterations."""
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for name, value in options.items():
+            setattr(spec.option, name, value)
+
+    return edit
+
+
 def _no_self(spec: mujoco.MjSpec) -> None:
     """The hand touches the object only."""
     for geom in spec.geoms:
@@ -105,13 +115,16 @@ SETTINGS = {
     "njmax 112": Setting({"njmax": 112}),
     "nconmax 48": Setting({"nconmax": 48}),
     "links and palm firmer (solimp 0.99)": Setting({}, _firm_links),
+    "ccd_tolerance 1e-5": Setting({}, _ccd(ccd_tolerance=1e-5)),
+    "ccd_tolerance 1e-4": Setting({}, _ccd(ccd_tolerance=1e-4)),
+    "ccd_iterations 12": Setting({}, _ccd(ccd_iterations=12)),
     "hand does not touch itself": Setting({}, _no_self),
     "only tips and palm touch": Setting({}, _tips_only),
 }
 
 
 @contextlib.contextmanager
-def _edited(edit: Callable[[mujoco.MjSpec], None] | None) -> Iterator[None]:
+def edited(edit: Callable[[mujoco.MjSpec], None] | None) -> Iterator[None]:
     """Environments made inside get `edit` after their own solver options."""
     own = env_module._solver_options
 
@@ -296,7 +309,7 @@ def main(argv: list[str]) -> dict:
         if setting.sim or setting.edit:
             env = None
             gc.collect()
-            with _edited(setting.edit):
+            with edited(setting.edit):
                 env = make_env({**cfg, "sim": {**cfg["sim"], **setting.sim}}, cfg["worlds"], device, 0, cfg["sim"]["engine"])
         with torch.no_grad():
             seconds = _speed(env, grasp, steps)

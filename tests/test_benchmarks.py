@@ -80,11 +80,11 @@ def test_bare_environment_steps_the_physics_of_the_last_rollout(env):
 
 
 def test_an_edited_scene_is_edited_only_inside():
-    with physics._edited(physics._pyramidal):
+    with physics.edited(physics._pyramidal):
         env = grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1)
     assert env.engine.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     assert grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1).engine.mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    with physics._edited(physics._no_self):
+    with physics.edited(physics._no_self):
         m = grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1).engine.mjm
     on_object = m.geom_bodyid == m.body("object").id
     type_, affinity = m.geom_contype, m.geom_conaffinity
