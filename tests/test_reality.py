@@ -92,6 +92,15 @@ def test_sensors_report_counts(env):
     assert torch.allclose(amps, amps.round(), atol=1e-3) and env.torque.abs().max() > 0
 
 
+def test_the_force_scale_stays_what_training_believed():
+    """F_max scales what the grasp policy sees and is asked; the other world does not tell its drives."""
+    believed = start.for_train(["task=grasp", "device=cpu"], CONFIGS).cfg
+    there = world("task=grasp")
+    assert there["belief"]["servo"] == believed["servo"] != there["servo"]
+    a, b = (make_env(c, 1, "cpu", 0, "mujoco") for c in (believed, there))
+    assert a.f_max == b.f_max
+
+
 def test_timing_varies_about_the_nominal():
     cfg = yaml.safe_load((CONFIGS / "reality" / "bench.yaml").read_text())
     w = reality.Reality(cfg, torch.Generator().manual_seed(0))

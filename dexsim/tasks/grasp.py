@@ -45,7 +45,8 @@ class GraspEnv(HandEnv):
         for name in ("servo.efficiency", "servo.torque_limit"):
             low, high, _ = self.sampler.range(name)
             drive *= (low + high) / 2
-        self.f_max = fingertip_press(self.cfg["servo"], stiffness=t["contact"]["stiffness"], drive=drive)
+        believed = self.cfg.get("belief") or {"servo": self.cfg["servo"], "drive": drive}  # another world does not tell its drives
+        self.f_max = fingertip_press(believed["servo"], stiffness=t["contact"]["stiffness"], drive=believed["drive"])
         # index tensors on the device: a Python list would be copied there at every use
         self.roots, self.inner, self.outer = (torch.tensor(x, device=dev) for x in (FINGER_ROOT, INNER, OUTER))
         self.tau_max = self.effort[self.roots]

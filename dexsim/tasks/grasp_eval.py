@@ -35,6 +35,7 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     held_out = _play_all(env, policy, max(episodes // 2, 1), env.held_rows, progress, "kept-out shapes")
     env.graphs = was
     metrics = _metrics(trained, held_out, env.f_max)
+    metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
 
     def force_command(ax):
         _force_plot(ax, trained)
@@ -208,6 +209,13 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
         out["by_command"] = _by_command(r, held)
     return out
+
+
+def _by_object(r: dict, env) -> dict[str, float | None]:
+    """Share of unpushed episodes held, command >= 0.1, by object."""
+    names = np.array([env.scene.variants[int(v)].shape.name for v in r["shape"]])
+    among = ~r["pushed"].astype(bool) & (r["command"] >= 0.1)
+    return {str(name): _rate(r["held"], among & (names == name)) for name in np.unique(names)}
 
 
 def _by_command(r: dict, held: np.ndarray) -> dict:

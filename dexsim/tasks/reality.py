@@ -41,7 +41,7 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     """The config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task draws.
 
     The world's servo replaces the policy's belief; its ranges replace those of training, name by name; drives are not
-    randomized (it is one hand). Raises UserError for a file with other keys, or without the task that is played.
+    randomized (it is one hand). What was believed before is kept under "belief". Raises UserError for a file with other keys, or without the task that is played.
     """
     world, cfg = cfg["reality"], copy.deepcopy(cfg)
     for key in world:
@@ -51,6 +51,7 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     if task not in world["tasks"]:
         raise UserError(f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])}")
     cfg["sim"].update(world["sim"], engine="mujoco")
+    cfg["belief"] = {"servo": cfg["servo"], "drive": math.prod(_middle(cfg, c) for c in ("efficiency", "torque_limit"))}
     cfg["servo"] = world["servo"]
     cfg["tactile"].update(world["tactile"])
     cfg["randomize"]["servo"] = {name: 1.0 if name in RELATIVE else 0.0 for name in cfg["randomize"]["servo"]}
@@ -63,6 +64,13 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
             else:
                 over[node] = value
     return cfg
+
+
+def _middle(cfg: dict[str, Any], column: str) -> float:
+    """Middle of the training's range of a drive's factor."""
+    value = cfg["randomize"]["servo"].get(column, 1.0)
+    value = value["log"] if isinstance(value, dict) else value
+    return float(np.mean(value))
 
 
 class Reality:
