@@ -9,8 +9,8 @@ For each number of worlds, in one run:
   bare   the same PPO on a stand-in that returns the same observations, rewards and ends, and in whose step only physics
          happens: the physics steps of the last rollout, from the same states, driven by the recorded torques.
 Seconds an iteration are medians, from device clocks: physics, rest of the environment's step, inference (actor, critic,
-storage, statistics), update. ratio: steps a second of full over bare. variants=true times settings of the update as well:
-TF32, bfloat16 autocast, torch.compile.
+storage, statistics), update. ratio: steps a second of full over bare. variants=true times other settings of learning as
+well: float32 products instead of TF32, bfloat16 autocast, torch.compile.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from dexsim.learning.runner import Runner
 from dexsim.tasks import make_env
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "tf32": {"tf32": True},
-    "bf16": {"use_mixed_precision": True},
-    "tf32+compile": {"tf32": True, "compile": "default"},
+    "float32": {"tf32": False},
+    "bfloat16": {"use_mixed_precision": True},
+    "compiled": {"compile": "default"},
 }
 
 
@@ -155,6 +155,7 @@ def _settings(cfg: dict, changes: dict[str, Any]) -> dict:
     agent = {**cfg["agent"], "algorithm": dict(cfg["agent"]["algorithm"])}
     if "compile" in changes:
         agent["torch_compile_mode"] = changes["compile"]
+    cfg = {**cfg, "tf32": changes.get("tf32", cfg["tf32"])}
     if "use_mixed_precision" in changes:
         agent["algorithm"]["use_mixed_precision"] = True
     return {**cfg, "agent": agent}
@@ -184,14 +185,11 @@ def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, v
         "contacts": env.engine.peaks()["contacts"], "bare": bare,
     }  # fmt: skip
     for name, changes in variants.items():
-        torch.backends.cuda.matmul.allow_tf32 = changes.get("tf32", False)
         try:
             found = _timed(_runner(env, _settings(cfg, changes), actor), env, iterations)
             row[f"{name}_steps_per_s"], row[f"{name}_update_s"] = steps / found["all"], found["update"]
         except Exception as error:  # a compiler that is not there is a finding, not a failure of the benchmark
             row[f"{name}_failed"] = str(error).strip().splitlines()[0][:200]
-        finally:
-            torch.backends.cuda.matmul.allow_tf32 = False
     return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
 
 
