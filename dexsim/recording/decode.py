@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from dexsim.recording import cdr
+from dexsim.recording import cdr, idl
 from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
 
 
@@ -211,12 +211,17 @@ def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
     if schema is None:
         raise Unreadable("its message definition is lost")
     text = schema.data.decode("utf-8", "replace")
-    if schema.encoding != "ros2msg" or not text.strip():  # IDL, or none stored: the standard messages are known anyway
+    if schema.encoding == "ros2idl" and text.strip():
+        try:
+            text = idl.to_msg(schema.name, text)
+        except idl.IdlError as error:
+            raise Unreadable(f"the IDL definition of {schema.name} is not read: {error}") from None
+    elif schema.encoding != "ros2msg" or not text.strip():  # none stored: the standard messages are known anyway
         text = DEFINITIONS.get(schema.name, "")
         if not text:
             raise Unreadable(
                 f"its type {schema.name} is described in '{schema.encoding or 'nothing'}', which is not read;"
-                " record it with message definitions (ros2msg)"
+                " record it with message definitions (ros2msg or ros2idl)"
             )
     try:
         return generate_dynamic(schema.name, text)[schema.name]
