@@ -1,0 +1,66 @@
+"""benchmarks.coverage: the shares are those of known samples; recordings and policies go through the same contact."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import coverage
+from dexsim.errors import UserError
+from dexsim.tactile.layout import xhand_layout
+
+
+def samples(n: int, force: tuple, centre: tuple, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(*force, n), rng.uniform(*centre, (n, 2))
+
+
+def test_what_lies_within_is_covered_and_what_does_not_is_not():
+    ours = samples(20000, (0.1, 8.0), (-0.005, 0.005))
+    same = coverage.envelope(ours, samples(5000, (0.1, 8.0), (-0.005, 0.005), 1))
+    assert same["force_covered"] > 0.995 and same["centre_covered"] > 0.995 and same["region_visited"] > 0.95
+    inside = coverage.envelope(ours, samples(5000, (1.0, 4.0), (-0.0019, 0.0019), 1))
+    assert inside["force_covered"] == inside["centre_covered"] == 1.0 and inside["region_visited"] < 0.3
+    half = coverage.envelope(ours, samples(5000, (4.0, 12.0), (0.0, 0.02), 1))
+    assert half["force_covered"] == pytest.approx(0.5, abs=0.03)
+    assert half["centre_covered"] == pytest.approx((0.006 / 0.02) ** 2, abs=0.03)  # a cell of 2 mm reaches over the edge
+    assert coverage.envelope(ours, samples(3, (1, 2), (0, 1)))["force_covered"] is None
+
+
+def test_contact_centres_lie_on_the_pad():
+    """A force on one taxel alone gives its own position in the pad's plane, exactly."""
+    layout = xhand_layout()
+    force, local = np.array([[0.0, 2.0, 0.05, 0.0, 3.0]]), layout.point[None, :, 7]
+    out = coverage.of_contact(force, local)
+    assert [len(f) for f, _ in out] == [0, 1, 0, 0, 1]  # a force at rest is no contact
+    for f in (1, 4):
+        plane = coverage.planes()[f]
+        back = plane.middle + out[f][1][0] @ plane.axes
+        assert np.linalg.norm(back - layout.point[f, 7]) < 0.007  # what the plane leaves out is the pad's own curvature
+
+
+def test_the_command_line_is_checked():
+    for argv, text in (([], "checkpoint=PATH"), (["checkpoint=a.pt"], "reality=bench, or recording"),
+                       (["checkpoint=a.pt", "reality=bench", "recording=b.mcap"], "reality=bench, or recording"),
+                       (["checkpoint=a.pt", "reality=bench", "seconds=0"], "seconds=0")):
+        with pytest.raises(UserError, match=text):
+            coverage.main(argv)
+
+
+@pytest.mark.slow
+def test_against_the_other_world_and_a_recording(tmp_path):
+    """The included checkpoint for a second, against the other world and against its own recording."""
+    from dexsim.cli import play, start
+
+    common = ["checkpoint=checkpoints/rotate.pt", "worlds=4", "seconds=1", "device=cpu"]
+    assert coverage.main([*common, "reality=bench", f"out={tmp_path}"]) == 0
+    found = json.loads((tmp_path / "coverage.json").read_text())["fingers"]
+    assert set(found) == {"thumb", "index", "mid", "ring", "pinky"} and (tmp_path / "coverage.png").stat().st_size > 1000
+    begun = start.for_play(["checkpoint=checkpoints/rotate.pt", "episodes=1", "video=false", f"record={tmp_path}/a.mcap", "device=cpu",
+                            "task.evaluation.cap_s=2", "tactile=raw", f"out={tmp_path}/play"], coverage.tools.ROOT / "configs")
+    assert play.run(begun) == 0
+    touch = coverage.recorded(str(tmp_path / "a.mcap"), {})
+    assert sum(len(f) for f, _ in touch) > 5
+    assert all(np.abs(mu).max() < 0.03 for _, mu in touch if len(mu))
