@@ -86,16 +86,25 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     low, high = points.min(0) - margin, points.max(0) + margin
     n = np.ceil((high - low) / spacing).astype(int) + 1
     out = np.empty(tuple(n), dtype=np.float32)
-    # By blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest anywhere in it.
-    size = 8
-    for corner in np.ndindex(*(-(-n // size))):
-        first = np.array(corner) * size
-        last = np.minimum(first + size, n)
-        value = planes[:, :3] @ (low + spacing * (first + last - 1) / 2) + planes[:, 3]
-        near = planes[value >= value.max() - np.sqrt(3.0) * size * spacing]
-        cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1)
-        d = (low + spacing * cells) @ near[:, :3].T + near[:, 3]
-        out[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = d.max(-1)
+    # By blocks within blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest in it.
+
+    def block(first: np.ndarray, size: int, last: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Of the planes `near`, those that can be highest in the block of `size` samples from `first` on."""
+        value = near[:, :3] @ (low + spacing * (first + last - 1) / 2) + near[:, 3]
+        return near[value >= value.max() - np.sqrt(3.0) * size * spacing]
+
+    outer, inner = 12, 6
+    for corner in np.ndindex(*(-(-n // outer))):
+        start = np.array(corner) * outer
+        end = np.minimum(start + outer, n)
+        around = block(start, outer, end, planes)
+        for part in np.ndindex(*(-(-(end - start) // inner))):
+            first = start + np.array(part) * inner
+            last = np.minimum(first + inner, end)
+            near = block(first, inner, last, around)
+            cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1)
+            d = (low + spacing * cells) @ near[:, :3].T + near[:, 3]
+            out[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = d.max(-1)
     return Grid(low, float(spacing), out)
 
 

@@ -103,17 +103,22 @@ def taxel_table(finger: str) -> dict[str, np.ndarray]:
     }
 
 
-@cache
 def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
     """Closed, convex, watertight fingertip (vertices [n, 3] m, outward triangles [m, 3]) in the distal body's frame.
 
     It passes through the taxels (within 0.1 mm; the lattice surface is convex to
     0.04 mm); `tip_*` in the MJCF is the same solid with at most 64 vertices.
     """
+    return _tip_skin(pad_of(finger))
+
+
+@cache
+def _tip_skin(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """`tip_skin_mesh` of all fingers with this pad."""
     from dexsim.assets.xhand.shells import hull_mesh
     from dexsim.assets.xhand.surface import PADS, Lattice, tip_points, to_link, to_sensor
 
-    pad = PADS[pad_of(finger)]
-    points = taxel_table(finger)["position"].reshape(COLUMNS, ROWS, 3)
+    pad = PADS[name]
+    points = taxel_table(next(f for f in FINGERS if pad_of(f) == name))["position"].reshape(COLUMNS, ROWS, 3)
     skin, rest = tip_points(Lattice(to_sensor(points, pad)), pad)
     return hull_mesh(to_link(np.concatenate([skin, rest]), pad))

@@ -159,9 +159,9 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
     b1, p = pad.round_from, 2.6
     depth = pad.waist - pad.back
 
-    def inside(x: np.ndarray) -> np.ndarray:
-        ok = (x @ planes.T <= offset[None, :] - under).all(axis=1)
-        ok &= (x[:, 1] >= pad.start - 1e-9) & (x[:, 1] <= pad.tip)
+    def rounded(x: np.ndarray) -> np.ndarray:
+        """Within the link's rounded bounds."""
+        ok = (x[:, 1] >= pad.start - 1e-9) & (x[:, 1] <= pad.tip)
         low = np.clip(pad.waist - x[:, 2], 0, None) / depth
         end = np.clip(x[:, 1] - b1, 0, None) / (pad.tip + 0.0005 - b1)
         return ok & ((np.abs(x[:, 0]) / pad.half_width) ** p + low**p + end**p <= 1.0)
@@ -177,10 +177,13 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
         starts += [(0.0, b1, mid_c)] * len(angles)
         rays += [(np.cos(t) * np.cos(tilt), np.sin(tilt), np.sin(t) * np.cos(tilt)) for t in angles]
     starts, rays = np.array(starts), np.array(rays)
+    # Under the tangent planes a ray ends where it meets the first of them; the rounded bounds are found by bisection.
+    room, climb = offset[None, :] - under - starts @ planes.T, rays @ planes.T
+    first = np.where(climb > 0.0, room / np.where(climb > 0.0, climb, 1.0), np.inf).min(axis=1)
     lo, hi = np.zeros(len(rays)), np.full(len(rays), 0.06)
     for _ in range(40):
         mid = (lo + hi) / 2
-        ok = inside(starts + rays * mid[:, None])
+        ok = (mid <= first) & rounded(starts + rays * mid[:, None])
         lo, hi = np.where(ok, mid, lo), np.where(ok, hi, mid)
     rest = starts + rays * lo[:, None]
     return skin.reshape(-1, 3), rest
