@@ -128,19 +128,22 @@ def one(truth: dict, d: dict) -> dict:
     confident = sure({"findings": physics})
     true_ids = {e["effect"] for e in effects if e["effect"]}
 
+    def ends(e: dict) -> list[str]:  # a linkage acts on both of the joints that it connects
+        return [e["joint"], e["from_joint"]] if e.get("from_joint") else [e["joint"]]
+
     def right_here(f: dict, e: dict) -> bool:
-        return _holds(f, e["effect"]) and (not f["where"]["joints"] or e["joint"] in f["where"]["joints"])
+        return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
 
     group = truth["group"]
     inside = group in ("effect", "pair", "touch") or (group == "hand" and effects)
-    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and e["joint"] in (f["where"]["joints"] or [e["joint"]]) for e in effects)
+    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
                             for f in confident)  # fmt: skip
     if inside:
         if len(effects) == 1:
             e = effects[0]
             out["right"] = named_right(first, e["effect"])
             out["alone"] = bool(first and first["effect"] == e["effect"] and len(set(first.get("indistinguishable") or [])) < 2)
-            mine = next((f for f in physics if f["effect"] == e["effect"] and right_here(f, e)), None)
+            mine = next((f for f in physics if f["effect"] == e["effect"] and e["joint"] in (f["where"]["joints"] or [e["joint"]])), None)
             out["parameter_errors"], out["covered"] = _parameters(mine, e)
             if mine is not None and e["when"]:
                 out["overlap"] = overlap(mine, e["when"])
@@ -149,7 +152,8 @@ def one(truth: dict, d: dict) -> dict:
         hit = [e for e in effects if any(right_here(f, e) for f in physics)]
         out["f1"] = [len(hit), len(physics), len(effects)]
         said_joints = {j for f in physics for j in f["where"]["joints"]}
-        true_joints = {e["joint"] for e in effects}
+        # of a linkage, the end that was named
+        true_joints = {next((j for j in ends(e) if j in said_joints), e["joint"]) for e in effects}
         if truth["joints"] > 1:
             out["joint_f1"] = [len(said_joints & true_joints), len(said_joints), len(true_joints)]
         out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None
