@@ -102,7 +102,7 @@ def _coulomb(s: Scales) -> list[Variant]:
     top = max(1.2 * s.demand, 3 * nominal, 1e-9)
     torque = _p("torque", "coulomb_friction", "set", 0.0, top, nominal, "N.m")
     asymmetry = _p("asymmetry", "friction_asymmetry", "set", -1.5, 1.5)
-    starts = [(nominal + f * s.tau, 0.0) for f in (0.03, 0.12, 0.35)]
+    starts = [(nominal + f * s.tau, 0.0) for f in (0.015, 0.03, 0.06, 0.12, 0.22, 0.4)]
     if nominal > 0.02 * s.tau:
         starts.append((0.5 * nominal, 0.0))
     starts += [(nominal + 0.1 * s.tau, 0.8), (nominal + 0.1 * s.tau, -0.8)]
@@ -112,12 +112,12 @@ def _coulomb(s: Scales) -> list[Variant]:
 def _stribeck(s: Scales) -> list[Variant]:
     peak = _p("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
     v_s = _p("v_s", "stribeck_speed", "set", 0.003 * s.speed, 0.35 * s.speed, 0.1 * s.speed, "rad/s")
-    return [Variant((peak, v_s), tuple((a * s.tau, b * s.speed) for a in (0.08, 0.3) for b in (0.02, 0.08, 0.25)))]
+    return [Variant((peak, v_s), tuple((a * s.tau, b * s.speed) for a in (0.03, 0.08, 0.2, 0.45) for b in (0.02, 0.08, 0.25)))]
 
 
 def _viscous(s: Scales) -> list[Variant]:
     nominal, unit = s.nominal["viscous_friction"], s.tau / s.speed
-    starts = [(nominal + f * unit,) for f in (0.05, 0.2, 0.6)]
+    starts = [(nominal + f * unit,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)]
     if nominal > 0.03 * unit:
         starts.append((0.5 * nominal,))
     top = max(3 * unit, 4 * nominal)
@@ -127,14 +127,14 @@ def _viscous(s: Scales) -> list[Variant]:
 def _load_friction(s: Scales) -> list[Variant]:
     drive = _p("fraction", "load_friction", "set", 0.0, 0.95, s.nominal["load_friction"])
     back = _p("fraction_backdriven", "load_friction_backdriven", "set", 0.0, 3.0, s.nominal["load_friction_backdriven"])
-    return [Variant((drive, back), ((0.1, 0.1), (0.35, 0.35), (0.3, 0.8)))]
+    return [Variant((drive, back), ((0.04, 0.05), (0.1, 0.12), (0.2, 0.25), (0.35, 0.35), (0.3, 0.8)))]
 
 
 def _backlash(s: Scales) -> list[Variant]:
     top = min(0.5 * s.span, 60 * s.error + 30 * s.sigma)
     low = min(3.0 * s.sigma, 0.1 * top)  # less cannot be told from the plant's own inaccuracy
     gap = _p("gap", "backlash", "set", low, top, low, "m" if s.slide else "rad")
-    starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 12.0, 40.0, 120.0)})
+    starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 7.0, 12.0, 20.0, 40.0, 70.0, 120.0)})
     rebound = _p("rebound", "rebound", "set", 0.02, 0.7, 0.1)
     params, extra = (gap, rebound), (0.1,)
     if s.armature <= 0:  # how much of the inertia is the rotor's is not known
@@ -146,18 +146,18 @@ def _compliance(s: Scales) -> list[Variant]:
     # not stiffer than a tenth of the loop's own spring is softness that leaves no trace
     top = 3.0 / s.stiffness
     soft = _p("softness", "softness", "set", 0.04 / s.stiffness, top, 0.04 / s.stiffness, "rad/N.m")
-    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.15, 0.4, 1.0)))]
+    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.1, 0.15, 0.25, 0.4, 0.65, 1.0, 1.7)))]
 
 
 def _delay(s: Scales) -> list[Variant]:
     delay = _p("delay", "delay", "add", -s.nominal["delay"], 0.2, 0.0, "s")
-    return [Variant((delay,), ((0.003,), (0.012,), (0.035,), (0.08,)))]
+    return [Variant((delay,), ((0.003,), (0.006,), (0.012,), (0.02,), (0.035,), (0.08,)))]
 
 
 def _lag(s: Scales) -> list[Variant]:
-    out = [Variant((_p("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),), ((0.004,), (0.015,), (0.05,)), "drive")]
+    out = [Variant((_p("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),), ((0.003,), (0.006,), (0.012,), (0.025,), (0.06,)), "drive")]
     if s.nominal["kd"] > 0:
-        out.append(Variant((_p("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),), ((0.01,), (0.04,)), "velocity filter"))
+        out.append(Variant((_p("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),), ((0.006,), (0.012,), (0.03,), (0.08,)), "velocity filter"))
     return out
 
 
@@ -168,7 +168,7 @@ def _torque_limit(s: Scales) -> list[Variant]:
     if top <= low or s.voltage:
         top = believed * 1.0
     limit = _p("torque", "torque_limit", "set", min(low, 0.5 * top), top, top, "N.m")
-    return [Variant((limit,), tuple((max(f * min(s.demand, believed), 1.05 * low),) for f in (0.9, 0.7, 0.5, 0.3)))]
+    return [Variant((limit,), tuple((max(f * min(s.demand, believed), 1.05 * low),) for f in (0.95, 0.88, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)))]
 
 
 def _speed_limit(s: Scales) -> list[Variant]:
@@ -176,7 +176,8 @@ def _speed_limit(s: Scales) -> list[Variant]:
     top = min(believed, 30 * s.peak_speed)
     low = min(0.3 * s.peak_speed, 0.8 * top)
     speed = _p("no_load_speed", "no_load_speed", "set", low, top, top, "rad/s")
-    starts = [x for x in (0.7 * s.peak_speed, 1.1 * s.peak_speed, 1.6 * s.peak_speed, 3 * s.peak_speed, 0.8 * believed, 0.6 * believed) if low < x < top]
+    starts = [x for x in (0.7 * s.peak_speed, 0.9 * s.peak_speed, 1.1 * s.peak_speed, 1.6 * s.peak_speed, 2.3 * s.peak_speed, 3.5 * s.peak_speed,
+                                0.9 * believed, 0.8 * believed, 0.65 * believed) if low < x < top]
     return [Variant((speed,), tuple((x,) for x in starts))] if starts else []
 
 
@@ -185,7 +186,7 @@ def _sag(s: Scales) -> list[Variant]:
         return []
     top = 0.9 / s.others_torque
     sag = _p("sag", "sag", "set", 0.0, top, 0.0, "1/N.m")
-    return [Variant((sag,), tuple((f * top,) for f in (0.1, 0.3, 0.6)))]
+    return [Variant((sag,), tuple((f * top,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)))]
 
 
 def _ripple(s: Scales) -> list[Variant]:
@@ -227,7 +228,7 @@ def _coupling(s: Scales) -> list[Variant]:
     out = []
     for k, other in enumerate(s.others[:4]):
         p = _p("ratio", "coupling", "set", -1.0, 1.0)
-        out.append(Variant((p,), ((-0.2,), (-0.03,), (0.03,), (0.2,)), other, (("coupling_from", float(k)),), {"from_joint": other}))
+        out.append(Variant((p,), ((-0.2,), (-0.05,), (-0.012,), (0.012,), (0.05,), (0.2,)), other, (("coupling_from", float(k)),), {"from_joint": other}))
     return out
 
 
@@ -235,11 +236,11 @@ def _offset(s: Scales) -> list[Variant]:
     if s.gravity < 0.02 * s.tau:
         return []
     p = _p("offset", "position_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
-    return [Variant((p,), ((-0.15,), (-0.03,), (0.03,), (0.15,)))]
+    return [Variant((p,), ((-0.2,), (-0.07,), (-0.02,), (0.02,), (0.07,), (0.2,)))]
 
 
 def _scale(s: Scales) -> list[Variant]:
-    out = [Variant((_p("scale", "position_scale", "set", 0.7, 1.4, 1.0),), ((0.9,), (0.97,), (1.03,), (1.12,)), "scale")]
+    out = [Variant((_p("scale", "position_scale", "set", 0.7, 1.4, 1.0),), ((0.85,), (0.94,), (0.98,), (1.02,), (1.06,), (1.15,)), "scale")]
     if not s.slide and s.span > 0.5:
         e = min(0.2, 0.3 * s.span)
         params = (_p("ecc_sin", "eccentric_sin", "set", -e, e, 0.0, "rad"), _p("ecc_cos", "eccentric_cos", "set", -e, e, 0.0, "rad"))
@@ -253,25 +254,25 @@ def _payload(s: Scales) -> list[Variant]:
     unit = min(unit, 3 * s.inertia / max(s.load_inertia, 1e-12))
     if np.isfinite(unit) and s.load_torque > 0.02 * s.gravity:
         mass = _p("mass", "payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
-        out.append(Variant((mass,), tuple((f * unit,) for f in (0.04, 0.15, 0.5, -0.1)), "mass"))
+        out.append(Variant((mass,), tuple((f * unit,) for f in (0.03, 0.08, 0.2, 0.5, 1.0, -0.06, -0.15)), "mass"))
     for letter, size in s.tilt.items():
         if size > 0.05 * s.tau * 0.1 and size > 0.2 * max(s.tilt.values()):
             p = _p(f"tilt_{letter}", f"tilt_{letter}", "set", -0.8, 0.8, 0.0, "rad")
-            out.append(Variant((p,), ((-0.3,), (-0.06,), (0.06,), (0.3,)), f"tilt {letter}"))
+            out.append(Variant((p,), ((-0.2,), (-0.07,), (-0.02,), (0.02,), (0.07,), (0.2,)), f"tilt {letter}"))
     return out
 
 
 def _inertia(s: Scales) -> list[Variant]:
     p = _p("armature", "armature", "add", -0.7 * s.inertia, 6.0 * s.inertia, 0.0, "kg" if s.slide else "kg.m2")
-    return [Variant((p,), tuple((f * s.inertia,) for f in (0.12, 0.4, 1.2, -0.25)))]
+    return [Variant((p,), tuple((f * s.inertia,) for f in (0.08, 0.2, 0.5, 1.2, 3.0, -0.1, -0.3)))]
 
 
 def _gain(s: Scales) -> list[Variant]:
     params = [_p("kp_factor", "kp", "factor", 0.25, 4.0, 1.0)]
-    starts = [(0.6,), (0.85,), (1.18,), (1.6,)]
+    starts = [(0.6,), (0.8,), (0.91,), (1.1,), (1.3,), (1.7,)]
     if s.nominal["kd"] > 0:
         params.append(_p("kd_factor", "kd", "factor", 0.1, 6.0, 1.0))
-        starts = [(x[0], 1.0) for x in starts] + [(1.0, 0.5), (1.0, 1.6), (1.0, 3.0)]
+        starts = [(x[0], 1.0) for x in starts] + [(1.0, 0.5), (1.0, 0.8), (1.0, 1.25), (1.0, 1.8), (1.0, 3.0)]
     return [Variant(tuple(params), tuple(starts))]
 
 

@@ -24,12 +24,13 @@ from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch, Outcome
+from dexsim.gap.sharpen import sharpen
 from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
-SET_SHARE = 0.12  # of the bootstraps: a rival of the same class with as much belongs to the set
+SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
 
 @dataclass
@@ -195,6 +196,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
 
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
+    cases = sharpen(model, runs, cases, s.device, _step(runs))
     clock.lap("model along the motion")
     group = conditions(runs)
     drives = [json.dumps(_plain(r.servo.to_dict()), sort_keys=True) for r in runs]

@@ -9,7 +9,9 @@ import numpy as np
 from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX
 
-PRIOR = 10.0  # samples that one belief weighs: neighbouring residuals are not independent
+STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
+PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
 
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
 
@@ -50,9 +52,19 @@ class Param:
                 params[:, :, c] = x[:, None]
 
 
+def centre_of(params: list[Param]) -> np.ndarray:
+    """[P] value at which each parameter is not there."""
+    return np.array([{"add": 0.0, "factor": 1.0}.get(p.mode, p.start) for p in params], float)
+
+
 def prior_weight(params: list[Param]) -> np.ndarray:
     """[P] weight of each belief on the sum of squares, per squared unit of its parameter."""
     return np.array([PRIOR / p.sd**2 if p.sd > 0 else 0.0 for p in params])
+
+
+def disbelief(params: list[Param], x: np.ndarray) -> float:
+    """How far x [P] is from what is believed, on the scale of a sum of squared residuals."""
+    return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
 
 
 def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
@@ -181,6 +193,50 @@ class Fitter:
         res, s = self.init_directions(params, x)
         return self.eliminated(res[None], s)[0]
 
+    def shake(self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 32) -> Fitted:
+        """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the loss
+        rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
+        P = len(params)
+        if P == 0:
+            return f
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        centre, believed = np.array([p.start for p in params], float), prior_weight(params)
+        for _ in range(rounds):
+            span = high - low
+            J = f.jacobian * span
+            k = self.r.knee
+            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+            A = (J * w[:, None]).T @ J + np.diag(believed * span**2)
+            # what a rise of the loss by 5 % allows
+            A = A / (0.05 * max(f.loss, 1e-12) * len(f.residual)) + 4.0 * np.eye(P)
+            values, vectors = np.linalg.eigh(A)
+            size = np.where(np.arange(count) % 2, 1.0, 0.3)[:, None]
+            z = (rng.standard_normal((count, P)) / np.sqrt(P) * size) @ (vectors / np.sqrt(np.maximum(values, 1e-12))).T
+            trial = np.clip(f.x + z * span, low, high)
+            s = self.init_directions(params, f.x)[1] if self.eliminate else None
+            score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: B023, E731
+            tried = score(trial, self.eliminated(self.residuals(params, trial), s))
+            here = float(score(f.x, f.residual))
+            best = int(np.argmin(tried))
+            start = trial[best] if tried[best] < here else f.x
+            again = self.fit(params, x0=start, iterations=4, tolerance=5e-3)
+            if not float(score(again.x, again.residual)) < here * (1 - 5e-3):
+                break
+            f = again
+        return f
+
+    def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
+        """[H, P] guesses about x [P]: each effect's parameter scaled, each belief moved, one at a time."""
+        out = []
+        for i, p in enumerate(params):
+            zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
+            moves = [0.1 * p.span, -0.1 * p.span, 0.03 * p.span, -0.03 * p.span] if p.nuisance else [(f - 1) * (x[i] - zero) for f in PATTERN]
+            for d in moves:
+                g = x.copy()
+                g[i] += d
+                out.append(g)
+        return np.array(out)
+
     def fit(self, params: list[Param], x0: np.ndarray | None = None, iterations: int = 10, tolerance: float = 2e-3,
             step: float = 0.01) -> Fitted:
         """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts)."""
@@ -197,7 +253,9 @@ class Fitter:
         for it in range(iterations + 1):
             if fresh:
                 # one batch: here, each parameter moved, the initial state moved
-                delta = np.where(x + step * span <= high, step, -step) * span
+                # small beside the value too: a range may be wide, and many effects are kinked where they begin
+                size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
+                delta = np.where(x + size <= high, size, -size)
                 guesses = np.concatenate([x[None], x[None] + np.diag(delta), np.repeat(x[None], 2, 0)])
                 inits = np.zeros((P + 3, 2))
                 inits[P + 1, 0], inits[P + 2, 1] = self.r.sigma_q0, self.r.sigma_v0
@@ -235,10 +293,17 @@ class Fitter:
             tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
             best = int(np.argmin(tried))
             if not tried[best] < loss * (1 - 1e-6):
-                if damping > 1e2:
+                if damping <= 1e2:
+                    damping *= 1e3
+                    fresh = False
+                    continue
+                # a kinked loss has no slope to follow: try sizes outright
+                trial = np.clip(self.pattern(params, x), low, high)
+                tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
+                best = int(np.argmin(tried))
+                if not tried[best] < loss * (1 - tolerance):
                     break
-                damping *= 1e3
-                fresh = False
+                x, damping, fresh = trial[best], 1e-2, True
                 continue
             gain = (loss - tried[best]) / max(loss, 1e-30)
             x, damping, fresh = trial[best], max(lambdas[best] * 0.3, 1e-6), True

@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.gap.plant_columns import SERIES, SERIES_INDEX
 
-RATE = 100.0  # Hz at which the model is evaluated; the series are interpolated between
+RATE, FINE = 100.0, 250.0  # Hz at which the model is evaluated (along a sharpened motion); the series are interpolated between
 
 
 @dataclass
@@ -66,13 +66,13 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
     """
     run.smooth()
     t0, t1 = run.t[0], run.t[-1]
-    n = max(int(np.ceil((t1 - t0) * RATE)) + 1, 2)
+    n = max(int(np.ceil((t1 - t0) * (FINE if run.fine else RATE))) + 1, 2)
     times = np.linspace(t0, t1, n)
     ids = [model.joint(name).id for name in joints]
     qadr = np.array([model.jnt_qposadr[i] for i in ids])
     dadr = np.array([model.jnt_dofadr[i] for i in ids])
-    at = lambda x: np.stack([np.interp(times, run.t, x[:, j]) for j in range(x.shape[1])], 1)  # noqa: E731
-    q, v, a = at(run.qs), at(run.vs), at(run.as_)
+    known, motion = (run.fine[0], run.fine[1:]) if run.fine else (run.t, (run.qs, run.vs, run.as_))
+    q, v, a = (np.stack([np.interp(times, known, x[:, j]) for j in range(x.shape[1])], 1) for x in motion)
     data = mujoco.MjData(model)
     flags = model.opt.disableflags
     model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(

@@ -40,6 +40,8 @@ class Run:
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None
     as_: np.ndarray | None = None
+    # filled by `sharpen`: times [n], position, speed, acceleration [n, J]
+    fine: tuple[np.ndarray, ...] | None = None
 
     @property
     def duration(self) -> float:

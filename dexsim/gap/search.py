@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Variant, confusable
-from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, prior_weight
+from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, disbelief, prior_weight
 from dexsim.gap.plant import Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
@@ -21,7 +21,8 @@ DOUBT, OFF = 0.015, 0.025  # relative: what a fitted effect, and a refitted beli
 BUDGET = 100.0  # s of a joint's recordings that the search simulates
 BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
-ENOUGH = 1.4  # x the noise: an error within it needs no effect
+ENOUGH = 1.15  # x the noise: an error within it needs no effect
+ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
 MOST = 4  # effects on one joint
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
@@ -136,13 +137,13 @@ class JointSearch:
         taken = {p.columns[0] for p in out}
         # a sampled loop acts half a period late and a clock is read when it is read
         if "delay" not in taken:
-            d = s.nominal["delay"]
-            out.append(Param("delay", ("delay",), "add", -min(d, 0.002), 0.002, 0.0, "s", nuisance=True))
+            d, most = s.nominal["delay"], 1.5 / rate
+            out.append(Param("delay", ("delay",), "add", -min(d, most), most, 0.0, "s", nuisance=True, sd=0.5 * most))
         if "lag" not in taken:
-            out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True))
+            out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=0.5 / rate))
         # a drive tells its speed from its encoder through some filter
         if s.nominal["kd"] > 0:
-            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 0.5 / rate, "s", nuisance=True))
+            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 0.5 / rate, "s", nuisance=True, sd=0.3 * FILTER))
         # what holds a joint gives a little before it slides
         give = GIVE_SLIDE if s.slide else GIVE
         out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
@@ -198,7 +199,11 @@ class JointSearch:
         # large residuals are effects still to be named: the knee follows them down
         self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8)
-        return Trial((), fit)
+        return Trial((), self._shaken(self.nuisances, fit))
+
+    def _shaken(self, params: list[Param], fit: Fitted) -> Fitted:
+        """The fit, looked for nearby too, where it does not follow the data yet."""
+        return self.fitter.shake(params, fit, self.rng) if fit.loss > ENOUGH**2 else fit
 
     def scan(self, current: Trial) -> list[tuple[float, float, Member, np.ndarray]]:
         """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
@@ -220,6 +225,7 @@ class JointSearch:
                 variant = self._narrow(variant)
                 if variant is None:
                     continue
+                member = Member(effect, variant)
                 for start in variant.starts:
                     g = base.copy()
                     for name, value in variant.fixed:
@@ -228,7 +234,7 @@ class JointSearch:
                         value = float(np.clip(value, p.low, p.high))
                         p.apply(g[None], np.array([value]), case.plant.base())
                     guesses.append(_legal(g))
-                    owners.append((Member(effect, variant), np.array(start)))
+                    owners.append((member, np.array(start)))
         rows = []
         J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
         k = self.r.knee
@@ -264,10 +270,13 @@ class JointSearch:
                 member, start = owners[a + i]
                 rows.append((gain, member, start))
         best: dict[tuple, tuple] = {}
-        for gain, member, start in rows:
+        self.other_start: dict[str, np.ndarray] = {}
+        for gain, member, start in sorted(rows, key=lambda r: -r[0]):
             key = (member.id, member.variant.label)
-            if key not in best or gain > best[key][0]:
+            if key not in best:
                 best[key] = (gain, member, start)
+            elif member.id not in self.other_start and best[key][1] is member:
+                self.other_start[member.id] = start
         out = [(g, float(np.mean(null >= g)), m, st) for g, m, st in best.values()]
         return sorted(out, key=lambda o: -o[0])
 
@@ -310,6 +319,8 @@ class JointSearch:
             if like is not None and not quick and a.loss > like.fit.loss:
                 b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3)
                 a = b if b.loss < a.loss else a
+            if not quick:
+                a = self._shaken(params, a)
         return Trial(members, a)
 
     def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
@@ -318,7 +329,12 @@ class JointSearch:
 
     def _score(self, trial: Trial) -> float:
         """Left-out loss with a price on parameters: 3 % each."""
-        return float(self.cross(trial).sum()) * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
+        return float(self._left(trial).sum()) * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
+
+    def _left(self, trial: Trial) -> np.ndarray:
+        """Losses by block [B] on what was left out, and what the beliefs had to give for them, spread over the blocks."""
+        out = self.cross(trial)
+        return out + disbelief(trial.fit.params, trial.fit.x) / len(out)
 
     def cross(self, trial: Trial) -> np.ndarray:
         """Losses by block [B] when the block's condition is left out of the fit: from the optimum of all, one bounded
@@ -373,7 +389,7 @@ class JointSearch:
         """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
         self.fitted: dict[frozenset, Trial] = {}
         none = self.start()
-        self.none_loss = self.cross(none)
+        self.none_loss = self._left(none)
         current = none
         gains, price, scanned = {}, {}, []
         rivals: dict[str, list[tuple[str, float]]] = {}
@@ -382,7 +398,7 @@ class JointSearch:
         pool: dict[str, tuple[Member, np.ndarray]] = {}
         level: list[Trial] = []
         for _ in range(MOST):
-            loss = float(self.cross(current).sum()) / per
+            loss = self._left(current).sum() / per
             if loss < ENOUGH**2:
                 break
             scan = self.scan(current)
@@ -390,7 +406,7 @@ class JointSearch:
                 scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
             if not scan:
                 break
-            listed = self._shortlist(scan, shortlist)
+            listed = self._shortlist(scan, shortlist, loss, current.members)
             if not listed:
                 break
             drafts = []
@@ -398,9 +414,16 @@ class JointSearch:
                 if member.id not in pool or price.get(member.id, 1.0) > p:
                     pool[member.id] = (member, start)
                 price[member.id] = p
-                drafts.append(self.draft((*current.members, member), np.concatenate([self._values(current), start]), current))
+                begin = lambda x, current=current: np.concatenate([self._values(current), x])  # noqa: E731
+                tries = [self.draft((*current.members, member), begin(start), current)]
+                if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
+                    tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
+                drafts.append(min(tries, key=lambda d: d[2].loss))
             drafts.sort(key=lambda d: d[2].loss)
-            good = [d for k, d in enumerate(drafts) if k < 2 or (k < 5 and d[2].loss < 2.0 * drafts[0][2].loss + 0.3)]
+            good = [d for k, d in enumerate(drafts) if k < 3 or (k < 6 and d[2].loss < 2.0 * drafts[0][2].loss + 0.3)]
+            for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
+                if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
+                    pool[member.id], price[member.id] = (member, start), p
             trials = []
             for d in good:
                 trial = self.finish(*d, current)
@@ -432,15 +455,17 @@ class JointSearch:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned)
 
-    def _shortlist(self, scan, size):
+    def _shortlist(self, scan, size, loss, members):
         """The best variants of the best effects, and what the first is confused with."""
         seen: dict[str, int] = {}
         out = []
         for row in scan:
             g, p, m, _ = row
-            if g < 0.25 * LEAST or p > 4 * PRICE:
+            if g < 0.25 * LEAST * min(1.0, ROUGH / loss) or (p > 4 * PRICE and loss < ROUGH):
                 continue
             if seen.get(m.id, 0) >= (2 if m.id in ("torque_ripple", "payload", "thermal", "joint_coupling") else 1):
+                continue
+            if any(not _compatible(m, other) for other in members):
                 continue
             leader = out[0][2].id if out else None
             if len(out) < size or (leader and confusable(leader, m.id) and len(out) < size + 2):
@@ -453,7 +478,7 @@ class JointSearch:
         return trial.fit.x[:n]
 
     def _earns(self, new: Trial, old: Trial) -> bool:
-        a, b = self.cross(old), self.cross(new)
+        a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
         if gain < LEAST:
             return False
@@ -495,7 +520,7 @@ class JointSearch:
                 if key in current.ids or not confusable(key, member.id) or any(not _compatible(other, m) for m in rest):
                     continue
                 trial = self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
-                if trial.fit.loss < best.fit.loss and self.cross(trial).sum() < self.cross(best).sum():
+                if trial.fit.loss < best.fit.loss and self._left(trial).sum() < self._left(best).sum():
                     best = trial
         return best, level
 
@@ -517,14 +542,14 @@ class JointSearch:
     def rivals(self, current: Trial, pool) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
         """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
         out = {}
-        mine = self.cross(current)
+        mine = self._left(current)
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
         for i, member in enumerate(current.members):
             rest = tuple(m for k, m in enumerate(current.members) if k != i)
             kept = [v for k, v in enumerate(values) if k != i]
             without = self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
-            lost = self.cross(without) if without else self.cross(self._none(current))
+            lost = self._left(without) if without else self._left(self._none(current))
             others: list[Trial] = []
             for key, (other, start) in pool.items():
                 if key == member.id or key in current.ids or any(not _compatible(other, m) for m in rest):
@@ -538,7 +563,7 @@ class JointSearch:
                 if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
                     self.cross(trial)
                     others.append(trial)
-            table = np.stack([mine, *[t.left_out for t in others], lost])
+            table = np.stack([mine, *[self._left(t) for t in others], lost])
             n = table.shape[1]
             size = min(4, n)
             starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
@@ -556,7 +581,7 @@ class JointSearch:
         """No search: the nuisances alone."""
         self.fitted = {}
         none = self.start()
-        self.none_loss = self.cross(none)
+        self.none_loss = self._left(none)
         return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
 
     def polish(self, trial: Trial) -> Trial:
@@ -637,6 +662,8 @@ def _named(member: Member) -> list[Param]:
 
 
 def _compatible(a: Member, b: Member) -> bool:
+    if {a.id, b.id} == {"position_offset", "payload"} and any(m.variant.label.startswith("tilt") for m in (a, b)):
+        return False  # the same turn, once of the encoder and once of gravity: both at once mean neither
     return not ({c for p in a.variant.params for c in p.columns} & {c for p in b.variant.params for c in p.columns})
 
 
