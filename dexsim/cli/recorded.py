@@ -10,13 +10,13 @@ from dexsim.cli import folder
 from dexsim.cli.report import table
 from dexsim.errors import UserError
 
-KEYS = ("replay", "model", "servo", "servo_file", "out", "video", "timestep")
+KEYS = ("replay", "model", "servo", "servo_file", "out", "video", "timestep", "object", "object_size", "object_mass", "object_friction")
 USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
-    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep",
-    "remap", "meta"}."""
+    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "object": a
+    `led_object.Stated` or None, "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments
 
     own: dict[str, str] = {}
@@ -52,9 +52,34 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
         "out": own.get("out") or None,
         "video": own.get("video", "true") == "true",
         "timestep": timestep,
+        "object": _object(own),
         "remap": remap,
         "meta": meta,
     }
+
+
+def _object(own: dict[str, str]) -> Any:
+    """What the recorded object is, as stated; None where nothing is."""
+    from dexsim.recording.led_object import Stated
+
+    rest = [k for k in ("object_size", "object_mass", "object_friction") if k in own]
+    if "object" not in own:
+        if rest:
+            raise UserError(f"{rest[0]}={own[rest[0]]}: say object=SHAPE too")
+        return None
+    values: dict[str, Any] = {}
+    for key in rest:
+        try:
+            numbers = tuple(float(x) for x in own[key].strip("[]").replace(",", " ").split())
+        except ValueError:
+            numbers = ()
+        low, high = {"object_size": (1e-3, 1.0), "object_mass": (1e-4, 10.0), "object_friction": (0.01, 5.0)}[key]
+        if not numbers or not all(low <= x <= high for x in numbers) or (key != "object_size" and len(numbers) > 1):
+            raise UserError(f"{key}={own[key]}: must be {'numbers' if key == 'object_size' else 'a number'} from {low:g} to {high:g}")
+        values[key.removeprefix("object_")] = numbers if key == "object_size" else numbers[0]
+    stated = Stated(own["object"], **values)
+    stated.about()  # answers what is impossible
+    return stated
 
 
 def run(play: dict[str, Any]) -> int:
@@ -78,15 +103,19 @@ def run(play: dict[str, Any]) -> int:
     m = mechanism.for_recording(recording, model, play["servo"])
     config = yaml.safe_load(recording.config) if recording.config else {}
     timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
-    led = led_object.add_object(m, recording)
+    placed = led_object.add_object(m, recording, play["object"])
+    led = placed == "led"
+    if play["object"] is not None and not led:
+        raise UserError(f"object={play['object'].shape}: recording {path} has no /object_pose in the palm frame for it, or model= is not the xHand")
     out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
     print(
         f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
-        + (", the object led along its recorded path" if led else ""),
+        + {"led": ", the object led along its recorded path", "none": "",
+           "marked": ", the object marked by a ball that nothing feels: say its shape with object=box object_size=0.05,0.05,0.05"}[placed],  # fmt: skip
         flush=True,
     )
     result = mechanism.replay(
-        recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if led else None
+        recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if placed != "none" else None
     )
     c = compare.compare(recording, result, m, forces=led)
     position, effort = c.position_rmse(), c.effort_rmse()
@@ -98,7 +127,7 @@ def run(play: dict[str, Any]) -> int:
         "replay": str(path),
         "model": model or "xhand_right",
         "timestep_s": timestep,
-        "object": "led" if led else "none",
+        "object": placed,
         "position_rmse_rad": _plain(c.joints, position),
         "torque_rmse_Nm": _plain(c.joints, effort),
         "current_per_torque": _plain(c.joints, c.effort_scale),

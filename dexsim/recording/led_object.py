@@ -1,7 +1,8 @@
-"""The object of a simulated recording, put back into the scene and led along its recorded path."""
+"""The object of a recording, put back into the scene and led along its recorded path."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -10,6 +11,7 @@ import yaml
 
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
+from dexsim.errors import UserError
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
@@ -26,17 +28,63 @@ PAIRS = tuple(
 """Fingertip on object, one a finger."""
 
 
-def add_object(m: Mechanism, recording: Recording) -> bool:
-    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction; False where
-    the recording does not say what it was, or its path is missing. The object follows its recorded path: fingers
-    press on it, it does not yield, so forces follow the error of the joints rather than the balance of a grasp."""
+MARKER = 0.015  # m, radius of what stands for an object of unknown shape: seen, not felt
+
+
+@dataclass(frozen=True)
+class Stated:
+    """An object as somebody describes it. shape: of the library; size [1 to 3] m: its extents (box: x y z; sphere: diameter; capsule:
+    diameter, length; other shapes: the longest extent), empty: as the library has it."""
+
+    shape: str
+    size: tuple[float, ...] = ()
+    mass: float = 0.1
+    friction: float = 0.8
+
+    def about(self) -> dict[str, Any]:
+        """As a recorded play states it: MuJoCo's sizes. Raises UserError."""
+        shapes = library()
+        if self.shape not in shapes:
+            raise UserError(f"object={self.shape}: must be one of {', '.join(shapes)}")
+        shape = shapes[self.shape]
+        count = {"box": 3, "sphere": 1, "capsule": 2}.get(shape.kind, 1)
+        size = [float(x) for x in self.size] or [float(x) for x in ((2 * s for s in _library_size(shape)) if shape.kind in TYPES else (shape.extents.max(),))]
+        if len(size) != count or not all(1e-3 <= x <= 1.0 for x in size):
+            raise UserError(f"object_size={','.join(f'{x:g}' for x in size)}: a {self.shape} has {count} extent{'s' * (count > 1)} from 0.001 to 1 m")
+        if shape.kind == "capsule" and size[1] <= size[0]:
+            raise UserError(f"object_size={size[0]:g},{size[1]:g}: a capsule's length (with its caps) must be over its diameter")
+        if shape.kind == "capsule":
+            half = [size[0] / 2, (size[1] - size[0]) / 2, 0.0]
+        elif shape.kind in TYPES:
+            half = [x / 2 for x in size] + [0.0] * (3 - count)
+        else:
+            half = [size[0] / float(shape.extents.max())] * 3
+        return {"shape": self.shape, "kind": shape.kind, "size": half, "mass": self.mass, "friction": self.friction,
+                "stiffness": 7000.0, "damping_ratio": 0.8}  # fmt: skip
+
+
+def _library_size(shape: Any) -> list[float]:
+    """Half extents of a primitive of the library as its kind counts them."""
+    e = [float(x) / 2 for x in shape.extents]
+    return {"box": e, "sphere": e[:1], "capsule": [min(e), max(e)]}[shape.kind]
+
+
+def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None) -> str:
+    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction: "led". The object follows its
+    recorded path: fingers press on it, it does not yield, so forces follow the error of the joints rather than the balance of
+    a grasp. "marked": its path is known and its shape is not, a small ball that touches nothing shows where it was. "none": no
+    path was recorded, or the mechanism is not the hand. stated: what it is; default: what the recording says."""
     config = yaml.safe_load(recording.config) if recording.config else None
-    about = (config or {}).get("recorded_world", {}).get("object") if isinstance(config, dict) else None
-    if not about or recording.object_pose is None or m.robot != "xhand_right" or about["shape"] not in library():
-        return False
-    shape, size = library()[about["shape"]], np.array(about["size"], float)
+    config = config if isinstance(config, dict) else {}
+    about = config.get("recorded_world", {}).get("object") if stated is None else stated.about()
+    if recording.object_pose is None or m.robot != "xhand_right" or not np.isfinite(recording.object_pose.value).all(1).any():
+        return "none"
     body = m.spec.worldbody.add_body(name=NAME, pos=recording.object_pose.value[0, :3])
     body.add_freejoint(name=JOINT)
+    if not about or about["shape"] not in library():
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8], mass=0.01)
+        return "marked"
+    shape, size = library()[about["shape"]], np.array(about["size"], float)
     common: dict[str, Any] = dict(
         contype=xhand.OBJECT_BIT, conaffinity=xhand.HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
     )
@@ -52,7 +100,7 @@ def add_object(m: Mechanism, recording: Recording) -> bool:
     contact = config.get("task", {}).get("contact", {})
     _contact(m.spec, about, float(contact.get("impedance", 0.9)))
     _solver(m.spec, config.get("sim", {}))
-    return True
+    return "led"
 
 
 def _contact(spec: mujoco.MjSpec, about: dict[str, Any], d: float) -> None:
