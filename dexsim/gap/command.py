@@ -15,8 +15,16 @@ HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=va
        python diagnose.py columns=true
 
 Find what the simulator leaves out of a recorded mechanism: where it goes wrong, which physics is missing, its size, and the
-proof on recordings not used for the fit. Writes diagnosis.json, report.html (one page), servo.yaml (what was fitted, for
-train.py servo_file=FILE), model.xml where the model changed, next_recording.mcap where another recording would help.
+proof on recordings not used for the fit. Joints by their motion, current and duty; touch by /tactile and what is known of the
+object (/object_pose, or a body of the model) and of its force (/external_force). A joint is judged while nothing is touched.
+
+writes to out=:
+  report.html           one page: open it in a browser
+  diagnosis.json        the same for programs
+  servo.yaml            the fitted drives with intervals: python train.py servo_file=FILE randomizes inside them
+  model.xml             where masses or inertias were fitted: python train.py model_file=FILE
+  servo_standin.yaml    servo.yaml with a torque that stands in for what no effect explains, where that helps; it names nothing
+  next_recording.mcap   commands to send, where another recording would settle a question
 
 examples:
   python diagnose.py recordings='[a.mcap,b.mcap,c.mcap]' out=out/hand
@@ -29,7 +37,7 @@ settings (key=default):
   model=                      MuJoCo or URDF file; the xHand by default
   servo=                      servo.yaml believed of its drives; the xHand's by default
   out=out/diagnosis           folder for the results
-  effects=                    consider only these effects: [backlash,lag,...]; all by default
+  effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
   device=cpu                  cpu | cuda: where hypotheses are simulated
@@ -88,8 +96,10 @@ def main(argv: list[str]) -> int:
         return 0
     from dexsim.cli.build import quiet_warp
     from dexsim.gap import inputs
+    from dexsim.actuator.columns import did_you_mean
     from dexsim.gap.catalogue import EFFECTS
     from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.gap.touch_effects import BY_ID
 
     start = time.perf_counter()
     device = given.get("device", "cpu")
@@ -108,9 +118,10 @@ def main(argv: list[str]) -> int:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
     allowed = None
     if given.get("effects"):
+        known = (*EFFECTS, *(e for e in BY_ID if e not in EFFECTS))
         for e in given["effects"]:
-            if e not in EFFECTS:
-                raise UserError(f"effects: '{e}' is not in the catalogue: {', '.join(EFFECTS)}")
+            if e not in known:
+                raise UserError(f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}")
         allowed = set(given["effects"])
     settings = Settings(
         inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,

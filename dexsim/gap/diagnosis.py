@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import inputs, judge, locate, stage, standin, touch
+from dexsim.gap import channels, inputs, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
@@ -137,9 +137,9 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
             recordings.append(None)
     clock.lap("reading and audit")
     lengths = {r.path.name: r.duration for r in recordings if r is not None}
+    _copies(recordings[: len(s.recordings)], recordings[len(s.recordings) :])
     runs: list[Run] = []
     held: list[int] = []
-    used: list[Any] = []
     for i, r in enumerate(recordings):
         if r is None:
             continue
@@ -151,9 +151,19 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         if i >= len(s.recordings):
             held.append(len(runs))
         runs.append(run)
-        used.append(r)
     channel = inputs.channel_findings([r for r in recordings if r is not None], m.joints)
+    readable = [r for r in recordings if r is not None]
+    notes += [f"{r.path.name}: {f.text}" for r in readable for f in r.findings if f.kind == "joint_names" and "left out" in f.text]
+    absent = [j for j in m.joints if runs and not any(j in r.joints for r in runs)]
+    if absent:
+        notes.append(f"in the model but in no recording: {', '.join(absent)}; nothing can be said of {'it' if len(absent) == 1 else 'them'}, taken to stand at rest")
+    wrong, out = channels.inspect(runs, m.spec.compile(), channels.spoiled(readable))
+    channel = channels.secondary(channel + wrong)
+    before = {id(r): k for k, r in enumerate(runs)}
+    runs = channels.drop(runs, out, notes)
+    held = [k for k, r in enumerate(runs) if before[id(r)] in held]
     notes += failures
+    failures += [f"{name}: {joint}: {why}" for (name, joint), why in out.items()] if not runs else []
     if failures and runs and len(held) < len(runs):
         say(f"  left out: {'; '.join(failures)}")
     held_names = {names[p] for p in s.held_out or []}
@@ -197,6 +207,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
     cases = sharpen(model, runs, cases, s.device, _step(runs))
+    notes += _cannot(s, cases, felt)
     clock.lap("model along the motion")
     group = conditions(runs)
     drives = [json.dumps(_plain(r.servo.to_dict()), sort_keys=True) for r in runs]
@@ -494,6 +505,29 @@ def _unusable(reason: str, channel, notes, m) -> Diagnosis:
     data["unexplained"]["depends_on"] = []
     data["reason"] = reason
     return Diagnosis(data, f"{reason.rstrip('.')}.", notes, mechanism=m)
+
+
+def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
+    """UserError where a held-out recording is one of the others under another name."""
+    for h in held:
+        for r in train:
+            a, b = (None if x is None else x.states.position for x in (h, r))
+            if a is not None and b is not None and len(a) > 20 and a.value.shape == b.value.shape and np.array_equal(a.value, b.value, equal_nan=True):
+                raise UserError(f"held_out: {h.path.name} holds the same readings as {r.path.name}; what is held out must not be fitted")
+
+
+def _cannot(s: Settings, cases: Sequence[Case], felt: touch.TouchResult) -> list[str]:
+    """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
+    from dexsim.gap.touch_effects import BY_ID
+
+    notes = []
+    for e in sorted(s.allowed or ()):
+        if e in BY_ID and e not in EFFECTS:
+            if not felt.contact:
+                notes.append(f"{e} cannot be seen here: nothing is touched in these recordings; to see it: {BY_ID[e].experiment}")
+        elif not any(EFFECTS[e].variants(c.scales) for c in cases):
+            notes.append(f"{e} cannot be seen on this mechanism with these recordings; to see it: {EFFECTS[e].experiment}")
+    return notes
 
 
 def _still(s: Settings) -> str:

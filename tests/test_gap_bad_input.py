@@ -1,0 +1,179 @@
+"""Bad input of the diagnosis: signals that are not what they say, and recordings that cannot carry an answer, named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dexsim.errors import UserError
+from dexsim.gap import channels, command, demo
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.recording import read, write
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    paths, model, servo, _ = demo.make(folder, "", seconds=4.0)
+    return folder, paths, model, servo
+
+
+def judged(rig, tmp_path, change, keep=(0, 2), **settings):
+    """The diagnosis of two recordings, both changed, with one effect to consider: the signals are what is tested."""
+    folder, paths, model, servo = rig
+    out = []
+    for k in keep:
+        r = read(paths[k], joints=["joint"], audit=False)
+        change(r)
+        out.append(tmp_path / f"{k}.mcap")
+        write(out[-1], r)
+    s = Settings(out, tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed=settings.pop("allowed", {"command_delay"}), **settings)
+    d = diagnose(s, say=lambda _: None)
+    save(d, s.out)
+    json.loads((s.out / "diagnosis.json").read_text())
+    return d
+
+
+def wrapped_effort(r):
+    e = r.states.effort
+    e.value = np.where(e.value < 0, e.value + 65.536, e.value)
+
+
+def lost_sign(r):
+    r.states.effort.value = np.abs(r.states.effort.value)
+
+
+def repeated(r):
+    p = r.states.position
+    for a in range(20, len(p.t) - 30, 60):
+        p.value[a : a + 25] = p.value[a]
+
+
+def degrees(r):
+    r.states.position.value = np.degrees(r.states.position.value)
+
+
+def degrees_everywhere(r):
+    degrees(r)
+    r.commands.value = np.degrees(r.commands.value)
+
+
+def counts(r):
+    r.states.position.value = np.round(r.states.position.value * 4096 / 2 / np.pi)
+
+
+def drifting_stamp(r):
+    r.states.position.stamp = r.states.position.t * 1.02 + 0.3
+
+
+def late_commands(r):
+    r.commands.t, r.commands.stamp = r.commands.t + 0.4, None
+
+
+def reversed_commands(r):
+    r.commands.value = -r.commands.value
+
+
+def wrapped_position(r):
+    r.states.position.value = np.mod(r.states.position.value, 2 * np.pi)
+
+
+def stopped(r):
+    r.states.position.value[150:] = r.states.position.value[150]
+
+
+STILL = [("wrap", wrapped_effort), ("lost_sign", lost_sign), ("stale", repeated), ("clock_skew", drifting_stamp)]
+LOST = [("unit", degrees), ("unit", degrees_everywhere), ("unit", counts), ("wrap", wrapped_position), ("sign", reversed_commands), ("stuck", stopped),
+        ("clock_skew", late_commands)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "change"), STILL, ids=[c.__name__ for _, c in STILL])
+def test_a_bad_channel_is_named_and_the_rest_still_judged(rig, tmp_path, kind, change):
+    d = judged(rig, tmp_path, change)
+    bad = [f for f in d.data["findings"] if f["effect"] == "bad_channel"]
+    assert [f["regime"].split(":")[0] for f in bad] == [kind] and bad[0]["where"]["topics"] and bad[0]["when"]
+    assert d.data["verdict"] == "none" and d.data["held_out"]["before"] < (6 if kind == "stale" else 2) * d.data["noise_floor"]["position_rad"]
+    assert "not what it says" in d.sentence
+
+
+@pytest.mark.parametrize(("kind", "change"), LOST, ids=[c.__name__ for _, c in LOST])
+def test_a_bad_position_or_command_makes_the_joint_unusable(rig, tmp_path, kind, change):
+    d = judged(rig, tmp_path, change, keep=(1, 2) if change is late_commands else (0, 2))
+    bad = [f["regime"].split(":")[0] for f in d.data["findings"]]
+    assert kind in bad and all(f["effect"] == "bad_channel" for f in d.data["findings"])
+    assert d.data["verdict"] == "unusable" and kind in d.sentence and d.data["held_out"]["before"] is None
+
+
+def test_healthy_recordings_have_no_bad_channel(rig, tmp_path):
+    d = judged(rig, tmp_path, lambda r: None, keep=(0, 1, 2, 3))
+    assert d.data["verdict"] == "none" and not d.data["findings"]
+
+
+def test_one_bad_recording_leaves_the_others(rig, tmp_path):
+    folder, paths, model, servo = rig
+    r = read(paths[3], audit=False)
+    degrees(r)
+    write(tmp_path / "wrong.mcap", r)
+    s = Settings([*paths[:2], tmp_path / "wrong.mcap"], tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed={"command_delay"})
+    d = diagnose(s, say=lambda _: None)
+    assert d.data["verdict"] == "none" and any("wrong.mcap" in n and "left out" in n for n in d.notes)
+    assert [f["effect"] for f in d.data["findings"]] == ["bad_channel"]
+
+
+def test_effects_that_cannot_be_there_are_named(rig, tmp_path):
+    d = judged(rig, tmp_path, lambda r: None, allowed={"supply_sag", "tactile_hysteresis"})
+    assert any(n.startswith("supply_sag cannot be seen") for n in d.notes) and any(n.startswith("tactile_hysteresis cannot be seen") for n in d.notes)
+    with pytest.raises(UserError, match="Did you mean 'backlash'"):
+        command.main(["recordings=" + str(rig[1][0]), "effects=[backlas]", f"model={rig[2]}", f"servo={rig[3]}"])
+
+
+def test_held_out_copies_are_refused(rig, tmp_path):
+    folder, paths, model, servo = rig
+    copy = tmp_path / "another_name.mcap"
+    copy.write_bytes(paths[0].read_bytes())
+    with pytest.raises(UserError, match="same readings"):
+        diagnose(Settings(paths[:2], tmp_path, [copy], str(model), str(servo)), say=lambda _: None)
+
+
+def test_a_model_that_does_not_compile_still_says_what_the_recordings_are(rig, tmp_path):
+    folder, paths, model, servo = rig
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    with pytest.raises(UserError, match=r"broken.xml.*of the recordings themselves: motion_1.mcap: 4.0 s of 1 joint, no fault") as error:
+        diagnose(Settings(paths[:1], tmp_path, None, str(broken), str(servo)), say=lambda _: None)
+    assert "\n" not in str(error.value)
+
+
+def test_joints_on_one_side_only_are_said(rig, tmp_path):
+    """The model has a joint that no recording has, the recording one that the model has not: both named, the common one judged."""
+    folder, paths, model, servo = rig
+    both = tmp_path / "two.xml"
+    both.write_text(model.read_text().replace('<body name="link">', '<body name="other"><joint name="wrist" type="hinge" axis="0 1 0"/>'
+                                              '<geom size="0.01" mass="0.1" pos="0 0 0.05"/></body><body name="link">'))  # fmt: skip
+    out = []
+    for k in (0, 2):
+        r = read(paths[k], audit=False)
+        twice = lambda s: np.concatenate([s.value, s.value], 1)  # noqa: E731
+        r.joints = ("joint", "elbow")
+        r.meta["joint_names"] = "joint,elbow"
+        for s in (r.commands, r.states.position):
+            s.value = twice(s)
+        r.states.effort = None
+        out.append(tmp_path / f"{k}.mcap")
+        write(out[-1], r)
+    s = Settings(out, tmp_path / "out", None, str(both), str(servo), next_recording=False, allowed={"command_delay"})
+    d = diagnose(s, say=lambda _: None)
+    assert d.data["verdict"] == "none" and set(d.joints) == {"joint"}
+    assert any("elbow" in n for n in d.notes) and any("wrist" in n for n in d.notes)
+
+
+def test_stiction_is_not_taken_for_repeated_readings():
+    t = np.arange(0, 10, 0.01)
+    q = np.round(0.3 * np.sin(t) / 1.5e-3) * 1.5e-3
+    q[(t % 2) < 0.3] = np.nan
+    index = np.maximum.accumulate(np.where(np.isfinite(q), np.arange(len(q)), 0))
+    assert channels._held(t, q[index]).any()  # it does jump after each rest ...
+    creeping = np.round(0.02 * np.sin(t) / 1.5e-3) * 1.5e-3
+    assert not channels._held(t, creeping).any()  # ... and slow motion in whole counts does not
