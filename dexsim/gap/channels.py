@@ -119,11 +119,12 @@ def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
 
 
 def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
-    """Far outside the range, both of them, and inside once divided."""
+    """Far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn outside: the
+    model's range may be the one in degrees.)"""
     wide = 0.1 * (limits[1] - limits[0])
     outside = lambda x: max(x.max() - limits[1], limits[0] - x.min()) > 3 * (limits[1] - limits[0])  # noqa: E731
     inside = (q / TURN).min() > limits[0] - wide and (q / TURN).max() < limits[1] + wide
-    return bool(outside(q) and outside(cmd) and inside)
+    return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
 
 
 def _sign(run: Run, q: np.ndarray, j: int) -> float:
