@@ -139,6 +139,24 @@ def xyz(v: wp.vec4):
 
 
 @wp.func
+def centre_of(pads: Pads, f: int, total: wp.vec4):
+    """Centre of pressure of pad f, body frame, of the sums (moment of force, force); the pad's centre where nothing presses."""
+    at = pads.centre[f]
+    if total[3] > 0.0:
+        at = xyz(total) / total[3]
+    return at
+
+
+@wp.func
+def may_meet(f: int, g: int, tip_column: wp.array2d(dtype=int), pair_normal: wp.array2d(dtype=float), w: int):
+    """Whether pad f may touch the tip of pad g: another one, and pressed where the physics says so."""
+    near = g != f
+    if near and tip_column[f, g] >= 0:
+        near = pair_normal[w, tip_column[f, g]] > 0.0
+    return near
+
+
+@wp.func
 def tips_apart(pads: Pads, tips: Shapes, f: int, g: int, a: wp.mat33, b: wp.vec3):
     """Whether pad f, whose body has rotation a and origin b in that of pad g, surely does not touch g's tip."""
     return boxes_apart(a, b, pads.middle[f], pads.half[f], tips.middle[g], tips.half[g])
@@ -250,18 +268,12 @@ def _serial(
                                 total += wp.vec4(c * p[0], c * p[1], c * p[2], c)
                                 if wp.static(raw):
                                     felt[w, f, t] = felt[w, f, t] + c
-        at = pads.centre[f]
-        if total[3] > 0.0:
-            at = xyz(total) / total[3]
         force[w, f] = total[3]
-        centre[w, f] = xmat[w, body] * at + xpos[w, body]
+        centre[w, f] = xmat[w, body] * centre_of(pads, f, total) + xpos[w, body]
         if wp.static(others):
             other = float(0.0)
             for g in range(pads.body.shape[0]):
-                near = g != f
-                if near and tip_column[f, g] >= 0:
-                    near = pair_normal[w, tip_column[f, g]] > 0.0
-                if near:
+                if may_meet(f, g, tip_column, pair_normal, w):
                     a = turn_in(xmat, w, body, pads.body[g])
                     b = pose_in(xpos, xmat, w, body, pads.body[g])
                     if not tips_apart(pads, tips, f, g, a, b):
@@ -396,19 +408,16 @@ def _lanes(
                         total += lanes_sum4(s, lane)
                         mine += d
         if lane == 0:
-            at = pads.centre[f]
-            if total[3] > 0.0:
-                at = xyz(total) / total[3]
             force[pad] = total[3]
-            centre[pad] = rot * at + pos
+            centre[pad] = rot * centre_of(pads, f, total) + pos
         if wp.static(others):
             # Lane j asks whether tip j is near, all at once; then the warp feels the tips that are.
             other = float(0.0)
             for block in range(wp.static(-(-pad_count // LANES))):
                 j = wp.static(32) * block + lane
-                near = j < wp.static(pad_count) and j != f
-                if near and tip_column[f, j] >= 0:
-                    near = pair_normal[w, tip_column[f, j]] > 0.0
+                near = j < wp.static(pad_count)
+                if near:
+                    near = may_meet(f, j, tip_column, pair_normal, w)
                 if near:
                     turn = wp.transpose(xmat[w, pads.body[j]])
                     near = not tips_apart(pads, tips, f, j, turn * rot, turn * (pos - xpos[w, pads.body[j]]))
