@@ -157,7 +157,7 @@ def _delay(s: Scales) -> list[Variant]:
 def _lag(s: Scales) -> list[Variant]:
     out = [Variant((_p("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),), ((0.003,), (0.006,), (0.012,), (0.025,), (0.06,)), "drive")]
     if s.nominal["kd"] > 0:
-        out.append(Variant((_p("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),), ((0.006,), (0.012,), (0.03,), (0.08,)), "velocity filter"))
+        out.append(Variant((_p("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),), ((0.006,), (0.012,), (0.03,), (0.08,)), "velocity filter", note={"of": "speed"}))
     return out
 
 

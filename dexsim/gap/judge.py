@@ -70,40 +70,63 @@ def own_signal(effect: str, case: Case, values: dict[str, float], note: dict) ->
         return (v > small).astype(float)
     if effect == "stribeck_friction":
         return np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2)) * ((v > 0.2 * small) | (tau > 0))
-    if effect in ("viscous_friction", "command_delay", "lag"):
-        return a if effect == "lag" else v
+    moving = (v > small).astype(float)
+    if effect == "viscous_friction":
+        return v
+    if effect == "command_delay":
+        return np.abs(m["_command_rate"])
+    if effect == "lag":
+        return np.abs(m["_torque_rate"]) if note.get("of", "drive") == "drive" else a
     if effect == "load_friction":
-        return tau
+        return np.abs(m["_load"]) * moving
     if effect == "backlash":
         return _near_sign_change(case, m["_load"] + m["_friction"], 0.04)
     if effect == "compliance":
         return load
     if effect == "torque_limit":
-        limit = values.get("torque", s.demand)
-        return np.maximum(np.abs(m["_asked"]) - limit, 0.0)
+        return _lost(s, m, values.get("torque", s.demand), s.nominal["no_load_speed"])
     if effect == "torque_speed_limit":
-        line = s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.demand
-        return np.maximum(np.abs(m["_asked"]) - line * np.maximum(1 - v / values.get("no_load_speed", s.peak_speed), 0), 0.0)
+        return _lost(s, m, s.nominal["torque_limit"], values.get("no_load_speed", s.peak_speed))
     if effect == "torque_ripple":
         return np.abs(np.sin(values.get("per_turn", 1) * m["position"] + values.get("phase", 0.0)))
     if effect == "thermal":
-        return np.abs(m.get("temperature", m["time"]) - np.min(m.get("temperature", m["time"]))) * tau
+        warm = np.abs(m.get("temperature", m["time"]) - np.min(m.get("temperature", m["time"])))
+        return warm * (moving if note.get("of") == "friction" else tau)
     if effect == "joint_coupling":
         k = list(s.others).index(note["from_joint"]) if note.get("from_joint") in s.others else 0
         return np.abs(m.get(f"_drag{k}", v))
     if effect == "supply_sag":
         return m.get("_others", v)
     if effect == "payload":
-        return np.abs(m["_gravity"])
+        return np.abs(m["_added"] if "mass" in values else m["_gravity"])
+    if effect == "position_scale":
+        if "scale" in values:
+            return np.abs(m["position"])
+        return np.abs(values.get("ecc_sin", 0.0) * np.sin(m["position"]) + values.get("ecc_cos", 0.0) * (np.cos(m["position"]) - 1))
     if effect == "inertia":
         return a
-    if effect == "gain_mismatch":
-        return e
+    if effect == "gain_mismatch":  # the torque that the other gains make more or less
+        more = (values.get("kp_factor", 1.0) - 1) * s.nominal["kp"] * m["_error"] - (values.get("kd_factor", 1.0) - 1) * s.nominal["kd"] * m["_speed"]
+        return np.abs(more)
     if effect == "deadband":
         return (e < values.get("width", 0.0)).astype(float)
     if effect == "current_sensor":
-        return tau
+        return np.abs((values.get("gain", 1.0) - 1) * m["_torque"] + values.get("offset", 0.0))
     return np.ones_like(v)
+
+
+def _lost(s, m: dict[str, np.ndarray], limit: float, no_load_speed: float) -> np.ndarray:
+    """[n] torque that the drive would give by its believed limits and does not give by these."""
+    asked, v = m["_asked"], m["_speed"]
+
+    def give(most: float, fastest: float) -> np.ndarray:
+        most = min(most, 1e9)
+        if s.voltage:
+            return most * (np.clip(asked, -1, 1) - v / fastest)
+        edge = most * np.maximum(1 - np.abs(v) / fastest, 0)
+        return np.clip(asked, -edge, edge)
+
+    return np.abs(give(s.nominal["torque_limit"], s.nominal["no_load_speed"]) - give(limit, no_load_speed))
 
 
 def _near_sign_change(case: Case, x: np.ndarray, seconds: float) -> np.ndarray:
@@ -111,7 +134,7 @@ def _near_sign_change(case: Case, x: np.ndarray, seconds: float) -> np.ndarray:
     out = np.zeros(len(t))
     change = np.flatnonzero((np.sign(x[1:]) != np.sign(x[:-1])) & (run[1:] == run[:-1]))
     for i in change:
-        j = np.searchsorted(t[case.plant.rows(int(run[i]))], [t[i], t[i] + seconds]) + case.plant.rows(int(run[i])).start
+        j = np.searchsorted(t[case.plant.rows(int(run[i]))], [t[i] - 0.25 * seconds, t[i] + 0.75 * seconds]) + case.plant.rows(int(run[i])).start
         out[j[0] : j[1] + 1] = 1.0
     return out
 

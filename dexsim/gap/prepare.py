@@ -179,7 +179,13 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
             ranges[name] = (value.low, value.high)
     regimes_extra = {"_gravity": gravity}
     for k in range(4):
-        regimes_extra[f"_drag{k}"] = cat(lambda i, k=k: runs[i].vs[:, others[k]] if k < len(others) else np.zeros(len(runs[i].t)))
+        moved_by = lambda i, k=k: runs[i].qs[:, others[k]] - runs[i].qs[0, others[k]] if k < len(others) else np.zeros(len(runs[i].t))  # noqa: E731
+        regimes_extra[f"_drag{k}"] = cat(moved_by)
+    regimes_extra["_error"] = cmd - plant.q
+    regimes_extra["_speed"] = v
+    regimes_extra["_command_rate"] = np.concatenate([np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs])
+    regimes_extra["_torque_rate"] = np.concatenate([np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)])
+    regimes_extra["_added"] = load_t
     regimes_extra["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
     moved = scales.span > 6 * sigma
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
