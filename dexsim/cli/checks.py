@@ -16,6 +16,7 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "worlds": (1, 1 << 20, True),
     "iterations": (1, 10**9, True),
     "episodes": (1, 10**7, True),
+    "view_port": (1, 65535, True),
     "seed": (0, 2**31 - 1, True),
     "save_interval": (1, 10**9, True),
     "final_episodes": (0, 10**7, True),

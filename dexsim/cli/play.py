@@ -30,6 +30,10 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     else:
         policy = plain_policy(str(play["policy"]), env, cfg["seed"])
         about = {"policy": play["policy"], "versions": machine.versions()}
+    if play["view"]:
+        from dexsim.cli import live
+
+        return live.run(start, env, policy)
     print(f"playing {play['episodes']} episodes", flush=True)
     recorder = None
     if play["record"] is not None:

@@ -19,6 +19,7 @@ from dexsim.errors import UserError
 
 WORLDS = {"cpu": 64, "cuda": 8192}  # where neither the user nor the task's preset says
 ITERATIONS = {"cpu": 200, "cuda": 1000}
+VIEW_WORLDS = 4
 MAX_PLAY_WORLDS = {"cpu": 64, "cuda": 4096}
 
 
@@ -94,6 +95,9 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     if _another_world(plain):
         plain, device = _elsewhere(plain, play), "cpu"
     checks.check(play)
+    if play["view"]:
+        play["worlds"] = play["worlds"] or VIEW_WORLDS
+        plain["tactile"]["raw"] = True  # the page shows every taxel
     play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
     plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
     checks.check(plain | {"agent": {}})
@@ -174,6 +178,9 @@ def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
     if str(play["device"] or "cpu") != "cpu":
         raise UserError(f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu")
     play["device"] = plain["device"] = "cpu"
+    if play["view"]:
+        play["worlds"] = play["worlds"] or VIEW_WORLDS
+        plain["tactile"]["raw"] = True  # the page shows every taxel
     play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS["cuda"])
     from dexsim.tasks.reality import overlay
 

@@ -1,0 +1,237 @@
+"""The live view: meshes, panels, controls, and the page in a real headless browser."""
+
+from __future__ import annotations
+
+import re
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import shell
+import torch
+from browser import CHROMIUM, Page
+
+from dexsim.cli import start as start_up
+from dexsim.errors import UserError
+from dexsim.tactile.layout import xhand_layout
+from dexsim.view import live_panels as panels
+from dexsim.view.live_meshes import body_meshes
+
+# --- meshes
+
+
+def volume(vertices, faces):
+    """Signed volume of a closed surface: positive where its triangles turn outwards."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize("kind, size, expected", [
+    ("box", "0.1 0.2 0.3", 8 * 0.1 * 0.2 * 0.3), ("sphere", "0.1", 4 / 3 * np.pi * 1e-3), ("cylinder", "0.1 0.2", np.pi * 0.01 * 0.4),
+    ("capsule", "0.1 0.2", np.pi * 0.01 * 0.4 + 4 / 3 * np.pi * 1e-3), ("ellipsoid", "0.1 0.2 0.3", 4 / 3 * np.pi * 6e-3)])
+def test_primitives_are_closed_outward_and_of_the_right_size(kind, size, expected):
+    model = mujoco.MjModel.from_xml_string(f'<mujoco><worldbody><body><geom type="{kind}" size="{size}" pos="1 2 3" quat="1 1 0 0"/></body></worldbody></mujoco>')
+    (mesh,) = body_meshes(model)[1]
+    assert volume(mesh.vertices - [1, 2, 3], mesh.faces) == pytest.approx(expected, rel=0.03)  # a round shape of 24 sides is smaller
+    assert np.allclose((mesh.vertices.min(0) + mesh.vertices.max(0)) / 2, [1, 2, 3])
+
+
+def test_parked_hidden_and_far_geoms_are_left_out():
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><geom size="0.1"/>
+        <geom size="0.1" pos="0 0 1000"/><geom size="0.1" group="3"/><geom size="0.1" rgba="1 0 0 0"/></body></worldbody></mujoco>""")
+    found = body_meshes(model)
+    assert list(found) == [1] and len(found[1]) == 1 and np.abs(found[1][0].vertices).max() < 0.11
+
+
+# --- panels
+
+def test_colours_darken_with_force():
+    values = panels.colours(np.linspace(0, 1, 20), 1.0).astype(int)
+    assert values.shape == (20, 3) and (np.diff(values[:, 1]) <= 0).sum() >= 17 and values[0].sum() > 550 > 150 > values[-1].sum()
+    assert (panels.colours(np.array([2.0]), 1.0) == values[-1]).all()
+
+
+def test_a_pressed_taxel_shows_on_its_own_fingertip_only():
+    layout = xhand_layout()
+    shown = panels.TaxelMap(layout)
+    force = np.zeros(layout.area.shape)
+    calm = shown.image(force, 1.0)
+    for finger in range(5):
+        force[:] = 0
+        force[finger, 60] = 1.0
+        changed = (shown.image(force, 1.0) != calm).any(-1)
+        columns = np.flatnonzero(changed.any(0))
+        left = finger * (panels.PAD_WIDTH + panels.GAP)
+        assert 4 <= changed.sum() <= 0.1 * panels.PAD_WIDTH * panels.PAD_HEIGHT
+        assert left <= columns.min() and columns.max() < left + panels.PAD_WIDTH
+    every = {tuple(p) for f in range(5) for p in np.unique(shown._nearest[f][shown._inside[f]])[:, None]}
+    assert len(every) == 120  # each taxel has a place
+
+
+def test_the_end_of_the_finger_is_up():
+    layout = xhand_layout()
+    shown = panels.TaxelMap(layout)
+    force = np.zeros(layout.area.shape)
+    calm = shown.image(force, 1.0)
+    for finger, axis in enumerate((1, 2, 2, 2, 2)):  # the thumb's distal link points along y, the others' along z
+        force[:] = 0
+        force[finger, layout.point[finger, :, axis].argmax()] = 1.0
+        rows = np.flatnonzero((shown.image(force, 1.0) != calm).any(-1).any(1))
+        assert rows.mean() < 0.35 * panels.PAD_HEIGHT, layout.names[finger]
+
+
+def test_force_bars_show_force_and_command():
+    text = panels.force_bars(["thumb", "index"], np.array([3.0, 6.0]), np.array([np.nan, 9.0]), 12.0)
+    assert "width:25.0%" in text and "width:50.0%" in text and "calc(75.0% - 1px)" in text and text.count("calc(") == 1
+    assert ">3.0<" in text and "6.0 / 9.0" in text
+    assert "command" not in panels.force_bars(["a"], np.array([1.0]), None, 12.0)
+
+
+def test_reward_bars_go_left_for_losses_and_names_are_escaped():
+    text = panels.reward_bars({"good": 0.5, "<bad>": -0.25}, {"good": 2.0, "<bad>": -1.0}, 1.0)
+    assert "&lt;bad&gt;" in text and "<bad>" not in text and re.search(r"width:25.0%;left:50%", text) and re.search(r"width:12.5%;right:50%", text)
+    assert "this step +0.250, this episode +1.0" in text and "-0.000" not in panels.reward_bars({"x": -1e-6}, {}, 1.0)
+
+
+# --- the view without a browser
+
+pytest.importorskip("viser", reason='viser is not installed (pip install -e ".[view]")')
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def env():
+    torch.set_num_threads(1)
+    from dexsim.tasks import make_env
+
+    start = start_up.for_play(["policy=zero", "task=grasp", "device=cpu", "view=true", "worlds=2", "seed=3", "sim.threads=1"], shell.ROOT / "configs")
+    assert start.cfg["tactile"]["raw"] is True
+    return make_env(start.cfg, 2, "cpu", 3, "auto")
+
+
+@pytest.fixture
+def view(env):
+    from dexsim.view.live import LiveView
+
+    rewards = env.rewards
+    policies = {"zero": lambda obs: torch.zeros(2, 12), "close": env.scripted_policy()}
+
+    def load(name):
+        if name not in policies:
+            raise UserError(f"{name}: trained on other observations")
+        return policies[name]
+
+    env.reset_all()
+    view = LiveView(env, policies["close"], "close", [*policies, "broken.pt"], load, "127.0.0.1", free_port())
+    yield view
+    view.stop()
+    env.rewards, env.fixed_command = rewards, None
+
+
+def test_serves_on_loopback_only(view):
+    with socket.create_connection(("127.0.0.1", view.port), timeout=5):
+        pass
+    listening = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    hosts = {x[1].split(":")[0] for x in listening if int(x[1].split(":")[1], 16) == view.port and x[3] == "0A"}
+    assert hosts == {"0100007F"}
+
+
+def test_pause_step_world_policy_command_and_restart(view, env):
+    w = view.wishes
+    w.pause, w.steps = True, 7
+    view.run(seconds=1.5)
+    assert view.steps == 7 and int(env.episode_length_buf[0]) == 7
+    assert "paused" in view._facts.content and 'data-fact="step">7<' in view._facts.content
+    shown = view._object[0].vertices.copy()
+    w.world, w.steps = 1, 1
+    view.run(seconds=0.7)
+    assert "1 of 2" in view._facts.content
+    assert len(view._object[0].vertices) != len(shown) or not np.allclose(view._object[0].vertices, shown)  # the other world's object
+    w.policy, w.command, w.steps = "zero", 0.75, 2
+    view.run(seconds=0.7)
+    assert view.name == "zero" and view.steps == 2 and float(env.command[1]) == 0.75
+    assert f"/ {0.75 * env.f_max:.1f}" in view._forces.content
+    w.policy = "broken.pt"
+    view.run(seconds=0.3)
+    assert view.name == "zero" and "other observations" in view._facts.content
+
+
+def test_touch_is_shown_where_it_is_felt(view, env):
+    view.wishes.speed = "fastest"
+    blank = view._image.image.copy()
+    view.run(seconds=6.0)
+    assert view.steps > 60
+    felt = env.touch.raw[0].numpy()
+    view.draw(panels_too=True)
+    assert float(felt.sum()) > 0 and (view._image.image != blank).any()
+    finger = int(felt.sum(1).argmax())
+    pressed = view._points[finger].colors.astype(int)
+    assert pressed[felt[finger].argmax()].sum() < pressed[felt[finger].argmin()].sum()
+    assert set(view._terms) == {row[0] for row in env.describe()["rewards"]}
+
+
+def test_a_port_in_use_is_one_line(view, env):
+    from dexsim.view.live import LiveView
+
+    with pytest.raises(UserError, match=f"view_port={view.port}: cannot serve there"):
+        LiveView(env, view.policy, "close", ["close"], view._load, "127.0.0.1", view.port)
+
+
+def test_without_viser_it_says_what_to_install(env, monkeypatch):
+    from dexsim.view.live import LiveView
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(UserError, match=r"\.\[view\]"):
+        LiveView(env, None, "x", ["x"], None, "127.0.0.1", 8080)
+
+
+# --- the page
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (Debian, Ubuntu: apt-get install chromium)")
+def test_the_page_in_a_browser(view, env, tmp_path):
+    """Opened in Chromium: the hand is drawn, figures move, pause and step work, another policy can be chosen."""
+    loop = threading.Thread(target=view.run, daemon=True)
+    loop.start()
+    page = Page(f"http://127.0.0.1:{view.port}")
+
+    def step() -> int:
+        return int(page.js("document.querySelector('[data-fact=step]').innerText"))
+
+    try:
+        page.wait("['[data-fact=step]', '[data-panel=rewards]', 'canvas'].every(x => document.querySelector(x) !== null)")
+        assert page.js("document.querySelectorAll('[data-panel=force-bars] > div:last-child > div').length") == 15  # 5 fingers x 3 cells
+        assert page.js("[...document.images].some(i => i.naturalWidth > 300)")  # the taxel maps
+        first = step()
+        page.wait(f"+document.querySelector('[data-fact=step]').innerText > {first + 5}")
+        page.click("step")
+        page.wait("document.querySelector('[data-fact=state]').innerText === 'paused'")
+        time.sleep(1.0)
+        still = step()
+        time.sleep(1.0)
+        assert step() == still
+        page.click("10 steps")
+        page.wait(f"document.querySelector('[data-fact=step]').innerText === '{still + 10}'")
+        page.click("new episodes")
+        page.wait("document.querySelector('[data-fact=step]').innerText === '0'")
+        picture = page.screenshot(tmp_path / "page.png")
+        from PIL import Image
+
+        scene = np.asarray(Image.open(picture).convert("RGB"))[250:900, 50:950].astype(int)
+        drawn = np.abs(scene - scene[:, :1]).sum(-1) > 40  # against the background's left edge
+        orange = (scene[..., 0] > scene[..., 2] + 60) & drawn
+        assert drawn.mean() > 0.04 and orange.mean() > 0.002, "hand and object are not in the picture"
+        assert not page.log
+    finally:
+        page.close()
+        view._stopped.set()
+        loop.join(10)
