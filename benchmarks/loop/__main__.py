@@ -1,14 +1,15 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
 
     python -m benchmarks.loop [tasks=grasp,rotate] [worlds=dry,late] [seeds=3] [naive_s=150] [tune_s=120] [gpus=0,1,...]
-                              [cpus=N] [episodes=grasp:256,rotate:64] [out=out/loop] [stop_s=0] [report=false]
+                              [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
 
-For each task and seed: the included policy goes on in the believed simulator without randomization of the drives (naive). Then three
-fine-tunes of the naive checkpoint at the same number of iterations: with the servo table that `diagnose` fitted to recordings made in
-the reality (its intervals are the randomization), with wide randomization of the believed drives alone, and with the true drives and
-touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
+A reality is one hand: it is recorded (safe excitation, and the included policies' own runs in it) and diagnosed once. For each task
+and seed: the included policy goes on in the believed simulator without randomization of the drives (naive). Then three
+fine-tunes of the naive checkpoint at the same number of iterations: with the servo table that `diagnose` fitted (its intervals
+are the randomization), with wide randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
 training, as many at a time as there are GPUs; judging, recording and diagnosing use the CPUs meanwhile. Resumable: a step that is
-done is not repeated. stop_s: seconds after which nothing more is begun. Writes loop.json, table.md, loop.png.
+done is not repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
+runs is ended. Writes loop.json, table.md, loop.png.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "dry,late", "seeds": "3", "naive_s": "150", "tune_s": "120", "gpus": "", "cpus": str(os.cpu_count() or 1),
-            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60"}  # fmt: skip
+            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0"}  # fmt: skip
 # what is judged: file key, larger is better
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
@@ -39,6 +40,7 @@ FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "effic
          "torque_ripple": 0.0}  # fmt: skip
 WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
+JUDGING = 75.0  # s that judging may be begun after the last training
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
 
@@ -57,9 +59,9 @@ class Job:
 class Queue:
     """Runs jobs on GPUs and CPU slots as their predecessors finish."""
 
-    def __init__(self, jobs: list[Job], gpus: list[str], cpu_slots: int, stop_s: float):
+    def __init__(self, jobs: list[Job], gpus: list[str], cpu_slots: int, stop_s: float, kill_s: float, kill):
         self.jobs = {j.name: j for j in jobs}
-        self.gpus, self.cpu_slots, self.stop_s = list(gpus), cpu_slots, stop_s
+        self.gpus, self.cpu_slots, self.stop_s, self.kill_s, self.kill = list(gpus), cpu_slots, stop_s, kill_s, kill
         self.state = {j.name: "done" if j.mark.is_file() else "waits" for j in jobs}
         self.lock, self.begun = threading.Condition(), time.perf_counter()
 
@@ -68,9 +70,12 @@ class Queue:
         threads: list[threading.Thread] = []
         with self.lock:
             while True:
-                out_of_time = self.stop_s and time.perf_counter() - self.begun > self.stop_s
+                spent = time.perf_counter() - self.begun
+                if self.kill_s and spent > self.kill_s:
+                    self.kill()
                 for job in sorted(self.jobs.values(), key=lambda j: j.rank):
-                    if self.state[job.name] != "waits" or out_of_time:
+                    late = self.stop_s and spent > self.stop_s + (0.0 if job.gpu else JUDGING)
+                    if self.state[job.name] != "waits" or late:
                         continue
                     before = [self.state[a] for a in job.after]
                     if "failed" in before:
@@ -121,6 +126,7 @@ class Loop:
         self.seeds = list(range(1, int(s["seeds"]) + 1))
         self.gpus = [g for g in s["gpus"].split(",") if g] or ["cpu"]
         self.episodes = {k: int(v) for k, v in (part.split(":") for part in s["episodes"].split(","))}
+        self.running: set[subprocess.Popen] = set()
         self.extra = [x for x in s["train"].split(" ") if x]
         cores = int(s["cpus"])
         self.slots = max(cores // 8, 1)
@@ -133,10 +139,13 @@ class Loop:
         env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
         with open(log, "w", encoding="utf-8") as file:
             process = subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
+            self.running.add(process)
             begun = time.perf_counter()
             while True:
                 try:
-                    return process.wait(0.5)
+                    status = process.wait(0.5)
+                    self.running.discard(process)
+                    return status
                 except subprocess.TimeoutExpired:
                     if on_poll is not None and on_poll():
                         process.send_signal(signal.SIGINT)
@@ -144,6 +153,11 @@ class Loop:
                     if time.perf_counter() - begun > limit:
                         process.kill()
                         return 124
+
+    def kill(self) -> None:
+        """Ends what this program began."""
+        for process in list(self.running):
+            process.kill()
 
     def folder(self, task: str, seed: int, world: str = "") -> Path:
         return self.out / f"{task}_{seed}" / world
@@ -197,7 +211,7 @@ class Loop:
             if variant == "wide":
                 argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
             elif variant == "fitted":
-                argv.append(f"servo_file={base / world / 'diagnosis' / 'servo.yaml'}")
+                argv.append(f"servo_file={self.out / f'diagnosis_{world}' / 'servo.yaml'}")
             else:
                 true = yaml.safe_load((ROOT / "configs" / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
                 (base / world).mkdir(parents=True, exist_ok=True)
@@ -217,12 +231,8 @@ class Loop:
         def run(slot: str) -> bool:
             where = self.folder(task, seed, world) / f"judged_{variant}"
             cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
-            # the first run of the naive policy is recorded as well: its own motion in the reality
-            own = [f"record={self.folder(task, seed, world) / 'recordings' / 'policy.mcap'}", "record_worlds=2", "realistic=true"] if variant == "naive" else []
-            if own:
-                (self.folder(task, seed, world) / "recordings").mkdir(parents=True, exist_ok=True)
             status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}", f"episodes={self.episodes[task]}",
-                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.threads}", *cap, *own], where / "log.txt", limit=400)  # fmt: skip
+                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.threads}", *cap], where / "log.txt", limit=400)  # fmt: skip
             return status == 0 and (where / "metrics.json").is_file()
 
         return run
@@ -230,28 +240,41 @@ class Loop:
     def excite(self, world: str):
         def run(slot: str) -> bool:
             where = self.out / f"excited_{world}"
-            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=4"], where / "log.txt") == 0
+            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=2"], where / "log.txt") == 0
 
         return run
 
-    def diagnose(self, task: str, seed: int, world: str):
+    def own_run(self, task: str, world: str):
+        """Recordings of the policy's own runs in the reality: of the included policy, which naive training goes on from."""
         def run(slot: str) -> bool:
-            where = self.folder(task, seed, world)
+            where = self.out / f"excited_{world}"
+            where.mkdir(parents=True, exist_ok=True)
+            cap = ["task.evaluation.cap_s=12"] if task == "rotate" else []
+            return self.call(["play.py", f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"reality={world}", "episodes=8", "seed=5", "video=false",
+                              f"out={self.out / f'own_{task}_{world}'}", f"sim.threads={self.threads}", f"record={where / f'own_{task}.mcap'}", "record_worlds=1",
+                              "realistic=true", *cap], self.out / f"own_{task}_{world}.log", limit=200) == 0  # fmt: skip
+
+        return run
+
+    def diagnose(self, world: str):
+        """One reality is one hand: it is diagnosed once, from what was excited and from the policies' own runs."""
+        def run(slot: str) -> bool:
+            where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            own = sorted((where / "recordings").glob("policy*.mcap"))
-            fit, held = [*excited[:-1], *own[:1]], excited[-1:]
-            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", f"out={where / 'diagnosis'}", "next=false"]
-            if self.call(argv, where / "diagnosis.log", limit=300) == 0 and (where / "diagnosis" / "servo.yaml").is_file():
-                return True
-            # a policy's run that cannot be used must not cost the loop: what was excited alone
-            argv[1] = f"recordings=[{','.join(map(str, excited[:-1]))}]"
-            return self.call(argv, where / "diagnosis_again.log", limit=300) == 0 and (where / "diagnosis" / "servo.yaml").is_file()
+            own = sorted((self.out / f"excited_{world}").glob("own_*.mcap"))
+            fit, held = [*excited[:-1], *own], excited[-1:]
+            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", f"out={where}", "next=false"]
+            return self.call(argv, self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"])) == 0 and (where / "servo.yaml").is_file()
 
         return run
 
     def jobs(self) -> list[Job]:
         """All steps; those that others wait for come first."""
-        out = [Job(f"excite {w}", self.out / f"excited_{w}" / "done", self.excite(w), False, [], 0) for w in self.worlds]
+        out = []
+        for w in self.worlds:
+            out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
+            out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0) for t in self.tasks]
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0))
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
@@ -261,9 +284,8 @@ class Loop:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
                         Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank))
-                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 1)
-                    add("diagnose", self.diagnose(task, seed, w), False, [f"judge naive {name} {w}", f"excite {w}"], 1)
-                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {name} {w}"], 2 + seed)
+                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 9)
+                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], 2)
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 3 + seed)
                     add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
                     for variant in ("fitted", "truth"):
@@ -289,14 +311,12 @@ class Loop:
                             line[f"recovered_{other}"] = _ratio(x["naive"][both], x[other][both], x["truth"][both])
                     lines.append(line)
         found = {}
-        for task in self.tasks:
-            for seed in self.seeds:
-                for world in self.worlds:
-                    path = self.folder(task, seed, world) / "diagnosis" / "diagnosis.json"
-                    if path.is_file():
-                        d = json.loads(path.read_text(encoding="utf-8"))
-                        found[f"{task} {seed} {world}"] = {"verdict": d["verdict"], "before": d["held_out"]["before"], "after": d["held_out"]["after"],
-                                                          "findings": [[f["effect"], f["where"]["joints"], round(f["confidence"], 2)] for f in d["findings"]]}  # fmt: skip
+        for world in self.worlds:
+            path = self.out / f"diagnosis_{world}" / "diagnosis.json"
+            if path.is_file():
+                d = json.loads(path.read_text(encoding="utf-8"))
+                found[world] = {"verdict": d["verdict"], "before": d["held_out"]["before"], "after": d["held_out"]["after"],
+                                "findings": [[f["effect"], f["where"]["joints"], round(f["confidence"], 2)] for f in d["findings"]]}  # fmt: skip
         return {"benchmark": "loop", "settings": self.s, "lines": lines, "diagnoses": found}
 
     def _metric(self, task: str, seed: int, world: str, variant: str, key: str) -> float | None:
@@ -374,8 +394,7 @@ def main(argv: list[str]) -> dict:
     loop = Loop(s)
     loop.out.mkdir(parents=True, exist_ok=True)
     if s["report"] != "true":
-        queue = Queue(loop.jobs(), loop.gpus, loop.slots, float(s["stop_s"]))
-        queue.go()
+        Queue(loop.jobs(), loop.gpus, loop.slots, float(s["stop_s"]), float(s["kill_s"]), loop.kill).go()
     data = loop.report()
     (loop.out / "loop.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")
