@@ -39,10 +39,11 @@ class LoopSettings:
 
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
     home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task starts with
-    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: a reading older than this relaxes; late s: so does a turn
-    that is later than this; overruns: so do as many turns in a row that end after the next was due; hang s: so does a loop
-    that does not turn at all (seen by a thread of its own). speed: targets' largest, over the joints' no-load speeds;
-    margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one; kp: its gain.
+    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: a reading older than this relaxes; late
+    s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading period after
+    they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed: targets' largest, over
+    the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one;
+    kp: its gain.
     recover: after letting go, home again once readings have been good for recover_s; else the run ends.
     """
 
@@ -204,11 +205,11 @@ class Loop:
                 self._act(now)
             timing.end()
             after = c.now()
-            if after > min(read_at, act_at) + 1e-9 and type(c) is Clock:
+            if after - due > self.read_period and type(c) is Clock:
                 timing.overruns += 1
                 in_a_row += 1
                 if in_a_row >= s.overruns and self.phase != RELAXED:
-                    self._tripped = f"{in_a_row} turns in a row took longer than their period"
+                    self._tripped = f"{in_a_row} turns in a row ended more than a reading period late"
                 # what was missed is left out, not made up for in a burst
                 read_at += max(0.0, np.ceil((after - read_at) / self.read_period)) * self.read_period
                 act_at += max(0.0, np.floor((after - act_at) / self.period)) * self.period
