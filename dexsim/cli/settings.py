@@ -57,7 +57,7 @@ def parse(argv: list[str], config_dir: Path) -> Request:
             raise UserError(f"cannot read {text!r}: a value with special characters needs quotes, {key}='\"{value}\"'"
                             " in a shell") from None
         if item.is_sweep_override():
-            raise UserError(f"{text!r} gives several values: one run takes one value for each setting")
+            raise UserError(f"{text!r} gives several values: one run takes one value for each setting (--multirun runs them all)")
         if item.key_or_group in known and item.type == OverrideType.CHANGE:
             request.choices[item.key_or_group] = _option(item, known[item.key_or_group])
         else:

@@ -1,0 +1,119 @@
+"""Several runs from one command, through Hydra's sweeper and launcher: python train.py --multirun seed=1,2,3 servo=xhand,ideal.
+
+Hydra expands the lists into jobs and hands them to its launcher; each job is train.py again, in a process of its own. The basic
+launcher runs them one after the other; a launcher plugin (hydra/launcher=joblib, submitit_slurm, ...) runs them as it does.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from dexsim.cli.report import table
+from dexsim.errors import UserError
+
+FLAGS = ("--multirun", "-m")
+
+
+def wanted(argv: list[str]) -> bool:
+    """Whether the command asks for a sweep."""
+    return any(a in FLAGS for a in argv)
+
+
+def run(argv: list[str], config_dir: Path, script: Path) -> int:
+    """Run all jobs; returns 0 when all ended with 0, else 1. Raises UserError for what Hydra refuses.
+
+    Each job's run folder is `<sweep>/<number>`; the sweep folder is runs/<task>/sweep_<date and time>, or `sweep=FOLDER`.
+    """
+    argv = [a for a in argv if a not in FLAGS]
+    for name in ("out", "run"):
+        if any(a.startswith(f"{name}=") for a in argv):
+            raise UserError(f"{name}=: a sweep names its run folders itself, <sweep>/<number>; choose the place with sweep=FOLDER")
+    given = [a.partition("=")[2] for a in argv if a.startswith("sweep=")]
+    argv = [a for a in argv if not a.startswith("sweep=")]
+    task = next((a.partition("=")[2] for a in reversed(argv) if a.startswith("task=")), "grasp").replace(",", "_")
+    folder = Path(given[-1] if given else Path("runs") / task / time.strftime("sweep_%Y-%m-%d_%H-%M-%S")).expanduser().resolve()
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder} already holds a sweep: choose another sweep=")
+    places = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${hydra.job.num}", "hydra.output_subdir=null", "hydra.job.chdir=false",
+              "hydra/job_logging=disabled", "hydra/hydra_logging=none"]
+    _hydra(argv, places, config_dir, Job(script))
+    rows, failed = _collect(folder)
+    print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
+    return 1 if failed or not rows else 0
+
+
+class Job:
+    """What a launcher calls for each job; picklable, so that a launcher may run it elsewhere (with the same files)."""
+
+    def __init__(self, script: Path) -> None:
+        self.script = str(script)
+
+    def __call__(self, _cfg: Any) -> int:
+        from hydra.core.hydra_config import HydraConfig
+
+        hydra = HydraConfig.get()
+        folder = Path(hydra.runtime.output_dir)
+        settings, number = list(hydra.overrides.task), int(hydra.job.num)
+        env, devices = dict(os.environ), _cuda()
+        if devices and "basic" not in hydra.launcher._target_.lower():  # side by side: the GPUs in turn
+            env["CUDA_VISIBLE_DEVICES"] = devices[number % len(devices)]
+        print(f"job {number}: {' '.join(settings)}", flush=True)
+        start = time.perf_counter()
+        status = subprocess.run([sys.executable, self.script, *settings, f"out={folder}"], env=env).returncode
+        note = {"settings": settings, "status": status, "seconds": round(time.perf_counter() - start, 1)}
+        (folder / "job.json").write_text(json.dumps(note))
+        if status in (130, 143):
+            raise KeyboardInterrupt
+        return status
+
+
+def _cuda() -> list[str]:
+    """Names of the CUDA devices that jobs may use."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return [d for d in visible.split(",") if d]
+    from dexsim.cli import machine
+
+    return [str(k) for k in range(machine.cuda_devices())]
+
+
+def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Job) -> None:
+    """Hydra's own entry, with our settings file; its one-line refusals become UserError."""
+    from hydra._internal.utils import _run_hydra, get_args_parser
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    parser = get_args_parser()
+    args = parser.parse_args(["--multirun", *argv, *places])
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors as exceptions, to be said our way
+    try:
+        _run_hydra(args=args, args_parser=parser, task_function=job, config_path=str(config_dir.resolve()), config_name="config")
+    except (HydraException, OmegaConfBaseException) as error:
+        lines = [x.strip() for x in str(error).splitlines() if x.strip()]
+        raise UserError(f"sweep: {' '.join(lines[:3])}") from None
+
+
+def _collect(folder: Path) -> tuple[list[tuple], bool]:
+    """A row for each job: name, settings, status, iterations, last step reward, seconds; and whether one failed."""
+    rows, failed = [], False
+    notes = sorted(folder.glob("*/job.json"), key=lambda p: int(p.parent.name))
+    jobs = [json.loads(note.read_text()) for note in notes]
+    common = set.intersection(*(set(job["settings"]) for job in jobs)) if len(jobs) > 1 else set()
+    for note, job in zip(notes, jobs):
+        progress: list[dict[str, str]] = []
+        if (note.parent / "progress.csv").exists():
+            with open(note.parent / "progress.csv", newline="") as file:
+                progress = list(csv.DictReader(file))
+        last = progress[-1] if progress else {}
+        tail = [float(r["step_reward"]) for r in progress[-10:]]
+        rows.append((note.parent.name, " ".join(x for x in job["settings"] if x not in common), job["status"], int(last.get("iteration", 0)),
+                     sum(tail) / len(tail) if tail else float("nan"), job["seconds"]))
+        failed |= job["status"] != 0
+    return rows, failed
