@@ -1,10 +1,12 @@
-"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage DATA_DIR [out=DIR]. One JSON line at the end."""
+"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage DATA_DIR [out=DIR] [jobs=1] [figure=FILE.png]. One JSON line at the end."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -12,39 +14,66 @@ import numpy as np
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real]
+USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [figure=FILE.png]
 
 DATA_DIR is where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml).
+jobs: of BAM's four gains left out in turn, how many at a time. Also writes out/NAME.json.
 """
 
 
-def bam(data: Path, out: Path) -> dict:
-    """Leave one gain out: each of the 16 recordings run free in closed loop, with everything chosen on the other three gains."""
+def _fold(job: tuple[Path, Path, int]) -> dict:
+    """One gain of BAM left out: fitted on the other three, judged on its four recordings."""
     from benchmarks.real.convert_bam import convert
+    from dexsim.cli.build import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
-    made = convert(data, out / "recordings")
-    errors, found, seconds = {}, {}, []
-    for gain in sorted(set(made.gains.values())):
-        held = [p for p in made.recordings if made.gains[p.name] == gain]
-        rest = [p for p in made.recordings if p not in held]
-        start = time.perf_counter()
-        d = diagnose(Settings(rest, out / f"gain_{gain}", held, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
-        seconds.append(time.perf_counter() - start)
-        save(d, out / f"gain_{gain}")
-        found[gain] = [f"{f['effect']} {f['confidence']:.2f}" for f in d.data["findings"]]
-        for (_, recording), (before, after) in d.mae.items():
-            errors[recording] = (before, after)
-        print(f"gain {gain} left out: {d.data['verdict']}, {', '.join(found[gain]) or 'nothing'}; position MAE "
-              f"{1e3 * np.mean([errors[p.name][1] for p in held]):.1f} mrad ({seconds[-1]:.0f} s)", flush=True)  # fmt: skip
-    table = {p.name: round(1e3 * errors[p.name][1], 1) for p in made.recordings}
-    return {"benchmark": "bam", "mae_mrad": float(1e3 * np.mean([e[1] for e in errors.values()])),
-            "mae_before_mrad": float(1e3 * np.mean([e[0] for e in errors.values()])), "to_beat_mrad": 52.3, "coulomb_viscous_mrad": 64.1,
-            "found": found, "by_recording": table, "seconds": round(sum(seconds), 1)}  # fmt: skip
+    data, out, gain = job
+    quiet_warp("cpu")
+    made = convert(data, out / f"recordings_{gain}")
+    held = [p for p in made.recordings if made.gains[p.name] == gain]
+    rest = [p for p in made.recordings if p not in held]
+    start = time.perf_counter()
+    d = diagnose(Settings(rest, out / f"gain_{gain}", held, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
+    save(d, out / f"gain_{gain}")
+    return {"gain": gain, "verdict": d.data["verdict"], "floor_rad": d.data["noise_floor"]["position_rad"], "findings": [_brief(f) for f in d.data["findings"]],
+            "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()}, "notes": d.notes, "stages": d.stages,
+            "depends_on": d.data["unexplained"]["depends_on"], "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
-def emps(data: Path, out: Path) -> dict:
-    """Fitted on the estimation data, judged on the pulses."""
+def _brief(f: dict) -> dict:
+    """A finding without its stretches of time."""
+    return {k: f.get(k) for k in ("effect", "confidence", "indistinguishable", "alternatives", "regime", "parameters", "held_out", "separating_experiment")} | {
+        "joints": f["where"]["joints"]}  # fmt: skip
+
+
+def bam(data: Path, out: Path, jobs: int) -> dict:
+    """Leave one gain out: each of the 16 recordings run free in closed loop, with everything chosen on the other three gains."""
+    from benchmarks.real.convert_bam import convert
+
+    gains = sorted(set(convert(data, out / "recordings").gains.values()))
+    folds, errors = [], {}
+    with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
+        for fold in pool.map(_fold, [(data, out, g) for g in gains]):
+            folds.append(fold)
+            errors |= fold["recordings"]
+            print(f"gain {fold['gain']} left out: {fold['verdict']}, {', '.join(_named(f) for f in fold['findings']) or 'nothing'}; position MAE "
+                  f"{1e3 * np.mean([e[1] for e in fold['recordings'].values()]):.1f} mrad ({fold['seconds']:.0f} s)", flush=True)  # fmt: skip
+    x = np.array(list(errors.values()))
+    rng = np.random.default_rng(0)
+    draws = [x[rng.integers(0, len(x), len(x)), 1].mean() for _ in range(2000)]
+    low, high = np.percentile(draws, (2.5, 97.5))
+    return {"benchmark": "bam", "mae_mrad": float(1e3 * x[:, 1].mean()), "mae_low_mrad": float(1e3 * low), "mae_high_mrad": float(1e3 * high),
+            "mae_before_mrad": float(1e3 * x[:, 0].mean()), "to_beat_mrad": 52.3, "coulomb_viscous_mrad": 64.1,
+            "by_recording_mrad": {k: [round(1e3 * a, 1), round(1e3 * b, 1)] for k, (a, b) in sorted(errors.items())}, "folds": folds}  # fmt: skip
+
+
+def _named(f: dict) -> str:
+    return f"{f['effect']} {f['confidence']:.2f}"
+
+
+def emps(data: Path, out: Path, jobs: int) -> dict:
+    """Fitted on the estimation data, judged on the pulses; in closed loop, and driven by the recorded force alone."""
+    from benchmarks.real import emps_force as force
     from benchmarks.real.convert_emps import REFERENCE, convert
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
@@ -52,12 +81,40 @@ def emps(data: Path, out: Path) -> dict:
     start = time.perf_counter()
     d = diagnose(Settings([made.estimation], out, [made.pulses], str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
     save(d, out)
-    return {"benchmark": "emps", "verdict": d.data["verdict"], "found": {f["effect"]: f["parameters"] for f in d.data["findings"]},
-            "nuisance": d.data["nuisance"], "reference": REFERENCE, "held_out": d.data["held_out"], "joints": d.joints,
-            "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    result = {"benchmark": "emps", "verdict": d.data["verdict"], "findings": [_brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"],
+              "reference": REFERENCE, "held_out": d.data["held_out"], "joints": d.joints, "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    found = _emps_parameters(d)
+    result["found"] = found
+    result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE if found.get(k) is not None}
+    result["open_loop_mm"] = {}
+    for name in force.FILES:
+        t, q, f = force.load(data, name)
+        given = {k: v for k, v in found.items() if k in ("mass", "viscous", "coulomb", "offset", "peak", "v_s")}
+        result["open_loop_mm"][name] = {"found": round(1e3 * force.open_loop(t, q, f, **given), 3), "reference": round(1e3 * force.open_loop(t, q, f, **REFERENCE), 3)}
+    t, q, f = force.load(data, "estimation")
+    result["least_squares"] = force.least_squares(t, q, f)
+    return result
 
 
-def sage(data: Path, out: Path) -> dict:
+def _emps_parameters(d) -> dict[str, float]:
+    """Mass, viscous and dry friction, offset of the fitted drive, in the literature's terms."""
+    from dexsim.actuator.columns import INDEX
+
+    row = d.servo.nominal(("carriage",))[0]
+    by = {f["effect"]: {k: v["value"] for k, v in f["parameters"].items()} for f in d.data["findings"]}
+    n = d.data["nuisance"]
+    pick = lambda key, default: float(n.get(f"{key}@carriage", n.get(f"{key}_factor@carriage", default)))  # noqa: E731
+    coulomb = by.get("coulomb_friction", {}).get("torque", n.get("coulomb_friction@carriage", float(row[INDEX["coulomb_friction"]])))
+    viscous = by.get("viscous_friction", {}).get("coefficient", n.get("viscous_friction@carriage", float(row[INDEX["viscous_friction"]])))
+    asymmetry = by.get("coulomb_friction", {}).get("asymmetry", n.get("friction_asymmetry@carriage", float(row[INDEX["friction_asymmetry"]])))
+    mass = 95.0 * pick("inertia", 1.0) + by.get("inertia", {}).get("armature", 0.0) + (by.get("payload", {}).get("mass") or 0.0)
+    out = {"mass": float(mass), "viscous": float(viscous), "coulomb": float(coulomb), "offset": 0.5 * float(asymmetry) * float(coulomb)}
+    if "stribeck_friction" in by:
+        out |= {"peak": float(by["stribeck_friction"]["peak"]), "v_s": float(by["stribeck_friction"]["v_s"])}
+    return out
+
+
+def sage(data: Path, out: Path, jobs: int) -> dict:
     """Twenty motions to fit, ten held out; by joint."""
     from benchmarks.real.convert_sage import convert
     from dexsim.gap.diagnosis import Settings, diagnose, save
@@ -66,22 +123,54 @@ def sage(data: Path, out: Path) -> dict:
     start = time.perf_counter()
     d = diagnose(Settings(made.recordings, out, made.held_out, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
     save(d, out)
-    found: dict[str, list[str]] = {}
-    for f in d.data["findings"]:
-        for j in f["where"]["joints"]:
-            found.setdefault(j, []).append(f"{f['effect']} {f['confidence']:.2f}")
-    rows = {j: {"before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2), "found": found.get(j, [])} for j, v in d.joints.items()}
-    return {"benchmark": "sage", "verdict": d.data["verdict"], "joints": rows, "seconds": round(time.perf_counter() - start, 1)}
+    rows = {}
+    for j, v in d.joints.items():
+        mine = [_brief(f) for f in d.data["findings"] if j in f["where"]["joints"]]
+        rows[j] = {"before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2), "findings": mine}
+        print(f"{j:<12} {rows[j]['before_mrad']:>7} -> {rows[j]['after_mrad']:>6} mrad  {', '.join(_named(f) for f in mine) or '-'}")
+    return {"benchmark": "sage", "verdict": d.data["verdict"], "joints": rows, "held_out": d.data["held_out"], "depends_on": d.data["unexplained"]["depends_on"],
+            "nuisance": d.data["nuisance"], "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
 JOBS = {"bam": bam, "emps": emps, "sage": sage}
+
+
+def figure(result: dict, path: Path) -> None:
+    """Errors before and after, by recording (BAM), by joint (SAGE), or the open loop (EMPS)."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    if result["benchmark"] == "bam":
+        rows = [(f"gain {f['gain']}", *(1e3 * np.mean([e[i] for e in f["recordings"].values()]) for i in (0, 1))) for f in result["folds"]]
+        label = "position MAE, left-out gain (mrad)"
+    elif result["benchmark"] == "sage":
+        rows = [(j, v["before_mrad"], v["after_mrad"]) for j, v in result["joints"].items()]
+        label = "position RMSE, held-out motions (mrad)"
+    else:
+        rows = [(k, v["reference"], v["found"]) for k, v in result["open_loop_mm"].items()]
+        label = "position RMSE, recorded force, no feedback (mm)"
+    fig, ax = plt.subplots(figsize=(6.4, 0.42 * len(rows) + 1.3))
+    y = np.arange(len(rows))
+    first = "published parameters" if result["benchmark"] == "emps" else "as believed, refitted within 5 %"
+    ax.barh(y - 0.2, [r[1] for r in rows], 0.38, color="#a0aec0", label=first)
+    ax.barh(y + 0.2, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
+    ax.set_yticks(y, [r[0] for r in rows])
+    ax.invert_yaxis()
+    ax.set_xlabel(label)
+    ax.legend(fontsize=8, frameon=False)
+    fig.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
 
 
 def main(argv: list[str]) -> int:
     """Runs one benchmark; returns the exit status."""
     plain = [a for a in argv if "=" not in a]
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if len(plain) != 2 or plain[0] not in JOBS or set(given) - {"out"}:
+    if len(plain) != 2 or plain[0] not in JOBS or set(given) - {"out", "jobs", "figure"} or not given.get("jobs", "1").isdigit():
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
     data = Path(plain[1]).expanduser()
@@ -90,7 +179,14 @@ def main(argv: list[str]) -> int:
     from dexsim.cli.build import quiet_warp
 
     quiet_warp("cpu")
-    print(json.dumps(JOBS[plain[0]](data, Path(given.get("out", f"out/real/{plain[0]}")))))
+    out = Path(given.get("out", f"out/real/{plain[0]}"))
+    result = JOBS[plain[0]](data, out, int(given.get("jobs", 1)))
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(result, default=float)
+    (out / f"{plain[0]}.json").write_text(text, encoding="utf-8")
+    if "figure" in given:
+        figure(result, Path(given["figure"]))
+    print(text)
     return 0
 
 
