@@ -512,3 +512,34 @@ def test_the_c_engine_refuses_what_it_cannot_place():
     spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>')
     with pytest.raises(UserError, match="mocap"):
         make_engine(spec, 1, "cpu", "mujoco")
+
+
+def test_kernels_compile_together_without_running(monkeypatch):
+    """What a program needs is loaded before it runs: nothing is launched, copied or looped over, and Warp is as it was."""
+    from dexsim.sim import compile as together
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_one(x: wp.array(dtype=float)):
+        x[wp.tid()] = x[wp.tid()] + 1.0
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_two(x: wp.array(dtype=float), go: wp.array(dtype=int)):
+        x[wp.tid()] = x[wp.tid()] + 2.0
+        go[0] = 0
+
+    x, y, go = (wp.zeros(3, dtype=t, device="cpu") for t in (float, float, int))
+    go.fill_(1)
+    before = (wp.copy, wp.capture_while, wp.capture_if, together.Module.load)
+
+    def program() -> None:
+        wp.launch(add_one, dim=3, inputs=[x], device="cpu")
+        wp.capture_while(go, lambda: wp.launch(add_two, dim=3, inputs=[x, go], device="cpu"))
+        wp.copy(y, x)
+
+    monkeypatch.setattr(together.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    together.compile_together(program, "cpu")
+    assert add_one.module.execs and add_two.module.execs
+    assert not x.numpy().any() and not y.numpy().any() and go.numpy()[0] == 1
+    assert (wp.copy, wp.capture_while, wp.capture_if, together.Module.load) == before
+    program()
+    assert (y.numpy() == 3.0).all()
