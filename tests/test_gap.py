@@ -458,5 +458,5 @@ def test_demo_finds_what_it_hid(tmp_path):
     folder = tmp_path / "demo"
     assert command.main(["demo=true", f"out={folder}"]) == 0
     data = json.loads((folder / "diagnosis.json").read_text())
-    assert data["findings"][0]["effect"] == "stribeck_friction"
+    assert data["findings"][0]["effect"] == "command_delay"
     shutil.rmtree(folder)

@@ -112,7 +112,7 @@ def main(argv: list[str]) -> int:
         from dexsim.gap import demo as maker
 
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
-        paths, model, servo, demo = maker.make(out / "recordings", seed=given.get("seed", 0), joint="knuckle")
+        paths, model, servo, demo = maker.make(out / "recordings", "command_delay", seed=given.get("seed", 0), joint="knuckle")
         given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")

@@ -622,10 +622,10 @@ def _sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
     parts = []
     strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
-    for f in strong[:3]:
+    for f in strong[:2]:
         words = entry(f).words
         if f["indistinguishable"]:
-            words += f", or one of {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}, which this recording cannot tell apart"
+            words += f" (or it is {' or '.join(x.replace('_', ' ') for x in f['indistinguishable'] if x != f['effect'])}: these recordings cannot tell)"
         parts.append(f"{place(f)} {words}{_size(f)}")
     parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] else parts[0]
     left_out = len(named) - len(parts)
