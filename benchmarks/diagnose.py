@@ -59,6 +59,8 @@ def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool
         for j, joint in enumerate(joints):
             low, high = limits[m.joints.index(joint)]
             middle, half = 0.5 * (low + high), 0.22 * (high - low)
+            if joint.startswith("thumb") or joint == "index_bend_joint":  # clear of the fingers
+                middle, half = low + (0.2 if joint.startswith("thumb") else 0.5) * (high - low), 0.12 * (high - low)
             f = rng.uniform(0.15, 0.9, 3)
             value[:, j] = middle + half * (sum(np.sin(2 * np.pi * x * t + rng.uniform(0, 6)) for x in f) / 2.2)
             start[m.joints.index(joint)] = value[0, j]

@@ -177,3 +177,33 @@ def test_stiction_is_not_taken_for_repeated_readings():
     assert channels._held(t, q[index]).any()  # it does jump after each rest ...
     creeping = np.round(0.02 * np.sin(t) / 1.5e-3) * 1.5e-3
     assert not channels._held(t, creeping).any()  # ... and slow motion in whole counts does not
+
+
+def test_links_that_touch_each_other_are_cut_out():
+    """Thumb against index in the xHand's own model: the stretch in which they press is no free air."""
+    import mujoco
+
+    from dexsim.assets import xhand
+    from dexsim.gap import inputs
+    from dexsim.gap.runs import Run
+
+    model = xhand.hand_spec().compile()
+    data = mujoco.MjData(model)
+    low, high = xhand.joint_limits().T
+    rng = np.random.default_rng(0)
+    while True:  # a pose in which the hand touches itself
+        pose = rng.uniform(low, high)
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon and data.contact.dist[: data.ncon].min() < -2e-3:
+            break
+    t = np.arange(0, 8, 0.01)
+    share = np.clip((t - 3.0) / 1.0, 0, 1) * np.clip((6.0 - t) / 1.0, 0, 1)  # open, closed from 4 to 5 s, open
+    q = share[:, None] * pose[None]
+    run = Run("a", xhand.JOINTS, t, q, t, q, None, np.zeros(3))
+    spans = inputs.self_touch([run], model)["a"]
+    assert len(spans) == 1 and 3.0 < spans[0][0] <= 4.0 and 5.0 <= spans[0][1] < 6.0
+    assert inputs.merged_spans({"a": [(1.0, 2.0)]}, {"a": [(1.5, 3.0), (4.0, 5.0)]}) == {"a": [(1.0, 3.0), (4.0, 5.0)]}
+    open_hand = Run("b", xhand.JOINTS, t, 0 * q, t, 0 * q, None, np.zeros(3))
+    assert not inputs.self_touch([open_hand], model)

@@ -185,8 +185,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
 
     if not runs or (s.held_out and len(held) == len(runs)):
         return alone("No recording can be used: " + "; ".join(failures))
-    if felt.contact:
-        runs, held = inputs.free_air(runs, held, felt.contact, notes)
+    touched = inputs.merged_spans(felt.contact, inputs.self_touch(runs, m.spec.compile()))
+    clock.lap("contacts along the motion")
+    if touched:
+        runs, held = inputs.free_air(runs, held, touched, notes)
         if not runs or (s.held_out and len(held) == len(runs)):
             return alone("every joint moves only while something is touched")
     try:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from dexsim.actuator.table import ServoTable
@@ -140,7 +141,8 @@ def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[flo
     A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in between
     becomes several of the same name, on its own clock.
     """
-    out, kept = [], []
+    out: list[Run] = []
+    kept: list[int] = []
     for i, run in enumerate(runs):
         spans = touched.get(run.name, [])
         if not spans:
@@ -154,8 +156,8 @@ def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[flo
         pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2.0]
         pieces = [p for p in pieces if len(p.t) >= 20 and (np.ptp(p.q, axis=0) > 2e-3).any()]
         share = sum(p.duration for p in pieces) / max(run.duration, 1e-9)
-        notes.append(f"{run.name}: something is touched; joints are judged by the {100 * share:.0f} % of its time in free air" if pieces
-                     else f"{run.name}: something is touched nearly all the time; its joints are not judged")  # fmt: skip
+        notes.append(f"{run.name}: something is touched, or links touch each other; joints are judged by the {100 * share:.0f} % of its time in free air" if pieces
+                     else f"{run.name}: something is touched, or links touch each other, nearly all the time; its joints are not judged")  # fmt: skip
         kept += range(len(out), len(out) + len(pieces)) if i in held else []
         out += pieces
     return out, kept
@@ -235,4 +237,51 @@ def files(given: Any, key: str) -> list[Path]:
             out.append(path)
     if not out:
         raise UserError(f"{key}: say which, e.g. {key}='[a.mcap,b.mcap]'")
+    return out
+
+
+def self_touch(runs: list[Run], model: mujoco.MjModel, rate: float = 25.0, depth: float = 3e-4) -> dict[str, list[tuple[float, float]]]:
+    """By recording, the stretches [s] in which links of the model press on one another along the measured motion.
+
+    A pair that touches nearly always overlaps by design and says nothing. depth [m]: less is left to the geometry's accuracy.
+    """
+    data = mujoco.MjData(model)
+    seen: list[tuple[str, float, set[tuple[int, int]]]] = []
+    for run in runs:
+        address = [int(model.joint(j).qposadr[0]) for j in run.joints]
+        for t in np.arange(run.t[0], run.t[-1], 1 / rate):
+            data.qpos[address] = [np.interp(t, run.t, run.q[:, j]) for j in range(len(run.joints))]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            contacts = data.contact
+            deep = np.flatnonzero(contacts.dist[: data.ncon] < -depth) if data.ncon else ()
+            pairs = {tuple(sorted(int(model.geom_bodyid[g]) for g in contacts.geom[c])) for c in deep}
+            seen.append((run.name, float(t), pairs))
+    counts: dict[tuple[int, int], int] = {}
+    for _, _, pairs in seen:
+        for p in pairs:
+            counts[p] = counts.get(p, 0) + 1
+    always = {p for p, n in counts.items() if n > 0.9 * len(seen)}
+    out: dict[str, list[tuple[float, float]]] = {}
+    for name, t, pairs in seen:
+        if pairs - always:
+            spans = out.setdefault(name, [])
+            if spans and t - spans[-1][1] < 0.3:
+                spans[-1] = (spans[-1][0], t + 1 / rate)
+            else:
+                spans.append((t - 1 / rate, t + 1 / rate))
+    return out
+
+
+def merged_spans(*several: dict[str, list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
+    """Stretches of several sources by recording, sorted, those that overlap joined."""
+    out: dict[str, list[tuple[float, float]]] = {}
+    for name in {n for s in several for n in s}:
+        joined: list[tuple[float, float]] = []
+        for a, b in sorted(x for s in several for x in s.get(name, [])):
+            if joined and a <= joined[-1][1]:
+                joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
+            else:
+                joined.append((a, b))
+        out[name] = joined
     return out
