@@ -168,6 +168,13 @@ def network(rig: Rig, seed: int = 0, epochs: int = 250) -> float:
 
 def sysid(rig: Rig, iterations: int = 30) -> float | None:
     """Held-out RMSE [rad] of MuJoCo's own identification with everything free; None where it is not installed."""
+    found = identify(rig, iterations)
+    return None if found is None else found[1]
+
+
+def identify(rig: Rig, iterations: int = 30) -> tuple[dict[str, float], float] | None:
+    """What `mujoco.sysid` finds with everything free, {name: value} (SI units; kp and kd of a voltage drive times its torque limit), and its
+    held-out RMSE [rad]; None where it is not installed."""
     import mujoco
 
     try:
@@ -232,7 +239,8 @@ def sysid(rig: Rig, iterations: int = 30) -> float | None:
         found, _ = s.optimize(params, fit, optimizer="mujoco", verbose=False, max_iters=iterations)
     judge = s.build_residual_fn(models_sequences=sequences(HELD), modify_residual=transform.apply, n_threads=1)
     left, _, _ = judge(found.as_vector(), found)
-    return float(np.sqrt(np.mean(np.concatenate([x.ravel() for x in left]) ** 2)))
+    values = {k: float(found[k].value[0]) for k in (*ranges, "delay", "bias")}
+    return values, float(np.sqrt(np.mean(np.concatenate([x.ravel() for x in left]) ** 2)))
 
 
 def _one(job: tuple[str, str]) -> dict:
