@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
     from dexsim.recording.mechanism import mechanism
     from dexsim.recording.schema import numbers
 
-    if "out" not in given:
+    if not given.get("out"):
         raise UserError("say where to write: out=DIR")
     quiet_warp("cpu")
     gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None

@@ -604,7 +604,7 @@ def test_timing_percentiles():
 def test_command_line(made, capsys):
     for arguments, says in ((["bundle=nowhere"], "manifest"), ([f"bundle={made[0]}", "driver=xhand"], "port="), (["sedonds=3"], "sedonds"),
                             ([f"bundle={made[0]}", "seconds=abc"], "seconds=abc"), ([f"bundle={made[0]}", "driver=x"], "driver=x"),
-                            ([f"bundle={made[0]}", "shape=blob"], "shape=blob")):  # fmt: skip
+                            ([f"bundle={made[0]}", "shape=blob"], "shape=blob"), ([f"bundle={made[0]}", "place=1,2"], "place=1,2: must be x y z")):  # fmt: skip
         with pytest.raises(UserError, match=says) as caught:
             command(arguments)
         assert "\n" not in str(caught.value)

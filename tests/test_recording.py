@@ -274,6 +274,13 @@ def test_metadata_beside_the_file_and_by_hand(tmp_path):
             read(path, meta=bad)
 
 
+@pytest.mark.parametrize("key, value", [("gravity", "down"), ("gravity", "0 0"), ("tactile_axis_sign", "1"), ("tactile_lsb", "a tenth")])
+def test_metadata_that_is_no_number_is_named(tmp_path, key, value):
+    path = foreign(tmp_path / "a.mcap")
+    with pytest.raises(UserError, match=f"metadata {key}='{value}'"):
+        read(path, meta={key: value})
+
+
 def test_signs_follow_the_joints_when_they_are_reordered(tmp_path):
     made = recordings.signal(1.0, ("index_joint1", "thumb_bend_joint"))
     made.meta["effort_sign"] = "-1,0"

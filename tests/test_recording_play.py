@@ -418,6 +418,8 @@ def test_settings_of_a_recorded_play():
         engine = servo = touch = objects = target = None
         num_envs = 4
 
+    with pytest.raises(UserError, match="cannot be written"):
+        PlayRecorder.place("/proc/nowhere/x")
     for worlds in (9, 0, [1, 4], [1, 1], [], "some", [0, "x"]):
         with pytest.raises(UserError, match="record_worlds="):
             PlayRecorder(Env(), worlds, {})

@@ -39,6 +39,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if play["record"] is not None:
         from dexsim.recording.tap import PlayRecorder
 
+        PlayRecorder.place(play["record"])  # a place that cannot be written is answered before the play
         recorder = PlayRecorder(env, play["record_worlds"], cfg)
     try:
         replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)

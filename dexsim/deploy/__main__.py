@@ -96,13 +96,19 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
     import numpy as np
 
     from dexsim.deploy.vision import FixedPlace
-    from dexsim.recording.schema import numbers
-
     kind, task = given.get("driver", "sim"), b.manifest["task"]
     for key in ("vision", "place", "shape") if task == "rotate" else ("imu",):
         if key in given:
             raise UserError(f"{key}={given[key]}: the policy in {b.path} is of task={task}, which does not use it")
-    place = FixedPlace(np.array(numbers(given["place"], 3, "place", "deploy"))) if "place" in given else None
+    place = None
+    if "place" in given:
+        try:
+            at = np.array([float(x) for x in given["place"].replace(",", " ").split()])
+        except ValueError:
+            at = np.zeros(0)
+        if at.shape != (3,) or not (np.abs(at) < 0.5).all():
+            raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
+        place = FixedPlace(at)
     if kind == "sim":
         from dexsim.deploy.simulated import SimulatedXHand
 

@@ -10,7 +10,7 @@ import yaml
 
 from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
-from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding
+from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers
 
 VALID = (*KEYS, *UNIT_KEYS)
 NAN = float("nan")
@@ -118,6 +118,9 @@ def _check(path: Path, stated: Mapping[str, str]) -> None:
                 f"{path}: metadata {key}='{stated[key]}' must be one of {', '.join(valid)};"
                 f" correct it with meta.{key}=..."
             )
+    for key, count in (("gravity", 3), ("tactile_axis_sign", 3), ("tactile_lsb", 1)):
+        if key in stated and stated[key] != "unknown":
+            numbers(stated[key], count, key, str(path))
     if stated.get("servo"):
         try:
             raw = yaml.safe_load(stated["servo"])

@@ -168,14 +168,25 @@ class PlayRecorder:
             track.finish()
         return [self._recording(track) for track in self.tracks if track.episode.times]
 
-    def save(self, path: str | Path, realistic: bool = False, seed: int = 0) -> list[Path]:
-        """Write `path` (several worlds: NAME_w0.mcap, ...), like the hardware would have seen it if `realistic`."""
+    @staticmethod
+    def place(path: str | Path) -> Path:
+        """`path` as a file that can be written, its folder made. Raises UserError: before a long play, rather than after it."""
         path = Path(path).expanduser()
         path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
+        there = path.exists()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            with open(path, "ab"):
+                pass
+            if not there:
+                path.unlink()
         except OSError as error:
-            raise UserError(f"record={path}: {error.strerror}") from None
+            raise UserError(f"record={path}: cannot be written: {error.strerror}; choose another place") from None
+        return path
+
+    def save(self, path: str | Path, realistic: bool = False, seed: int = 0) -> list[Path]:
+        """Write `path` (several worlds: NAME_w0.mcap, ...), like the hardware would have seen it if `realistic`."""
+        path = self.place(path)
         out = []
         for k, recording in enumerate(self.recordings()):
             if realistic:
