@@ -16,6 +16,8 @@ examples:
   python train.py worlds=64 iterations=10 device=cpu        a quick look
   python train.py servo=ideal agent.algorithm.learning_rate=5e-4
   python train.py resume=runs/grasp/<run>/last.pt iterations=2000
+  python train.py --multirun seed=1,2,3 servo=xhand,ideal   every combination, one run each (docs/scale.md)
+  torchrun --nproc_per_node=8 train.py task=grasp           one run on eight GPUs, worlds= for each of them (docs/scale.md)
 """
 PLAY = """usage: python play.py checkpoint=PATH [key=value ...]
        python play.py policy=random|zero|scripted task=grasp [key=value ...]
@@ -27,6 +29,7 @@ examples:
   python play.py checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
   python play.py checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
   python play.py policy=random task=grasp tactile=raw record=a.mcap realistic=true
+  python play.py checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install -e ".[view]")
   python play.py replay=a.mcap                                        recorded against simulated: plots, video
   python play.py replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
 """

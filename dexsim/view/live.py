@@ -298,7 +298,8 @@ class LiveView:
         if w.restart:
             w.restart, changed = False, True
             env.reset_all()
-            self.steps = 0
+            self.steps, self._terms = 0, {}
+            self._reward_html.content = ""
             self._new_episode()
         return changed
 
