@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.concealed import effects, generate, plant, score
+from benchmarks.concealed import effects, generate, plant, score, touch
 from benchmarks.concealed import __main__ as command
 from dexsim.recording import read
 
@@ -34,7 +34,7 @@ def crossings(x: np.ndarray) -> np.ndarray:
 
 
 def test_plant_imports_nothing_of_the_simulator():
-    for module in (plant, effects):
+    for module in (plant, effects, touch):
         tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
         names = set()
         for node in ast.walk(tree):
@@ -106,6 +106,29 @@ def test_other_joints_matter_where_they_should():
     hold[0, 0] = 1.2
     together = plant.simulate(rig, p, hold, q0=np.array([[0.0, 0.5]]))["position"][0, 1, -1]
     assert together < alone - 0.01
+
+
+def test_ball_on_a_flat_pad():
+    """A ball pressed on a square of two triangles: depth by hand, force by its law, all of it on the taxels, read late and with its gain."""
+    square = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]]) * 0.02
+    xy = np.stack(np.meshgrid(np.arange(-6, 7) * 2e-3, np.arange(-6, 7) * 2e-3), -1).reshape(-1, 2)
+    points = np.c_[xy, np.zeros(len(xy))]
+    pad = touch.Pad(square, 1e-4, points, np.tile([0, 0, 1.0], (len(xy), 1)), np.full(len(xy), 4e-6), np.array([0, 0, 0.0141]), np.array([0, 0, -1.0]),
+                    np.array([1.0, 0, 0]), 0.012, np.zeros(3))  # fmt: skip
+    assert pad.depth(np.array([0.0, 3e-3]), np.array([0.0, 1e-3])) == pytest.approx([-2e-3, 1e-3], abs=2e-5)
+    command = np.zeros((2, 400))
+    command[1] = np.where(np.arange(400) > 100, 4e-3, 0.0)
+    p = touch.DEFAULTS | {"gain": 0.5, "delay": 0.05}
+    q, force = touch.move(pad, p, command)
+    assert force[-1] == pytest.approx(7000 * (q[1, -1] - 2e-3), rel=0.01) and force[-1] == pytest.approx(4000 * (4e-3 - q[1, -1]), rel=0.01)
+    z = touch.readings(pad, p, q, force)
+    assert z[-1].sum() == pytest.approx(0.5 * force[-1], rel=1e-3) and points[z[-1].argmax()] == pytest.approx([0, 0, 0])
+    first = [int(np.flatnonzero(x > 0.05 * x.max())[0]) for x in (force, z.sum(1))]
+    assert first[1] - first[0] == 50
+    held = touch.readings(pad, p | {"delay": 0.0, "fraction": 0.4, "time_constant": 0.02}, q, force).sum(1)
+    assert held.max() > 1.1 * 0.5 * force.max() and held[-1] == pytest.approx(0.5 * force[-1], rel=0.01)  # stiffer while fast, then relaxed
+    spread = touch.readings(pad, p | {"delay": 0.0, "crosstalk": 0.3}, q, force)[-1]
+    assert (spread > 0.01).sum() > (z[-1] > 0.01).sum() and spread.sum() == pytest.approx(z[-1].sum(), rel=0.02)
 
 
 def entries(*kinds: str, shape: str = "one", tier: str = "easy") -> list[dict]:
@@ -199,14 +222,14 @@ def test_hash_binds_the_truth_and_the_salt_hides_it(some, tmp_path):
 
 
 def test_plan_is_fixed_by_its_seed_and_takes_every_effect_in_turn():
-    mix = {"effect": 3 * len(effects.BY_EFFECT), "none": 4, "noise": 2, "pair": 3, "outside": 2, "decoy": 5, "hand": 3}
+    mix = {"effect": 3 * len(effects.BY_EFFECT), "none": 4, "noise": 2, "pair": 3, "outside": 2, "decoy": 5, "hand": 3, "touch": 4}
     assert generate.plan(mix, 7) == generate.plan(mix, 7) != generate.plan(mix, 8)
     plan = generate.plan(mix, 7)
     hidden = [(effects.KINDS[p["kinds"][0]].effect, p["tier"]) for p in plan if p["group"] == "effect"]
     assert sorted(hidden) == sorted((e, t) for e in effects.BY_EFFECT for t in ("easy", "medium", "hard"))
     assert {g: sum(p["group"] == g for p in plan) for g in mix} == mix
     for p in plan:
-        assert not any(effects.ALL[k].joints > 1 for k in p["kinds"]) or p["shape"] != "one"
+        assert p["group"] == "touch" or not any(effects.ALL[k].joints > 1 for k in p["kinds"]) or p["shape"] != "one"
     assert all(p["shape"] == "one" for p in generate.plan({"effect": 60}, 7, one_joint=True))
     with pytest.raises(ValueError, match="no group"):
         generate.plan({"nothing": 1}, 7)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from benchmarks.concealed import plant, rigs
+from benchmarks.concealed import plant, rigs, touch_cases
 from benchmarks.concealed.effects import ALL, BY_EFFECT, KINDS, OUTSIDE, Kind, stalled
 from dexsim.recording import Writer
 
@@ -31,7 +31,7 @@ REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_
 BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
 DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
-MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 0}
+MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 0, "touch": 0}
 SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
 
@@ -39,7 +39,8 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
     """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same, noise
-    doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns). Effects, tiers
+    doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns), touch (a fingertip under a ball: the
+    same). Effects, tiers
     and shapes take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
@@ -60,6 +61,10 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
                 entry |= {"kinds": [kind], "tier": tiers[(k + turn) % 3], "shape": str(rng.choice(SEVERAL)) if several else "one"}
             if group == "hand":
                 entry |= {"shape": "hand", "tier": tiers[k % 2]} if k % 3 else {"shape": "hand", "kinds": [], "tier": "none"}
+            elif group == "touch":
+                names = list(touch_cases.KINDS)
+                hidden = k % 4 > 0
+                entry |= {"shape": "touch", "kinds": [names[(k - k // 4) % len(names)]] if hidden else [], "tier": ("easy", "medium")[k // 4 % 2] if hidden else "none"}
             elif group == "none" and not one_joint and k % 10 == 9:
                 entry["shape"] = str(rng.choice(SEVERAL))
             elif group == "pair":
@@ -317,7 +322,8 @@ def once(job: tuple[dict, int, int, Path]) -> dict:
     entry, number, seed, root = job
     stub = root / "made" / f"{number}.json"
     if not stub.is_file():
-        made = build(entry, number, seed, root / "cases", root / "truth")
+        make = touch_cases.build if entry["shape"] == "touch" else build
+        made = make(entry, number, seed, root / "cases", root / "truth")
         stub.parent.mkdir(parents=True, exist_ok=True)
         stub.write_text(json.dumps(made), encoding="utf-8")
     return json.loads(stub.read_text(encoding="utf-8"))

@@ -135,7 +135,7 @@ def one(truth: dict, d: dict) -> dict:
         return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
 
     group = truth["group"]
-    inside = group in ("effect", "pair", "touch") or (group == "hand" and effects)
+    inside = group in ("effect", "pair") or (group in ("hand", "touch") and effects)
     out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
                             for f in confident)  # fmt: skip
     if inside:
@@ -157,7 +157,7 @@ def one(truth: dict, d: dict) -> dict:
         if truth["joints"] > 1:
             out["joint_f1"] = [len(said_joints & true_joints), len(said_joints), len(true_joints)]
         out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None
-    elif group in ("none", "noise") or (group == "hand" and not effects):
+    elif group in ("none", "noise") or (group in ("hand", "touch") and not effects):
         out["false_alarm"] = bool(findings) or d["verdict"] == "failed"
     elif group == "outside":
         out["humble"] = d["verdict"] not in ("explained", "failed") and not confident
@@ -211,9 +211,11 @@ def table(results: list[dict]) -> dict[str, dict]:
     rate("90 % interval covers the truth", [c for r in hidden for c in r["covered"]])
     middle("held-out error removed, mean", [r["removed"] for r in hidden if r.get("removed") is not None], np.mean)
     middle("held-out error removed, median", [r["removed"] for r in hidden if r.get("removed") is not None], np.median)
-    rate("false alarm, nothing missing", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] != "hand"])
+    rate("false alarm, nothing missing", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] in ("none", "noise")])
     rate("  with doubled noise", [r["false_alarm"] for r in results if r["group"] == "noise"])
     rate("false alarm, xHand", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "hand"])
+    rate("touch and contact: right effect first", [r["right"] for r in hidden if r["group"] == "touch"])
+    rate("  false alarm", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "touch"])
     rate("outside the catalogue: not claimed", [r["humble"] for r in results if r["group"] == "outside"])
     rate("decoys seen through", [r["caught"] for r in results if r["group"] == "decoy"])
     for decoy in sorted({r["decoy"] for r in results if r["decoy"]}):
