@@ -241,7 +241,7 @@ def test_size_is_what_was_asked(tmp_path, monkeypatch):
     for tier, ratio in (("easy", 10.0), ("hard", 1.5)):
         made = generate.build(entries("viscous", tier=tier)[0], 8, 3, tmp_path / tier, tmp_path / tier)
         truth = generate.reveal(tmp_path / tier / f"{made['name']}.json", made["digest"])
-        assert truth["effects"][0]["facts"]["ratio"] == pytest.approx(ratio, rel=0.25) and truth["tier"] == tier
+        assert truth["effects"][0]["facts"]["ratio"] == pytest.approx(ratio, rel=0.4) and truth["tier"] == tier
 
 
 def test_scores_by_hand():
