@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.concealed import effects, generate, plant, score, touch
+from benchmarks.concealed import baselines, effects, generate, plant, score, touch
 from benchmarks.concealed import __main__ as command
 from dexsim.recording import read
 
@@ -284,9 +284,27 @@ def test_scores_by_hand():
 
 
 @pytest.mark.slow
-def test_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
-    line = command.main(["mix=effect:1", "seed=2", f"out={tmp_path}"])
-    assert line["cases"] == 1 and line["failed"] == 0 and line["lines"]
+def test_twelve_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
+    """Every group but the xHand: diagnosed by the command, none fails, most is not confidently wrong; then again from the disk."""
+    monkeypatch.setattr(generate, "SIZES", 12)
+    line = command.main(["ci=true", "seed=2", "jobs=2", "limit=600", f"out={tmp_path}"])
+    assert line["cases"] == sum(command.CI.values()) == 12 and line["failed"] == line["left_out"] == 0
+    assert line["lines"]["confident and wrong, all cases"]["value"] <= 0.34
+    assert line["lines"]["false alarm, nothing missing"]["value"] <= 0.5
     assert json.loads(capsys.readouterr().out.strip().splitlines()[-1])["benchmark"] == "concealed"
-    monkeypatch.setattr(sys, "executable", "no such program")  # a finished case is not diagnosed again
-    assert command.main(["mix=effect:1", "seed=2", f"out={tmp_path}"])["lines"] == line["lines"]
+    hashes = (tmp_path / "seed_2" / "hashes.txt").read_text(encoding="utf-8").split()
+    assert len(hashes) == 24 and all(len(h) == 64 for h in hashes[::2])
+    monkeypatch.setattr(sys, "executable", "no such program")  # a finished case is not made or diagnosed again
+    assert command.main(["ci=true", "seed=2", f"out={tmp_path}"])["lines"] == line["lines"]
+
+
+def test_baselines_recover_what_they_can(tmp_path, monkeypatch):
+    """CMA-ES finds a minimum; the plain simulation agrees with the plant where nothing but a known delay is wrong."""
+    best = baselines.cma(lambda x: ((x - [0.3, -0.2]) ** 2 * [1.0, 25.0]).sum(1), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), np.array([0.8, 0.8]), 40, 0)
+    assert best == pytest.approx([0.3, -0.2], abs=0.01)
+    monkeypatch.setattr(generate, "SECONDS", 1.5)
+    monkeypatch.setattr(generate, "SIZES", 2)
+    made = generate.build(entries("none")[0], 9, 3, tmp_path / "cases", tmp_path / "truth")
+    rig = baselines.Rig(tmp_path / "cases" / made["name"])
+    error = rig.error({"delay": np.array([0.0, 0.05])}, baselines.HELD)
+    assert error[0] < 0.02 and error[1] > 2 * error[0]
