@@ -27,7 +27,7 @@ class Twin:
     """A step of each engine from the same state."""
 
     def __init__(self):
-        settings = ("task.objects.baked_scales=[1.25]",)
+        settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}")  # all shapes alike
         self.c, self.w = grasp_env(*settings, worlds=N, engine="mujoco"), grasp_env(*settings, worlds=N, engine="warp")
         self.c.skip_idle_resets = False  # the same random numbers for both
         self.copy()
