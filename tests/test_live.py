@@ -235,3 +235,27 @@ def test_the_page_in_a_browser(view, env, tmp_path):
         page.close()
         view._stopped.set()
         loop.join(10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", [("policy=scripted", "task=grasp"), ("policy=zero", "task=rotate", "task.perception=imu")])
+def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
+    import signal
+    import subprocess
+    import urllib.request
+
+    port = free_port()
+    with open(tmp_path / "log", "w") as log:
+        process = subprocess.Popen([sys.executable, str(shell.ROOT / "play.py"), *what, "view=true", f"view_port={port}", "device=cpu", "worlds=2",
+                                    "sim.threads=1"], cwd=tmp_path, stdout=log, stderr=log)
+    end = time.monotonic() + 120
+    while "ssh -L" not in (tmp_path / "log").read_text():
+        assert process.poll() is None and time.monotonic() < end, (tmp_path / "log").read_text()[-2000:]
+        time.sleep(0.3)
+    assert f"http://localhost:{port}" in (tmp_path / "log").read_text()
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
+        assert page.status == 200 and b"<html" in page.read()
+    time.sleep(3)
+    assert process.poll() is None, (tmp_path / "log").read_text()[-2000:]  # it steps and draws
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 0, (tmp_path / "log").read_text()[-2000:]
