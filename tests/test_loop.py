@@ -1,0 +1,84 @@
+"""The closed loop's own parts: order of its steps, what is done twice, the share recovered, and realities that training refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.loop import __main__ as loop
+from benchmarks.loop import worlds
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_queue_keeps_order_and_goes_on_where_it_stopped(tmp_path):
+    done = []
+
+    def job(name, after=(), gpu=False, good=True):
+        def run(slot):
+            done.append((name, slot))
+            return good
+
+        return loop.Job(name, tmp_path / name, run, gpu, list(after))
+
+    jobs = lambda: [job("judge", ["train"]), job("train", ["start"], gpu=True), job("start"), job("broken", good=False), job("after", ["broken"])]  # noqa: E731
+    loop.Queue(jobs(), ["3"], 1, 0.0, 0.0, lambda: None).go()
+    names = [n for n, _ in done]
+    assert names.index("start") < names.index("train") < names.index("judge") and "after" not in names
+    assert dict(done)["train"] == "3" and dict(done)["judge"] == "cpu"
+    done.clear()
+    loop.Queue(jobs(), ["3"], 1, 0.0, 0.0, lambda: None).go()
+    assert [n for n, _ in done] == ["broken"]  # only what did not work is tried again
+
+
+def test_share_recovered_by_hand():
+    r = loop._ratio(np.array([1.0, 2.0]), np.array([2.0, 3.5]), np.array([3.0, 4.0]))
+    assert r["value"] == pytest.approx(1.25 / 2.0) and r["low"] <= r["value"] <= r["high"] and r["seeds"] == 2
+    smaller_is_better = loop._ratio(np.array([4.0]), np.array([3.0]), np.array([2.0]))
+    assert smaller_is_better["value"] == pytest.approx(0.5)
+
+
+def test_report_reads_what_was_judged(tmp_path):
+    s = loop.SETTINGS | {"tasks": "grasp", "worlds": "dry", "seeds": "2", "out": str(tmp_path)}
+    one = loop.Loop(s)
+    for seed in (1, 2):
+        for variant, held in zip(loop.VARIANTS, (0.5, 0.6, 0.7 + 0.1 * seed, 0.9), strict=True):
+            where = one.folder("grasp", seed, "dry") / f"judged_{variant}"
+            where.mkdir(parents=True)
+            (where / "metrics.json").write_text(json.dumps({"hold_rate_all": held, "force_error_N": 1.0}))
+    line = one.report()["lines"][0]
+    assert line["values"]["naive"] == [50.0, 50.0] and line["recovered_fitted"]["value"] == pytest.approx((85 - 50) / 40)
+    assert "85" in loop.markdown(one.report())
+    jobs = {j.name: j for j in one.jobs()}
+    assert jobs["fitted grasp 1 dry"].after == ["diagnose dry", "naive grasp 1"] and jobs["naive grasp 1"].gpu and not jobs["judge naive grasp 1 dry"].gpu
+
+
+def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
+    nominal = yaml.safe_load((ROOT / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    for name in worlds.SEEDS:
+        kept = yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
+        drawn = worlds.draw(name)
+        assert kept["servo"]["joints"] == drawn["servo"]["joints"]
+        for joint, p in kept["servo"]["joints"].items():
+            b = nominal["joints"]["*"] | nominal["joints"].get(joint, {})
+            assert 0.95 < p["torque_limit"] / b["torque_limit"] < 1.05
+            assert p["kp"] / b["kp"] < 0.65 if name == "dry" else p["delay"] - b["delay"] > 0.02
+
+
+def test_forced_mass_follows_its_formula():
+    """EMPS driven by its own force: exact parameters leave next to nothing, wrong ones do not."""
+    from benchmarks.real import emps_force
+
+    dt, n = 1e-3, 4000
+    t = np.arange(n) * dt
+    v = 0.1 * np.sin(2 * np.pi * 0.7 * t)
+    q = np.concatenate([[0.0], np.cumsum(v[:-1]) * dt])
+    force = 95.0 * np.gradient(v, dt) + 200.0 * v + 20.0 * np.sign(v) - 3.0
+    assert emps_force.open_loop(t, q, force, 95.0, 200.0, 20.0, -3.0) < 2e-3
+    assert emps_force.open_loop(t, q, force, 95.0, 120.0, 20.0, -3.0) > 4e-3
+    found = emps_force.least_squares(t, q, force)
+    assert found["mass"] == pytest.approx(95.0, rel=0.02) and found["viscous"] == pytest.approx(200.0, rel=0.05)
