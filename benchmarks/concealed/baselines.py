@@ -172,9 +172,9 @@ def sysid(rig: Rig, iterations: int = 30) -> float | None:
     return None if found is None else found[1]
 
 
-def identify(rig: Rig, iterations: int = 30) -> tuple[dict[str, float], float] | None:
-    """What `mujoco.sysid` finds with everything free, {name: value} (SI units; kp and kd of a voltage drive times its torque limit), and its
-    held-out RMSE [rad]; None where it is not installed."""
+def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tuple[dict[str, float], float] | None:
+    """What `mujoco.sysid` finds, {name: value} (SI units; kp and kd of a voltage drive times its torque limit), and its held-out
+    RMSE [rad]; None where it is not installed. free: the parameters to fit, all nine where none are named."""
     import mujoco
 
     try:
@@ -216,12 +216,15 @@ def identify(rig: Rig, iterations: int = 30) -> tuple[dict[str, float], float] |
 
     ranges = {"armature": (b["armature"], 0.0, 4 * (rig.link + b["armature"])), "damping": (b["viscous"], 0.0, 0.3 * rig.weight), "frictionloss": (b["dry"], 0.0, 1.2 * rig.weight),
               "mass": (mass0, 0.5 * mass0, 3 * mass0), "kp": (kp, 0.25 * kp, 4 * kp), "kd": (kd, 0.1 * kd, 6 * kd), "limit": (b["limit"], 0.1 * b["limit"], 1.5 * b["limit"])}  # fmt: skip
-    params = s.ParameterDict({k: s.Parameter(k, v, lo, hi, modifier=put(k)) for k, (v, lo, hi) in ranges.items()})
-    params.add(s.Parameter("delay", 0.005, 0.0, 0.1))
-    params.add(s.Parameter("bias", 0.001, -0.2, 0.2))
+    free = free or (*ranges, "delay", "bias")
+    params = s.ParameterDict({k: s.Parameter(k, v, lo, hi, modifier=put(k)) for k, (v, lo, hi) in ranges.items() if k in free})
     transform = s.SignalTransform()
-    transform.delay("*", params["delay"])
-    transform.bias("*", params["bias"], target="predicted")
+    if "delay" in free:
+        params.add(s.Parameter("delay", 0.005, 0.0, 0.1))
+        transform.delay("*", params["delay"])
+    if "bias" in free:
+        params.add(s.Parameter("bias", 0.001, -0.2, 0.2))
+        transform.bias("*", params["bias"], target="predicted")
 
     def sequences(runs: range):
         states, controls, sensors = [], [], []
@@ -239,7 +242,7 @@ def identify(rig: Rig, iterations: int = 30) -> tuple[dict[str, float], float] |
         found, _ = s.optimize(params, fit, optimizer="mujoco", verbose=False, max_iters=iterations)
     judge = s.build_residual_fn(models_sequences=sequences(HELD), modify_residual=transform.apply, n_threads=1)
     left, _, _ = judge(found.as_vector(), found)
-    values = {k: float(found[k].value[0]) for k in (*ranges, "delay", "bias")}
+    values = {k: float(found[k].value[0]) for k in free}
     return values, float(np.sqrt(np.mean(np.concatenate([x.ravel() for x in left]) ** 2)))
 
 

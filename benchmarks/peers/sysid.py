@@ -2,7 +2,8 @@
 
 Concealed cases (an independent plant, see `benchmarks/concealed`) of one joint whose hidden effect is a parameter that both know. Both get
 the same recordings and the same believed model. `diagnose` has to find which effect it is among its whole catalogue; `mujoco.sysid`
-has no such step, all nine of its parameters are free and the one that is meant is read off.
+has no such step: once all nine of its parameters are free and the one that is meant is read off, once it is told which one to fit
+and believes the rest, which is right here.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-KINDS = {  # kind of the plant: key in the truth, what mujoco.sysid's parameters say about it
-    "coulomb": ("torque", lambda p, b: p["frictionloss"]),
-    "viscous": ("coefficient", lambda p, b: p["damping"]),
-    "inertia": ("armature", lambda p, b: p["armature"] - b["armature"]),
-    "payload": ("mass", lambda p, b: p["mass"] - b["mass"]),
-    "delay": ("delay", lambda p, b: p["delay"]),
-    "gain": ("kp_factor", lambda p, b: p["kp"] / b["kp"]),
-    "offset": ("offset", lambda p, b: p["bias"]),
+KINDS = {  # kind of the plant: key in the truth, mujoco.sysid's parameter, what that says about the key
+    "coulomb": ("torque", "frictionloss", lambda x, b: x),
+    "viscous": ("coefficient", "damping", lambda x, b: x),
+    "inertia": ("armature", "armature", lambda x, b: x - b["armature"]),
+    "payload": ("mass", "mass", lambda x, b: x - b["mass"]),
+    "delay": ("delay", "delay", lambda x, b: x),
+    "gain": ("kp_factor", "kp", lambda x, b: x / b["kp"]),
+    "offset": ("offset", "bias", lambda x, b: x),
 }
+WHO = ("diagnose", "sysid", "sysid_told")
 SEED = 8
 
 
@@ -48,24 +50,24 @@ def ours(name: str, truth: dict, root: Path, limit: float) -> dict:
     return {"seconds": float((out / "seconds").read_text()), "error": errors[0] if errors else None, "named": finding is not None}
 
 
-def theirs(name: str, truth: dict, root: Path) -> dict:
-    """mujoco.sysid on the same recordings."""
+def theirs(name: str, truth: dict, root: Path, told: bool) -> dict:
+    """mujoco.sysid on the same recordings; told: which parameter to fit."""
     import mujoco
 
     from benchmarks.concealed import baselines
 
     rig = baselines.Rig(root / "cases" / name)
+    key, parameter, read = KINDS[truth["effects"][0]["kind"]]
     start = time.perf_counter()
-    answer = baselines.identify(rig)
+    answer = baselines.identify(rig, free=(parameter,) if told else ())
     seconds = time.perf_counter() - start
     if answer is None:
         return {"missing": True}
     b = rig.believed
     kp = b["kp"] * b["limit"] if rig.voltage else b["kp"]
     mass = float(mujoco.MjModel.from_xml_path(str(root / "cases" / name / "rig.xml")).body_mass[1])
-    key, read = KINDS[truth["effects"][0]["kind"]]
     value = truth["effects"][0]["parameters"][key]
-    got = read(answer[0], {"armature": b["armature"], "mass": mass, "kp": kp})
+    got = read(answer[0][parameter], {"armature": b["armature"], "mass": mass, "kp": kp})
     return {"seconds": seconds, "error": abs(got - value) / abs(value), "value": got, "held_out_rad": answer[1]}
 
 
@@ -77,24 +79,25 @@ def main(own: dict[str, str], out: Path) -> int:
     for k in range(count):
         kind = names[k % len(names)]
         name, truth = make(k, kind, root)
-        row = {"case": name, "kind": kind, "tier": truth["tier"], "diagnose": ours(name, truth, root, 600.0), "sysid": theirs(name, truth, root)}
+        row = {"case": name, "kind": kind, "tier": truth["tier"], "diagnose": ours(name, truth, root, 600.0), "sysid": theirs(name, truth, root, False),
+               "sysid_told": theirs(name, truth, root, True)}
         rows.append(row)
         if row["sysid"].get("missing"):
             print('mujoco.sysid is not installed: pip install "mujoco[sysid]"')
             return 1
         text = [f"{who} {r['seconds']:.0f} s, error {_percent(r['error'])}" for who, r in
-                (("diagnose", row["diagnose"]), ("mujoco.sysid", row["sysid"]))]
+                ((who, row[who]) for who in WHO)]
         print(f"  {k + 1}/{count} {kind:8s} ({truth['tier']})  " + "   ".join(text), flush=True)
         (out / "sysid.json").write_text(json.dumps({"benchmark": "peers sysid", "rows": rows, "summary": summary(rows)}, indent=1))
     for who, s in summary(rows).items():
-        print(f"  {who:9s} median error {100 * s['error']:.0f} % of {s['n']}, median time {s['seconds']:.0f} s")
+        print(f"  {who:10s} median error {100 * s['error']:.0f} % of {s['n']}, median time {s['seconds']:.0f} s")
     return 0
 
 
 def summary(rows: list[dict]) -> dict[str, dict]:
     """Median error (an effect that is not named counts as 100 %) and time of both."""
     found = {}
-    for who in ("diagnose", "sysid"):
+    for who in WHO:
         errors = [1.0 if r[who]["error"] is None else min(r[who]["error"], 10.0) for r in rows]
         found[who] = {"error": float(np.median(errors)), "seconds": float(np.median([r[who]["seconds"] for r in rows])), "n": len(rows)}
     return found
