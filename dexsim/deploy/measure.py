@@ -44,6 +44,7 @@ class Measure:
         self._xy: np.ndarray | None = None
         self._z: torch.Tensor | None = None
 
+    @torch.inference_mode()
     def observe(self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame; command 0..1."""
         s = self.signals(state, seen, command)
@@ -96,6 +97,7 @@ class TurnMeasure:
         self._last: tuple[float, np.ndarray] | None = None
         self._speed = np.zeros(12)
 
+    @torch.inference_mode()
     def observe(self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y z as its
         IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
@@ -126,7 +128,11 @@ class TurnMeasure:
 
     def _aim(self, q: torch.Tensor) -> None:
         """The first goal, or the next where this one is reached."""
-        reached = self.goal is not None and float(rotation.error(q, self.goal)) < float(self.task["reward"]["delta_rot"])
+        # rotation.error(q, goal): the angle whose half has the cosine |<q, goal>|; tangent of the half, accurate near 0
+        reached = False
+        if self.goal is not None:
+            away = rotation.multiply(rotation.conjugate(q), self.goal)[0].tolist()
+            reached = 2 * math.atan2(math.hypot(*away[1:]), abs(away[0])) < float(self.task["reward"]["delta_rot"])
         self.goals += reached
         if self.goal is None or reached:
             self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
