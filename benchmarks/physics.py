@@ -12,7 +12,7 @@ then the palm is turned face down within 0.5 s, so that friction carries the obj
   K          force over depth of fingertips over the stiffness set, median: 1 means that the rubber is as soft as asked
   contacts, rows a world; newton: mean iterations
   steps/s    environment steps a second that physics and servo alone would allow, from the settled grasp
-Writes physics.md, physics.json and physics.png to `out`.
+Writes physics.md, physics.json and physics.png to `out`; join=a/physics.json,b/physics.json puts several runs into one.
 """
 
 from __future__ import annotations
@@ -262,30 +262,58 @@ def table(rows: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
-def figure(rows: dict[str, dict], path: Path) -> None:
-    """Creep over throughput, a point a setting."""
+def figure(rows: dict[str, dict], path: Path, about: str) -> None:
+    """A row a setting: throughput, share held, creep."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    fig, axes = plt.subplots(1, 2, figsize=(12, 5))
-    for ax, key, label in ((axes[0], "creep_mm_s", "creep under load, median (mm/s)"), (axes[1], "held", "share still held after 4.5 s, palm down from 1 s on")):
-        for name, row in rows.items():
-            x, y = row["steps_per_s"] / 1e3, row[key]
-            ax.plot(x, y, "o", color="C3" if name == "chosen" else "C0")
-            ax.annotate(name, (x, y), fontsize=6, xytext=(3, 3), textcoords="offset points")
-        ax.set_xlabel("environment steps/s that physics and servo allow (thousands)")
-        ax.set_ylabel(label)
+    names = list(rows)[::-1]
+    fig, axes = plt.subplots(1, 4, figsize=(13, 1.2 + 0.24 * len(names)), sharey=True)
+    panels = (("steps_per_s", 1e-3, "thousand steps/s that physics\nand servo allow"), ("held", 100.0, "held, palm down (%)"),
+              ("creep_mm_s", 1.0, "creep under load (mm/s):\nmedian, 95 %"), ("other_depth_p95_mm", 1.0, "penetration, 95 % (mm):\nfingertips, all else"))
+    for ax, (key, unit, label) in zip(axes, panels, strict=True):
+        for y, name in enumerate(names):
+            colour = "C3" if name == "chosen" else "C0"
+            points = {"creep_mm_s": ("creep_mm_s", "creep_p95_mm_s"), "other_depth_p95_mm": ("tip_depth_p95_mm", key)}.get(key, (key,))
+            x = [unit * rows[name][k] for k in points if rows[name].get(k) is not None]
+            if x:
+                ax.plot(x, [y] * len(x), "-", color=colour, lw=1)
+                ax.plot(x[:1], [y], "o", color=colour, ms=5)
+                ax.plot(x[1:], [y] * len(x[1:]), "o", color=colour, ms=5, mfc="white")
+        ax.set_xlabel(label, fontsize=9)
         ax.grid(alpha=0.3)
-    axes[0].set_yscale("log")
+    axes[0].set_yticks(range(len(names)), names, fontsize=8)
+    axes[2].set_xscale("log")
+    fig.suptitle(about, fontsize=9)
     fig.tight_layout()
-    fig.savefig(path, dpi=110)
+    fig.savefig(path, dpi=100)
     plt.close(fig)
 
 
+def write(result: dict, out: Path) -> None:
+    """physics.json, physics.md and physics.png."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "physics.json").write_text(json.dumps(result, indent=1))
+    (out / "physics.md").write_text(table(result["rows"]) + "\n")
+    figure(result["rows"], out / "physics.png", f"{result['device']}, {result['engine']}, {result['worlds']} worlds")
+
+
+def join(files: str, out: Path) -> dict:
+    """One result of several, in the order of SETTINGS; the machine is that of the first."""
+    parts = [json.loads(Path(f).read_text()) for f in files.split(",")]
+    rows = {name: row for part in parts[::-1] for name, row in part["rows"].items()}
+    result = {**parts[0], "rows": {name: rows[name] for name in SETTINGS if name in rows}}
+    write(result, out)
+    print(table(result["rows"]))
+    return result
+
+
 def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"only": "", "minutes": "20", "out": "out/physics", "steps": "", "policy": str(tools.ROOT / "checkpoints" / "grasp.pt")})
+    own, rest = tools.split(argv, {"only": "", "minutes": "20", "out": "out/physics", "steps": "", "join": "", "policy": str(tools.ROOT / "checkpoints" / "grasp.pt")})
+    if own["join"]:
+        return join(own["join"], Path(own["out"]))
     cfg = tools.config(rest)
     device = cfg["device"]
     names = [n.strip() for n in own["only"].split(",")] if own["only"] else list(SETTINGS)
@@ -295,7 +323,6 @@ def main(argv: list[str]) -> dict:
     steps = tools.numbers(own["steps"] or ("30" if device.startswith("cuda") else "10"), "steps")[0]
     until = time.monotonic() + 60 * float(own["minutes"])
     out = Path(own["out"])
-    out.mkdir(parents=True, exist_ok=True)
     env, grasp = _grasp(cfg, own["policy"])
     stiffness = env.objects.stiffness.clone()
     rows: dict[str, dict] = {}
@@ -320,9 +347,7 @@ def main(argv: list[str]) -> dict:
         print(f"  {name:36s} {r['steps_per_s']:9.0f} steps/s  held {r['held']:.3f}  creep {r['creep_mm_s']:.3f} mm/s (95 %: {r['creep_p95_mm_s']:.2f})  "
               f"tip {r['tip_depth_p95_mm']:.2f} mm  K {r['k_ratio']:.3f}  ({r['measured_in_s']:.0f} s)", flush=True)
         result["rows"] = rows
-        (out / "physics.json").write_text(json.dumps(result, indent=1))
-        (out / "physics.md").write_text(table(rows) + "\n")
-    figure(rows, out / "physics.png")
+        write(result, out)
     print(json.dumps(result), flush=True)
     return result
 
