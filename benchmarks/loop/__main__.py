@@ -263,8 +263,26 @@ class Loop:
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
             own = sorted((self.out / f"excited_{world}").glob("own_*.mcap"))
             fit, held = [*excited[:-1], *own], excited[-1:]
-            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", f"out={where}", "next=false"]
-            return self.call(argv, self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"])) == 0 and (where / "servo.yaml").is_file()
+            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
+            # on a CPU and, where there is a spare GPU, on that as well: whichever is ready first
+            devices = ["cpu"] + (["cuda"] if slot != "cpu" else [])
+            first: list[Path] = []
+
+            def attempt(device: str) -> None:
+                out = self.out / f"diagnosis_{world}_{device}"
+                status = self.call([*argv, f"out={out}", f"device={device}"], self.out / f"diagnosis_{world}_{device}.log", slot if device == "cuda" else "",
+                                   float(self.s["diagnose_s"]), lambda: bool(first))  # fmt: skip
+                if status == 0 and (out / "servo.yaml").is_file():
+                    first.append(out)
+
+            attempts = [threading.Thread(target=attempt, args=(d,)) for d in devices]
+            for x in attempts:
+                x.start()
+            for x in attempts:
+                x.join()
+            if first:
+                shutil.copytree(first[0], where, dirs_exist_ok=True)
+            return bool(first)
 
         return run
 
@@ -274,7 +292,7 @@ class Loop:
         for w in self.worlds:
             out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
             out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0) for t in self.tasks]
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0))
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), len(self.gpus) > 1, [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0))
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"

@@ -1,7 +1,7 @@
 """The steps of the loop that no entry script does: a start that may be trained on, and recordings of the hand in its reality.
 
     python -m benchmarks.loop.steps start checkpoint=FILE out=last.pt device=cuda [any setting of train.py]
-    python -m benchmarks.loop.steps record world=dry out=DIR seed=1 [count=2]
+    python -m benchmarks.loop.steps record world=dry out=DIR seed=1 [count=2] [seconds=19]
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def record(given: dict[str, str]) -> None:
     for k in range(int(given.get("count", 2))):
         rng = np.random.default_rng([seed, k])
         p = plan(believed, kinds=kinds[k % len(kinds)], seed=seed + k, repeats=0)
+        p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
         arrives = rng.random(len(p.t)) >= world["timing"]["lost"]
         late = p.t + world["timing"]["late"] * rng.random(len(p.t))
         order = np.argsort(late[arrives], kind="stable")
