@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from dexsim.errors import UserError
 
@@ -28,7 +29,8 @@ settings (key=default):
   rate=100          commands a second
   repeats=1         motions of each group of joints that come twice
   speed=0.6         largest joint speed, over the no-load speed
-  torque=0.8        largest motor torque, over the stall torque: what limits the current
+  torque=0.8        largest motor torque, over the stall torque
+  current=          A that no motor may draw, e.g. 0.3 for a firmware limit of 300 mA (by the servo's current_per_torque)
   margin=0.05       share of each joint's range kept free at both ends
   clearance=0.002   m between bodies that are not neighbours
   gravity=          in the model's frame, e.g. gravity="0 0 -9.81": how the hand is mounted (default: the model's)
@@ -51,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
     quiet_warp("cpu")
     gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
     m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity)
-    limits = Limits(**{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance") if k in given})
+    limits = Limits(**{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)})
     start = time.perf_counter()
     p = plan(
         m,
@@ -71,12 +73,23 @@ def main(argv: Sequence[str]) -> int:
         print(f"left out: {text}")
     print(
         f"\nsimulated: speed at most {100 * p.peaks.speed.max():.0f} % of no-load,"
-        f" torque at most {100 * p.peaks.torque.max():.0f} % of stall,"
+        f" torque at most {100 * p.peaks.torque.max():.0f} % of stall{_current(m, p.peaks)},"
         f" no contact; {p.t[-1]:.0f} s of commands, made in {time.perf_counter() - start:.0f} s"
     )
     for path in write_plan(p, given["out"]):
         print(path)
     return 0
+
+
+def _current(m: Any, peaks: Any) -> str:
+    """The largest current of the simulated motions, in words."""
+    import numpy as np
+
+    from dexsim.recording.excitation import current_per_torque
+
+    most = float((peaks.torque * m.column("torque_limit") * current_per_torque(m)).max())
+    known = np.isfinite(np.asarray(m.table.current(m.joints), float)).all()
+    return f" ({most:.2f} A{'' if known else ', with current_per_torque assumed'})" if np.isfinite(most) else ""
 
 
 KEYS = (
@@ -90,6 +103,7 @@ KEYS = (
     "repeats",
     "speed",
     "torque",
+    "current",
     "margin",
     "clearance",
     "gravity",

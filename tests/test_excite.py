@@ -120,6 +120,19 @@ def two_links(gap):
     return Mechanism(mujoco.MjSpec.from_string(xml), ("a", "b"), ServoTable.from_dict(SERVO), "two")
 
 
+def test_no_motor_draws_more_than_the_current_that_is_allowed():
+    m = rig()
+    per = excitation.current_per_torque(m)
+    stall = m.column("torque_limit")
+    free = excitation.plan(m, kinds=("ladder", "steps"), repeats=0)
+    drawn = free.peaks.torque * stall * per
+    allowed = 0.6 * float(drawn.max())
+    held = excitation.plan(rig(), kinds=("ladder", "steps"), repeats=0, limits=Limits(current=allowed))
+    assert (held.peaks.torque * stall * per).max() <= allowed + 1e-6 < drawn.max()
+    with pytest.raises(UserError, match="current=0.0"):
+        excitation.plan(rig(), limits=Limits(current=0.0))
+
+
 def test_bodies_that_would_meet_are_kept_apart():
     # the model's own filter would let them pass through each other: the check must not
     m = two_links(0.3)

@@ -14,6 +14,7 @@ import yaml
 from dexsim.errors import UserError
 from dexsim.recording import safety
 from dexsim.recording.mechanism import Mechanism, Run, drive, recorded
+from dexsim.recording.realistic import CURRENT_PER_TORQUE
 from dexsim.recording.schema import COMMANDS, Series
 from dexsim.recording.waveforms import KINDS, PEAK, minimum_jerk
 from dexsim.recording.writer import Writer, write
@@ -28,12 +29,29 @@ CHECK_STEP, FRAME = 0.004, 0.008  # s: physics step and spacing of contact check
 @dataclass
 class Limits:
     """What a motion may reach. speed: fraction of the no-load speed; torque: fraction of the stall torque; margin:
-    share of a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours."""
+    share of a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours; current: A that no
+    motor may draw (None: only `torque` limits it)."""
 
     speed: float = 0.6
     torque: float = 0.8
     margin: float = 0.05
     clearance: float = 0.002
+    current: float | None = None
+
+    def torques(self, m: Mechanism) -> np.ndarray:
+        """Fraction of the stall torque that each joint may reach [J], by `torque` and `current`."""
+        share = np.full(len(m.joints), self.torque)
+        if self.current is not None:
+            stall = m.column("torque_limit")
+            most = self.current / (current_per_torque(m) * np.where(np.isfinite(stall), stall, np.nan))
+            share = np.fmin(share, most)  # a drive without a limit has no share of it
+        return share
+
+
+def current_per_torque(m: Mechanism) -> np.ndarray:
+    """A per N.m [J] of the servo table, `realistic.CURRENT_PER_TORQUE` where it does not say."""
+    known = np.asarray(m.table.current(m.joints), float)
+    return np.where(np.isfinite(known), known, CURRENT_PER_TORQUE)
 
 
 @dataclass
@@ -267,7 +285,10 @@ def _check(m: Mechanism, joints: Sequence[str], kinds: Sequence[str], limits: Li
         ("torque", 0.01, 1.0),
         ("margin", 0.0, 0.4),
         ("clearance", 0.0, 0.05),
+        ("current", 1e-3, 1e3),
     ):
+        if getattr(limits, name) is None:
+            continue
         if not low <= getattr(limits, name) <= high:
             raise UserError(f"{name}={getattr(limits, name)}: must lie in [{low}, {high}]")
 
@@ -323,7 +344,7 @@ def _motion(
         why = _faults(m, peaks, limits, RESERVE)
         if not why:
             return Segment(kind, group, command, scale), ""
-        over = max(peaks.speed.max() / limits.speed, peaks.torque.max() / limits.torque) / RESERVE
+        over = max(peaks.speed.max() / limits.speed, (peaks.torque / limits.torques(m)).max()) / RESERVE
         scale *= float(np.clip(1.0 / over, 0.5, SHRINK))
         if scale < SMALLEST:
             break
@@ -342,7 +363,7 @@ def _command(
     scale: float,
 ) -> np.ndarray | None:
     """Targets [T, J]: from home to each joint's centre, the motion, and back."""
-    kp, stall = m.column("kp"), m.column("torque_limit")
+    kp, stall, allowed = m.column("kp"), m.column("torque_limit"), limits.torques(m)
     rng = np.random.default_rng(seed)
     speed = limits.speed * m.speeds * (1.0 if kind == "steps" else max(scale, 0.2))
     centre, paths = home.copy(), {}
@@ -356,7 +377,7 @@ def _command(
         centre[j] = home[j] + (0.5 * (low + high) - home[j]) * scale
         a = half * scale
         if kind == "steps" and m.table.drive == "torque" and np.isfinite(stall[j]):
-            a = min(a, RESERVE * limits.torque * stall[j] / kp[j] * scale)
+            a = min(a, RESERVE * allowed[j] * stall[j] / kp[j] * scale)
         paths[j] = KINDS[kind](a, speed[j], dt, rng)
     longest = max(len(p) for p in paths.values())
     body = np.tile(centre, (longest, 1))
@@ -374,10 +395,11 @@ def _simulate(m: Mechanism, t: np.ndarray, command: np.ndarray, home: np.ndarray
 def _faults(m: Mechanism, peaks: safety.Peaks, limits: Limits, reserve: float = 1.0) -> str:
     """What a motion violates of this share of the limits, in words; "" where nothing."""
     out = []
-    for name, value, allowed in (("speed", peaks.speed, limits.speed), ("torque", peaks.torque, limits.torque)):
-        j = int(np.argmax(value))
-        if value[j] > reserve * allowed + 1e-6:
-            out.append(f"{name} of {m.joints[j]} reaches {value[j]:.2f} of its limit, {allowed:g} is allowed")
+    speeds = np.full(len(m.joints), limits.speed)
+    for name, value, allowed in (("speed", peaks.speed, speeds), ("torque", peaks.torque, limits.torques(m))):
+        j = int(np.argmax(value / allowed))
+        if value[j] > reserve * allowed[j] + 1e-6:
+            out.append(f"{name} of {m.joints[j]} reaches {value[j]:.2f} of its limit, {allowed[j]:.3g} is allowed")
     if peaks.excess > 1e-4:
         out.append(f"a joint passes its limit by {peaks.excess:.3g}")
     out += [f"{a} touches {b} at {t:.2f} s" for (a, b), t in list(peaks.contacts.items())[:2]]
