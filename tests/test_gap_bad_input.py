@@ -169,14 +169,21 @@ def test_joints_on_one_side_only_are_said(rig, tmp_path):
     assert any("elbow" in n for n in d.notes) and any("wrist" in n for n in d.notes)
 
 
-def test_stiction_is_not_taken_for_repeated_readings():
+def test_what_is_taken_for_repeated_readings():
     t = np.arange(0, 10, 0.01)
-    q = np.round(0.3 * np.sin(t) / 1.5e-3) * 1.5e-3
-    q[(t % 2) < 0.3] = np.nan
-    index = np.maximum.accumulate(np.where(np.isfinite(q), np.arange(len(q)), 0))
-    assert channels._held(t, q[index]).any()  # it does jump after each rest ...
+    smooth = np.round(0.3 * np.sin(2 * t) / 1.5e-3) * 1.5e-3
+    frozen = smooth.copy()
+    for a in (157, 314, 471):  # in the middle of a motion
+        frozen[a : a + 20] = frozen[a]
+    assert channels._held(t, frozen).sum() == 3 * 19
+    assert not channels._held(t, smooth).any()
     creeping = np.round(0.02 * np.sin(t) / 1.5e-3) * 1.5e-3
-    assert not channels._held(t, creeping).any()  # ... and slow motion in whole counts does not
+    assert not channels._held(t, creeping).any()  # slow motion in whole counts
+    goal = np.repeat(np.random.default_rng(0).uniform(-1, 1, 10), 100)
+    servo = np.zeros_like(t)
+    for i in range(1, len(t)):
+        servo[i] = servo[i - 1] + 0.35 * (goal[i] - servo[i - 1])
+    assert not channels._held(t, np.round(servo / 1.5e-3) * 1.5e-3).any()  # a joint that rests and then starts at once
 
 
 def test_links_that_touch_each_other_are_cut_out():

@@ -180,11 +180,10 @@ def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         return out
     usual = float(np.percentile(moving, 90))
     edge = np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0]))
-    jumps = []
-    for a, b in zip(edge[::2], edge[1::2], strict=True):
-        if b < len(q) and t[b - 1] - t[a - 1] >= HELD and abs(q[b] - q[b - 1]) > 2.5 * usual:
-            jumps.append((a, b))
-    if len(jumps) >= 2:
+    jumps = [(a, b) for a, b in zip(edge[::2], edge[1::2], strict=True)
+             if b < len(q) and t[b - 1] - t[a - 1] >= HELD and abs(q[b] - q[b - 1]) > 2.5 * usual]  # fmt: skip
+    # a joint at rest may start with a jump: at least two must have been moving when they froze
+    if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > 0.1 * usual for a, _ in jumps) >= 2:
         for a, b in jumps:
             out[a:b] = True
     return out

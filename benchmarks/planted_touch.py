@@ -1,0 +1,93 @@
+"""Planted touch and contact effects, several sizes and seeds: python -m benchmarks.planted_touch [seeds=2] [load_cell=true] [only=EFFECT].
+
+Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch_rig`: MuJoCo's contact geometry, the taxel kernels
+that train policies, counts of 0.1 N, a load cell with 20 mN of noise). Right: named first, or in a set of its class. One JSON line
+at the end. The sanity check of the method on our own simulator, not a proof.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.cli.ending import guard
+from dexsim.errors import UserError
+
+HALF = 0.5 / 90.0  # s: the sensor shows its last reading that is older than the delay
+CASES: list[tuple[str, dict, dict[str, float]]] = [
+    *(("tactile_gain", {"gains": dict.fromkeys(range(120), g)}, {"gain": g}) for g in (0.6, 0.8, 1.3)),
+    *(("tactile_hysteresis", {"sensor": {"hysteresis": h, "hysteresis_time": t}}, {"fraction": h, "time_constant": t})
+      for h, t in ((0.15, 0.3), (0.3, 0.15), (0.3, 1.0))),
+    *(("tactile_crosstalk", {"crosstalk": c}, {"fraction": c}) for c in (0.1, 0.2, 0.4)),
+    *(("tactile_delay", {"sensor": {"delay": d}}, {"delay": d + HALF}) for d in (0.02, 0.04, 0.08)),
+    *(("tactile_stiffening", {"rubber": r}, {"c10": r[0], "c01": r[1]}) for r in ((5e4, 1e4), (1e5, 2e4), (2e5, 1e4))),
+    *(("thermal", {"drift": d}, {"per_degree": d}) for d in (-0.012, -0.006, 0.01)),
+    *(("contact_friction", {"slides": True, "friction": f}, {"mu": f}) for f in (0.3, 0.5, 1.2)),
+    *(("contact_stiffness", {"stiffness": k}, {"stiffness": k}) for k in (4000.0, 5500.0, 10000.0)),
+    *((None, {}, {}) for _ in range(3)),
+]  # fmt: skip
+
+
+def main(argv: list[str]) -> int:
+    """Runs the cases and prints a line for each, then the sums."""
+    s = {"seeds": "2", "load_cell": "true", "only": ""}
+    for a in argv:
+        key, equals, value = a.partition("=")
+        if a in ("-h", "--help"):
+            print(__doc__)
+            return 0
+        if not equals or key not in s:
+            raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
+        s[key] = value
+    from dexsim.cli.build import quiet_warp
+    from dexsim.gap import touch, touch_rig
+    from dexsim.recording import read
+    from dexsim.recording.mechanism import mechanism
+
+    quiet_warp("cpu")
+    right: dict[str, list[bool]] = {}
+    sets, covered, errors, false, seconds = 0, [], [], [], []
+    for seed in range(int(s["seeds"])):
+        for effect, planted, values in CASES:
+            if s["only"] and s["only"] != effect:
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                paths, model, servo = touch_rig.record(Path(folder), 3, 8.0, seed=10 + seed, load_cell=s["load_cell"] == "true", **planted)
+                m = mechanism(model, servo)
+                start = time.perf_counter()
+                out = touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set(), seed)
+                seconds.append(time.perf_counter() - start)
+            first = out.findings[0] if out.findings else None
+            names = [f["effect"] for f in out.findings]
+            if effect is None:
+                false.append(bool(names))
+                print(f"nothing planted: {names or 'nothing found'}", flush=True)
+                continue
+            good = first is not None and (first["effect"] == effect or effect in first["indistinguishable"])
+            right.setdefault(effect, []).append(good)
+            sets += bool(good and first["indistinguishable"])
+            line = ""
+            if good and first["effect"] == effect:
+                for key, value in values.items():
+                    p = first["parameters"][key]
+                    covered.append(p["low"] <= value <= p["high"])
+                    errors.append(abs(p["value"] / value - 1))
+                    line += f" {key} {p['value']:.4g} ({p['low']:.4g} to {p['high']:.4g}), planted {value:.4g};"
+            print(f"{effect}: {', '.join(names) or 'nothing'}{' as a set' if good and first['indistinguishable'] else ''};{line} {1e3 * out.before[0]:.0f} -> {1e3 * out.after[0]:.0f} mN",
+                  flush=True)  # fmt: skip
+    print(json.dumps({
+        "benchmark": "planted_touch", "load_cell": s["load_cell"] == "true", "cases": sum(map(len, right.values())), "right": {e: f"{sum(r)}/{len(r)}" for e, r in right.items()},
+        "sets": sets, "covered": round(float(np.mean(covered)), 3) if covered else None, "parameters": len(covered),
+        "median_error": round(float(np.median(errors)), 4) if errors else None, "false_alarms": f"{sum(false)}/{len(false)}",
+        "seconds_a_case": round(float(np.mean(seconds)), 1),
+    }))  # fmt: skip
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(guard(main, sys.argv[1:]))
