@@ -3,7 +3,7 @@
 Concealed cases (an independent plant, see `benchmarks/concealed`) of one joint whose hidden effect is a parameter that both know. Both get
 the same recordings and the same believed model. `diagnose` has to find which effect it is among its whole catalogue; `mujoco.sysid`
 has no such step: once all nine of its parameters are free and the one that is meant is read off, once it is told which one to fit
-and believes the rest, which is right here.
+and believes the rest, which but for the law of friction is right here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ KINDS = {  # kind of the plant: key in the truth, mujoco.sysid's parameter, what
     "payload": ("mass", "mass", lambda x, b: x - b["mass"]),
     "delay": ("delay", "delay", lambda x, b: x),
     "gain": ("kp_factor", "kp", lambda x, b: x / b["kp"]),
-    "offset": ("offset", "bias", lambda x, b: x),
 }
 WHO = ("diagnose", "sysid", "sysid_told")
 SEED = 8
