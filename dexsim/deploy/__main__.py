@@ -15,7 +15,7 @@ from dexsim.errors import UserError
 USAGE = """usage: python -m dexsim.deploy bundle=DIR [key=value ...]
 
 Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C relaxes at once. Stand clear of a real hand,
-and try driver=sim first.
+and try driver=sim first. On a machine that does other work too, run it with real-time priority (chrt -r 10 python -m ...).
 
 settings (key=default):
   bundle=             folder of python -m dexsim.export
