@@ -531,12 +531,18 @@ def test_kernels_compile_together_without_running(monkeypatch):
     go.fill_(1)
     before = (wp.copy, wp.capture_while, wp.capture_if, together.Module.load)
 
+    def stuck() -> None:
+        wp.launch(add_one, dim=3, inputs=[x], device="cpu")
+        raise RuntimeError("this program wants to know what an unlaunched kernel did")
+
     def program() -> None:
         wp.launch(add_one, dim=3, inputs=[x], device="cpu")
         wp.capture_while(go, lambda: wp.launch(add_two, dim=3, inputs=[x, go], device="cpu"))
         wp.copy(y, x)
 
     monkeypatch.setattr(together.os, "sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    together.compile_together(stuck, "cpu")  # whatever happens there, the real run goes on
+    assert (wp.copy, wp.capture_while, wp.capture_if, together.Module.load) == before
     together.compile_together(program, "cpu")
     assert add_one.module.execs and add_two.module.execs
     assert not x.numpy().any() and not y.numpy().any() and go.numpy()[0] == 1

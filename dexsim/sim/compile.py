@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import warp as wp
 from warp._src.context import Module
@@ -16,13 +16,13 @@ _MOST = 16  # compilers at once: each takes up to a gigabyte
 def compile_together(program: Callable[[], None], device: str) -> None:
     """Load what `program` (Warp launches on `device`) needs, compiling on all cores of this process what no cache holds.
 
-    The program is gone through without launching: its arrays stay as they are, loops that a device value ends run once. What
-    that misses is compiled when it is launched.
+    The program is gone through without launching: its arrays stay as they are, loops that a device value ends run once. It is
+    a convenience: what it misses, or cannot go through, is compiled when it is launched.
     """
     workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, _MOST)
     if workers < 2:
         return
-    with _noted() as needed:
+    with _noted() as needed, suppress(Exception):  # the real run tells what is wrong, if something is
         program()
     on = wp.get_device(device)
     left = [(module, size) for module, size in needed if (on.context, size) not in module.execs]
@@ -47,9 +47,17 @@ def _noted() -> Iterator[dict[tuple[Module, int | None], None]]:
             if body is not None:
                 body(**kwargs)
 
-    own = {name: getattr(wp, name) for name in ("copy", "capture_while", "capture_if")}
+    own = {name: getattr(wp, name) for name in ("copy", "capture_while", "capture_if", "get_suggested_block_size")}
     load = Module.load
-    Module.load, wp.copy, wp.capture_while, wp.capture_if = note, lambda *a, **k: None, once, either
+
+    def block_size(*args: object, **kwargs: object) -> tuple[int, int]:
+        Module.load = load  # it asks the compiled kernel
+        try:
+            return own["get_suggested_block_size"](*args, **kwargs)
+        finally:
+            Module.load = note
+
+    Module.load, wp.copy, wp.capture_while, wp.capture_if, wp.get_suggested_block_size = note, lambda *a, **k: None, once, either, block_size
     try:
         yield needed
     finally:
