@@ -18,13 +18,13 @@ import numpy as np
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
-HALF = 0.5 / 90.0  # s: the sensor shows its last reading that is older than the delay
+PERIOD = 1 / 90.0  # s between readings: the sensor shows its last one that is older than the delay
 CASES: list[tuple[str, dict, dict[str, float]]] = [
     *(("tactile_gain", {"gains": dict.fromkeys(range(120), g)}, {"gain": g}) for g in (0.6, 0.8, 1.3)),
     *(("tactile_hysteresis", {"sensor": {"hysteresis": h, "hysteresis_time": t}}, {"fraction": h, "time_constant": t})
       for h, t in ((0.15, 0.3), (0.3, 0.15), (0.3, 1.0))),
     *(("tactile_crosstalk", {"crosstalk": c}, {"fraction": c}) for c in (0.1, 0.2, 0.4)),
-    *(("tactile_delay", {"sensor": {"delay": d}}, {"delay": d + HALF}) for d in (0.02, 0.04, 0.08)),
+    *(("tactile_delay", {"sensor": {"delay": d}}, {"delay": PERIOD * np.ceil(d / PERIOD)}) for d in (0.02, 0.04, 0.08)),
     *(("tactile_stiffening", {"rubber": r}, {"c10": r[0], "c01": r[1]}) for r in ((5e4, 1e4), (1e5, 2e4), (2e5, 1e4))),
     *(("thermal", {"drift": d}, {"per_degree": d}) for d in (-0.012, -0.006, 0.01)),
     *(("contact_friction", {"slides": True, "friction": f}, {"mu": f}) for f in (0.3, 0.5, 1.2)),

@@ -76,9 +76,15 @@ def test_foundation_and_neighbours_keep_their_sums(plain):
 
 def test_a_slipping_bristle_stops_at_friction_times_force(plain):
     run = collected(*plain)[0].runs[0]
-    run.slide = np.stack([np.linspace(0, 5e-3, len(run.grid)), np.zeros(len(run.grid))], 1)
-    out = touch_plant.shear(run, touch_plant.neutral() | {"mu": 0.5}, np.full(len(run.t), 3.0))
+    run.slide = np.stack([np.linspace(0, 30e-3, len(run.grid)), np.zeros(len(run.grid))], 1)
+    run.z = np.zeros_like(run.z)
+    run.z[:, [60, 61]] = 1.0, 2.0
+    run.pressed = run.z > 0
+    out = touch_plant.shear(run, touch_plant.neutral() | {"mu": 0.5})
     assert out[-1, 0] == pytest.approx(0.5 * touch_data.FRICTION * 3.0) and out[-1, 1] == 0
+    early = 5  # before anything slips: stiffness times area times path
+    k = touch_plant.SHEAR_STIFFNESS * run.area[[60, 61]].sum()
+    assert out[early, 0] == pytest.approx(k * (np.interp(run.t[early], run.grid, run.slide[:, 0]) - np.interp(run.t[0], run.grid, run.slide[:, 0])), rel=1e-6)
 
 
 QUICK = [
@@ -88,8 +94,8 @@ MORE = [
     ("contact_stiffness", {"stiffness": 4500.0}, {"stiffness": 4500.0}),
     ("tactile_gain", {"gains": dict.fromkeys(range(120), 0.7)}, {"gain": 0.7}),
     ("tactile_crosstalk", {"crosstalk": 0.25}, {"fraction": 0.25}),
-    # the sensor reports its last reading that is older than the delay: half a period of 11 ms on top
-    ("tactile_delay", {"sensor": {"delay": 0.04}}, {"delay": 0.0455}),
+    # the sensor reports its last reading that is older than the delay: four periods of 11 ms
+    ("tactile_delay", {"sensor": {"delay": 0.04}}, {"delay": 4 / 90}),
     ("tactile_stiffening", {"rubber": (1e5, 2e4)}, {"c10": 1e5}),
     ("thermal", {"drift": -0.01}, {"per_degree": -0.01}),
     ("contact_friction", {"slides": True, "friction": 0.4}, {"mu": 0.4}),

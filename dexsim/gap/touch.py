@@ -284,8 +284,7 @@ def _when(e: str, search: PadSearch, t: TouchTrial) -> list[dict]:
     out = []
     for r in search.runs:
         if e == "contact_friction":
-            n = r.z.sum(1)
-            off = np.linalg.norm(shear(r, t.values, n) - shear(r, t.values | {"mu": 1.0}, n), axis=1)
+            off = np.linalg.norm(shear(r, t.values) - shear(r, t.values | {"mu": 1.0}), axis=1)
         elif e == "tactile_gain" and t.gains is not None:
             off = np.abs(readings(r, t.values, t.gains, t.order) - readings(r, t.values)).max(1)
         elif BY_ID[e].stage == "cell" and r.load is not None:

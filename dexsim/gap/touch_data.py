@@ -23,6 +23,7 @@ ASSUMED_LSB = 0.1  # N a count where nothing is stated; the common scale is then
 SHIFT = 3e-4  # m by which the object is moved to learn how distances change
 RATE = 100.0  # Hz of the grid on which touch is simulated
 LONGEST = 60.0  # s of one recording that are simulated: the stretch with the most touch
+GRIP = 6.0  # counts of normal force from which a taxel's shear is summed
 NEAR = 4e-3  # m: what comes nearer than this to a pad may press it
 KINDS = {mujoco.mjtGeom.mjGEOM_SPHERE: "sphere", mujoco.mjtGeom.mjGEOM_BOX: "box", mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
          mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder"}  # fmt: skip
@@ -58,7 +59,13 @@ class PadRun:
     stiffness: float = STIFFNESS
     friction: float = FRICTION
     doubt: float = 1.5e-4  # m by which the object may be elsewhere over the pad than the joints say
+    pressed: np.ndarray | None = None  # [S, K] taxels that `shear` sums
     memory: dict = field(default_factory=dict)  # contacts that were computed
+
+    @property
+    def grip(self) -> np.ndarray:
+        """[S] N, normal force of the taxels that `shear` sums."""
+        return np.where(self.pressed, self.z, 0.0).sum(1)
 
     @property
     def near(self) -> np.ndarray:
@@ -209,9 +216,11 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     q = np.einsum("gij,j->gi", R, middle) + p
     step = np.einsum("gji,gj->gi", R[:-1], np.diff(q, axis=0))  # pad over object, in the pad's axes
     slide = -np.concatenate([np.zeros((1, 2)), np.cumsum(step @ np.stack([e1, e2], 1), 0)])
-    shear = None
+    shear, counted = None, z > 0
     if np.abs(force[..., :2]).max() > 0:
-        sheared = np.einsum("ski,kij->sj", force[keep][:, f, :, :2], np.stack([layout.tx[f, :K], layout.ty[f, :K]], 1))
+        # whole counts swallow the shear of taxels that hardly press
+        counted = z >= GRIP * lsb
+        sheared = np.einsum("ski,kij->sj", force[keep][:, f, :, :2] * counted[..., None], np.stack([layout.tx[f, :K], layout.ty[f, :K]], 1))
         # the taxel shows what the finger exerts on the object, against the object's path
         shear = -sheared @ np.stack([e1, e2], 1)
     load = None
@@ -227,7 +236,7 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
         o = yaml.safe_load(r.config)["recorded_world"]["object"]
         stiffness, friction = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
     return PadRun(r.path.name, f, grid, dist, along, across, depth, slide, layout.area[f, :K], t, z, shear, load, full, warm, lsb,
-                  stiffness, friction, _doubt(model, layout.bodies[f], thing))  # fmt: skip
+                  stiffness, friction, _doubt(model, layout.bodies[f], thing), counted)  # fmt: skip
 
 
 def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:

@@ -22,7 +22,7 @@ from dexsim.gap.touch_data import SHIFT, PadRun
 from dexsim.tactile import reference as ref
 
 REACH, THICKNESS = 1e-3, 2e-3  # m: configs/tactile/default.yaml
-SHEAR_STIFFNESS = 1.0e4  # N/m of a pad's skin along its surface, where the fit starts
+SHEAR_STIFFNESS = 1.0e8  # N/m^3 of the skin along its surface (configs/tactile/default.yaml), where the fit starts
 
 
 @dataclass(frozen=True)
@@ -149,23 +149,24 @@ def readings(run: PadRun, v: dict[str, float], gains: np.ndarray | None = None, 
     return np.minimum(out, 255 * run.lsb) if run.lsb else out
 
 
-def shear(run: PadRun, v: dict[str, float], normal: np.ndarray) -> np.ndarray:
-    """[S, 2] N of the skin's tangential force along the recorded sliding, under the normal force [S] N that was measured."""
-    k = SHEAR_STIFFNESS * v["skin"]
+def shear(run: PadRun, v: dict[str, float]) -> np.ndarray:
+    """[S, 2] N of the skin's tangential force along the recorded sliding: a bristle at every taxel that slips where it exceeds
+    friction times the normal force that the taxel read. Taxels with little to read slip first, so a pad does not slip at once."""
+    live = run.pressed.any(0)
+    force = np.where(run.pressed, run.z, 0.0)[:, live]
+    k = (SHEAR_STIFFNESS * v["skin"] * run.area[live])[:, None]
     path = np.stack([np.interp(run.t, run.grid, run.slide[:, i]) for i in (0, 1)], 1)
     step = np.diff(path, axis=0, prepend=path[:1])
-    cap = run.friction * v["mu"] * normal
+    cap = run.friction * v["mu"] * force
     out = np.zeros_like(path)
-    f0 = f1 = 0.0
-    for i in range(len(path)):
-        if cap[i] <= 0:
-            f0 = f1 = 0.0
-            continue
-        f0, f1 = f0 + k * step[i, 0], f1 + k * step[i, 1]
-        size = (f0 * f0 + f1 * f1) ** 0.5
-        if size > cap[i]:
-            f0, f1 = f0 * cap[i] / size, f1 * cap[i] / size
-        out[i] = f0, f1
+    now = np.zeros((int(live.sum()), 2))
+    for i in np.flatnonzero(force.any(1)):
+        if i == 0 or not force[i - 1].any():
+            now[:] = 0.0
+        now += k * step[i]
+        size = np.sqrt(now[:, 0] ** 2 + now[:, 1] ** 2)
+        now *= (np.minimum(cap[i], size) / np.maximum(size, 1e-12))[:, None]
+        out[i] = now.sum(0)
     return out
 
 

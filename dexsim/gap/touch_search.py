@@ -140,7 +140,7 @@ class PadSearch:
                 mine = touched & (np.arange(len(r.grid)) % 2 == 0)
                 out.append(self._sample(r, i, "cell", mine, wide, r.grid, held))
             if self.shear:
-                n = r.z.sum(1)
+                n = r.grip
                 on = np.repeat((n > 0.3)[:, None], 2, 1)
                 wide = np.repeat(np.hypot(2 * self.noise, 0.03 * n)[:, None], 2, 1)
                 out.append(self._sample(r, i, "shear", on, wide, r.t, held))
@@ -162,7 +162,7 @@ class PadSearch:
             elif s.stage == "cell":
                 d = r.load - cell(r, v)
             else:
-                d = r.shear - shear(r, v, r.z.sum(1))
+                d = r.shear - shear(r, v)
             out.append((d / s.sigma)[s.mask])
         return np.concatenate(out)
 
@@ -281,6 +281,10 @@ class PadSearch:
                 break
             current = min(good, key=lambda t: self.cross(t).sum() * (1 + 0.02 * len(t.ids)))
         current = self._drop(current, trials)
+        if current.ids:  # the numbers, to their end
+            full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
+            if self._size(full.res) < self._size(current.res):
+                current = full
         out = PadOutcome(self.runs[0].pad, none, current, notes=notes)
         for e in current.ids:
             out.rivals[e], out.confidence[e] = self._rivals(current, e, trials)
