@@ -10,7 +10,9 @@ from contextlib import contextmanager, suppress
 import warp as wp
 from warp._src.context import Module
 
-_MOST = 16  # compilers at once: each takes up to a gigabyte
+_MOST = 8  # compilers at once: each takes up to a gigabyte
+SWITCH = "DEXSIM_COMPILE_TOGETHER"
+"""Environment variable: 1 compiles together on CUDA too, where it is not tried enough to be the default; 0 never."""
 
 
 def compile_together(program: Callable[[], None], device: str) -> None:
@@ -20,14 +22,14 @@ def compile_together(program: Callable[[], None], device: str) -> None:
     a convenience: what it misses, or cannot go through, is compiled when it is launched.
     """
     workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, _MOST)
-    if workers < 2:
+    if workers < 2 or os.environ.get(SWITCH, "1" if device == "cpu" else "0") != "1":
         return
     with _noted() as needed, suppress(Exception):  # the real run tells what is wrong, if something is
         program()
     on = wp.get_device(device)
     left = [(module, size) for module, size in needed if (on.context, size) not in module.execs]
     if len(left) > 1:
-        with ThreadPoolExecutor(workers) as pool:
+        with ThreadPoolExecutor(workers) as pool, suppress(Exception):
             list(pool.map(lambda pair: pair[0].load(on, pair[1]), left))
 
 
