@@ -28,7 +28,8 @@ def main(argv: list[str]) -> int:
     if unknown or len(given) != len(argv):
         raise UserError(f"{' '.join(argv)}: keys are worlds, record_worlds, steps, rounds, device, tactile")
     device = given.get("device", "cuda:0" if torch.cuda.is_available() else "cpu")
-    worlds, chosen, steps, rounds = (int(given.get(k, d)) for k, d in (("worlds", "8192"), ("record_worlds", "1"), ("steps", "64"), ("rounds", "6")))
+    defaults = {"worlds": 8192, "record_worlds": 1, "steps": 64, "rounds": 6}
+    worlds, chosen, steps, rounds = (int(given.get(k, d)) for k, d in defaults.items())
     plain, recorded = (environment(worlds, device, given.get("tactile", "raw")) for _ in range(2))
     from dexsim.recording.tap import PlayRecorder
 
@@ -42,8 +43,8 @@ def main(argv: list[str]) -> int:
                 print(f"round {k}: {name:<9} {took:8.2f} ms a control step", flush=True)
     a, b = (float(np.median(times[n])) for n in ("plain", "recorded"))
     kept = sum(len(t.episode.times) + len(t._now.times) for t in tap.tracks)
-    print(json.dumps({"worlds": worlds, "record_worlds": chosen, "plain_ms": round(a, 3), "recorded_ms": round(b, 3), "slower": round(b / a - 1, 4),
-                      "steps_kept": kept} | tools.about(device)))
+    found = {"worlds": worlds, "record_worlds": chosen, "plain_ms": round(a, 3), "recorded_ms": round(b, 3), "slower": round(b / a - 1, 4)}
+    print(json.dumps(found | {"steps_kept": kept} | tools.about(device)))
     return 0
 
 

@@ -194,8 +194,8 @@ def _grasp(env: Any) -> dict[str, Any]:
     from dexsim.deploy import observations
 
     scaling = {"tau/tau_max": "torque [N.m] / normalization.tau_max", "F/F_max": "force [N] / normalization.force_max_N"}
-    rows = [(name, width, unit, source, "the commanded share of normalization.force_max_N" if name == "force_command" else scaling.get(unit, "none"))
-            for name, width, unit, source in observations.OBSERVATION]  # fmt: skip
+    named = {"force_command": "the commanded share of normalization.force_max_N"}
+    rows = [(name, width, unit, source, named.get(name, scaling.get(unit, "none"))) for name, width, unit, source in observations.OBSERVATION]
     return {
         "rows": rows, "initial_pose": _floats(env.pose0),
         "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
@@ -214,11 +214,13 @@ def _rotate(env: Any) -> dict[str, Any]:
     from dexsim.deploy import observations_rotate
 
     task, g = env.task, env.grasps
-    scaled = {"last_action": "(target - middle) / half of action.low..high" if task["observe"].get("last_action", "step") != "step" else "none"}
+    targets = task["observe"].get("last_action", "step") != "step"
+    scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
     rows = [(name, width, unit, source, scaled.get(name, "none")) for name, width, unit, source in observations_rotate.rows(task)]
     imu = task["perception"] == "imu"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
-    settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")} | {"reward": {"delta_rot": task["reward"]["delta_rot"]}}
+    settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
+    settings["reward"] = {"delta_rot": task["reward"]["delta_rot"]}
     return {
         "rows": rows, "initial_pose": _floats(g.hand[middle]),
         "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},

@@ -117,8 +117,9 @@ def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Rec
     posed.t.xpos[:, :5] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(5)])  # the pads, far apart
     posed.t.xmat[:] = torch.eye(3)
     active = force.argmax(1)
-    posed.t.xpos[:, 5] = torch.as_tensor(centre + np.where(force.max(1, keepdims=True) > 0, 10.0 * (active[:, None] + 1) * [[1.0, 0, 0]], 0),
-                                         dtype=torch.float32)  # fmt: skip
+    away = 10.0 * (active[:, None] + 1) * [[1.0, 0, 0]]
+    at = centre + np.where(force.max(1, keepdims=True) > 0, away, 0)
+    posed.t.xpos[:, 5] = torch.as_tensor(at, dtype=torch.float32)
     posed.t.pair_normal[:, :5] = torch.as_tensor(force, dtype=torch.float32)
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
@@ -129,10 +130,12 @@ def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Rec
     load = np.zeros((n, 6))
     load[:, 2] = felt[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
     pose = np.tile([POSE[x] for x in xhand.JOINTS], (n, 1))
-    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS), "effort_is": "torque_Nm", "effort_sign": "+1",
-                       "tactile_unit": "N", "tactile_lsb": "1", "notes": f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"}
+    notes = f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"
+    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS), "effort_is": "torque_Nm",
+                       "effort_sign": "+1", "tactile_unit": "N", "tactile_lsb": "1", "notes": notes}  # fmt: skip
     series = lambda x, topic: Series(t, x, topic, t.copy())  # noqa: E731
-    return Recording(Path("rolled.mcap"), meta, xhand.JOINTS, Series.empty(COMMANDS, 12), States(series(pose, STATES), None, series(0 * pose, STATES)),
+    states = States(series(pose, STATES), None, series(0 * pose, STATES))
+    return Recording(Path("rolled.mcap"), meta, xhand.JOINTS, Series.empty(COMMANDS, 12), states,
                      tactile=Series(t, felt, TACTILE), external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
                      start_ns=1_000_000_000)  # fmt: skip
 

@@ -140,7 +140,9 @@ def _beside(k: int, step: tuple[int, int], way: int, gone: set[int], far: int = 
     return None
 
 
-def _swapped(clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15, sure: float = 2.5, beside: float = 5.0) -> list[tuple[int, int]]:
+def _swapped(
+    clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15, sure: float = 2.5, beside: float = 5.0
+) -> list[tuple[int, int]]:
     """Pairs that each fit the other's neighbours better than their own by `least` (correlation), and by `sure` standard
     deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies much. Taxels
     side by side feel nearly the same, and a contact's edge between them looks like an exchange: `beside` deviations."""

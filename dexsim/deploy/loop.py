@@ -107,7 +107,8 @@ class Loop:
         self.measure = for_bundle(m, calibration)
         wanted = {None: None, "place": "place", ORIENTATION: "orientation"}[self.measure.needs]
         if wanted is not None and not hasattr(eye, wanted):
-            raise UserError(f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it (dexsim/deploy/vision.py, imu.py)")
+            raise UserError(f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it"
+                            " (dexsim/deploy/vision.py, imu.py)")
         tor_max = 1e3 * calibration.current_max if settings.tor_max is None else settings.tor_max
         self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (12,)), 1, 32767)
         self.guard = Guard(

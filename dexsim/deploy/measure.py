@@ -45,7 +45,9 @@ class Measure:
         self._z: torch.Tensor | None = None
 
     @torch.inference_mode()
-    def observe(self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def observe(
+        self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame; command 0..1."""
         s = self.signals(state, seen, command)
         return self.observation(s), s.touch_force[0].numpy()
@@ -98,7 +100,9 @@ class TurnMeasure:
         self._speed = np.zeros(12)
 
     @torch.inference_mode()
-    def observe(self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def observe(
+        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y z as its
         IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
         s = self.signals(state, seen, target, action)

@@ -48,9 +48,11 @@ class Stated:
             raise UserError(f"object={self.shape}: must be one of {', '.join(shapes)}")
         shape = shapes[self.shape]
         count = {"box": 3, "sphere": 1, "capsule": 2}.get(shape.kind, 1)
-        size = [float(x) for x in self.size] or [float(x) for x in ((2 * s for s in _library_size(shape)) if shape.kind in TYPES else (shape.extents.max(),))]
+        own = [2 * x for x in _library_size(shape)] if shape.kind in TYPES else [float(shape.extents.max())]
+        size = [float(x) for x in self.size] or own
         if len(size) != count or not all(1e-3 <= x <= 1.0 for x in size):
-            raise UserError(f"object_size={','.join(f'{x:g}' for x in size)}: a {self.shape} has {count} extent{'s' * (count > 1)} from 0.001 to 1 m")
+            raise UserError(f"object_size={','.join(f'{x:g}' for x in size)}: a {self.shape} has {count} extent{'s' * (count > 1)}"
+                            " from 0.001 to 1 m")
         if shape.kind == "capsule" and size[1] <= size[0]:
             raise UserError(f"object_size={size[0]:g},{size[1]:g}: a capsule's length (with its caps) must be over its diameter")
         if shape.kind == "capsule":
@@ -82,7 +84,9 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     body = m.spec.worldbody.add_body(name=NAME, pos=recording.object_pose.value[0, :3])
     body.add_freejoint(name=JOINT)
     if not about or about["shape"] not in library():
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8], mass=0.01)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8], mass=0.01
+        )
         return "marked"
     shape, size = library()[about["shape"]], np.array(about["size"], float)
     common: dict[str, Any] = dict(
