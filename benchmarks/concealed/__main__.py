@@ -100,8 +100,8 @@ def main(argv: list[str]) -> dict:
     begun = time.perf_counter()
     root = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}"
     jobs = [(entry, n, s["seed"], root) for n, entry in enumerate(generate.plan(s["mix"], s["seed"], s["one_joint"]))]
-    # the long ones first, so that none is waited for at the end
-    jobs.sort(key=lambda job: -{"hand": 3, "one": 0}.get(job[0]["shape"], 1))
+    # the longest first, so that none is waited for at the end; the others in the order of the plan, which is drawn
+    jobs.sort(key=lambda job: job[0]["shape"] != "hand")
     made, tick = [], Progress("made", len(jobs))
     with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
         for m in pool.map(generate.once, jobs):

@@ -289,6 +289,6 @@ def show(others: dict) -> str:
     """The comparison as text."""
     out = [f"{'held-out error over the floor, median':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}"]
     out += [f"{LABELS[k]:<44}{v['value']:>8.2f}   {v['low']:.2f} .. {v['high']:<12.2f}{v['n']:>4}" for k, v in others["lines"].items()]
-    if "sysid" not in others["lines"]:
+    if others["cases"] and "sysid" not in others["lines"]:
         out.append('mujoco.sysid is not installed: pip install "mujoco[sysid]"')
     return "\n".join(out)

@@ -26,7 +26,7 @@ SECONDS = 7.0
 START_NS = 1_700_000_000_000_000_000  # the same for every recording: time tells nothing
 RECORDINGS = ("a", "b", "c", "d")
 HELD = 1  # of them held out, at the end
-SIZES = 24
+SIZES = 20
 REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_load_speed")
 BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
@@ -135,8 +135,9 @@ class Bench:
             out[k][joint] = x
         return out
 
-    def sized(self, kind: Kind | None, joint: int, ratio: float, seed: int) -> tuple[float, dict]:
-        """(size of the effect, figures): the size at which it changes held-out error in its joint by the ratio."""
+    def sized(self, kind: Kind | None, joint: int, ratio: float, seed: int) -> tuple[float, dict, dict]:
+        """(size of the effect, figures, outputs [1, R, J, M] with it): the size at which it changes held-out error in its joint by
+        the ratio."""
         d, true = self.d, {k: float(v[joint]) for k, v in self.base.items()}
         sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
         unit, inertia = float(d.unit[joint]), float(d.inertia[joint])
@@ -169,8 +170,9 @@ class Bench:
         law = hidden(y[-1] - y[0])
         floor = float(np.hypot(noise, law))
         facts = {"floor": floor, "law": law, "noise": noise}
+        of = lambda i: {key: x[i : i + 1].copy() for key, x in run.items()}  # noqa: E731
         if kind is None:
-            return 0.0, facts
+            return 0.0, facts, of(0)
         if moves:
             change = np.array([hidden(x - y[0]) for x in y[1:first]])
         elif kind is KINDS["current_gain"]:
@@ -179,7 +181,8 @@ class Bench:
             change = np.array([hidden(np.full_like(y[0], s * unit)) for s in sizes])
         reached = np.hypot(change, floor) / floor
         pick = int(np.nanargmin(np.abs(np.log(reached / ratio))))
-        return float(sizes[pick]), facts | {"ratio": float(reached[pick]), "before": float(np.hypot(change[pick], floor)), "size": float(sizes[pick])}
+        facts |= {"ratio": float(reached[pick]), "before": float(np.hypot(change[pick], floor)), "size": float(sizes[pick])}
+        return float(sizes[pick]), facts, of(1 + pick if moves else 0)
 
     def stalls(self, size: float, seed: int) -> np.ndarray:
         """The commands as they arrive on a bus that stalls; the same stalls whatever their length."""
@@ -221,7 +224,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     bench = Bench(d, command, warm, noise, source)
     facts, new, sent, current = [], bench.base, command, {"current_gain": 1.0, "current_offset": 0.0}
     for kind, label, at in zip(kinds, entry["kinds"], joints, strict=True):
-        size, fact = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number)
+        size, fact, run = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number)
         facts.append(fact)
         old = {k: float(v[at]) for k, v in bench.base.items()}
         new = bench.changed(at, kind.apply(old, size, float(d.unit[at]), float(d.inertia[at])), new)
@@ -232,7 +235,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         elif label == "current_offset":
             current["current_offset"] = size * float(d.unit[at])
     if not kinds:
-        facts.append(bench.sized(None, joint, 1.0, number)[1])
+        _, fact, run = bench.sized(None, joint, 1.0, number)
+        facts.append(fact)
     hand_touch, wrong = None, {}
     if decoy == "touched":  # somebody leans on the link for a while, in one recording
         hand_touch = np.zeros_like(command)
@@ -242,7 +246,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         wrong = {"mass": float(new["mass"][joint])}
         d.believed["mass"][joint] *= 1 + float(rng.choice([-0.3, 0.4]))
         wrong = {"mass": wrong["mass"] - float(d.believed["mass"][joint])}
-    run = bench.run([new], [sent], external=hand_touch)
+    if len(kinds) == 2 or hand_touch is not None:
+        run = bench.run([new], [sent], external=hand_touch)
     if confounding:  # friction wears up run by run, and the motor happens to be warmer each time
         parts = [bench.run([bench.changed(joint, {"coulomb": new["coulomb"][joint] * (1 + 1.2 * k)}, new)], [sent]) for k in range(len(RECORDINGS))]
         run = {key: np.stack([parts[k][key][:, k] for k in range(len(RECORDINGS))], 1) for key in run}

@@ -11,39 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.real.fold import brief, fold
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [figure=FILE.png]
+USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [fit=20] [figure=FILE.png]
 
 DATA_DIR is where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml).
-jobs: of BAM's four gains left out in turn, how many at a time. Also writes out/NAME.json.
+jobs: of BAM's four gains left out in turn, how many at a time; fit: of SAGE's twenty motions, how many to fit. Also writes out/NAME.json.
 """
-
-
-def _fold(job: tuple[Path, Path, int]) -> dict:
-    """One gain of BAM left out: fitted on the other three, judged on its four recordings."""
-    from benchmarks.real.convert_bam import convert
-    from dexsim.cli.build import quiet_warp
-    from dexsim.gap.diagnosis import Settings, diagnose, save
-
-    data, out, gain = job
-    quiet_warp("cpu")
-    made = convert(data, out / f"recordings_{gain}")
-    held = [p for p in made.recordings if made.gains[p.name] == gain]
-    rest = [p for p in made.recordings if p not in held]
-    start = time.perf_counter()
-    d = diagnose(Settings(rest, out / f"gain_{gain}", held, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
-    save(d, out / f"gain_{gain}")
-    return {"gain": gain, "verdict": d.data["verdict"], "floor_rad": d.data["noise_floor"]["position_rad"], "findings": [_brief(f) for f in d.data["findings"]],
-            "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()}, "notes": d.notes, "stages": d.stages,
-            "depends_on": d.data["unexplained"]["depends_on"], "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
-
-
-def _brief(f: dict) -> dict:
-    """A finding without its stretches of time."""
-    return {k: f.get(k) for k in ("effect", "confidence", "indistinguishable", "alternatives", "regime", "parameters", "held_out", "separating_experiment")} | {
-        "joints": f["where"]["joints"]}  # fmt: skip
 
 
 def bam(data: Path, out: Path, jobs: int) -> dict:
@@ -53,11 +29,11 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
     gains = sorted(set(convert(data, out / "recordings").gains.values()))
     folds, errors = [], {}
     with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
-        for fold in pool.map(_fold, [(data, out, g) for g in gains]):
-            folds.append(fold)
-            errors |= fold["recordings"]
-            print(f"gain {fold['gain']} left out: {fold['verdict']}, {', '.join(_named(f) for f in fold['findings']) or 'nothing'}; position MAE "
-                  f"{1e3 * np.mean([e[1] for e in fold['recordings'].values()]):.1f} mrad ({fold['seconds']:.0f} s)", flush=True)  # fmt: skip
+        for done in pool.map(fold, [(data, out, g) for g in gains]):
+            folds.append(done)
+            errors |= done["recordings"]
+            print(f"gain {done['gain']} left out: {done['verdict']}, {', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
+                  f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
     x = np.array(list(errors.values()))
     rng = np.random.default_rng(0)
     draws = [x[rng.integers(0, len(x), len(x)), 1].mean() for _ in range(2000)]
@@ -81,7 +57,7 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
     start = time.perf_counter()
     d = diagnose(Settings([made.estimation], out, [made.pulses], str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
     save(d, out)
-    result = {"benchmark": "emps", "verdict": d.data["verdict"], "findings": [_brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"],
+    result = {"benchmark": "emps", "verdict": d.data["verdict"], "findings": [brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"],
               "reference": REFERENCE, "held_out": d.data["held_out"], "joints": d.joints, "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
     found = _emps_parameters(d)
     result["found"] = found
@@ -114,21 +90,23 @@ def _emps_parameters(d) -> dict[str, float]:
     return out
 
 
-def sage(data: Path, out: Path, jobs: int) -> dict:
-    """Twenty motions to fit, ten held out; by joint."""
+def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
+    """Twenty motions to fit (or `fit` of them, evenly), ten held out; by joint."""
     from benchmarks.real.convert_sage import convert
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
     made = convert(data, out / "recordings")
+    if fit:
+        made.recordings = made.recordings[:: max(len(made.recordings) // fit, 1)][:fit]
     start = time.perf_counter()
     d = diagnose(Settings(made.recordings, out, made.held_out, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
     save(d, out)
     rows = {}
     for j, v in d.joints.items():
-        mine = [_brief(f) for f in d.data["findings"] if j in f["where"]["joints"]]
+        mine = [brief(f) for f in d.data["findings"] if j in f["where"]["joints"]]
         rows[j] = {"before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2), "findings": mine}
         print(f"{j:<12} {rows[j]['before_mrad']:>7} -> {rows[j]['after_mrad']:>6} mrad  {', '.join(_named(f) for f in mine) or '-'}")
-    return {"benchmark": "sage", "verdict": d.data["verdict"], "joints": rows, "held_out": d.data["held_out"], "depends_on": d.data["unexplained"]["depends_on"],
+    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "verdict": d.data["verdict"], "joints": rows, "held_out": d.data["held_out"], "depends_on": d.data["unexplained"]["depends_on"],
             "nuisance": d.data["nuisance"], "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
@@ -170,7 +148,7 @@ def main(argv: list[str]) -> int:
     """Runs one benchmark; returns the exit status."""
     plain = [a for a in argv if "=" not in a]
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if len(plain) != 2 or plain[0] not in JOBS or set(given) - {"out", "jobs", "figure"} or not given.get("jobs", "1").isdigit():
+    if len(plain) != 2 or plain[0] not in JOBS or set(given) - {"out", "jobs", "figure", "fit"} or not given.get("jobs", "1").isdigit():
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
     data = Path(plain[1]).expanduser()
@@ -180,7 +158,8 @@ def main(argv: list[str]) -> int:
 
     quiet_warp("cpu")
     out = Path(given.get("out", f"out/real/{plain[0]}"))
-    result = JOBS[plain[0]](data, out, int(given.get("jobs", 1)))
+    more = {"fit": int(given["fit"])} if "fit" in given and plain[0] == "sage" else {}
+    result = JOBS[plain[0]](data, out, int(given.get("jobs", 1)), **more)
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(result, default=float)
     (out / f"{plain[0]}.json").write_text(text, encoding="utf-8")
