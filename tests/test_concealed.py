@@ -251,7 +251,7 @@ def test_scores_by_hand():
                 "parameters": {k: dict(zip(("value", "low", "high"), v, strict=True)) for k, v in parameters.items()}}  # fmt: skip
 
     hidden = {"effect": "backlash", "kind": "backlash", "joint": "joint0", "parameters": {"gap": 0.02}, "facts": {"floor": 1.0, "before": 11.0, "ratio": 11.0},
-              "when": [["a", 1.0, 2.5]], "from_joint": None}  # fmt: skip
+              "when": [["a", 1.0, 2.5]], "also": []}  # fmt: skip
     truth = {"name": "x", "group": "effect", "decoy": "", "tier": "easy", "shape": "one", "joints": 1, "effects": [hidden]}
     held = {"before": 11.0, "after": 3.0}
     right = {"verdict": "explained", "held_out": held, "findings": [finding("backlash", gap=(0.022, 0.019, 0.025))]}
@@ -269,7 +269,7 @@ def test_scores_by_hand():
     pair = {**truth, "group": "pair", "joints": 2, "effects": [hidden, {**hidden, "effect": "lag", "kind": "lag", "joint": "joint1"}]}
     p = score.one(pair, {**right, "findings": [finding("backlash"), finding("lag")]})
     assert p["f1"] == [1, 2, 2] and p["joint_f1"] == [1, 1, 2]  # lag is named on the wrong joint
-    linked = {**truth, "joints": 2, "effects": [{**hidden, "effect": "joint_coupling", "from_joint": "joint1"}]}
+    linked = {**truth, "joints": 2, "effects": [{**hidden, "effect": "joint_coupling", "also": ["joint1"]}]}
     other_end = score.one(linked, {**right, "findings": [finding("joint_coupling", joint="joint1")]})
     assert other_end["right"] and not other_end["wrong_sure"] and other_end["joint_f1"] == [1, 1, 1]  # a linkage has two ends
     nothing = {**truth, "group": "none", "effects": []}

@@ -223,6 +223,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         warm = np.sort(warm)
     bench = Bench(d, command, warm, noise, source)
     facts, new, sent, current = [], bench.base, command, {"current_gain": 1.0, "current_offset": 0.0}
+    current_at = joint
     for kind, label, at in zip(kinds, entry["kinds"], joints, strict=True):
         size, fact, run = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number)
         facts.append(fact)
@@ -231,9 +232,9 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         if label == "bus_stalls":
             sent = bench.stalls(size, number)
         elif label == "current_gain":
-            current["current_gain"] = 1 + size
+            current_at, current["current_gain"] = at, 1 + size
         elif label == "current_offset":
-            current["current_offset"] = size * float(d.unit[at])
+            current_at, current["current_offset"] = at, size * float(d.unit[at])
     if not kinds:
         _, fact, run = bench.sized(None, joint, 1.0, number)
         facts.append(fact)
@@ -256,7 +257,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     settings = rigs.files(where, d)
     bad = str(rng.choice(["stale", "degrees", "wrap"])) if decoy == "bad_channel" else ""
     effort = effort or bad == "wrap"
-    _record(where, d, command, run, rng, quantum, extra, effort, current, joint, bad)
+    _record(where, d, command, run, rng, quantum, extra, effort, current, current_at, joint, bad)
     told = {}
     effects = []
     for kind, label, at, fact in zip(kinds, entry["kinds"], joints, facts, strict=False):
@@ -267,16 +268,24 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         if kind.effect == "payload":
             told = {"mass": n["mass"] + n["extra"] - believed["mass"]}
         effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told, "facts": fact,
-                        "from_joint": d.rig.names[source] if kind.effect == "joint_coupling" else None,
+                        "also": _also(kind, d, at, source),
                         "when": _when(kind, run, command, d, at, source, n, o)})  # fmt: skip
     if wrong:
-        effects = [{"effect": "payload", "kind": "payload", "joint": d.rig.names[joint], "parameters": wrong, "facts": facts[0], "from_joint": None, "when": []}]
+        effects = [{"effect": "payload", "kind": "payload", "joint": d.rig.names[joint], "parameters": wrong, "facts": facts[0], "also": [], "when": []}]
     tier = entry["tier"]
     if group in ("effect", "hand", "pair", "outside") and kinds:
         tier = min((tier_of(f["ratio"]) for f in facts), key=("silent", "hard", "medium", "easy").index)
     answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier, "shape": d.shape, "joints": len(d.rig.names),
               "voltage": d.voltage, "effort": effort, "floor": facts[0]["floor"], "effects": effects}  # fmt: skip
     return {"name": name, "digest": commit(answer, truth), "settings": settings}
+
+
+def _also(kind: Kind, d: rigs.Drawn, j: int, source: int) -> list[str]:
+    """Other joints at which the effect is just as true: a linkage has two ends, and what a link carries its parents carry."""
+    if kind.effect == "joint_coupling":
+        return [d.rig.names[source]]
+    chain, depth = d.rig.place[j]
+    return [d.rig.names[i] for i, (c, k) in enumerate(d.rig.place) if c == chain and k < depth] if kind.effect == "payload" else []
 
 
 def _when(kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, source: int, n: dict, o: dict) -> list[list]:
@@ -295,10 +304,10 @@ def _when(kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, sou
     return out
 
 
-def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, quantum, extra, effort, current, joint, bad) -> None:
+def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, quantum, extra, effort, current, current_at, joint, bad) -> None:
     for k, letter in enumerate(RECORDINGS):
         tau = run["torque"][0, k].copy()
-        tau[joint] = current["current_gain"] * tau[joint] + current["current_offset"]
+        tau[current_at] = current["current_gain"] * tau[current_at] + current["current_offset"]
         t, (angle, torque, heat) = plant.log([run["position"][0, k], tau, run["temperature"][0, k].astype(float)], rng, 100.0, 1e-3)
         torque = torque + rng.normal(0, 1, torque.shape) * (NOISE_OF_EFFORT * d.unit[:, None])
         angle = np.round((angle + rng.normal(0, extra, angle.shape)) / quantum) * quantum

@@ -128,8 +128,8 @@ def one(truth: dict, d: dict) -> dict:
     confident = sure({"findings": physics})
     true_ids = {e["effect"] for e in effects if e["effect"]}
 
-    def ends(e: dict) -> list[str]:  # a linkage acts on both of the joints that it connects
-        return [e["joint"], e["from_joint"]] if e.get("from_joint") else [e["joint"]]
+    def ends(e: dict) -> list[str]:  # a linkage acts on both of the joints that it connects, a mass on all that carry it
+        return [e["joint"], *e["also"]]
 
     def right_here(f: dict, e: dict) -> bool:
         return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
@@ -152,8 +152,8 @@ def one(truth: dict, d: dict) -> dict:
         hit = [e for e in effects if any(right_here(f, e) for f in physics)]
         out["f1"] = [len(hit), len(physics), len(effects)]
         said_joints = {j for f in physics for j in f["where"]["joints"]}
-        # of a linkage, the end that was named
-        true_joints = {next((j for j in ends(e) if j in said_joints), e["joint"]) for e in effects}
+        # of several joints at which it is true, those that were named
+        true_joints = {j for e in effects for j in ([j for j in ends(e) if j in said_joints] or [e["joint"]])}
         if truth["joints"] > 1:
             out["joint_f1"] = [len(said_joints & true_joints), len(said_joints), len(true_joints)]
         out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None

@@ -18,10 +18,19 @@ SECONDS, LSB, NOISE, SIZES = 8.0, 0.1, 0.02, 14
 FINGERS = ("index", "mid", "ring", "pinky")
 
 
+def _relaxed(f: np.ndarray, time_constant: float) -> np.ndarray:
+    """The force [M] as the rubber's slow branch follows it."""
+    a, state, out = np.exp(-1e-3 / time_constant), 0.0, np.empty_like(f)
+    for i, x in enumerate(f):
+        state = a * state + (1 - a) * x
+        out[i] = state
+    return out
+
+
 @dataclass(frozen=True)
 class TouchKind:
-    """effect: id of the catalogue; span: sizes; apply(p, s): parameters that change; report(new): {key: value}; own(x): [M]
-    strength from force [M] N."""
+    """effect: id of the catalogue; span: sizes; apply(p, s): parameters that change; report(new): {key: value}; own(f, n):
+    [M] strength from force f [M] N and parameters n."""
 
     effect: str
     span: tuple[float, float]
@@ -31,12 +40,13 @@ class TouchKind:
 
 
 KINDS: dict[str, TouchKind] = {
-    "pad_gain": TouchKind("tactile_gain", (0.06, 0.8), lambda p, s: {"gain": p["gain"] * (1 - s)}, lambda n: {"gain": n["gain"]}, np.abs),
+    "pad_gain": TouchKind("tactile_gain", (0.06, 0.8), lambda p, s: {"gain": p["gain"] * (1 - s)}, lambda n: {"gain": n["gain"]}, lambda f, n: f),
     "hysteresis": TouchKind("tactile_hysteresis", (0.02, 1.5), lambda p, s: {"fraction": s}, lambda n: {"fraction": n["fraction"], "time_constant": n["time_constant"]},
-                            lambda f: np.abs(np.gradient(f))),
-    "crosstalk": TouchKind("tactile_crosstalk", (0.02, 0.6), lambda p, s: {"crosstalk": s}, lambda n: {"fraction": n["crosstalk"]}, np.abs),
-    "touch_delay": TouchKind("tactile_delay", (0.003, 0.2), lambda p, s: {"delay": s}, lambda n: {"delay": n["delay"]}, lambda f: np.abs(np.gradient(f))),
-    "soft_contact": TouchKind("contact_stiffness", (0.06, 0.85), lambda p, s: {"stiffness": p["stiffness"] * (1 - s)}, lambda n: {"stiffness": n["stiffness"]}, np.abs),
+                            lambda f, n: np.abs(f - _relaxed(f, n["time_constant"]))),
+    "crosstalk": TouchKind("tactile_crosstalk", (0.02, 0.6), lambda p, s: {"crosstalk": s}, lambda n: {"fraction": n["crosstalk"]}, lambda f, n: f),
+    "touch_delay": TouchKind("tactile_delay", (0.003, 0.2), lambda p, s: {"delay": s}, lambda n: {"delay": n["delay"]},
+                             lambda f, n: np.abs(f - np.r_[np.zeros(int(n["delay"] * 1000)), f][: len(f)])),
+    "soft_contact": TouchKind("contact_stiffness", (0.06, 0.85), lambda p, s: {"stiffness": p["stiffness"] * (1 - s)}, lambda n: {"stiffness": n["stiffness"]}, lambda f, n: f),
 }  # fmt: skip
 REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across": 6e-4}
 
@@ -159,11 +169,11 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
                 w.add_tactile(x, out)
                 w.add_external_force(x, np.r_[np.interp(x, grid, f) + 0.02 * rng.normal(), np.zeros(5)], "indenter")
         if kind and k < len(RECORDINGS) - HELD:
-            strength = kind.own(f)
+            strength = kind.own(f, p)
             edge = np.flatnonzero(np.diff(np.r_[0, (strength > 0.25 * max(np.percentile(strength, 99.9), 1e-12)).astype(int), 0]))
             when += [[letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)] for a, b in zip(edge[::2], edge[1::2], strict=True)]
     effects = [] if not kind else [{"effect": kind.effect, "kind": entry["kinds"][0], "joint": "pad", "parameters": {k: float(v) for k, v in kind.report(p).items()},
-                                    "facts": facts, "from_joint": None, "when": when}]  # fmt: skip
+                                    "facts": facts, "also": [], "when": when}]  # fmt: skip
     answer = {"name": name, "group": "touch", "decoy": "", "bad": "", "asked_tier": entry["tier"], "tier": tier_of(facts["ratio"]) if kind else "none", "shape": "touch",
               "joints": 1, "voltage": False, "effort": False, "floor": floor, "effects": effects}  # fmt: skip
     return {"name": name, "digest": commit(answer, truth), "settings": []}
