@@ -284,9 +284,9 @@ def test_scores_by_hand():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(2400)
 def test_twelve_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
-    """Every group but the xHand: diagnosed by the command, none fails, most is not confidently wrong; then again from the disk."""
-    monkeypatch.setattr(generate, "SIZES", 12)
+    """Effects, nothing missing, a pair, decoys, one outside the catalogue: diagnosed by the command; then again from the disk."""
     line = command.main(["ci=true", "seed=2", "jobs=2", "limit=600", f"out={tmp_path}"])
     assert line["cases"] == sum(command.CI.values()) == 12 and line["failed"] == line["left_out"] == 0
     assert line["lines"]["confident and wrong, all cases"]["value"] <= 0.34

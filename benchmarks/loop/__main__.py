@@ -240,7 +240,7 @@ class Loop:
     def excite(self, world: str):
         def run(slot: str) -> bool:
             where = self.out / f"excited_{world}"
-            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=2"], where / "log.txt") == 0
+            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=3"], where / "log.txt") == 0
 
         return run
 

@@ -1,7 +1,7 @@
 """The steps of the loop that no entry script does: a start that may be trained on, and recordings of the hand in its reality.
 
     python -m benchmarks.loop.steps start checkpoint=FILE out=last.pt device=cuda [any setting of train.py]
-    python -m benchmarks.loop.steps record world=dry out=DIR seed=1 [count=2] [seconds=19]
+    python -m benchmarks.loop.steps record world=dry out=DIR seed=1 [count=3] [seconds=19]
 """
 
 from __future__ import annotations
@@ -52,11 +52,12 @@ def record(given: dict[str, str]) -> None:
     believed, true = mechanism(), mechanism(servo=world["servo"])
     out, seed = Path(given["out"]), int(given.get("seed", 0))
     out.mkdir(parents=True, exist_ok=True)
-    kinds = [["random"]]  # all joints at once: most is seen in little time
-    for k in range(int(given.get("count", 2))):
+    kinds = [["random"], ["chirp"]]  # all joints at once: most is seen in little time; chirps tell a delay from damping
+    for k in range(int(given.get("count", 3))):
         rng = np.random.default_rng([seed, k])
         p = plan(believed, kinds=kinds[k % len(kinds)], seed=seed + k, repeats=0)
-        p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
+        if kinds[k % len(kinds)] == ["random"]:
+            p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
         arrives = rng.random(len(p.t)) >= world["timing"]["lost"]
         late = p.t + world["timing"]["late"] * rng.random(len(p.t))
         order = np.argsort(late[arrives], kind="stable")
