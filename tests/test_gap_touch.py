@@ -142,7 +142,7 @@ def test_gains_dead_stuck_and_exchanged_taxels(tmp_path):
     (f,) = out.findings
     assert f["effect"] == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(f["where"]["taxels"])
     gain = dict(zip(f["where"]["taxels"], f["parameters"]["gain"]["value"], strict=True))
-    assert gain["1:54"] == pytest.approx(0.5, abs=0.1) and gain["1:66"] == pytest.approx(1.5, abs=0.2) and gain["1:67"] == 0 == gain["1:80"]
+    assert gain["1:54"] == pytest.approx(0.5, abs=0.1) and gain["1:66"] == pytest.approx(1.5, abs=0.2) and gain["1:67"] < 0.05 and gain["1:80"] == 0
     assert f["parameters"]["taxels"]["swapped"] == [["1:55", "1:65"]]
 
 

@@ -105,17 +105,20 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     name = xhand.FINGERS[o.pad]
     none, best = o.none, o.best
     bounds = search.intervals(best) if best.keys else {}
-    before, e0, blocks = held_out_rms(search, none)
-    after, e1, _ = held_out_rms(search, best)
     dead = _broken(search, o.pad)
+    # the error is that of the signals in which something was found: readings, the cell's force, shear
+    stages = sorted({_stage(search, e) for e in best.ids} | ({0} if dead is not None or not best.ids else set()))
+    e0, e1 = (np.concatenate([held_out_rms(search, t, k)[1] for k in stages]) for t in (none, best))
+    blocks = np.concatenate([held_out_rms(search, best, k)[2] for k in stages])
+    after = float(np.sqrt(e1.mean())) if len(e1) else 0.0
     if not len(e0):
         out.notes.append(f"the {name}'s pad feels nothing in what was kept out: nothing is judged there")
         return
-    silent = _silent_squares(search)
+    silent = _silent_squares(search) if 0 in stages else (np.zeros(0), np.zeros(0))
     squares["before"].append(np.concatenate([e0, silent[0]]))
     squares["after"].append(np.concatenate([e1, silent[1]]))
     times.append(np.concatenate([blocks, np.repeat(blocks[-1:], len(silent[0]))]) * 0.5)
-    floors.append(_floor(search))
+    floors.append(_floor(search, stages))
     rms = lambda x: float(np.sqrt(np.mean(x))) if len(x) else 0.0  # noqa: E731
     out.pads[name] = {"before": rms(squares["before"][-1]), "after": rms(squares["after"][-1]), "noise": search.noise}
     if dead is not None:
@@ -123,7 +126,7 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     fresh: list[dict[str, Any]] = []
     for e in best.ids:
         effect = BY_ID[e]
-        stage = {"cell": 1 if search.load else 0, "shear": 2}.get(effect.stage, 0)
+        stage = _stage(search, e)
         less = search._without(best, e) if len(best.ids) > 1 else none
         b, a = held_out_rms(search, less, stage)[0], held_out_rms(search, best, stage)[0]
         rivals, share = o.rivals[e], o.confidence[e]
@@ -154,7 +157,7 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
             out.nuisance[f"touch_{k}@{name}"] = round(best.values[k], 7)
     out.recordings = sorted(set(out.recordings) | (kept or {r.recording for r in search.runs}))
     loss = float(search.cross(best).sum()) / max(int(search.train.sum()), 1)
-    if loss > 2.0**2 and after > 2.0 * _floor(search):
+    if loss > 2.0**2 and after > 2.0 * _floor(search, stages):
         out.structured = True
         out.depends_on += _depends(search, best, name)
     error = np.zeros((len(xhand.FINGERS), xhand.TAXELS_PER_FINGER)) if out.error is None else out.error
@@ -170,9 +173,18 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     out.curves.append(PadCurve(name, run.recording, run.t[pick], run.z[pick].sum(1), p0[pick].sum(1), p1[pick].sum(1), None if load is None else load[pick]))
 
 
-def _floor(search: PadSearch) -> float:
-    """N: the noise of one reading."""
-    return search.noise
+def _stage(search: PadSearch, effect: str) -> int:
+    """Which signal judges an effect: 0 the taxels, 1 the load cell (where there is one), 2 shear."""
+    return {"cell": 1 if search.load else 0, "shear": 2}.get(BY_ID[effect].stage, 0)
+
+
+def _floor(search: PadSearch, stages: list[int]) -> float:
+    """N: the noise of one reading; of a sum of taxels or a load cell, with what is not trusted of the plant."""
+    if stages == [0]:
+        return search.noise
+    stage = search.stage_of()
+    sigma = np.concatenate([s.sigma[s.mask] for s in search.samples])
+    return float(np.sqrt(np.mean(sigma[np.isin(stage, stages)] ** 2)))
 
 
 def _silent_squares(search: PadSearch) -> tuple[np.ndarray, np.ndarray]:

@@ -173,7 +173,8 @@ class PadSearch:
     # -- fits ------------------------------------------------------------------------------------------------------------------------
     def _keys(self, ids: tuple[str, ...], mapped: bool = False) -> tuple[str, ...]:
         keys = [k for e in ids for k in BY_ID[e].fits if not (e == "tactile_gain" and mapped)]
-        keys += ["scale", "zero", "along", "across"] + (["skin"] if self.shear else [])
+        # single taxels' gains leave nothing to a common one
+        keys += ([] if mapped and self.scale_known else ["scale"]) + ["zero", "along", "across"] + (["skin"] if self.shear else [])
         if "tactile_delay" not in ids:
             keys.append("clock")
         return tuple(dict.fromkeys(keys))
@@ -202,7 +203,8 @@ class PadSearch:
         x0 = np.clip([start.get(k, PARAMS[k].neutral) for k in keys], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
 
         def values(x):
-            return self.base | dict(zip(keys, (float(a) for a in x), strict=True))
+            fixed = {"scale": start["scale"]} if "scale" not in keys and "scale" in start else {}
+            return self.base | fixed | dict(zip(keys, (float(a) for a in x), strict=True))
 
         def error(y):
             x = y * scale
@@ -281,7 +283,7 @@ class PadSearch:
                 break
             current = min(good, key=lambda t: self.cross(t).sum() * (1 + 0.02 * len(t.ids)))
         current = self._drop(current, trials)
-        if current.ids:  # the numbers, to their end
+        if current.ids and current.gains is None:  # the numbers, to their end
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
             if self._size(full.res) < self._size(current.res):
                 current = full
@@ -343,7 +345,7 @@ class PadSearch:
             order = self._swaps(current)
             base = current if order is None else self.fit(current.ids, current.values, None, None, order, 24)
             # single taxels must not be taken for a shifted object: gains first, against the believed geometry
-            base.values = base.values | {k: p.neutral for k, p in PARAMS.items() if p.nuisance and k != "scale"}
+            base.values = base.values | {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
             for _ in range(2):
                 gains = self.gain_map(base, self.train)
                 base = self.fit(current.ids, base.values, None, gains, base.order, 24)
