@@ -29,7 +29,10 @@ def main(folder: str, worlds: int, device: str) -> dict:
         d = mjw.put_data(model, data, nworld=worlds, nconmax=about["sim"]["nconmax"], njmax=about["sim"]["njmax"])
         if hasattr(m.opt, "warn_overflow"):
             m.opt.warn_overflow = False
-        graph = None
+        rng, qpos = np.random.default_rng(0), d.qpos.numpy()
+        qpos[:, :12] += about["spread"]["joint"] * rng.uniform(-1, 1, (worlds, 12))
+        qpos[:, 12:15] += np.array([about["spread"][k] for k in ("xy", "xy", "z")]) * rng.uniform(-1, 1, (worlds, 3))
+        wp.copy(d.qpos, wp.array(qpos.astype(np.float32), dtype=float))
 
         def step() -> None:
             for _ in range(about["decimation"]):

@@ -21,6 +21,7 @@ from mjlab.envs.mdp.actions import JointPositionActionCfg
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.observation_manager import ObservationGroupCfg, ObservationTermCfg
 from mjlab.managers.reward_manager import RewardTermCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.termination_manager import TerminationTermCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
@@ -56,18 +57,21 @@ def config(folder: Path, about: dict, worlds: int) -> ManagerBasedRlEnvCfg:
                     init_state=EntityCfg.InitialStateCfg(pos=tuple(pose[:3]), rot=tuple(pose[3:7])))
     terms = {"joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel), "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel),
              "box": ObservationTermCfg(func=box_pose), "actions": ObservationTermCfg(func=mdp.last_action)}
-    terms = {k: v for k, v in terms.items()}
+    joints = SceneEntityCfg("hand", joint_names=(".*",))
     for name in ("joint_pos", "joint_vel"):
-        from mjlab.managers.scene_entity_config import SceneEntityCfg
-
-        terms[name].params = {"asset_cfg": SceneEntityCfg("hand", joint_names=(".*",))}
-    sim = about["sim"]
+        terms[name].params = {"asset_cfg": joints}
+    sim, spread = about["sim"], about["spread"]
     return ManagerBasedRlEnvCfg(
         decimation=about["decimation"], episode_length_s=8.0, seed=1,
-        scene=SceneCfg(num_envs=worlds, env_spacing=1.0, entities={"hand": hand, "box": box}),
+        scene=SceneCfg(num_envs=worlds, env_spacing=0.0, entities={"hand": hand, "box": box}),
         observations={"actor": ObservationGroupCfg(dict(terms)), "critic": ObservationGroupCfg(dict(terms))},
         actions={"joint_pos": JointPositionActionCfg(entity_name="hand", actuator_names=(".*",), scale=1.0, use_default_offset=False)},
-        events={"reset": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")},
+        events={"reset": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset"),
+                "joints": EventTermCfg(func=mdp.reset_joints_by_offset, mode="reset", params={
+                    "position_range": (-spread["joint"], spread["joint"]), "velocity_range": (0.0, 0.0), "asset_cfg": joints}),
+                "place": EventTermCfg(func=mdp.reset_root_state_uniform, mode="reset", params={
+                    "pose_range": {"x": (-spread["xy"], spread["xy"]), "y": (-spread["xy"], spread["xy"]), "z": (-spread["z"], spread["z"])},
+                    "velocity_range": {}, "asset_cfg": SceneEntityCfg("box")})},
         rewards={"height": RewardTermCfg(func=box_height, weight=1.0), "action_rate": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
                  "lost": RewardTermCfg(func=mdp.is_terminated, weight=-1.0)},
         terminations={"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True), "lost": TerminationTermCfg(func=box_lost)},

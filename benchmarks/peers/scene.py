@@ -19,10 +19,13 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.tasks.env import OBJECT, HandEnv, _solver_options
 
-# One box, always dropped from the same place; physics still randomized by world as in training is dexsim's own affair.
+# One box, dropped with a spread of places and joint angles that all simulators get: worlds that are all alike would all need the
+# same few solver iterations, which no training has. The servo is also randomized by world in dexsim; the others have none.
+SPREAD = {"joint": 0.1, "xy": 0.012, "z": 0.02}  # half widths: rad, m, m
 SETTINGS = ("task=grasp", "task.objects.train=[box]", "task.objects.held_out=[tetra]", "task.action.mode=absolute",
             "randomize.object.scale=1.38", "randomize.object.aspect=1.0", "randomize.object.mass=0.1", "randomize.object.com=0.0",
-            "randomize.object.friction=0.8", "randomize.initial.joint=0.0", "randomize.initial.object_xy=0.0", "randomize.initial.drop=0.05",
+            "randomize.object.friction=0.8", "randomize.initial.joint=[-0.1,0.1]", "randomize.initial.object_xy=[-0.012,0.012]",
+            "randomize.initial.drop=[0.03,0.07]",
             "randomize.initial.velocity_xy=0.0", "randomize.initial.velocity_z=0.0", "randomize.initial.spin=0.0",
             "randomize.initial.tilt=0.0", "randomize.push.weights=0.0")
 CLOSE = 0.42  # rad beyond the start pose, every flexing joint
@@ -66,6 +69,7 @@ def write(env: HandEnv, folder: Path) -> Path:
         joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
     both = hand.copy()
     size, pose = env.objects.size[0].cpu().numpy(), env.object_pose[0].cpu().numpy()
+    pose[:3] = [*env.task["initial"]["object_xy"], float(env.objects.radius[0]) + 0.05]
     g = ids["object_box"]
     box = mujoco.MjSpec()
     for spec in (box, both):
@@ -79,7 +83,7 @@ def write(env: HandEnv, folder: Path) -> Path:
         (folder / f"{name}.xml").write_text(_plain(spec, nominal if name == "scene" else None))
     start, closed = targets()
     about = {"joints": list(xhand.JOINTS), "start": start.tolist(), "closed": closed.tolist(), "object_pose": pose.tolist(), "decimation": env.decimation,
-             "closing": CLOSING, "timed": TIMED, "sim": {k: sim[k] for k in ("timestep", "impratio", "iterations", "ls_iterations", "nconmax", "njmax")},
+             "closing": CLOSING, "timed": TIMED, "spread": SPREAD, "sim": {k: sim[k] for k in ("timestep", "impratio", "iterations", "ls_iterations", "nconmax", "njmax")},
              "servo": {k: v.tolist() for k, v in nominal.items()}}
     (folder / "scene.json").write_text(json.dumps(about, indent=1))
     return folder
