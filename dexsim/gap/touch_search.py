@@ -14,6 +14,7 @@ from dexsim.gap.touch_plant import PARAMS, cell, neutral, readings, shear
 
 LEAST = 0.12  # of the squared error on presses left out: what an effect must remove
 MOST = 4  # effects on one pad
+MAP_PRICE = 1.5  # on the squared error of a gain for every taxel
 BOOTSTRAPS = 300
 BLOCK = 0.5  # s
 MODEL = 0.02  # of a reading: finer than that the plant is not to be trusted
@@ -272,7 +273,10 @@ class PadSearch:
         for _ in range(MOST):
             if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < 1.2**2:
                 break
-            options = [t for e in self.scan(current) if (t := self._try(current, e)) is not None]
+            listed = self.scan(current)
+            options = [t for e in listed if (t := self._try(current, e)) is not None]
+            if self.scale_known and any(e.id == "tactile_gain" for e in listed):  # one number for the pad, beside one for each taxel
+                options.append(self._common(current, 120))
             for t in options:
                 trials[frozenset(t.ids)] = t
             options.sort(key=lambda t: float(np.minimum(np.abs(t.res[self.train]), 30).sum()))
@@ -281,7 +285,9 @@ class PadSearch:
             good = [t for t in options[:3] if self._earns(t, current)]
             if not good:
                 break
-            current = min(good, key=lambda t: self.cross(t).sum() * (1 + 0.02 * len(t.ids)))
+            # a gain for every taxel must do clearly better than one number
+            priced = lambda t, had=current.gains is not None: self.cross(t).sum() * (1.0 if t.gains is None or had else MAP_PRICE)  # noqa: E731
+            current = min(good, key=priced)
         current = self._drop(current, trials)
         if current.ids and current.gains is None:  # the numbers, to their end
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
@@ -352,8 +358,7 @@ class PadSearch:
             gains = self.gain_map(base, self.train)
             tries.append(TouchTrial(ids, base.values, gains, base.order, base.keys, None, self.residual(base.values, gains, base.order)))
             if self.scale_known:
-                ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
-                tries.append(self.fit(ids, current.values | {"gain": ratio}, None, current.gains, current.order, 60))
+                tries.append(self._common(current, 60))
             # a map where one number does not: a third less error, beside the price of its 120 numbers
             if len(tries) == 2 and self._size(tries[0].res) > 0.7 * self._size(tries[1].res):
                 tries = tries[1:]
@@ -369,6 +374,11 @@ class PadSearch:
     def _size(self, res: np.ndarray) -> float:
         a = np.abs(res[self.train])
         return float(np.where(a <= 3, a * a, 6 * a - 9).sum())
+
+    def _common(self, current: TouchTrial, evaluations: int) -> TouchTrial:
+        """The hypothesis with one gain for all of the pad."""
+        ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
+        return self.fit((*current.ids, "tactile_gain"), current.values | {"gain": ratio}, None, current.gains, current.order, evaluations)
 
     def _swaps(self, current: TouchTrial) -> np.ndarray | None:
         """Order of the taxels [K] in which exchanged pairs are put right; None where there are none."""
@@ -438,9 +448,15 @@ class PadSearch:
             if x.id in current.ids or not (x in tried or confusable(x.id, e)):
                 continue
             t = trials.get(frozenset((*base.ids, x.id))) or self._try(base, x)
-            if x.id == "tactile_gain" and t is not None and t.gains is not None and e != "tactile_gain" and self.scale_known:
-                one = self.fit((*base.ids, x.id), base.values | {"gain": current.values["stiffness"]}, None, base.gains, base.order, 60)
-                t = one if self._size(one.res) < 1.5 * self._size(t.res) else t
+            if confusable(x.id, e) and t is not None:  # what is said to be no rival must have been fitted to its end
+                start = t.values
+                if x.id == "tactile_gain" and t.gains is not None and self.scale_known:
+                    start, t = base.values, self._common(base, 120)
+                elif x.id == "contact_stiffness" and current.gains is None:
+                    start = base.values | {"stiffness": current.values["gain"]}
+                if t.gains is None:
+                    again = self.fit(t.ids, start if x.id == "contact_stiffness" else t.values, None, t.gains, t.order, 160)
+                    t = again if self._size(again.res) < self._size(t.res) else t
             if t is not None and (self._size(t.res) < 2.5 * self._size(current.res) or confusable(x.id, e)):
                 self.cross(t)
                 others.append((x.id, t))
