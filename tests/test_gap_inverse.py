@@ -1,0 +1,35 @@
+"""Inverse dynamics against a carriage with known figures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dexsim.gap.inverse import identify
+
+
+def carriage(backward: float = 0.0, seed: int = 0):
+    """Times, noisy positions and forces of 95 kg, 200 N.s/m, 20 N, -3 N; backward: viscous friction more when it goes back."""
+    t = np.arange(0, 12, 2e-3)
+    v = 0.1 * np.sin(2 * np.pi * 0.4 * t) + 0.04 * np.sin(2 * np.pi * 1.3 * t)
+    q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * 2e-3)])
+    force = 95 * np.gradient(v, 2e-3) + (200 + backward * (v < 0)) * v + 20 * np.sign(v) - 3
+    rng = np.random.default_rng(seed)
+    return t, q + 1e-7 * rng.standard_normal(len(t)), force + 0.5 * rng.standard_normal(len(t))
+
+
+def test_known_figures_are_recovered_within_one_percent():
+    found = identify(*carriage())
+    for name, value in {"inertia": 95, "viscous_friction": 200, "coulomb_friction": 20, "offset": -3}.items():
+        assert found.value[name] == pytest.approx(value, rel=0.01)
+    assert found.low["inertia"] < found.high["inertia"] and abs(found.extra[0][1]) < 0.05
+
+
+def test_friction_that_differs_by_direction_is_told_on_other_data():
+    found = identify(*carriage(60.0), test=carriage(60.0, 1))
+    assert found.extra[0][0].startswith("viscous friction that differs") and found.extra[0][1] > 0.2
+
+
+def test_too_few_samples():
+    with pytest.raises(ValueError, match="too few"):
+        identify(np.arange(10.0), np.zeros(10), np.zeros(10))
