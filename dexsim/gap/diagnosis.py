@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, inputs, judge, locate, stage, standin, touch
+from dexsim.gap import channels, inputs, inverse, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
@@ -222,6 +222,9 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     stages = stage.tests(cases, runs, train, s.seed)
     for x in stages[:4]:
         say(f"  {x.text}")
+    behind = inverse.texts(cases, runs, train, test, s.seed)
+    for x in behind[:4]:
+        say(f"  {x}")
     clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
     rng = np.random.default_rng(s.seed)
@@ -239,7 +242,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         progress(len(cases), len(cases), "")
     clock.lap("search")
     result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
-    result.stages = [x.text for x in stages]
+    result.stages = [x.text for x in stages] + behind
     _with_touch(result, felt)
     result.lengths = lengths
     clock.lap("judging on held-out data")

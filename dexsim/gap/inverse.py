@@ -15,6 +15,7 @@ from scipy.signal import butter, filtfilt
 
 CUTOFF = 0.2  # of half the sampling rate, and no more than TOP Hz
 TOP = 60.0
+RATE = 200.0  # Hz: readings slower than this are too few for a second derivative
 DRAWS = 300
 BLOCK = 0.5  # s
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
@@ -55,6 +56,27 @@ def identify(t: np.ndarray, q: np.ndarray, torque: np.ndarray, seed: int = 0, te
         extra.append((name, float(1 - after / before)))
     pack = lambda x: {n: float(y) for n, y in zip(NAMES, x, strict=True)}  # noqa: E731
     return Inverse(pack(theta), pack(low), pack(high), float(np.std(left) / np.std(u)), sorted(extra, key=lambda e: -e[1]))
+
+
+def texts(cases, runs, train: list[int], test: list[int], seed: int = 0) -> list[str]:
+    """In words, of each joint that gravity does not load and whose motor torque was logged: its figures by inverse dynamics from
+    the first training recording, and the further effect that helps most on the first one kept out."""
+    out = []
+    for case in cases:
+        seen = lambda r, j=case.index: (runs[r].t, runs[r].q[:, j], runs[r].torque[:, j])  # noqa: E731
+        good = lambda r: runs[r].torque is not None and np.isfinite(seen(r)[2]).all() and len(runs[r].t) >= 2000  # noqa: B023, E731
+        first = next((r for r in train if good(r)), None)
+        if first is None or case.scales.gravity > 0.02 * case.scales.tau or 1 / np.median(np.diff(runs[first].t)) < RATE or case.scales.others:
+            continue
+        other = next((r for r in test if r not in train and good(r)), None)
+        found = identify(*seen(first), seed, None if other is None else seen(other))
+        said = ", ".join(f"{n.replace('_', ' ')} {found.value[n]:.4g} ({found.low[n]:.4g} to {found.high[n]:.4g})" for n in NAMES)
+        text = f"{case.joint}: by the recorded motor torque alone: {said}; {100 * found.residual:.1f} % of the torque is left"
+        name, share = found.extra[0]
+        if share > 0.05:
+            text += f"; {name} takes {100 * share:.0f} % of that away" + (" in the recording kept out" if other is not None else "")
+        out.append(text)
+    return out
 
 
 def _further(top: float) -> dict:
