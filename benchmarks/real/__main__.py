@@ -69,6 +69,15 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
         result["open_loop_mm"][name] = {"found": round(1e3 * force.open_loop(t, q, f, **given), 3), "reference": round(1e3 * force.open_loop(t, q, f, **REFERENCE), 3)}
     t, q, f = force.load(data, "estimation")
     result["least_squares"] = force.least_squares(t, q, f)
+    # the tool's own stage for a logged motor torque, as its report has it
+    from dexsim.gap.inverse import identify
+
+    found = identify(t[::2], q[::2], f[::2], test=tuple(x[::2] for x in force.load(data, "pulses")))
+    names = {"mass": "inertia", "viscous": "viscous_friction", "coulomb": "coulomb_friction", "offset": "offset"}
+    by = {k: found.value[n] for k, n in names.items()}
+    result["inverse"] = {"value": by, "low": {k: found.low[n] for k, n in names.items()}, "high": {k: found.high[n] for k, n in names.items()},
+                         "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 2) for k in by}, "extra": found.extra[:3], "residual": found.residual,
+                         "open_loop_mm": {n: round(1e3 * force.open_loop(*force.load(data, n), **by), 3) for n in force.FILES}}  # fmt: skip
     return result
 
 
