@@ -12,12 +12,9 @@ import torch
 import warp as wp
 
 from dexsim.sim import contact
-from dexsim.sim.compile import compile_together
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
-
-
 _STREAMS: dict[int, wp.Stream] = {}
 
 
@@ -166,8 +163,6 @@ class WarpEngine(Engine):
         with wp.ScopedDevice(self.device):
             inside = self.device.startswith("cuda") and torch.cuda.is_current_stream_capturing()
             if inside or key not in self._eager_done:  # inside another recording, be part of it
-                if not inside:
-                    compile_together(program, self.device)
                 program()
                 self._eager_done.add(key)
                 return
