@@ -270,8 +270,9 @@ def check_planted(effect, changes, key, value):
     rivals = [e for e, share in outcome.rivals[first.id] if share > 0.1 and confusable(e, first.id)]
     assert first.id == effect or effect in rivals, f"{outcome.best.ids} {outcome.rivals}"
     if first.id == effect:
-        # gains and mass are refitted within 5 %, and inertia or a load trades against both
-        tolerance = 0.3 if effect in ("inertia", "payload") else 0.15
+        # gains and mass are refitted within 5 %, and inertia or a load trades against both; so does a share of the load against
+        # the dry friction that was believed
+        tolerance = {"inertia": 0.3, "payload": 0.3, "load_friction": 0.2}.get(effect, 0.15)
         assert outcome.best.fit.value(f"{effect}.{key}") == pytest.approx(value, rel=tolerance)
 
 
