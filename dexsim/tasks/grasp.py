@@ -205,9 +205,9 @@ class GraspEnv(HandEnv):
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
-            "force_near": w.get("force_near", 0.0) * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
+            "force_near": w["force_near"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
             # a finger that does not touch has nothing else that says which way the object lies
-            "reach": w.get("reach", 0.0) * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r.get("reach_length", 0.02)).mean(1),
+            "reach": w["reach"] * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r["reach_length"]).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
@@ -290,7 +290,7 @@ class GraspEnv(HandEnv):
         return {
             "observations": groups,
             "action": [(j, float(lo), float(hi), f"rad ({act['mode']})") for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
-            "rewards": [(k, w, notes.get(k, "")) for k, w in r.items()],
+            "rewards": [(k, w, notes[k]) for k, w in r.items()],
             "terminations": [("dropped", f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m away"),
                              ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
             "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],
