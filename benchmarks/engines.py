@@ -13,14 +13,12 @@ Aim: C MuJoCo at least 8 times as fast in physics and 5 times in the full step.
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
 
 import torch
 
 from benchmarks import tools
-from dexsim.errors import UserError
 from dexsim.tasks import make_env
 
 ENGINES = ("mujoco", "warp")
@@ -91,8 +89,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as e:
-        print(e, file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)

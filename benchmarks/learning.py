@@ -18,7 +18,6 @@ from __future__ import annotations
 import gc
 import json
 import statistics
-import sys
 import time
 from typing import Any
 
@@ -27,7 +26,6 @@ import torch
 from benchmarks import tools
 from benchmarks.tape import Tape
 from dexsim.cli import machine
-from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.runner import Runner
 from dexsim.tasks import make_env
@@ -220,8 +218,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as e:
-        print(e, file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)

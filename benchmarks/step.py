@@ -14,14 +14,12 @@ All worlds are driven into a grasp of moderate force. From that state, the same 
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 
 import torch
 
 from benchmarks import tools
 from benchmarks.tape import Tape
-from dexsim.errors import UserError
 from dexsim.tasks import make_env
 
 def main(argv: list[str]) -> dict:
@@ -74,8 +72,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as e:
-        print(e, file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,10 +16,21 @@ import torch
 from dexsim.actuator.kernel import QUEUE
 from dexsim.cli import machine
 from dexsim.cli import start as start_up
+from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 from dexsim.sim.scene import OBJECT_FIELDS
 
 ROOT = Path(__file__).parents[1]
+
+
+def command(main: Callable[[list[str]], object]) -> None:
+    """Run `main` on the command line's arguments and end the process as every command of dexsim ends (`dexsim.cli.ending`)."""
+
+    def run(argv: list[str]) -> int:
+        main(argv)
+        return 0
+
+    sys.exit(guard(run, sys.argv[1:]))
 
 
 def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], list[str]]:

@@ -15,7 +15,6 @@ their summed force over ours. variants=true times the kernel's launch choices (t
 from __future__ import annotations
 
 import json
-import sys
 
 import mujoco
 import numpy as np
@@ -218,8 +217,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as e:
-        print(e, file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)

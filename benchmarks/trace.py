@@ -9,7 +9,6 @@ cost: contacts, constraint rows and Newton iterations of a world. setting: one o
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 import mujoco_warp as mjw
@@ -79,8 +78,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as e:
-        print(e, file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)
