@@ -36,7 +36,7 @@ SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much be
 @dataclass
 class Settings:
     """What was asked. recordings, held_out: paths; model, servo: files, None for the xHand's; allowed: effect ids to
-    consider, None for all."""
+    consider, joints: those to judge (the others' motion is only prescribed); None for all."""
 
     recordings: list[Path]
     out: Path
@@ -47,6 +47,7 @@ class Settings:
     device: str = "cpu"
     next_recording: bool = True
     allowed: set[str] | None = None
+    joints: set[str] | None = None
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
 
@@ -210,6 +211,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     cases = build(model, runs, device=s.device, dt=_step(runs))
     cases = sharpen(model, runs, cases, s.device, _step(runs))
     notes += _cannot(s, cases, felt)
+    if s.joints is not None:
+        cases = [c for c in cases if c.joint in s.joints]
+        if not cases:
+            raise UserError(f"joints: none of {', '.join(sorted(s.joints))} is in the recordings ({', '.join(runs[0].joints)})")
     clock.lap("model along the motion")
     group = conditions(runs)
     drives = [json.dumps(_plain(r.servo.to_dict()), sort_keys=True) for r in runs]
