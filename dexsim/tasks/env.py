@@ -67,10 +67,15 @@ class HandEnv(VecEnv):
         d = contact["impedance"]
         if not 0.5 <= d < 1.0:
             raise UserError(f"task.contact.impedance={d}: must lie in [0.5, 1)")
+        firm = contact.get("hand_impedance")  # links and palm; null, and in checkpoints from before: MuJoCo's default
+        if firm is not None and not 0.5 <= firm < 1.0:
+            raise UserError(f"task.contact.hand_impedance={firm}: must be null or lie in [0.5, 1)")
         scene = hand_object_scene(spec, [shapes[s] for s in self.shape_names], self.task["objects"]["baked_scales"], sim["timestep"])
         for geom in spec.geoms:
             if geom.name in xhand.TIP_GEOMS:
                 geom.solimp = [d, d, 1e-3, 0.5, 2.0]
+            elif firm is not None:  # the object's too: MuJoCo takes the mean of two that touch
+                geom.solimp = [firm, firm, 1e-3, 0.5, 2.0]
         for joint in spec.joints:
             if joint.name in xhand.JOINTS:
                 # stiffer dry friction than MuJoCo's default, in which a stuck joint creeps; stiffer yet, and Newton

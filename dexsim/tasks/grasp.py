@@ -27,6 +27,9 @@ FINGER_ROOT = [xhand.FLEXION_ROOT[f] for f in xhand.FINGERS]
 INNER, OUTER = [4, 6, 8, 10], [5, 7, 9, 11]
 """First and second flexion joints of the four fingers (SDK order)."""
 
+CENTRE_LENGTH = 0.03
+"""Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward `centre`."""
+
 assert ACTOR_SIZE == 66
 
 PRIVILEGED = (
@@ -206,6 +209,10 @@ class GraspEnv(HandEnv):
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
             "force_near": w["force_near"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
+            # the mean hides one finger that presses on nothing
+            "worst": w["worst"] * (1 - ((force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1))).clamp(min=0),
+            # an object that lies to one side is out of the reach of the outer fingers
+            "centre": w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(max=2.0),
             # a finger that does not touch has nothing else that says which way the object lies
             "reach": w["reach"] * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r["reach_length"]).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
@@ -280,6 +287,7 @@ class GraspEnv(HandEnv):
         notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
                  "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed",
                  "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers", "reach": "ours: pads near the object",
+                 "worst": "ours: force_near of the finger that is furthest off", "centre": f"ours: object beside the fingers' middle, over {CENTRE_LENGTH} m",
                  "self": "ours: tips pressing on the hand"}
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
