@@ -87,9 +87,11 @@ def main(argv: list[str]) -> int:
     s = settings(argv)
     from dexsim.cli.build import quiet_warp
     from dexsim.gap import demo
+    from dexsim.gap.command import available
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
     quiet_warp(s["device"])
+    s["device"] = available(s["device"])
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(s["out"] or scratch)
         folder.mkdir(parents=True, exist_ok=True)

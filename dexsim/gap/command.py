@@ -40,7 +40,7 @@ settings (key=default):
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
-  device=cpu                  cpu | cuda: where hypotheses are simulated
+  device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits the cores that are used
   demo=false                  make a recording with a hidden effect, diagnose it, then open the answer
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
@@ -106,6 +106,7 @@ def main(argv: list[str]) -> int:
     if device != "cpu" and not device.startswith("cuda"):
         raise UserError(f"device={device}: must be cpu or cuda")
     quiet_warp(device)
+    device = available(device)
     demo = None
     out = Path(given.get("out", "out/demo" if given.get("demo") else "out/diagnosis")).expanduser()
     if given.get("demo"):
@@ -134,6 +135,23 @@ def main(argv: list[str]) -> int:
         print(f"\nWhat was hidden: {', '.join(f'{k} {v:g}' for k, v in demo.items())}")
     print("\n" + "\n".join(str(p) for p in written) + f"\n{time.perf_counter() - start:.0f} s")
     return 0
+
+
+def available(device: str) -> str:
+    """The device, or the CPU with a line that says so where there is no such GPU."""
+    if device == "cpu":
+        return device
+    import warp as wp
+
+    count = wp.get_cuda_device_count()
+    number = device.partition(":")[2] or "0"
+    if not number.isdigit():
+        raise UserError(f"device={device}: must be cpu, cuda or cuda:0, cuda:1, ...")
+    if int(number) < count:
+        return device
+    have = f"it has {count}, counted from 0" if count else "no NVIDIA driver or none visible, see nvidia-smi and CUDA_VISIBLE_DEVICES"
+    print(f"device={device}: this machine has no such GPU ({have}); the CPU is used", flush=True)
+    return "cpu"
 
 
 class Progress:

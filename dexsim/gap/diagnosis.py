@@ -25,6 +25,7 @@ from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch, Outcome
 from dexsim.gap.sharpen import sharpen
+from dexsim.gap.together import together
 from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
@@ -233,18 +234,23 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
     rng = np.random.default_rng(s.seed)
-    for k, case in enumerate(cases):
-        if progress:
-            progress(k, len(cases), case.joint)
-        if not case.moved:
-            notes.append(f"{case.joint} does not move: nothing can be said of it")
+
+    def search_of(k: int) -> tuple[JointSearch, Outcome | None]:
+        case = cases[k]
         search = JointSearch(case, train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed)
         if len(search.long.window) == 0:
+            return search, None
+        found = search.run() if case.moved else search.idle()
+        search.polish(found.best), search.polish(found.none)  # kept for the judgement
+        return search, found
+
+    for case, (search, found) in zip(cases, together([c.joint for c in cases], search_of, s.device, progress), strict=True):
+        if not case.moved:
+            notes.append(f"{case.joint} does not move: nothing can be said of it")
+        if found is None:
             notes.append(f"{case.joint}: no stretch long enough to simulate")
-            continue
-        outcomes.append((case, search, search.run() if case.moved else search.idle()))
-    if progress:
-        progress(len(cases), len(cases), "")
+        else:
+            outcomes.append((case, search, found))
     clock.lap("search")
     result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
     result.stages = [x.text for x in stages] + behind

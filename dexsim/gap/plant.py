@@ -13,6 +13,50 @@ from dexsim.gap.mechanics import JointConstants
 from dexsim.gap.plant_columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
 
 THREADS = 2  # CPU launches release the interpreter: two run side by side
+FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
+_GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
+_LANE = threading.local()
+
+
+class Lane:
+    """One thread's way to a GPU: a stream of its own, so that the launches of several joints overlap, and memory that is
+    allocated once (an allocation or a release in between would wait for every stream)."""
+
+    def __init__(self, device: str):
+        self.device = device
+        self.stream = wp.Stream(device)
+        self._there: dict[object, wp.array] = {}
+        self._host: wp.array | None = None
+
+    def room(self, name: object, shape: tuple[int, ...]) -> wp.array:
+        """Memory of the device for `shape` numbers, the same for the same name."""
+        size = int(np.prod(shape))
+        if name not in self._there or self._there[name].shape[0] < size:
+            self._there[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device=self.device)
+        return wp.array(ptr=self._there[name].ptr, shape=shape, dtype=wp.float64, device=self.device)
+
+    def up(self, name: object, x: np.ndarray) -> wp.array:
+        """The numbers on the device, valid until `name` is used again."""
+        x = np.ascontiguousarray(x, dtype=np.float64)
+        out = self.room(name, x.shape)
+        wp.copy(out, wp.array(x, dtype=wp.float64, device="cpu", copy=False))
+        return out
+
+    def back(self, size: int) -> wp.array:
+        """Page-locked memory for `size` numbers."""
+        if self._host is None or self._host.shape[0] < size:
+            self._host = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device="cpu", pinned=True)
+        return self._host
+
+
+def lane(device: str) -> Lane:
+    """This thread's lane; call it with the lock held."""
+    known = getattr(_LANE, "by_device", None)
+    if known is None:
+        known = _LANE.by_device = {}
+    if device not in known:
+        known[device] = Lane(device)
+    return known[device]
 
 
 @dataclass
@@ -92,10 +136,12 @@ class JointPlant:
         self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
                            c.low, c.high, stiff, c.slide, 0)
         self.contact_stiffness = stiff
-        up = lambda x, d=wp.float64: wp.array(np.ascontiguousarray(x), dtype=d, device=self.device)  # noqa: E731
-        self._up = up
-        self._d = dict(series=up(self.series), cmd_t=up(np.concatenate(self._cmd_t)), cmd=up(np.concatenate(self._cmd)))
+        self._d = {}
         self._ready = True
+
+    def set_series(self, series: np.ndarray) -> None:
+        """Other series [G, E] in the place of those that were added."""
+        self.series, self._d = series, {}
 
     @property
     def runs(self) -> int:
@@ -164,56 +210,87 @@ class JointPlant:
         if inits is None:
             inits = np.zeros((H, 2))
         q, torque = np.empty((H, n)), np.empty((H, n))
-        if windows.device is None:
-            windows.device = {}
         # one launch a set of runs that shares its parameters: a guess is a row, so rows are (guess, distinct run)
-        by_run = [np.unique(windows.run)[i] for i in range(len(np.unique(windows.run)))]
         groups: dict[bytes, list[int]] = {}
-        for r in by_run:
+        for r in np.unique(windows.run):
             groups.setdefault(params[:, r].tobytes(), []).append(int(r))
         consts = self._consts.copy()
         consts[pk.C_OPEN] = open_stage
-        for group in groups.values():
-            key = tuple(group)
-            if key not in windows.device:
-                pick = np.flatnonzero(np.isin(windows.run, group))
-                keep = np.isin(windows.sample_window, pick)
-                w = windows.window[pick].copy()
-                w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
-                windows.device[key] = (
-                    np.flatnonzero(keep), len(pick), self._up(w, wp.int32), self._up(windows.window_t[pick]),
-                    self._up(windows.sample_step[keep], wp.int32), self._up(windows.sample_part[keep]),
-                )  # fmt: skip
-            keep, count, w, wt, ss, sp = windows.device[key]
-            shape = (H, len(keep))
-            oq, ot = np.empty(shape), np.empty(shape)
-            cpu = self.device == "cpu"
-            dq = wp.array(oq, dtype=wp.float64, device="cpu", copy=False) if cpu else wp.empty(shape, dtype=wp.float64, device=self.device)
-            do = wp.array(ot, dtype=wp.float64, device="cpu", copy=False) if cpu else wp.empty(shape, dtype=wp.float64, device=self.device)
-            p, init, cc = self._up(params[:, group[0]]), self._up(inits), self._up(consts)
-            d = self._d
-            args = (p, init, cc, d["series"], d["cmd_t"], d["cmd"], w, wt, ss, sp, dq, do)
-            kernel = pk.plant_kernel()
-
-            def launch(first, number, args=args, count=count):
-                wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, *args], device=self.device)
-
-            if cpu and H > 1 and THREADS > 1:
-                half = (H + 1) // 2
-                helper = threading.Thread(target=launch, args=(half, H - half))
-                helper.start()
-                launch(0, half)
-                helper.join()
-            else:
-                launch(0, H)
-            if not cpu:
-                oq, ot = dq.numpy(), do.numpy()
-            q[:, keep], torque[:, keep] = oq, ot
+        if self._on_cpu(H * len(windows.window)):
+            for group in groups.values():
+                keep, count, rest = self._inputs(windows, tuple(group), "cpu")
+                oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
+                out = [wp.array(x, dtype=wp.float64, device="cpu", copy=False) for x in (oq, ot)]
+                self._split(H, count, [_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out])
+                q[:, keep], torque[:, keep] = oq, ot
+            return q, torque
+        with _GPU:
+            mine = lane(self.device)
+            with wp.ScopedStream(mine.stream, sync_enter=False):
+                host, out = mine.back(2 * H * n), mine.room("out", (2 * H * n,))
+                at, parts = 0, []
+                for g, group in enumerate(groups.values()):
+                    keep, count, rest = self._inputs(windows, tuple(group), self.device)
+                    size = H * len(keep)
+                    given = [mine.up((k, g), x) for k, x in enumerate((params[:, group[0]], inits, consts))]
+                    oq, ot = (wp.array(ptr=out.ptr + 8 * (at + k * size), shape=(H, len(keep)), dtype=wp.float64, device=self.device) for k in (0, 1))
+                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, *given, *rest, oq, ot], device=self.device)
+                    parts.append((keep, at, size))
+                    at += 2 * size
+                wp.copy(host, out, count=at)
+        wp.synchronize_stream(mine.stream)
+        numbers = host.numpy()
+        for keep, at, size in parts:
+            q[:, keep] = numbers[at : at + size].reshape(H, -1)
+            torque[:, keep] = numbers[at + size : at + 2 * size].reshape(H, -1)
         return q, torque
+
+    def _on_cpu(self, threads: int) -> bool:
+        return self.device == "cpu" or threads <= FEW
+
+    def _inputs(self, windows: Windows, group: tuple[int, ...], device: str) -> tuple[np.ndarray, int, list[wp.array]]:
+        """(samples of the windows that are of these runs, number of windows, the kernel's arrays of them), made once a device."""
+        if windows.device is None:
+            windows.device = {}
+        if device not in self._d:
+            self._d[device] = [_up(x, device=device) for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))]
+        key = (group, device)
+        if key not in windows.device:
+            pick = np.flatnonzero(np.isin(windows.run, group))
+            keep = np.isin(windows.sample_window, pick)
+            w = windows.window[pick].copy()
+            w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
+            windows.device[key] = (
+                np.flatnonzero(keep), len(pick),
+                [_up(w, wp.int32, device), _up(windows.window_t[pick], device=device), _up(windows.sample_step[keep], wp.int32, device),
+                 _up(windows.sample_part[keep], device=device)],
+            )  # fmt: skip
+        keep, count, arrays = windows.device[key]
+        return keep, count, [*self._d[device], *arrays]
+
+    def _split(self, H: int, count: int, args: list[wp.array]) -> None:
+        """H guesses on the CPU, in two halves side by side."""
+        kernel = pk.plant_kernel()
+
+        def launch(first: int, number: int) -> None:
+            wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, *args], device="cpu")
+
+        if H > 1 and THREADS > 1:
+            half = (H + 1) // 2
+            helper = threading.Thread(target=launch, args=(half, H - half))
+            helper.start()
+            launch(0, half)
+            helper.join()
+        else:
+            launch(0, H)
 
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""
         return np.stack(self.nominal)
+
+
+def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu") -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:

@@ -97,6 +97,7 @@ class JointSearch:
             self.fold_of = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
             self.fold_by = "time"
         self.blocks = self._blocks(self.fitter, self.long)
+        self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
         self.all_nuisances = self._nuisances()
         self.nuisances = self.all_nuisances
         believed = [p for p in self.all_nuisances if p.key not in case.unknown and not (p.mode == "factor" and p.span > 0.3)]
@@ -586,7 +587,12 @@ class JointSearch:
 
     def polish(self, trial: Trial) -> Trial:
         """The trial refitted on whole training recordings run free from their first sample, where that follows them
-        better than the windows' fit: state carried over windows is right there."""
+        better than the windows' fit: state carried over windows is right there. Done once a trial."""
+        if id(trial) not in self._polished:
+            self._polished[id(trial)] = trial, self._polish(trial)
+        return self._polished[id(trial)][1]
+
+    def _polish(self, trial: Trial) -> Trial:
         plant = self.case.plant
         whole = plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, knee=max(self.r.knee, 3.0))

@@ -140,18 +140,17 @@ def _held_out(case: Case, runs: list[Run], trial: Trial, value: np.ndarray, test
     fixed = [f for m in trial.members for f in m.variant.fixed]
     measured = plant.q[windows.sample_row]
     out = []
-    kept, device = plant.series, plant._d["series"]
+    kept = plant.series
     try:
         for k in (0.0, 1.0):
             series = kept.copy()
             q, v = series[:, SERIES_INDEX["q"]], series[:, SERIES_INDEX["v"]]
             series[:, SERIES_INDEX["rest"]] -= k * basis(q, v) @ value
-            plant._d["series"] = plant._up(series)
-            windows.device = None
+            plant.set_series(series)
             simulated, _ = judge.free_run(case, trial.fit.params, trial.fit.x, windows, fixed)
             out.append(float(np.sqrt(np.mean((measured - simulated) ** 2))))
     finally:
-        plant.series, plant._d["series"] = kept, device
+        plant.set_series(kept)
     return out[0], out[1]
 
 

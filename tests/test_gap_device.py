@@ -1,0 +1,105 @@
+"""Where hypotheses are simulated: side by side on a CPU, in one stream a joint on a GPU, and what is said without one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from test_gap import demo, plant_run
+
+from dexsim.errors import UserError
+from dexsim.gap import command, together
+from dexsim.gap import plant as plants
+from dexsim.gap.plant_columns import INDEX
+from dexsim.gap.prepare import build
+from dexsim.gap.together import lanes
+from dexsim.gap.together import together as side_by_side
+
+GPU = wp.get_cuda_device_count() > 0
+
+
+@pytest.fixture(scope="module")
+def guesses():
+    """A joint's plant, windows of a second, guesses [9, R, C] of which some differ between runs, initial states."""
+    import mujoco
+
+    runs = [plant_run(f"r{k}", k, 4.0, {}, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    plant = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0].plant
+    rng = np.random.default_rng(0)
+    params = np.repeat(plant.base()[None], 9, 0)
+    params[:, :, INDEX["kp"]] *= rng.uniform(0.8, 1.2, (9, 1))
+    params[4:, :, INDEX["backlash"]] = 0.02
+    params[:, 1, INDEX["kd"]] *= 1.1
+    return plant, params, 0.01 * rng.normal(size=(9, 2))
+
+
+class HostLane(plants.Lane):
+    """A lane without a GPU: its memory is the CPU's."""
+
+    def __init__(self, device: str):
+        self.device, self.stream, self._there, self._host = "cpu", None, {}, None
+
+    def back(self, size: int) -> wp.array:
+        self._host = wp.empty(size, dtype=wp.float64, device="cpu")
+        return self._host
+
+
+def test_the_gpus_way_of_launching_gives_the_same_numbers(guesses, monkeypatch):
+    """Buffers, offsets and groups of runs of the GPU's branch, on the CPU: bit for bit the CPU's branch."""
+    from contextlib import nullcontext
+
+    plant, params, inits = guesses
+    expected = plant.simulate(params, plant.windows(1.0), inits)
+    monkeypatch.setattr(plants, "Lane", HostLane)
+    monkeypatch.setattr(plants.JointPlant, "_on_cpu", lambda self, threads: False)
+    monkeypatch.setattr(wp, "ScopedStream", lambda *a, **k: nullcontext())
+    monkeypatch.setattr(wp, "synchronize_stream", lambda stream: None)
+    monkeypatch.setattr(plants, "_LANE", plants.threading.local())
+    windows = plant.windows(1.0)
+    for count in (9, 3, 9):  # buffers are used again, larger and smaller
+        q, torque = plant.simulate(params[:count], windows, inits[:count])
+        assert np.array_equal(q, expected[0][:count]) and np.array_equal(torque, expected[1][:count])
+
+
+@pytest.mark.skipif(not GPU, reason="needs a GPU")
+def test_a_gpu_gives_what_the_cpu_gives(guesses):
+    plant, params, inits = guesses
+    expected = plant.simulate(params, plant.windows(1.0), inits)
+    plant.device = "cuda"
+    try:
+        q, torque = plant.simulate(params, plant.windows(1.0), inits)
+    finally:
+        plant.device = "cpu"
+    assert np.abs(q - expected[0]).max() < 1e-6 and np.abs(torque - expected[1]).max() < 1e-5
+
+
+def test_joints_side_by_side_come_back_in_order(monkeypatch):
+    import threading
+
+    seen, meet = [], threading.Barrier(3, timeout=20)
+
+    def work(k: int) -> int:
+        meet.wait()  # passes only where three run at once
+        return k * k
+
+    names = ["a", "b", "c"]
+    assert side_by_side(names, work, "cuda", lambda *x: seen.append(x)) == [0, 1, 4]
+    assert seen[-1] == (3, 3, "") and sorted(x[2] for x in seen[:-1]) == names
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(names, lambda k: 1 // 0, "cuda")
+    for given, cores in (("1", 1), ("4", 2), ("64", together.MOST_CPU), ("12", 6)):
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+        assert lanes("cpu", 20) == max(1, min(cores, int(given) // plants.THREADS))
+    assert lanes("cpu", 1) == 1 and lanes("cuda", 20) == together.MOST_GPU
+
+
+def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):
+    monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 0)
+    assert command.available("cuda") == "cpu" and "no such GPU" in capsys.readouterr().out
+    monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 2)
+    assert command.available("cuda:1") == "cuda:1" and command.available("cuda") == "cuda" and not capsys.readouterr().out
+    assert command.available("cuda:2") == "cpu" and "it has 2" in capsys.readouterr().out
+    with pytest.raises(UserError, match="cuda:0"):
+        command.available("cuda:x")
