@@ -5,33 +5,44 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.reproduce import __main__ as command
-from benchmarks.reproduce import jobs, report, rows
+from benchmarks.reproduce import jobs, pack, report, rows
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.learning import checkpoint
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-def plan(out: Path, task: str = "rotate") -> jobs.Plan:
-    return jobs.Plan(out, task, 4, None, {"simulation": 10, "reality": 5}, 60.0, "bench", 1, (), "cpu")
+def plan(out: Path, task: str = "rotate", **changed) -> jobs.Plan:
+    return replace(jobs.Plan(out, task, 400.0, 100, None, {"simulation": 10, "reality": 5}, 60.0, "bench", 1, (), "cpu"), **changed)
 
 
-def put(job: jobs.Job, p: jobs.Plan, world: str, successes: list[int], fall: float = 30.0) -> None:
-    """Metrics of a judged policy, and the progress of its training."""
+def train_file(path: Path, iteration: int) -> None:
+    """A training's checkpoint that says how far it came, and nothing else of use."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checkpoint.save(path, dict.fromkeys((*checkpoint.KEYS, *checkpoint.TRAIN_KEYS), {}) | {
+        "kind": "train", "iteration": iteration, "steps": 100 * iteration, "optimizer": {"state": {0: torch.ones(9)}, "param_groups": []}})
+    (path.parent / "progress.csv").write_text("iteration,steps\n" + "".join(f"{i},{100 * i}\n" for i in range(1, iteration + 1)))
+
+
+def put(job: jobs.Job, p: jobs.Plan, world: str, successes: list[int], fall: float = 30.0, iteration: int = 2) -> None:
+    """Metrics of a judged policy, and the checkpoint of its training."""
     path = job.metrics(p, world)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"episodes": len(successes), "capped": 1, "cap_s": 60.0, "seconds_to_fall": fall,
                                 "consecutive_successes": {"all": sorted(successes)}}))
-    train = job.folder(p) / "train_0"
-    train.mkdir(exist_ok=True)
-    (train / "progress.csv").write_text("iteration,steps\n1,100\n2,200\n")
-    (train / "last.pt").write_bytes(b"")
+    (path.parent / "judged.json").write_text(json.dumps({
+        "iteration": iteration, "steps": 100 * iteration, "episodes": p.episodes[world], "cap_s": p.cap if p.task == "rotate" else None,
+        "reality": p.reality if world == "reality" else None}))
+    train_file(job.folder(p) / "train_0" / "last.pt", iteration)
 
 
 def test_rows_are_settings_of_train():
@@ -96,31 +107,106 @@ def test_the_grasp_table(tmp_path):
     assert "| R_force + R_torque | 0.90 (0.90) | 3.00 (3.00) | 40.00 (40.00) |" in text
 
 
+class Children:
+    """Stands for subprocess: trainings write the checkpoint they were asked for, or what they reach before their limit."""
+
+    def __init__(self, monkeypatch):
+        self.commands: list[list[str]] = []
+        self.reach: int | None = None  # iterations after which the limit comes; None: it does not
+        monkeypatch.setattr(subprocess, "Popen", self.popen)
+        monkeypatch.setattr(subprocess, "run", self.play)
+
+    def popen(self, command, **kw):
+        said = dict(c.split("=", 1) for c in command[2:])
+        self.commands.append(command)
+        train_file(Path(said["out"]) / "last.pt", self.reach or int(said["iterations"]))
+        return self
+
+    def play(self, command, **kw):
+        said = dict(c.split("=", 1) for c in command[2:])
+        self.commands.append(command)
+        (Path(said["out"]) / "metrics.json").write_text(json.dumps({"of": said["checkpoint"], "episodes": int(said["episodes"])}))
+        return subprocess.CompletedProcess(command, 0)
+
+    def wait(self, timeout=None):
+        if self.reach is not None and self.commands[-1][1] == "train.py" and timeout != 60:
+            raise subprocess.TimeoutExpired("train.py", timeout)
+        return 0
+
+    def terminate(self):
+        pass
+
+
+def silent(text: str) -> None:
+    pass
+
+
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
-    """A finished training is not repeated, an unfinished one is resumed from its last checkpoint, judged metrics stay."""
-    p, job = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1)
+    """An unfinished training is resumed from its last checkpoint, a finished one is not repeated, judged metrics stay."""
+    p, job, children = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1), Children(monkeypatch)
     put(job, p, "simulation", [1])
-    called: list[list[str]] = []
+    last = jobs.train(job, p, None, silent)
+    assert f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in children.commands[0] and last == job.folder(p) / "train_1" / "last.pt"
+    assert jobs.train(job, p, None, silent) == last and len(children.commands) == 1
+    jobs.judge(job, p, last, "simulation", None, silent)  # it had been judged after two iterations
+    assert len(children.commands) == 2 and jobs.read(job, p, "simulation")["trained_steps"] == 400
+    jobs.judge(job, p, last, "simulation", None, silent)
+    assert len(children.commands) == 2
+    jobs.judge(job, replace(p, cap=30.0), last, "simulation", None, silent)  # otherwise than before
+    assert len(children.commands) == 3 and "task.evaluation.cap_s=30.0" in children.commands[-1]
 
-    class Child:
-        returncode = 0
 
-        def __init__(self, command, **kw):
-            called.append(command)
-            out = Path(next(c for c in command if c.startswith("out=")).removeprefix("out="))
-            out.mkdir(parents=True)
-            (out / "progress.csv").write_text("iteration,steps\n" + "".join(f"{i},{100 * i}\n" for i in range(1, 5)))
-            (out / "last.pt").write_bytes(b"")
+def test_a_larger_budget_goes_on_from_the_smaller(tmp_path, monkeypatch):
+    """budget=1 and then 3: the same row learns twice as much again and is judged anew; so does one that `minutes` had ended."""
+    p, job, children = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1), Children(monkeypatch)
+    jobs.run([job], p, [None], 1)
+    assert [c[1] for c in children.commands] == ["train.py", "play.py", "play.py"] and "iterations=4" in children.commands[0]
+    jobs.run([job], replace(p, steps=1200.0), [None], 1)
+    more = children.commands[3:]
+    assert [c[1] for c in more] == ["train.py", "play.py", "play.py"] and "iterations=12" in more[0]
+    assert f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in more[0]
+    assert jobs.read(job, p, "reality")["trained_iterations"] == 12
 
-        def wait(self, timeout=None):
-            return 0
+    other, limited = jobs.Job(rows.ROTATION[1], 1), replace(p, minutes=2.0)
+    children.reach = 3
+    del children.commands[:]
+    jobs.run([other], limited, [None], 1)
+    assert jobs.read(other, limited, "simulation")["trained_steps"] == 300  # judged as it is
+    jobs.run([other], limited, [None], 1)
+    assert len(children.commands) == 3  # the same minutes again: nothing more
+    children.reach = None
+    jobs.run([other], replace(limited, steps=1200.0), [None], 1)
+    assert "iterations=12" in children.commands[3] and jobs.read(other, limited, "simulation")["trained_steps"] == 1200
 
-    monkeypatch.setattr(subprocess, "Popen", Child)
-    policy = jobs.train(job, p, None, lambda text: None)
-    assert f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in called[0] and policy == job.folder(p) / "train_1" / "policy.pt"
-    assert jobs.train(job, p, None, lambda text: None) == policy and len(called) == 1
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail("judged twice"))
-    jobs.judge(job, p, policy, "simulation", None, lambda text: None)
+
+def test_a_sitting_ends_and_the_next_goes_on(tmp_path, monkeypatch):
+    """When the sitting is over, what runs is saved and not judged, what waits is not begun; the next sitting does both."""
+    p, children = plan(tmp_path, sitting=1e-9), Children(monkeypatch)
+    pair = [jobs.Job(rows.ROTATION[0], s) for s in (1, 2)]
+    children.reach = 2
+    assert jobs.train(pair[0], p, None, silent, until=0.0) is None and jobs.done(pair[0].folder(p)).iteration == 2
+    jobs.run(pair, p, [None], 1)
+    assert len(children.commands) == 1 and jobs.read(pair[0], p, "simulation") is None
+    children.reach = None
+    jobs.run(pair, replace(p, sitting=None), [None], 1)
+    assert [c[1] for c in children.commands].count("train.py") == 3 and all(jobs.read(j, p, w) for j in pair for w in jobs.WORLDS)
+
+
+def test_pack_takes_along_what_the_next_sitting_needs(tmp_path):
+    """Packed, unpacked elsewhere: the same progress and judging, without the optimizer's moments; a whole job in a part."""
+    p, q = plan(tmp_path / "a"), plan(tmp_path / "b")
+    pair = [jobs.Job(rows.ROTATION[0], s) for s in (1, 2)]
+    for job in pair:
+        put(job, p, "reality", [1, 2], iteration=3)
+    parts = pack.pack(p.out, tmp_path / "state", 1.0)
+    assert [x.name for x in parts] == ["state_0.tgz", "state_1.tgz"]
+    pack.main([f"unpack={tmp_path / 'state'}", f"out={q.out}"])
+    for job in pair:
+        assert jobs.done(job.folder(q)).steps == 300
+        assert jobs.read(job, q, "reality") == jobs.read(job, p, "reality") is not None
+        assert checkpoint.load(jobs.done(job.folder(q)).last)["optimizer"] == {"state": {}, "param_groups": []}
+    with pytest.raises(UserError, match="holds no training"):
+        pack.main([f"out={tmp_path / 'none'}", f"into={tmp_path / 'x'}"])
 
 
 @pytest.mark.slow
@@ -132,5 +218,13 @@ def test_a_row_end_to_end(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["missing"] == 0
     table = json.loads((tmp_path / "rotation.json").read_text())["rows"]
+    assert table["full"]["simulation"]["steps"] == [32]  # one iteration of 8 steps in 4 worlds
+    pack.main([f"out={tmp_path}", f"into={tmp_path / 'state'}"])
+    elsewhere = tmp_path / "elsewhere"
+    pack.main([f"unpack={tmp_path / 'state'}", f"out={elsewhere}"])
+    again = [a for a in argv if not a.startswith(("budget=", "out=", "rows="))] + ["budget=3e-7", "rows=full", f"out={elsewhere}"]
+    done = subprocess.run(again, capture_output=True, text=True, cwd=CONFIGS.parent, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads((elsewhere / "rotation.json").read_text())["rows"]["full"]["simulation"]["steps"] == [64]
     assert set(table) == {"full", "fixed"} and set(table["full"]) == {"simulation", "reality"}
     assert (tmp_path / "rotation.md").exists() and (tmp_path / "rotation.png").stat().st_size > 1000

@@ -1,14 +1,16 @@
 """Train and judge every row of the paper's ablation tables, and write them beside its numbers.
 
-    python -m benchmarks.reproduce table=rotation|grasp [budget=1] [seeds=2] [gpus=0,1,..] [out=out/reproduce_<table>]
+    python -m benchmarks.reproduce table=rotation|grasp [budget=1] [seeds=2] [gpus=0,1,..] [out=out/reproduce_<table>] [sitting=M]
                                    [rows=full,quaternion] [minutes=M] [episodes=128] [cap=120] [any other setting of train.py]
 
 budget=1 is STEPS environment steps a row and seed; every row gets the same. gpus: one training on each at a time; null = all
 there are, or the CPU. Each policy is judged twice: with the physics and ranges it was trained in (episodes trials) and in
-`reality=bench` (half as many); rotation trials end after `cap` seconds. minutes ends a training early (it is judged as it
-is). The same command again goes on where it stopped. report=true only writes the tables from what is there.
-Writes <table>.md, <table>.json, <table>.png into `out`; rotation has rows of our own besides the paper's, one seed each:
-trained without randomization (what the other world costs), with the paper's critic, its bare reward, a curriculum.
+`reality=bench` (half as many, or other_episodes); rotation trials end after `cap` seconds. minutes ends a training early (it is
+judged as it is); sitting ends all training after so many minutes, saved. The same command again goes on where it stopped, and
+with a larger budget from where the smaller one ended; `python -m benchmarks.reproduce.pack` makes what that needs small enough to
+take to another machine. report=true only writes the tables from what is there.
+Writes <table>.md, <table>.json, <table>.png into `out`; rotation has rows of our own besides the paper's: trained without
+randomization (what the other world costs), and from one seed each with the paper's critic, its bare reward, a curriculum.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from dexsim.errors import UserError
 
 STEPS = 150e6
 OWN = {"table": "", "budget": "1", "seeds": "2", "gpus": "null", "out": "null", "rows": "null", "minutes": "null", "episodes": "128",
-       "cap": "120", "reality": "bench", "judge": "auto", "report": "false"}  # fmt: skip
+       "other_episodes": "null", "sitting": "null", "cap": "120", "reality": "bench", "judge": "auto", "report": "false"}  # fmt: skip
 
 
 def number(own: dict[str, str], key: str, low: float, high: float, whole: bool = False) -> float:
@@ -69,23 +71,25 @@ def main(argv: list[str]) -> int:
     if own["report"] not in ("true", "false"):
         raise UserError(f"report={own['report']}: must be true or false")
     episodes = int(number(own, "episodes", 2, 1e6, whole=True))
-    threads = max(1, min(6, cores // 4))
-    judges = max(1, (cores - 4 * len(gpus)) // threads)  # a training keeps a few cores busy
+    other = max(2, episodes // 2) if own["other_episodes"] == "null" else int(number(own, "other_episodes", 2, 1e6, whole=True))
+    minutes, sitting = (None if own[k] == "null" else number(own, k, 0.01, 1e5) for k in ("minutes", "sitting"))
+    spare = max(1, cores - 2 * len(gpus))  # a training keeps a core or two busy
+    threads = max(1, min(4, spare // (2 * len(gpus))))  # few: a judging of twice the threads is not twice as fast
     plan = jobs.Plan(
         Path(own["out"] if own["out"] != "null" else f"out/reproduce_{table}").expanduser().absolute(), task,
-        max(1, math.ceil(number(own, "budget", 1e-9, 1e4) * STEPS / per)), None if own["minutes"] == "null" else number(own, "minutes", 0.01, 1e5),
-        {"simulation": episodes, "reality": max(2, episodes // 2)}, number(own, "cap", 1, 1e4), own["reality"], threads, tuple(extra), judge)
+        number(own, "budget", 1e-9, 1e4) * STEPS, per, minutes,
+        {"simulation": episodes, "reality": other}, number(own, "cap", 1, 1e4), own["reality"], threads, tuple(extra), judge, sitting)
     plan.out.mkdir(parents=True, exist_ok=True)
     seeds = range(1, 1 + int(number(own, "seeds", 1, 100, whole=True)))
-    all_jobs = [jobs.Job(row, seed) for seed in seeds for row in chosen if row.paper or seed == 1]
-    print(f"{len(chosen)} rows, {len(all_jobs)} trainings of {plan.iterations} iterations ({plan.iterations * per / 1e6:.1f} M steps), "
+    all_jobs = [jobs.Job(row, seed) for seed in seeds for row in chosen if seed <= row.seeds]
+    print(f"{len(chosen)} rows, {len(all_jobs)} trainings of {plan.steps / 1e6:.1f} M steps ({per:,} an iteration), "
           f"on {', '.join('CPU' if g is None else f'GPU {g}' for g in gpus)}; judged on {judge}: {plan.out}", flush=True)
     about = tools.about("cuda:0" if count else "cpu") | {"command": "python -m benchmarks.reproduce " + " ".join(argv), "gpus": len([g for g in gpus if g])}
     if own["report"] == "false":
-        jobs.run(all_jobs, plan, gpus, judges)
+        jobs.run(all_jobs, plan, gpus, spare // threads)
     path = report.write(table, plan, all_jobs, about)
     print(path.read_text())
-    missing = [f"{j.name} in {w}" for j in all_jobs for w in jobs.WORLDS if not j.metrics(plan, w).exists()]
+    missing = [f"{j.name} in {w}" for j in all_jobs for w in jobs.WORLDS if jobs.read(j, plan, w) is None]
     if missing:
         print(f"not judged: {'; '.join(missing)}", file=sys.stderr)
     print(json.dumps({"benchmark": "reproduce", "table": table, "markdown": str(path), "missing": len(missing)}))
