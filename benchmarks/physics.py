@@ -76,11 +76,11 @@ def _tips_only(spec: mujoco.MjSpec) -> None:
             geom.contype, geom.conaffinity = ALONE, 1 if on else ALONE << 1
 
 
-def _firm_links(spec: mujoco.MjSpec) -> None:
-    """Links and palm yield five times less than by MuJoCo's default (fingertips have their rubber's stiffness)."""
+def _soft_links(spec: mujoco.MjSpec) -> None:
+    """Links, palm and object yield as by MuJoCo's default (fingertips have their rubber's stiffness)."""
     for geom in spec.geoms:
-        if not geom.name.startswith(OBJECT) and geom.name not in xhand.TIP_GEOMS:
-            geom.solimp, geom.priority = [0.99, 0.99, 1e-3, 0.5, 2.0], 1
+        if geom.name not in xhand.TIP_GEOMS:
+            geom.solimp = [0.9, 0.95, 1e-3, 0.5, 2.0]
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ SETTINGS = {
     "njmax 256": Setting({"njmax": 256}),
     "njmax 112": Setting({"njmax": 112}),
     "nconmax 48": Setting({"nconmax": 48}),
-    "links and palm firmer (solimp 0.99)": Setting({}, _firm_links),
+    "links and palm softer (solimp 0.9)": Setting({}, _soft_links),
     "ccd_tolerance 1e-5": Setting({}, _ccd(ccd_tolerance=1e-5)),
     "ccd_tolerance 1e-4": Setting({}, _ccd(ccd_tolerance=1e-4)),
     "ccd_iterations 12": Setting({}, _ccd(ccd_iterations=12)),
