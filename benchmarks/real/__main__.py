@@ -5,20 +5,22 @@ from __future__ import annotations
 import json
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.fold import brief, fold
+from benchmarks.real.fold import brief, fold, joint
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
 USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [fit=20] [figure=FILE.png]
 
 DATA_DIR is where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml).
-jobs: of BAM's four gains left out in turn, how many at a time; fit: of SAGE's twenty motions, how many to fit. Also writes out/NAME.json.
+jobs: of BAM's four gains left out in turn, or of SAGE's six joints, how many at a time, each in a process of its own; fit: of SAGE's
+twenty motions, how many to fit. Each part's result is written to out/ as it is done; the whole to out/NAME.json.
 """
 
 
@@ -27,13 +29,13 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
     from benchmarks.real.convert_bam import convert
 
     gains = sorted(set(convert(data, out / "recordings").gains.values()))
-    folds, errors = [], {}
-    with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
-        for done in pool.map(fold, [(data, out, g) for g in gains]):
-            folds.append(done)
-            errors |= done["recordings"]
-            print(f"gain {done['gain']} left out: {done['verdict']}, {', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
-                  f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+    folds = []
+    for done in _parts(fold, [(data, out, g) for g in gains], jobs):
+        folds.append(done)
+        print(f"gain {done['gain']} left out: {done['verdict']}, {', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
+              f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+    folds.sort(key=lambda f: f["gain"])
+    errors = {k: v for f in folds for k, v in f["recordings"].items()}
     x = np.array(list(errors.values()))
     rng = np.random.default_rng(0)
     draws = [x[rng.integers(0, len(x), len(x)), 1].mean() for _ in range(2000)]
@@ -41,6 +43,13 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
     return {"benchmark": "bam", "mae_mrad": float(1e3 * x[:, 1].mean()), "mae_low_mrad": float(1e3 * low), "mae_high_mrad": float(1e3 * high),
             "mae_before_mrad": float(1e3 * x[:, 0].mean()), "to_beat_mrad": 52.3, "coulomb_viscous_mrad": 64.1,
             "by_recording_mrad": {k: [round(1e3 * a, 1), round(1e3 * b, 1)] for k, (a, b) in sorted(errors.items())}, "folds": folds}  # fmt: skip
+
+
+def _parts(work: Callable, given: Sequence[tuple], jobs: int):
+    """Results of work(x) for each x as they come, `jobs` at a time in processes of their own."""
+    with ProcessPoolExecutor(max(jobs, 1), mp_context=get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(work, x) for x in given]):
+            yield done.result()
 
 
 def _named(f: dict) -> str:
@@ -100,25 +109,23 @@ def _emps_parameters(d) -> dict[str, float]:
 
 
 def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
-    """Twenty motions to fit (or `fit` of them, evenly), ten held out; by joint."""
-    from benchmarks.real.convert_sage import convert
-    from dexsim.gap.diagnosis import Settings, diagnose, save
+    """Twenty motions to fit (or `fit` of them, evenly), ten held out; joint by joint, the others' motion prescribed."""
+    from benchmarks.real.convert_sage import JOINTS, convert
 
     made = convert(data, out / "recordings")
     if fit:
         made.recordings = made.recordings[:: max(len(made.recordings) // fit, 1)][:fit]
     start = time.perf_counter()
-    d = diagnose(Settings(made.recordings, out, made.held_out, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
-    save(d, out)
     rows = {}
-    for j, v in d.joints.items():
-        mine = [brief(f) for f in d.data["findings"] if j in f["where"]["joints"]]
-        rows[j] = {"before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2), "findings": mine}
-        print(f"{j:<12} {rows[j]['before_mrad']:>7} -> {rows[j]['after_mrad']:>6} mrad  {', '.join(_named(f) for f in mine) or '-'}")
-    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "verdict": d.data["verdict"], "joints": rows, "held_out": d.data["held_out"], "depends_on": d.data["unexplained"]["depends_on"],
-            "nuisance": d.data["nuisance"], "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    for done in _parts(joint, [(made, out, j) for j in sorted(JOINTS, key=HARD.index)], jobs):
+        rows[done["joint"]] = done
+        print(f"{done['joint']:<12} {done['before_mrad']:>7} -> {done['after_mrad']:>6} mrad  {', '.join(_named(f) for f in done['findings']) or '-'} "
+              f"({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "joints": {j: rows[j] for j in JOINTS},
+            "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
+HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
 JOBS = {"bam": bam, "emps": emps, "sage": sage}
 
 

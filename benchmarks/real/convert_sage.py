@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from benchmarks.real.common import dump, save
@@ -12,12 +13,15 @@ from dexsim.errors import UserError
 
 JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 JAW = 2.34  # rad per unit of the jaw's 0..1
-# Figures that others use for this arm; none was measured on it. kp is disputed: believed only within a wide range.
+# From the servo's datasheet at 12 V (30 kg.cm, 45 rpm): a motor on its firmware's duty, whose back-EMF (2.94 N.m at 4.7 rad/s) is
+# the 0.6 N.m.s/rad of damping that others use for this arm. Dry friction and armature are theirs too; none was measured on this
+# one. What duty the firmware makes of an error or of a speed is not stated: believed only within a factor of ten or more.
+ARMATURE = 0.028  # kg.m2
 SERVO = {
-    "drive": "torque",
+    "drive": "voltage",
     "joints": {"*": {
-        "kp": {"value": 17.8, "low": 5.0, "high": 200.0}, "torque_limit": {"value": 2.94, "low": 1.5, "high": 4.0},
-        "kd": {"value": 0.6, "low": 0.05, "high": 20.0}, "coulomb_friction": 0.052,
+        "kp": {"value": 4.0, "low": 0.4, "high": 40.0}, "kd": {"value": 0.05, "low": 0.0005, "high": 1.0}, "torque_limit": 2.94,
+        "no_load_speed": 4.7, "coulomb_friction": 0.052,
     }},
 }  # fmt: skip
 
@@ -35,9 +39,15 @@ class Sage:
 def convert(data: Path, out: Path, held: int = 10) -> Sage:
     """Converts the npz files of the motions; every third, up to `held`, is kept out."""
     files = sorted(data.glob("*.npz"))
-    model = data / "so101.xml"
-    if not files or not model.is_file():
+    if not files or not (data / "so101.xml").is_file():
         raise UserError(f"{data}: needs the motions (*.npz) and so101.xml")
+    out.mkdir(parents=True, exist_ok=True)
+    spec = mujoco.MjSpec.from_file(str(data / "so101.xml"))
+    for joint in spec.joints:
+        joint.armature = ARMATURE
+    spec.compile()
+    model = out / "so101.xml"
+    model.write_text(spec.to_xml(), encoding="utf-8")
     servo = dump(out / "so101.yaml", SERVO)
     made = []
     for path in files:

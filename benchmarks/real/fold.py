@@ -1,9 +1,11 @@
-"""One fold of BAM: a process of its own; and a finding as the summaries keep it."""
+"""One fold of BAM, one joint of SAGE: a process of its own each; and a finding as the summaries keep it."""
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
+from typing import Any
 
 
 def fold(job: tuple[Path, Path, int]) -> dict:
@@ -18,11 +20,54 @@ def fold(job: tuple[Path, Path, int]) -> dict:
     held = [p for p in made.recordings if made.gains[p.name] == gain]
     rest = [p for p in made.recordings if p not in held]
     start = time.perf_counter()
-    d = diagnose(Settings(rest, out / f"gain_{gain}", held, str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
-    save(d, out / f"gain_{gain}")
-    return {"gain": gain, "verdict": d.data["verdict"], "floor_rad": d.data["noise_floor"]["position_rad"], "findings": [brief(f) for f in d.data["findings"]],
-            "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()}, "notes": d.notes, "stages": d.stages,
-            "depends_on": d.data["unexplained"]["depends_on"], "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    name = f"gain_{gain}"
+    d = diagnose(Settings(rest, out / name, held, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
+    save(d, out / name)
+    return _keep(out, name, {
+        "gain": gain, "verdict": d.data["verdict"], "floor_rad": d.data["noise_floor"]["position_rad"], "findings": [brief(f) for f in d.data["findings"]],
+        "nuisance": d.data["nuisance"], "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()}, "notes": d.notes,
+        "stages": d.stages, "depends_on": d.data["unexplained"]["depends_on"], "seconds": round(time.perf_counter() - start, 1),
+    })  # fmt: skip
+
+
+def joint(job: tuple[Any, Path, str]) -> dict:
+    """One joint of SAGE: fitted on the motions to fit, judged on those held out."""
+    from dexsim.cli.build import quiet_warp
+    from dexsim.gap.diagnosis import Settings, diagnose, save
+
+    made, out, name = job
+    quiet_warp("cpu")
+    start = time.perf_counter()
+    d = diagnose(Settings(made.recordings, out / name, made.held_out, str(made.model), str(made.servo), next_recording=False, joints={name}),
+                 say=_log(out, name))  # fmt: skip
+    save(d, out / name)
+    v = d.joints[name]
+    return _keep(out, name, {
+        "joint": name, "verdict": d.data["verdict"], "before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2),
+        "findings": [brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"], "held_out": d.data["held_out"],
+        "recordings": {r: [before, after] for (_, r), (before, after) in d.mae.items()}, "notes": d.notes,
+        "scanned": [x for o in d.outcomes for x in o.scanned[:8]], "depends_on": d.data["unexplained"]["depends_on"],
+        "seconds": round(time.perf_counter() - start, 1),
+    })  # fmt: skip
+
+
+def _log(out: Path, name: str):
+    """Progress of a part into out/NAME.log."""
+    out.mkdir(parents=True, exist_ok=True)
+    path, begin = out / f"{name}.log", time.perf_counter()
+    path.write_text("", encoding="utf-8")
+
+    def say(text: str) -> None:
+        with path.open("a", encoding="utf-8") as f:
+            f.write(f"{time.perf_counter() - begin:6.0f} s  {text}\n")
+
+    return say
+
+
+def _keep(out: Path, name: str, result: dict) -> dict:
+    """The result, written to out/NAME.json as well."""
+    (out / f"{name}.json").write_text(json.dumps(result, default=float), encoding="utf-8")
+    return result
 
 
 def brief(f: dict) -> dict:

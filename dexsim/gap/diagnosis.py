@@ -16,11 +16,12 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, inputs, inverse, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confirm, inputs, inverse, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
 from dexsim.gap.fit import Fitter, expand, intervals
+from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch, Outcome
@@ -88,6 +89,7 @@ class Diagnosis:
     standins: list[standin.StandIn] = field(default_factory=list)
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
+    confirmation: confirm.Confirmation | None = None
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:
@@ -210,7 +212,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
 
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
-    cases = sharpen(model, runs, cases, s.device, _step(runs))
+    cases = sharpen(model, runs, cases, s.device, _step(runs), only=s.joints)
     notes += _cannot(s, cases, felt)
     if s.joints is not None:
         cases = [c for c in cases if c.joint in s.joints]
@@ -260,6 +262,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if result.data["verdict"] in ("unknown", "partly_explained"):
         _stand_in(result, outcomes, runs, train, test, span_train, span_test, floor, s.seed)
         clock.lap("stand-in")
+    _confirm(result, s, m, runs, outcomes, test, span_test, floor)
+    clock.lap("replay in the engine that trains")
     if s.next_recording:
         _next(result, s, m, outcomes, [r for r in recordings if r is not None])
         clock.lap("next recording")
@@ -432,6 +436,34 @@ def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, 
         if found is not None:
             d.standins.append(found)
             d.notes.append(found.text)
+
+
+def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span_test, floor: float) -> None:
+    """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the sentence says so."""
+    named = [f for f in d.data["findings"] if f["where"]["joints"] and f["effect"] in EFFECTS]
+    claimed = {j for f in named for j in f["where"]["joints"]}
+    searches = {case.joint: (search, outcome) for case, search, outcome in outcomes}
+    none = {case.joint: search.polish(outcome.none) for case, search, outcome in outcomes}
+    final = none | {j: searches[j][0].polish(searches[j][1].best) for j in claimed}
+    hypotheses = [confirm.Hypothesis("believed", none)] + ([confirm.Hypothesis("found", final)] if claimed else [])
+    for f in named:
+        rivals = [a["effect"] for a in f["alternatives"]]
+        joint = f["where"]["joints"][0]
+        other = rival_of(*searches[joint], f["effect"], rivals[0]) if rivals else None
+        if other is not None:
+            hypotheses.append(confirm.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}))
+            break
+    try:
+        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device)
+    except UserError as error:
+        d.notes.append(f"not replayed in the engine that trains: {error}")
+        return
+    if found is None:
+        return
+    d.confirmation = found
+    d.data["held_out"]["confirmed"] = found.entry()
+    if d.data["held_out"]["error"].startswith("position"):
+        d.sentence += f" {found.text}"
 
 
 def confounds(case: Case, train: list[int]) -> str:

@@ -78,8 +78,8 @@ def demand(row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np
     return np.clip(pd, -limit, limit)
 
 
-def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float = 1e-3, progress=None) -> list[Case]:
-    """One case a joint, over all runs (training and held-out alike: indices are those of `runs`)."""
+def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float = 1e-3, progress=None, only: set[str] | None = None) -> list[Case]:
+    """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     joints = runs[0].joints
     J = len(joints)
     voltage = runs[0].servo.drive == "voltage"
@@ -98,6 +98,8 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
     reference = runs[0].temperature[:, :].min(0) if runs[0].temperature is not None else None
     cases = []
     for j, joint in enumerate(joints):
+        if only is not None and joint not in only:
+            continue
         c = constants[j]
         inertia = float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
         rotor = c.armature if c.armature > 0 else 0.3 * inertia
