@@ -209,15 +209,16 @@ class GraspEnv(HandEnv):
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
             "force_near": w["force_near"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
-            # the mean hides one finger that presses on nothing
-            "worst": w["worst"] * (1 - ((force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1))).clamp(min=0),
-            # an object that lies to one side is out of the reach of the outer fingers
-            "centre": w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(max=2.0),
             # a finger that does not touch has nothing else that says which way the object lies
             "reach": w["reach"] * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r["reach_length"]).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
+        if "worst" in w:  # checkpoints from before have neither of the two
+            # the mean hides one finger that presses on nothing
+            out["worst"] = w["worst"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1)).clamp(min=0)
+            # an object that lies to one side is out of the reach of the outer fingers
+            out["centre"] = w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(max=2.0)
         self._measure(contact)
         return out
 
