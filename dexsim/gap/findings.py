@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim.actuator.columns import COLUMNS, INDEX
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.fit import Param
 from dexsim.gap.prepare import Case
 
 
@@ -88,11 +89,16 @@ def finding_parameters(member, raw: dict[str, float], spread: dict[str, tuple[fl
     return out
 
 
+def handed(p: Param, case: Case) -> bool:
+    """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
+    return not (p.nuisance and p.key in ("delay", "lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
+
+
 def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> list[str]:
     """Writes what was fitted into the servo table, with intervals; returns what the table has no column for."""
     left = []
     for p, x, (low, high) in zip(trial.fit.params, trial.fit.x, bounds, strict=True):
-        if p.nuisance and p.key in ("delay", "lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges:
+        if not handed(p, case):
             continue
         for name in p.columns:
             if name not in INDEX:

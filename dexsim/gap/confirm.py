@@ -1,0 +1,292 @@
+"""The few final hypotheses once more, in the engine and the servo that train policies.
+
+The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out of
+the fit, all joints at once, under the same commands: C MuJoCo on a CPU, MuJoCo-Warp on a GPU, with the servo's columns and
+model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one batch.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.actuator.servo import FIELDS, Servo
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.gap import judge
+from dexsim.gap.findings import handed, model_changes
+from dexsim.gap.fit import expand
+from dexsim.gap.plant_columns import SERIES_INDEX
+from dexsim.gap.prepare import Case
+from dexsim.gap.runs import Run
+from dexsim.gap.search import Trial
+from dexsim.recording.mechanism import Mechanism, hold_friction
+from dexsim.sim import make_engine
+
+STEP = 1e-3  # s: of the engine
+BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
+APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
+MOST = 120.0  # s of recordings that are replayed, at most
+
+
+@dataclass
+class Hypothesis:
+    """A name and the fitted trial of each joint that has one; joints without one are driven as believed."""
+
+    name: str
+    trials: dict[str, Trial]
+
+
+@dataclass
+class World:
+    """One free run: what drives it and where it begins. All in the units the encoders report, J joints of the mechanism.
+
+    rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first position
+    and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K, J] (NaN
+    keeps the last); enabled: None or (times, [n, J])."""
+
+    rows: np.ndarray
+    table: ServoTable
+    gravity: np.ndarray
+    duration: float
+    q: np.ndarray
+    v: np.ndarray
+    target: np.ndarray
+    stamps: np.ndarray
+    targets: np.ndarray
+    enabled: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclass
+class Confirmation:
+    """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the gap's own
+    plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot be given;
+    recordings: replayed; agrees: whether the engine leaves no more than APART times what the plant left."""
+
+    engine: str
+    step_s: float
+    errors: dict[str, tuple[float, float]]
+    joints: dict[str, tuple[float, float]]
+    missing: list[str]
+    recordings: list[str]
+    agrees: bool
+    floor: float
+    simulated: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """The result in a sentence; empty where it only repeats what the search's plant says."""
+        engine, plant = list(self.errors.values())[min(1, len(self.errors) - 1)]
+        if self.agrees:
+            return f"Confirmed in the engine that trains ({self.engine}, all joints at once): {1e3 * engine:.2g}."
+        because = f": it has no {', '.join(self.missing)}" if self.missing else ", so training would not follow the machine as closely"
+        return f"Not confirmed in the engine that trains ({self.engine}): it leaves {1e3 * engine:.3g} where the search's own plant leaves {1e3 * plant:.3g}{because}."
+
+    def entry(self) -> dict[str, Any]:
+        """As diagnosis.json has it."""
+        out = {"engine": self.engine, "step_s": self.step_s, "recordings": self.recordings, "agrees": self.agrees, "not_handed_on": self.missing}
+        out |= {name: {"engine": a, "plant": b} for name, (a, b) in self.errors.items()}
+        return out | {"joints": {j: {"engine": a, "plant": b} for j, (a, b) in self.joints.items()}}
+
+
+def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hypothesis) -> np.ndarray:
+    """[J, C] servo columns of the mechanism's joints in one run, with what the hypothesis hands on."""
+    rows = run.servo.nominal(m.joints).copy()
+    for case in cases:
+        trial = h.trials.get(case.joint)
+        if trial is None:
+            continue
+        plant = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, index]
+        j = m.joints.index(case.joint)
+        for p in trial.fit.params:
+            for name in p.columns if handed(p, case) else ():
+                if name in SERVO_INDEX:
+                    c = COLUMNS[SERVO_INDEX[name]]
+                    rows[j, SERVO_INDEX[name]] = np.clip(plant[SERVO_INDEX[name]], c.low, c.high)
+    if run.supply is not None and run.servo.supply_voltage:
+        rows[:, SERVO_INDEX["supply"]] *= float(np.mean(run.supply)) / run.servo.supply_voltage
+    return rows
+
+
+def model_of(m: Mechanism, cases: Sequence[Case], h: Hypothesis) -> tuple[mujoco.MjSpec, bool]:
+    """(model with the fields that the hypothesis hands on, whether anything differs)."""
+    spec, changed = m.spec.copy(), False
+    for case in cases:
+        trial = h.trials.get(case.joint)
+        if trial is not None:
+            changed |= bool(model_changes(spec, case, trial, values_of(trial)))
+    return spec, changed
+
+
+def values_of(trial: Trial) -> dict[str, dict[str, float]]:
+    """Fitted values of each member by parameter."""
+    known = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
+    return {x.id: {p.key: float(known[f"{x.id}.{p.key}"]) for p in x.variant.params} for x in trial.members}
+
+
+def missing_of(h: Hypothesis) -> list[str]:
+    """Fitted parameters of effects that neither the servo's table nor the model has, as effect@joint."""
+    out = []
+    for joint, trial in h.trials.items():
+        for x in trial.members:
+            columns = {c for p in x.variant.params for c in p.columns}
+            fixed = {name for name, value in x.variant.fixed if value}
+            if (columns - set(SERVO_INDEX) - {"armature", "payload"}) or fixed:
+                out.append(f"{x.id}@{joint}")
+    return sorted(out)
+
+
+def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows) -> list[World]:
+    """One world a window (a whole run, or the part of it that was kept out)."""
+    out = []
+    at_rest = m.spec.compile()
+    rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
+    for w in range(len(windows.window)):
+        r = int(windows.run[w])
+        run, start = runs[r], float(windows.window_t[w])
+        rows = servo_rows(m, run, r, cases, h)
+        scale, offset = rows[:, SERVO_INDEX["position_scale"]], rows[:, SERVO_INDEX["position_offset"]]
+        q, v = scale * rest + offset, np.zeros(len(m.joints))
+        for case in cases:
+            series = case.plant.series[windows.window[w, 0]]
+            j = m.joints.index(case.joint)
+            q[j], v[j] = series[SERIES_INDEX["q"]], series[SERIES_INDEX["v"]]
+        place = [m.joints.index(j) for j in run.joints]
+        first = int(np.clip(np.searchsorted(run.cmd_t, start - BEFORE) - 1, 0, len(run.cmd_t) - 1))
+        targets = np.full((len(run.cmd_t) - first, len(m.joints)), np.nan)
+        targets[:, place] = run.cmd[first:]
+        target = q.copy()
+        target[place] = run.cmd[first]
+        enabled = None
+        if run.enabled is not None:
+            on = np.ones((len(run.t), len(m.joints)))
+            on[:, place] = run.enabled
+            enabled = (run.t - start, on)
+        samples = windows.sample_row[windows.sample_window == w]
+        end = float(cases[0].plant.t[samples[-1]])
+        out.append(World(rows, run.servo, np.asarray(run.gravity, float), end - start, q, v, target, run.cmd_t[first:] - start, targets, enabled))
+    return out
+
+
+def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP) -> list[np.ndarray]:
+    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity."""
+    groups: dict[tuple, list[int]] = {}
+    for i, w in enumerate(worlds):
+        groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
+    out: list[np.ndarray] = [np.zeros((0, len(joints)))] * len(worlds)
+    for members in groups.values():
+        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep), strict=True):
+            out[i] = q
+    return out
+
+
+def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float) -> list[np.ndarray]:
+    spec = spec.copy()
+    spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    hold_friction(spec)
+    N = len(worlds)
+    engine = make_engine(spec, N, device, fields=FIELDS)
+    rows = np.stack([w.rows for w in worlds])
+    table = copy.deepcopy(worlds[0].table)
+    table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
+    spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
+    spacing = spacing[spacing > 1e-6]
+    servo = Servo(engine, joints, table, control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None)
+    real = engine.t.qpos.dtype
+    up = lambda x, dtype=real: torch.as_tensor(np.asarray(x), dtype=dtype, device=engine.t.qpos.device)  # noqa: E731
+    servo.params.copy_(up(rows))
+    scale, offset = rows[:, :, SERVO_INDEX["position_scale"]], rows[:, :, SERVO_INDEX["position_offset"]]
+    address, dofs = engine.qpos_index(joints), engine.dof_index(joints)
+    qpos, qvel = np.tile(engine.mjm.qpos0, (N, 1)), np.zeros((N, engine.mjm.nv))
+    qpos[:, address] = (np.stack([w.q for w in worlds]) - offset) / scale
+    qvel[:, dofs] = np.stack([w.v for w in worlds]) / scale
+    engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
+    now = np.stack([w.target for w in worlds])
+    servo.reset(None, up(now))
+    steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
+    seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
+    pick = torch.as_tensor(address, dtype=torch.int64, device=seen.device)
+    sent = [0] * N
+    freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
+    for k in range(steps):
+        t = k * timestep
+        while True:  # the next command of each world that has one within this step, in turns
+            mask, stamp = np.zeros(N, bool), np.zeros(N)
+            for i, w in enumerate(worlds):
+                while sent[i] < len(w.stamps) and w.stamps[sent[i]] < t + timestep:
+                    row = w.targets[sent[i]]
+                    new = np.where(np.isfinite(row), row, now[i])
+                    sent[i] += 1
+                    if (new != now[i]).any():
+                        now[i], mask[i], stamp[i] = new, True, w.stamps[sent[i] - 1]
+                        break
+            if not mask.any():
+                break
+            servo.send(up(now), up(mask, torch.bool), up(stamp))
+        for i, w in enumerate(worlds):
+            if freed[i] is not None:
+                on = w.enabled[1][max(int(np.searchsorted(w.enabled[0], t, side="right")) - 1, 0)] > 0.5
+                if (on != freed[i]).any():
+                    freed[i] = on
+                    servo.state[i, :, servo.slots["enabled"]] = up(on)
+        torch.index_select(engine.t.qpos, 1, pick, out=seen[k])
+        engine.step(1, servo.before_each)
+    q = seen.cpu().numpy().astype(float)
+    return [scale[i] * q[:, i] + offset[i] for i in range(N)]
+
+
+def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
+            floor: float, device: str = "cpu", timestep: float = STEP) -> Confirmation | None:
+    """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
+    kept out. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+    windows = [c.plant.windows(None, test, span=span_test) for c in cases]
+    if not cases or not len(windows[0].window):
+        return None
+    seconds = np.cumsum(windows[0].window[:, 1]) * cases[0].plant.dt
+    use = np.flatnonzero(seconds <= max(MOST, seconds[0]))
+    errors, joints, simulated = {}, {}, {}
+    final = min(1, len(hypotheses) - 1)
+    parts = [model_of(m, cases, h) for h in hypotheses]
+    worlds = [[w for i, w in enumerate(worlds_of(m, runs, cases, h, windows[0])) if i in use] for h in hypotheses]
+    plain = [i for i, (_, changed) in enumerate(parts) if not changed]
+    found: dict[int, list[np.ndarray]] = {}
+    for group in ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]:
+        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep)
+        for k, i in enumerate(group):
+            found[i] = q[k * len(use) : (k + 1) * len(use)]
+    for i, h in enumerate(hypotheses):
+        square, own = [], []
+        for case, ws in zip(cases, windows, strict=True):
+            on = np.isin(ws.sample_window, use)
+            measured = case.plant.q[ws.sample_row[on]]
+            trial = h.trials[case.joint]
+            fast = judge.free_run(case, trial.fit.params, trial.fit.x, ws, [f for x in trial.members for f in x.variant.fixed])[0][on]
+            t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
+            column = m.joints.index(case.joint)
+            engine = np.empty(len(t))
+            for k, w in enumerate(use):
+                here = ws.sample_window[on] == w
+                q = found[i][k][:, column]
+                engine[here] = np.interp(t[here], timestep * np.arange(len(q)), q)
+            square.append((measured - engine) ** 2)
+            own.append((measured - fast) ** 2)
+            if i == final:
+                joints[case.joint] = tuple(float(np.sqrt(np.mean(x))) for x in (square[-1], own[-1]))
+                simulated[case.joint] = engine
+        errors[h.name] = tuple(float(np.sqrt(np.mean(np.concatenate(x)))) for x in (square, own))
+    engine, plant = errors[hypotheses[final].name]
+    if not np.isfinite(engine):
+        raise UserError("the engine's state did not stay finite")
+    names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
+    return Confirmation("MuJoCo-Warp" if device != "cpu" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
+                        engine <= APART * max(plant, floor), floor, simulated)
