@@ -29,10 +29,11 @@ from dexsim.gap.plant_columns import SERIES_INDEX
 from dexsim.gap.prepare import Case
 from dexsim.gap.runs import Run
 from dexsim.gap.search import Trial
-from dexsim.recording.mechanism import Mechanism, hold_friction
+from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
 
-STEP = 1e-3  # s: of the engine
+STEP = 5e-4  # s: of the engine; its error is of first order in it
+TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
 MOST = 120.0  # s of recordings that are replayed, at most
@@ -80,20 +81,21 @@ class Confirmation:
     recordings: list[str]
     agrees: bool
     floor: float
+    at_tasks_step: float = math.nan
     simulated: dict[str, np.ndarray] = field(default_factory=dict)
 
-    @property
-    def text(self) -> str:
-        """The result in a sentence; empty where it only repeats what the search's plant says."""
+    def text(self, unit: str = "mrad") -> str:
+        """The result in a sentence; unit: what a thousandth of the position's is called."""
         engine, plant = list(self.errors.values())[min(1, len(self.errors) - 1)]
         if self.agrees:
-            return f"Confirmed in the engine that trains ({self.engine}, all joints at once): {1e3 * engine:.2g}."
-        because = f": it has no {', '.join(self.missing)}" if self.missing else ", so training would not follow the machine as closely"
-        return f"Not confirmed in the engine that trains ({self.engine}): it leaves {1e3 * engine:.3g} where the search's own plant leaves {1e3 * plant:.3g}{because}."
+            return f"Replayed in the engine that trains, all joints at once, {1e3 * engine:.3g} {unit} are left: confirmed."
+        because = f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
+        return f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own plant leaves {1e3 * plant:.3g} ({because})."
 
     def entry(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
         out = {"engine": self.engine, "step_s": self.step_s, "recordings": self.recordings, "agrees": self.agrees, "not_handed_on": self.missing}
+        out["engine_at_tasks_step"] = {"step_s": TASKS, "after": self.at_tasks_step}
         out |= {name: {"engine": a, "plant": b} for name, (a, b) in self.errors.items()}
         return out | {"joints": {j: {"engine": a, "plant": b} for j, (a, b) in self.joints.items()}}
 
@@ -193,7 +195,6 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    hold_friction(spec)
     N = len(worlds)
     engine = make_engine(spec, N, device, fields=FIELDS)
     rows = np.stack([w.rows for w in worlds])
@@ -264,29 +265,35 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
         q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep)
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
+    def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
+        """(simulated position, squared error) [n] of one joint at its samples."""
+        on = np.isin(ws.sample_window, use)
+        t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
+        out = np.empty(len(t))
+        for k, w in enumerate(use):
+            here = ws.sample_window[on] == w
+            x = q[k][:, m.joints.index(case.joint)]
+            out[here] = np.interp(t[here], step * np.arange(len(x)), x)
+        return out, (case.plant.q[ws.sample_row[on]] - out) ** 2
+
+    rms = lambda x: float(np.sqrt(np.mean(np.concatenate(x))))  # noqa: E731
     for i, h in enumerate(hypotheses):
         square, own = [], []
         for case, ws in zip(cases, windows, strict=True):
-            on = np.isin(ws.sample_window, use)
-            measured = case.plant.q[ws.sample_row[on]]
-            trial = h.trials[case.joint]
+            trial, on = h.trials[case.joint], np.isin(ws.sample_window, use)
             fast = judge.free_run(case, trial.fit.params, trial.fit.x, ws, [f for x in trial.members for f in x.variant.fixed])[0][on]
-            t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
-            column = m.joints.index(case.joint)
-            engine = np.empty(len(t))
-            for k, w in enumerate(use):
-                here = ws.sample_window[on] == w
-                q = found[i][k][:, column]
-                engine[here] = np.interp(t[here], timestep * np.arange(len(q)), q)
-            square.append((measured - engine) ** 2)
-            own.append((measured - fast) ** 2)
+            there, miss = error(found[i], timestep, case, ws)
+            square.append(miss)
+            own.append((case.plant.q[ws.sample_row[on]] - fast) ** 2)
             if i == final:
-                joints[case.joint] = tuple(float(np.sqrt(np.mean(x))) for x in (square[-1], own[-1]))
-                simulated[case.joint] = engine
-        errors[h.name] = tuple(float(np.sqrt(np.mean(np.concatenate(x)))) for x in (square, own))
+                joints[case.joint] = (rms(square[-1:]), rms(own[-1:]))
+                simulated[case.joint] = there
+        errors[h.name] = (rms(square), rms(own))
+    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS)
+    at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
     engine, plant = errors[hypotheses[final].name]
     if not np.isfinite(engine):
         raise UserError("the engine's state did not stay finite")
     names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
     return Confirmation("MuJoCo-Warp" if device != "cpu" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
-                        engine <= APART * max(plant, floor), floor, simulated)
+                        engine <= APART * max(plant, floor), floor, at_tasks_step, simulated)

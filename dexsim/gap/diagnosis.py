@@ -463,7 +463,7 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
     d.confirmation = found
     d.data["held_out"]["confirmed"] = found.entry()
     if d.data["held_out"]["error"].startswith("position"):
-        d.sentence += f" {found.text}"
+        d.sentence += " " + found.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
 
 
 def confounds(case: Case, train: list[int]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap import charts
+from dexsim.gap.confirm import TASKS
 from dexsim.gap.picture import mechanism, pad
 from dexsim.gap.touch_effects import entry
 
@@ -289,6 +290,16 @@ def _next(d: Diagnosis) -> str:
     return f'<section class="next"><h2>What to record next</h2><p>{_t(n["why"][:1].upper() + n["why"][1:])}.{send}</p></section>'
 
 
+def _confirmed(d: Diagnosis) -> str:
+    """The hypotheses in the engine that trains beside the search's own plant."""
+    c, unit = d.confirmation, "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad"
+    rows = "".join(f'<tr><td>{_t(name.replace("_", " "))}</td><td class="n">{charts.number(1e3 * a)}</td><td class="n">{charts.number(1e3 * b)} {unit}</td></tr>'
+                   for name, (a, b) in c.errors.items())  # fmt: skip
+    coarse = f" At {1e3 * TASKS:g} ms, the step of the tasks, it leaves {charts.number(1e3 * c.at_tasks_step)} {unit}."
+    return (f'<p class="small">{_t(c.engine)} with the servo and model that training loads, {1e3 * c.step_s:g} ms a step, all joints at once, over '
+            f"{_t(', '.join(c.recordings))}.{coarse}</p><table><tr><th>hypothesis</th><th class=\"n\">engine</th><th class=\"n\">the search's plant</th></tr>{rows}</table>")  # fmt: skip
+
+
 def _details(d: Diagnosis) -> str:
     """What a second minute is for, folded away."""
     folded = []
@@ -300,6 +311,8 @@ def _details(d: Diagnosis) -> str:
                        f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}"))  # fmt: skip
     if d.stages:
         folded.append(("Stage by stage", "<ul>" + "".join(f"<li>{_t(x)}</li>" for x in d.stages) + "</ul>"))
+    if d.confirmation is not None:
+        folded.append(("In the engine that trains", _confirmed(d)))
     nuisance = ", ".join(f"{_t(k)} {v:.4g}" for k, v in d.data["nuisance"].items())
     if nuisance:
         folded.append(("Believed figures as refitted", f'<p class="small">{nuisance}</p>'))

@@ -81,7 +81,7 @@ def mechanism(
     """
     if model is None:
         spec, robot = xhand.hand_spec(), "xhand_right"
-        hold_friction(spec)
+        _hold_friction(spec)
         table = _table(servo if servo is not None else xhand_servo_dict())
     else:
         path = Path(model).expanduser()
@@ -327,7 +327,7 @@ def _table(servo: str | Path | dict) -> ServoTable:
     return ServoTable.from_dict(servo) if isinstance(servo, dict) else ServoTable.load(Path(servo).expanduser())
 
 
-def hold_friction(spec: mujoco.MjSpec) -> None:
+def _hold_friction(spec: mujoco.MjSpec) -> None:
     """Dry friction that holds, as in the hand's tasks: MuJoCo's default lets a stuck joint creep."""
     for joint in spec.joints:
         joint.solimp_friction, joint.solref_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0], [0.01, 1.0]

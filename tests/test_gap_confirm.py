@@ -1,0 +1,119 @@
+"""The final hypotheses in the engine that trains: the same motion as a replay, said where it leaves more, handed on as it was confirmed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from test_gap import SERVO, demo, mechanism_of, motion, plant_run
+
+from dexsim.actuator.table import ServoTable
+from dexsim.gap import confirm
+from dexsim.gap.catalogue import EFFECTS
+from dexsim.gap.confirm import Hypothesis, World, free_runs
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.prepare import build
+from dexsim.gap.runs import conditions
+from dexsim.gap.search import JointSearch, Member
+from dexsim.recording import read
+from dexsim.recording.mechanism import drive, mechanism, replay
+from dexsim.recording.schema import COMMANDS, Series
+
+
+def world(table: ServoTable, t: np.ndarray, cmd: np.ndarray, duration: float, q: float, v: float = 0.0) -> World:
+    one = lambda x: np.array([float(x)])  # noqa: E731
+    return World(table.nominal(["joint"]), table, np.array([0, 0, -9.81]), duration, one(q), one(v), one(cmd[0]), t, cmd[:, None])
+
+
+def test_worlds_of_a_batch_move_as_a_replay_of_each_does():
+    table = ServoTable.from_dict({"joints": {"*": SERVO | {"delay": 0.013}}})
+    m = mechanism_of(table)
+    given = [motion(k, 2.0, k) for k in (0, 1)]
+    together = free_runs(m.spec, ["joint"], [world(table, t, c, 2.0, c[0]) for t, c in given], timestep=1e-3)
+    for q, (t, c) in zip(together, given, strict=True):
+        alone = drive(m, Series(t, c[:, None], COMMANDS, t), ["joint"], 2.0, np.array([c[0]]), timestep=1e-3)
+        assert np.abs(q[:2000, 0] - alone.position[:, 0]).max() < 1e-9
+
+
+def test_a_run_begun_in_its_middle_goes_on_as_it_did():
+    """Position, speed, and the commands that were sent shortly before and still act."""
+    table = ServoTable.from_dict({"joints": {"*": SERVO | {"delay": 0.05}}})
+    m = mechanism_of(table)
+    t, c = motion(0, 3.0)
+    whole = drive(m, Series(t, c[:, None], COMMANDS, t), ["joint"], 3.0, np.array([c[0]]), timestep=1e-3)
+    late = world(table, t[t > 0.9] - 1.5, c[t > 0.9], 1.4, whole.position[1500, 0], whole.velocity[1500, 0])
+    q = free_runs(m.spec, ["joint"], [late], timestep=1e-3)[0][:1400, 0]
+    assert np.abs(q - whole.position[1500:2900, 0]).max() < 1e-6
+    still = world(table, t[t > 1.5] - 1.5, c[t > 1.5], 1.4, whole.position[1500, 0], whole.velocity[1500, 0])
+    assert np.abs(free_runs(m.spec, ["joint"], [still], timestep=1e-3)[0][:1400, 0] - q).max() > 1e-4  # those commands matter
+
+
+def test_a_freed_joint_swings():
+    table = ServoTable.from_dict({"joints": {"*": SERVO | {"coulomb_friction": 0.0}}})
+    t, c = motion(0, 1.0)
+    w = world(table, t, np.full_like(c, 1.0), 1.0, 1.0)
+    w.enabled = (np.array([0.0, 0.3]), np.array([[1.0], [0.0]]))
+    q = free_runs(mechanism_of(table).spec, ["joint"], [w], timestep=1e-3)[0][:, 0]
+    assert np.ptp(q[100:300]) < 0.08 and q[600] < q[299] - 0.3
+
+
+@pytest.fixture(scope="module")
+def answer(tmp_path_factory):
+    """A diagnosis of dry friction in a simulated pendulum, and what it wrote."""
+    folder = tmp_path_factory.mktemp("confirm")
+    paths, model, servo, _ = demo.make(folder, "coulomb_friction", seconds=5.0)
+    allowed = {"coulomb_friction", "stribeck_friction", "viscous_friction"}
+    d = diagnose(Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False, allowed=allowed), say=lambda _: None)
+    save(d, folder / "out")
+    return d, folder, model
+
+
+def test_the_answer_is_confirmed_and_the_page_says_so(answer):
+    d, folder, _ = answer
+    h = json.loads((folder / "out" / "diagnosis.json").read_text())["held_out"]
+    c = h["confirmed"]
+    assert c["agrees"] is True and c["engine"] == "C MuJoCo" and c["not_handed_on"] == [] and c["recordings"] == h["recordings"]
+    assert c["found"]["plant"] == pytest.approx(h["after"], rel=0.02) and c["found"]["engine"] < 1.3 * max(h["after"], d.data["noise_floor"]["position_rad"])
+    assert c["believed"]["engine"] > 5 * c["found"]["engine"]  # it tells right from wrong
+    assert "confirmed" in d.sentence and f"{1e3 * c['found']['engine']:.3g} mrad" in d.sentence
+    page = (folder / "out" / "report.html").read_text()
+    assert "In the engine that trains" in page and "C MuJoCo" in page
+
+
+def test_what_is_handed_on_replays_as_it_was_confirmed(answer):
+    """servo.yaml, loaded and replayed by `play.py replay=`'s own function: the error that was confirmed."""
+    d, folder, model = answer
+    m = mechanism(str(model), str(folder / "out" / "servo.yaml"))
+    c = d.confirmation
+    recording = read(next(p for p in folder.glob("*.mcap") if p.name == c.recordings[0]), joints=m.joints)
+    recording.meta["servo"] = ""
+    run = replay(recording, m, timestep=c.step_s)
+    t, q = recording.states.position.t, recording.states.position.value[:, 0]
+    error = float(np.sqrt(np.mean((np.interp(t, run.t, run.position[:, 0]) - q) ** 2)))
+    assert error == pytest.approx(c.errors["found"][0], rel=0.15)
+
+
+def test_what_training_cannot_be_given_is_not_confirmed():
+    """An eccentric encoder is no column of the servo: the search's plant follows it, the engine does not, and both are said."""
+    runs = [plant_run(f"r{k}", k, 4.0, {"eccentric_sin": 0.08}, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    m = mechanism_of(runs[0].servo)
+    case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
+    search = JointSearch(case, [0, 2], None, conditions(runs))
+    none = search.start()
+    variant = next(v for v in EFFECTS["position_scale"].variants(case.scales) if v.label == "eccentricity")
+    found = search.fit((Member(EFFECTS["position_scale"], variant),), np.array([0.05, 0.0]), none, quick=True)
+    c = confirm.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
+    engine, plant = c.errors["found"]
+    assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["position_scale@joint"]
+    assert "Not confirmed" in c.text() and "position_scale@joint" in c.text()
+
+
+def test_the_tasks_step_is_that_of_the_configuration():
+    configured = yaml.safe_load((Path(__file__).parents[1] / "configs" / "config.yaml").read_text())
+    assert confirm.TASKS == configured["sim"]["timestep"]
