@@ -126,7 +126,8 @@ def main(argv: list[str]) -> int:
         allowed = set(given["effects"])
     settings = Settings(
         inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
-        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, given["meta"], given["remap"],
+        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, meta=given["meta"],
+        remap=given["remap"],
     )  # fmt: skip
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
     written = save(result, out)

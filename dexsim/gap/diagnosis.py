@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, confirm, inputs, inverse, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confidence, confirm, inputs, inverse, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
@@ -90,6 +90,7 @@ class Diagnosis:
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
     confirmation: confirm.Confirmation | None = None
+    evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
 
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:
@@ -172,6 +173,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         say(f"  left out: {'; '.join(failures)}")
     held_names = {names[p] for p in s.held_out or []}
     felt = touch.diagnose([r for r in recordings if r is not None], m, held_names, s.seed, s.allowed, progress)
+    if felt.before is not None and felt.floor is not None:
+        felt.notes += confidence.of_touch(felt.findings, felt.before[0], felt.floor)
     notes += felt.notes
     clock.lap("touch")
 
@@ -329,21 +332,30 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             without = judge_without(search, best, mm) if rest else none
             qw, ew = judge.free_run(case, without.fit.params, without.fit.x, windows, [f for x in rest for f in x.variant.fixed])
             rivals = outcome.rivals.get(mm.id, [])
-            confidence = outcome.confidence.get(mm.id, 0.5)
             same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
             signal = judge.own_signal(mm.id, case, raw, mm.variant.note)
             active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
             effort_only = mm.id == "current_sensor"
             earned = 1.0 if effort_only else float(np.clip((rms((measured - qw) ** 2) - rms(after)) / (0.1 * rms((measured - qw) ** 2) + 1e-12), 0.0, 1.0))
-            confidence *= 0.3 + 0.7 * earned  # what did not help on the data kept out is not to be relied on
-            confidence *= trusted(rms(before), rms(after), case.sigma)
-            confounded = confounds(case, train) if mm.id == "thermal" else ""
-            if confounded:
-                confidence = min(confidence, 0.7)
-                notes.append(f"{case.joint}: {confounded}; thermal may stand for anything that drifts in that order")
+            evidence = confidence.Evidence(
+                mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(rms(after), rms(before), case.sigma),
+                confidence.left_over(rms(after), rms((measured - qw) ** 2), case.sigma), outcome.folds.get(mm.id, []), len(best.members), 0)  # fmt: skip
+            if confidence.holds_nothing(mm.variant.params, spread, case):
+                evidence.reasons.append("its interval holds the size at which nothing is missing")
+            small = "" if effort_only else confidence.too_small(rms(before), rms((measured - qw) ** 2), rms(after), case.sigma, len(best.members) == 1)
+            if small:
+                evidence.reasons.append(small)
+            stopped = confidence.at_bound(mm.variant.params, raw, case)
+            if stopped:
+                evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
+            follows = confidence.temperature_follows(case, sorted({*train, *test})) if mm.id == "thermal" else ""
+            if follows:
+                evidence.reasons.append(f"temperature follows {follows}, so it may stand for anything that changes with it")
+            evidence.confidence = confidence.weigh(evidence, rms(before), rms(after), rms((measured - qw) ** 2), case.sigma)
+            out.evidence.append(evidence)
             findings.append({
                 "effect": mm.id,
-                "confidence": round(float(min(confidence, 0.99)), 3),
+                "confidence": evidence.confidence,  # what the other findings say of it comes last
                 "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
                 "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
                 "separating_experiment": EFFECTS[mm.id].experiment if same else None,
@@ -393,12 +405,14 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             servo.entries[case.joint] = copy.deepcopy(m.table.entries[case.joint])
         if any(f["effect"] in ("inertia", "payload") for f in mine):
             spec, changed_model = m.spec.copy(), False
+    findings.sort(key=lambda f: -_weight(f))
+    _doubts(out, findings, channel)
     b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
     a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
     slide = all(c.constants.slide for c in cases)
     data["held_out"] = {"recordings": [runs[i].name for i in test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
                         "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}
-    data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + sorted(findings, key=lambda f: -_weight(f))
+    data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     only_effort = findings and all(f["effect"] == "current_sensor" for f in findings)
     structured = any(o.none.fit.loss > 1.3**2 and (len(o.scanned) > 0) for o in out.outcomes)
     word = judge.verdict(data["findings"], floor, b, bl, a, structured)
@@ -417,12 +431,18 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     return out
 
 
-def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a twentieth,
-    half from a third on. What follows only half of a gap may be another effect's likeness."""
-    base = (1.3 * noise) ** 2
-    left = max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
-    return 1.0 - 0.5 * float(np.clip((left - 0.05) / 0.28, 0.0, 1.0))
+def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str, Any]]) -> None:
+    """Confidences of the joints' findings (the weightiest first), after what they and the signals say of each other."""
+    by = {(e.joint, e.effect): e for e in d.evidence}
+    mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
+    for joint in {e.joint for e in mine}:
+        confidence.together([e for e in mine if e.joint == joint])
+    coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if f["effect"] == "joint_coupling"}
+    confidence.of_the_whole(mine, coupled, {j for f in channel for j in f["where"]["joints"]})
+    for f, e in zip(findings, mine, strict=True):
+        f["confidence"] = round(e.confidence, 3)
+        d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]
+    d.evidence = mine
 
 
 def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, floor: float, seed: int) -> None:
@@ -464,19 +484,6 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
     d.data["held_out"]["confirmed"] = found.entry()
     if d.data["held_out"]["error"].startswith("position"):
         d.sentence += " " + found.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
-
-
-def confounds(case: Case, train: list[int]) -> str:
-    """Whether temperature follows the order of the recordings or their gain, in words; empty where it does not."""
-    if "temperature" not in case.regimes or len(train) < 4:
-        return ""
-    warm = np.array([case.regimes["temperature"][case.plant.rows(r)].mean() for r in train])
-    kp = np.array([case.plant.nominal[r][SERVO_INDEX["kp"]] for r in train])
-    said = []
-    for name, x in (("the order of the recordings", np.arange(len(train), dtype=float)), ("the gain", kp)):
-        if np.ptp(x) > 1e-12 and np.ptp(warm) > 0 and abs(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(warm)))[0, 1]) > 0.8:
-            said.append(name)
-    return "temperature rises with " + " and ".join(said) + ", so they cannot be told apart" if said else ""
 
 
 def judge_without(search: JointSearch, best, member):
@@ -808,6 +815,10 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     path = out / "diagnosis.json"
     path.write_text(json.dumps(_plain(d.data), indent=1, allow_nan=False), encoding="utf-8")
     written.append(path)
+    if d.evidence:
+        path = out / "evidence.json"
+        path.write_text(json.dumps(_plain([e.plain() for e in d.evidence]), indent=1, allow_nan=False), encoding="utf-8")
+        written.append(path)
     if d.servo is not None:
         d.servo.save(out / "servo.yaml")
         written.append(out / "servo.yaml")

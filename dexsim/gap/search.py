@@ -66,6 +66,7 @@ class Outcome:
     gains: dict[str, float]  # by effect: share of the squared left-out error that it removes
     price: dict[str, float]
     scanned: list[tuple[str, float, float]]  # (effect, share of squared error in the scan, its price)
+    folds: dict[str, list[float]] = field(default_factory=dict)  # by effect: relative cost of dropping it, by condition left out
     note: str = ""
 
 
@@ -454,7 +455,7 @@ class JointSearch:
                 final = self.rivals(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
-        return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned)
+        return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
 
     def _shortlist(self, scan, size, loss, members):
         """The best variants of the best effects, and what the first is confused with."""
@@ -543,6 +544,7 @@ class JointSearch:
     def rivals(self, current: Trial, pool) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
         """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
         out = {}
+        self.costs: dict[str, list[float]] = {}
         mine = self._left(current)
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
@@ -551,6 +553,7 @@ class JointSearch:
             kept = [v for k, v in enumerate(values) if k != i]
             without = self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
             lost = self._left(without) if without else self._left(self._none(current))
+            self.costs[member.id] = self._by_condition(lost, mine)
             others: list[Trial] = []
             for key, (other, start) in pool.items():
                 if key == member.id or key in current.ids or any(not _compatible(other, m) for m in rest):
@@ -576,6 +579,15 @@ class JointSearch:
             rows = [(next(x for x in t.ids if x not in {m.id for m in rest}), float(s)) for t, s in zip(others, shares[1:-1], strict=True)]
             rows.sort(key=lambda r: -r[1])
             out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
+        return out
+
+    def _by_condition(self, lost: np.ndarray, mine: np.ndarray) -> list[float]:
+        """Relative gain of `mine` over `lost` (losses by block [B]) on each condition that was left out."""
+        fold = self.fold_of[self.fitter.window]
+        out = []
+        for number in np.unique(fold):
+            pick = np.unique(self.blocks[fold == number])
+            out.append(float(1 - mine[pick].sum() / max(float(lost[pick].sum()), 1e-30)))
         return out
 
     def idle(self) -> Outcome:

@@ -1,0 +1,102 @@
+"""What lowers a finding's confidence: each rule by itself."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dexsim.gap import confidence
+from dexsim.gap.confidence import DOUBTED, Evidence
+from dexsim.gap.fit import Param
+from dexsim.gap.plant_columns import INDEX
+
+CASE = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0}))
+
+
+def evidence(**changes) -> Evidence:
+    given = dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, folds=[], members=1, place=0) | changes
+    return Evidence(**given)
+
+
+def viscous(low=0.0, high=0.1):
+    return Param("coefficient", ("viscous_friction",), "set", low, high, 0.002)
+
+
+@pytest.mark.parametrize(("low", "high", "nothing"), [(0.0, 0.004, True), (0.00207, 0.004, True), (0.003, 0.006, False), (0.0, 0.001, False)])
+def test_an_interval_that_holds_what_is_believed_holds_nothing(low, high, nothing):
+    assert confidence.holds_nothing([viscous()], {"coefficient": (low, high)}, CASE) is nothing
+
+
+def test_all_sizes_must_hold_nothing_and_shapes_do_not_count():
+    gains = [Param("kp_factor", ("kp",), "factor", 0.25, 4.0, 1.0), Param("kd_factor", ("kd",), "factor", 0.1, 6.0, 1.0)]
+    assert confidence.holds_nothing(gains, {"kp_factor": (0.9, 1.2), "kd_factor": (0.8, 1.3)}, CASE)
+    assert not confidence.holds_nothing(gains, {"kp_factor": (0.9, 1.2), "kd_factor": (1.4, 2.0)}, CASE)
+    peak = [Param("peak", ("stribeck_peak",), "set", 0.0, 1.0, 0.0), Param("v_s", ("stribeck_speed",), "set", 0.01, 1.0, 0.1)]
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"stribeck_peak": 0.0, "stribeck_speed": 0.1}))
+    assert not confidence.holds_nothing(peak, {"peak": (0.1, 0.3), "v_s": (0.05, 0.2)}, case)
+
+
+def test_a_size_at_its_bound_is_told_from_one_at_nothing():
+    assert confidence.at_bound([viscous()], {"coefficient": 0.0}, CASE) == "coefficient"  # less than none cannot be, and some is believed
+    assert confidence.at_bound([viscous()], {"coefficient": 0.01}, CASE) == ""
+    turns = Param("per_turn", ("ripple_per_turn",), "set", 3.92, 4.08, 4.0)
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"ripple_per_turn": 0.0}))
+    assert confidence.at_bound([turns], {"per_turn": 4.08}, case) == "per_turn"
+    coulomb = Param("torque", ("coulomb_friction",), "set", 0.0, 1.0, 0.0)
+    assert confidence.at_bound([coulomb], {"torque": 0.0}, CASE) == ""
+
+
+def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():
+    assert "hardly above the noise" in confidence.too_small(1.2, 1.2, 1.0, 1.0, True)
+    assert confidence.too_small(3.0, 3.0, 1.0, 1.0, True) == ""
+    assert "trifle" in confidence.too_small(10.0, 2.0, 1.2, 1.0, False)
+    assert confidence.too_small(10.0, 4.0, 1.2, 1.0, False) == ""
+
+
+def test_touch_is_doubted_alike():
+    findings = [{"effect": "tactile_hysteresis", "confidence": 0.99, "held_out": {"before": 215.0, "after": 40.0}},
+                {"effect": "tactile_crosstalk", "confidence": 0.99, "held_out": {"before": 54.5, "after": 40.0}},
+                {"effect": "tactile_gain", "confidence": 0.95, "held_out": None}]  # fmt: skip
+    said = confidence.of_touch(findings, 215.0, 35.0)
+    assert [f["confidence"] for f in findings] == [0.99, DOUBTED, 0.95] and len(said) == 1
+
+
+def test_weigh_takes_every_doubt_into_account():
+    assert confidence.weigh(evidence(), 10.0, 1.0, 10.0, 1.0) == 0.99
+    assert confidence.weigh(evidence(reasons=["x"]), 10.0, 1.0, 10.0, 1.0) == DOUBTED
+    assert confidence.weigh(evidence(), 10.0, 7.0, 10.0, 1.0) == pytest.approx(0.5)  # half of the squared error stays
+    assert confidence.weigh(evidence(members=2), 20.0, 4.0, 4.5, 1.0) < 0.6  # next to nothing of what the first one left
+    assert confidence.weigh(evidence(earned=0.0), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)
+
+
+def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_is_a_crowd():
+    sure, doubtful = evidence(effect="a", confidence=0.99), evidence(effect="b", confidence=0.4)
+    later = evidence(effect="c", confidence=0.99)
+    confidence.together([sure, doubtful])
+    assert sure.confidence == 0.99
+    confidence.together([doubtful, later])
+    assert later.confidence == DOUBTED and "b" in later.reasons[0]
+    crowd = [evidence(effect=x, confidence=0.99) for x in "abc"]
+    confidence.together(crowd)
+    assert [e.confidence for e in crowd] == [0.99, DOUBTED, DOUBTED]
+
+
+def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():
+    drags, dragged, other = (evidence(effect="payload", joint=j, confidence=0.99) for j in ("a", "b", "c"))
+    dragged.effect = "joint_coupling"
+    confidence.of_the_whole([drags, dragged, other], {"b": "a"}, {"c"})
+    assert drags.confidence == DOUBTED and dragged.confidence == 0.99 and other.confidence == DOUBTED
+
+
+@pytest.mark.parametrize(("starts", "gains", "what"), [
+    ((25, 35, 45, 55), (1, 1, 1, 1), "the clock"), ((45, 25, 55, 35), (1, 1, 1, 1), ""), ((55, 45, 35, 25), (1, 1, 1, 1), "the order of the recordings"),
+    ((25, 45, 35, 55), (1, 1, 1, 1), ""), ((25, 45, 35, 55), (8, 32, 16, 64), "the gain")])  # fmt: skip
+def test_temperature_that_follows_something_else(starts, gains, what):
+    n = 50
+    rows = lambda r: slice(n * r, n * (r + 1))  # noqa: E731
+    warm = np.concatenate([s + np.linspace(0, 1.0, n) for s in starts])
+    nominal = [np.where(np.arange(len(INDEX)) == INDEX["kp"], g, 0.0) for g in gains]
+    case = SimpleNamespace(regimes={"temperature": warm}, plant=SimpleNamespace(rows=rows, t=np.tile(np.linspace(0, 7, n), 4), nominal=nominal))
+    assert confidence.temperature_follows(case, range(4)) == what
