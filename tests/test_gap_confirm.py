@@ -98,20 +98,20 @@ def test_what_is_handed_on_replays_as_it_was_confirmed(answer):
 
 
 def test_what_training_cannot_be_given_is_not_confirmed():
-    """An eccentric encoder is no column of the servo: the search's plant follows it, the engine does not, and both are said."""
-    runs = [plant_run(f"r{k}", k, 4.0, {"eccentric_sin": 0.08}, seed=k) for k in (0, 1, 3)]
+    """A filter of the measured speed is no column of the servo: the search's plant follows it, the engine does not, and both are said."""
+    runs = [plant_run(f"r{k}", k, 4.0, {"speed_lag": 0.03}, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
     m = mechanism_of(runs[0].servo)
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
     search = JointSearch(case, [0, 2], None, conditions(runs))
     none = search.start()
-    variant = next(v for v in EFFECTS["position_scale"].variants(case.scales) if v.label == "eccentricity")
-    found = search.fit((Member(EFFECTS["position_scale"], variant),), np.array([0.05, 0.0]), none, quick=True)
+    variant = next(v for v in EFFECTS["lag"].variants(case.scales) if v.label == "velocity filter")
+    found = search.fit((Member(EFFECTS["lag"], variant),), np.array([0.03]), none, quick=True)
     c = confirm.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
     engine, plant = c.errors["found"]
-    assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["position_scale@joint"]
-    assert "Not confirmed" in c.text() and "position_scale@joint" in c.text()
+    assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["lag@joint"]
+    assert "Not confirmed" in c.text() and "lag@joint" in c.text()
 
 
 def test_the_tasks_step_is_that_of_the_configuration():
