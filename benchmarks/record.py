@@ -10,7 +10,6 @@ the figure is of the time while it lasts.
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -21,15 +20,15 @@ from benchmarks import tools
 from dexsim.errors import UserError
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str]) -> dict:
     """Prints a line a round and one line of JSON."""
     given = dict(a.split("=", 1) for a in argv if "=" in a)
     unknown = set(given) - {"worlds", "record_worlds", "steps", "rounds", "device", "tactile"}
     if unknown or len(given) != len(argv):
         raise UserError(f"{' '.join(argv)}: keys are worlds, record_worlds, steps, rounds, device, tactile")
     device = given.get("device", "cuda:0" if torch.cuda.is_available() else "cpu")
-    defaults = {"worlds": 8192, "record_worlds": 1, "steps": 64, "rounds": 6}
-    worlds, chosen, steps, rounds = (int(given.get(k, d)) for k, d in defaults.items())
+    defaults = {"worlds": "8192", "record_worlds": "1", "steps": "64", "rounds": "6"}
+    worlds, chosen, steps, rounds = (tools.numbers(given.get(k, d), k)[0] for k, d in defaults.items())
     plain, recorded = (environment(worlds, device, given.get("tactile", "raw")) for _ in range(2))
     from dexsim.recording.tap import PlayRecorder
 
@@ -44,8 +43,9 @@ def main(argv: list[str]) -> int:
     a, b = (float(np.median(times[n])) for n in ("plain", "recorded"))
     kept = sum(len(t.episode.times) + len(t._now.times) for t in tap.tracks)
     found = {"worlds": worlds, "record_worlds": chosen, "plain_ms": round(a, 3), "recorded_ms": round(b, 3), "slower": round(b / a - 1, 4)}
-    print(json.dumps(found | {"steps_kept": kept} | tools.about(device)))
-    return 0
+    found |= {"steps_kept": kept} | tools.about(device)
+    print(json.dumps(found), flush=True)
+    return found
 
 
 def environment(worlds: int, device: str, tactile: str) -> tuple:
@@ -77,8 +77,4 @@ def run(env, steps: int, device: str, seed: int) -> float:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    tools.command(main)

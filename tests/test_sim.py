@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -512,3 +516,28 @@ def test_the_c_engine_refuses_what_it_cannot_place():
     spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>')
     with pytest.raises(UserError, match="mocap"):
         make_engine(spec, 1, "cpu", "mujoco")
+
+
+LOGS = """
+import sys, mujoco, numpy as np
+if sys.argv[1] == "dexsim":
+    from dexsim.sim import make_engine
+    from dexsim.sim.pendulum import pendulum_spec
+    e = make_engine(pendulum_spec(), 2, "cpu", "mujoco")
+    e.t.qpos[0] = float("nan")
+    e.step(2)
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
+data = mujoco.MjData(model)
+data.qpos[:] = np.nan
+mujoco.mj_step(model, data)
+"""
+
+
+@pytest.mark.parametrize("which", ["mujoco", "dexsim"])
+def test_mujoco_leaves_no_log_in_the_users_folder(tmp_path, which):
+    """Alone it does: a world that diverges writes MUJOCO_LOG.TXT where the user is."""
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", LOGS, which], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "huge value in QPOS" in done.stderr
+    assert (tmp_path / "MUJOCO_LOG.TXT").exists() == (which == "mujoco")

@@ -162,6 +162,14 @@ class Engine:
         self.t.overflow.zero_()
 
 
+def no_log_file() -> None:
+    """MuJoCo's warnings go to stderr; not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that somebody chose stays."""
+    log = mujoco.MjLogConfig.get()
+    if log.logto_file and log.logfile == "MUJOCO_LOG.TXT":
+        log.logto_file = False
+        log.set()
+
+
 def make_engine(
     spec: mujoco.MjSpec,
     worlds: int,
@@ -179,6 +187,7 @@ def make_engine(
     fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
     (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all.
     """
+    no_log_file()
     if engine not in ("auto", "warp", "mujoco"):
         raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
     if engine == "auto":

@@ -10,7 +10,7 @@ from dexsim.tactile.sdf import Shapes, distance
 from dexsim.tactile.tactile import Tactile
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def clearance_kernel(
     xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), pads: Pads, shapes: Shapes, body: wp.array(dtype=int),
     shape_id: wp.array2d(dtype=int), shape_size: wp.array2d(dtype=wp.vec3), out: wp.array2d(dtype=float)
