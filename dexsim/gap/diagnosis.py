@@ -205,7 +205,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if s.held_out and not held:
         notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
     model = m.spec.compile()
-    notes += _limits(model, runs)
+    notes += _limits(model, runs) + ends.used(model, runs)
     for run in runs:
         run.smooth()
     moving = [j for j, name in enumerate(runs[0].joints) if max(float(np.ptp(r.q[:, j])) for r in runs) > 2e-3]

@@ -1,0 +1,53 @@
+"""Ends of motion that the model does not have."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator.table import ServoTable
+from dexsim.gap import ends
+from dexsim.gap.runs import Run
+
+XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/><geom type="capsule" size="0.01" fromto="0 0 0 0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>"""
+
+
+def run_of(stop: float | None, lag: float = 0.02, reach: float = 1.5) -> Run:
+    t = np.arange(0, 20, 0.02)
+    cmd = reach * np.sin(2 * np.pi * t / 5)
+    q = np.interp(t - lag, t, cmd)
+    if stop is not None:
+        q = np.maximum(q, stop)
+    q = np.round(q / 0.0015) * 0.0015
+    servo = ServoTable.from_dict({"drive": "torque", "joints": {"*": {"kp": 5.0, "torque_limit": 2.0}}}, source="test")
+    return Run("a.mcap", ("a",), t, cmd[:, None], t, q[:, None], servo, np.array([0.0, 0.0, -9.81]))
+
+
+def model_of(y: int = 0, z: int = 1, more: str = "", mass: float = 0.1) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(XML.format(y=y, z=z, more=more, mass=mass))
+
+
+def test_an_end_that_the_model_lacks_is_found_and_used():
+    model = model_of(more=' range="-2.7 2.7" limited="true"')
+    said = ends.used(model, [run_of(None, reach=0.8), run_of(-1.03)])
+    assert len(said) == 1 and "meets an end of its motion at -1.0" in said[0] and "-2.7" in said[0]
+    low, high = model.jnt_range[0]
+    assert low == pytest.approx(-1.03, abs=3e-3) and high == 2.7 and model.jnt_limited[0]
+
+
+def test_a_joint_that_follows_has_no_end():
+    model = model_of()
+    assert ends.used(model, [run_of(None), run_of(None, reach=0.5)]) == [] and not model.jnt_limited[0]
+
+
+def test_what_gravity_may_hold_is_no_end():
+    # 5 N.m/rad * 0.47 rad asked for at most, 1.5 N.m of gravity about a level axis
+    model = model_of(y=1, z=0, mass=3.0)
+    assert ends.used(model, [run_of(-1.03)]) == []
+
+
+def test_one_meeting_may_be_a_hand_in_the_way():
+    run = run_of(-1.03)
+    run = Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[:300], run.q[:300], run.servo, run.gravity)
+    assert ends.used(model_of(), [run]) == []
