@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, confidence, confirm, inputs, inverse, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confidence, confirm, ends, inputs, inverse, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
