@@ -15,6 +15,7 @@ from dexsim.gap.plant import JointPlant, nominal_row
 from dexsim.gap.plant_columns import SERIES_INDEX
 from dexsim.gap.runs import Run
 
+REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 BELIEF = 0.05  # nominal figures of a real machine are off by as much, and no finding before
 
 
@@ -95,7 +96,6 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
     for run, row in zip(runs, rows, strict=True):
         cmd = run.command_at(run.t)
         torques.append(np.stack([demand(row[j], voltage, cmd[:, j], run.q[:, j], run.vs[:, j]) for j in range(J)], 1))
-    reference = runs[0].temperature[:, :].min(0) if runs[0].temperature is not None else None
     cases = []
     for j, joint in enumerate(joints):
         if only is not None and joint not in only:
@@ -113,7 +113,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
             if run.enabled is not None:
                 exact["enabled"] = (run.enabled[:, j] > 0.5).astype(float)
             if run.temperature is not None:
-                exact["warmth"] = run.temperature[:, j] - reference[j]
+                exact["warmth"] = run.temperature[:, j] - REFERENCE
             if J > 1:
                 exact["others_torque"] = np.abs(np.delete(torques[i], j, 1)).sum(1)
             for k, o in enumerate(others[:4]):
@@ -160,7 +160,8 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         effort_noise = max(float(np.median(e)), 0.01 * big(plant.torque[np.isfinite(plant.torque)]), 1e-9)
     warm = 0.0
     if runs[0].temperature is not None:
-        warm = float(np.ptp(cat(lambda i: runs[i].temperature[:, j])))
+        heat = cat(lambda i: runs[i].temperature[:, j])
+        warm = float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
     scales = Scales(
         tau=tau_scale, demand=max(big(asked, 99.8) if not voltage else limit, tau_scale), speed=max(big(v), 1e-6),
         peak_speed=max(big(v, 99.8), 1e-6), error=max(big(cmd - plant.q, 90), sigma), stiffness=spring, inertia=inertia,
