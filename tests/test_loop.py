@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,30 @@ def test_queue_keeps_order_and_goes_on_where_it_stopped(tmp_path):
     done.clear()
     loop.Queue(jobs(), ["3"], 1, 0.0, 0.0, lambda: None).go()
     assert [n for n, _ in done] == ["broken"]  # only what did not work is tried again
+
+
+def test_queue_without_a_gpu_shares_the_cores_out(tmp_path):
+    """Trainings take cores then; never more than there are, and a large job is not overtaken by small ones of a higher rank."""
+    lock, now, most, order = threading.Lock(), [0], [0], []
+
+    def job(name, cores, rank=0, gpu=False, after=()):
+        def run(slot):
+            with lock:
+                now[0] += min(cores, 3)
+                most[0] = max(most[0], now[0])
+                order.append(name)
+            assert slot == "cpu"
+            time.sleep(0.05)
+            with lock:
+                now[0] -= min(cores, 3)
+            return True
+
+        return loop.Job(name, tmp_path / name, run, gpu, list(after), rank, cores)
+
+    every = [job("record", 1), job("diagnose", 9, rank=1, after=["record"]), *(job(f"train {k}", 1, rank=2, gpu=True, after=["record"]) for k in range(6))]
+    queue = loop.Queue(every, [], 3, 0.0, 0.0, lambda: None)
+    queue.go()
+    assert set(queue.state.values()) == {"done"} and most[0] == 3 and order[:2] == ["record", "diagnose"]
 
 
 def test_share_recovered_by_hand():

@@ -56,6 +56,15 @@ def test_rows_are_settings_of_train():
     assert all(np.median(r.listed) == pytest.approx(r.paper["median"]) for r in rows.ROTATION)
 
 
+def test_the_torque_row_is_paid_for_no_contact_force():
+    """Every reward of the default task that looks at the commanded force is off in it; R_torque is off in the force row."""
+    weights = {r.key: start.for_train(["task=grasp", "device=cpu", *r.settings], CONFIGS).cfg["task"]["rewards"] for r in rows.GRASP}
+    by_command = {"force", "force_near", "worst"}  # `torque` is the other half of the ablation
+    assert {k for k, w in weights["both"].items() if w != weights["torque"][k]} == by_command
+    assert all(weights["torque"][k] == 0 != weights["both"][k] for k in by_command)
+    assert {k for k, w in weights["both"].items() if w != weights["force"][k]} == {"torque"} and weights["force"]["torque"] == 0
+
+
 def test_the_command_line_is_checked():
     for argv, text in ((["table=chess"], "table=chess"), (["table=rotation", "rows=full,half"], "rows=full,half"),
                        (["table=rotation", "budget=-1"], "budget=-1"), (["table=grasp", "seeds=0.5"], "seeds=0.5"),

@@ -1,14 +1,15 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=dry,late] [seeds=3] [naive_s=150] [tune_s=120] [gpus=0,1,...]
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=dry,late] [seeds=3] [naive_s=150] [tune_s=120] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
+                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
 
 A reality is one hand: it is recorded (safe excitation, and the included policies' own runs in it) and diagnosed once. For each task
 and seed: the included policy goes on in the believed simulator without randomization of the drives (naive). Then three
 fine-tunes of the naive checkpoint at the same number of iterations: with the servo table that `diagnose` fitted (its intervals
 are the randomization), with wide randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
-training, as many at a time as there are GPUs; judging, recording and diagnosing use the CPUs meanwhile. Resumable: a step that is
-done is not repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
+training, as many at a time as there are GPUs; judging, recording and diagnosing use the CPUs meanwhile. gpus=none (where there is
+none, the default): trainings run on the CPU too, as many as cpus= cores allow. Resumable: a step that is done is not repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
 runs is ended. Writes loop.json, table.md, loop.png.
 """
 
@@ -32,7 +33,8 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "dry,late", "seeds": "3", "naive_s": "150", "tune_s": "120", "gpus": "", "cpus": str(os.cpu_count() or 1),
-            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0"}  # fmt: skip
+            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
+            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8"}  # fmt: skip
 # what is judged: file key, larger is better
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
@@ -46,7 +48,8 @@ VARIANTS = ("naive", "wide", "fitted", "truth")
 
 @dataclass
 class Job:
-    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or the CPU threads."""
+    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or "cpu". gpu: takes a GPU where
+    there are any; cores: that it takes otherwise."""
 
     name: str
     mark: Path
@@ -54,16 +57,22 @@ class Job:
     gpu: bool
     after: list[str] = field(default_factory=list)
     rank: int = 0
+    cores: int = 1
 
 
 class Queue:
-    """Runs jobs on GPUs and CPU slots as their predecessors finish."""
+    """Runs jobs on GPUs and CPU cores as their predecessors finish, the lowest rank first: none of a higher one overtakes it."""
 
-    def __init__(self, jobs: list[Job], gpus: list[str], cpu_slots: int, stop_s: float, kill_s: float, kill):
+    def __init__(self, jobs: list[Job], gpus: list[str], cores: int, stop_s: float, kill_s: float, kill):
         self.jobs = {j.name: j for j in jobs}
-        self.gpus, self.cpu_slots, self.stop_s, self.kill_s, self.kill = list(gpus), cpu_slots, stop_s, kill_s, kill
+        self.gpus, self.with_gpus, self.cores, self.free = list(gpus), bool(gpus), cores, cores
+        self.stop_s, self.kill_s, self.kill = stop_s, kill_s, kill
         self.state = {j.name: "done" if j.mark.is_file() else "waits" for j in jobs}
         self.lock, self.begun = threading.Condition(), time.perf_counter()
+
+    def _takes(self, job: Job) -> int:
+        """Cores of a job; a training on a GPU takes none."""
+        return 0 if job.gpu and self.with_gpus else min(job.cores, self.cores)
 
     def go(self) -> None:
         """Until nothing can be begun any more."""
@@ -73,6 +82,7 @@ class Queue:
                 spent = time.perf_counter() - self.begun
                 if self.kill_s and spent > self.kill_s:
                     self.kill()
+                full = False
                 for job in sorted(self.jobs.values(), key=lambda j: j.rank):
                     late = self.stop_s and spent > self.stop_s + (0.0 if job.gpu else JUDGING)
                     if self.state[job.name] != "waits" or late:
@@ -84,10 +94,12 @@ class Queue:
                         continue
                     if any(s != "done" for s in before):
                         continue
-                    if job.gpu and not self.gpus or not job.gpu and not self.cpu_slots:
+                    on_gpu = job.gpu and self.with_gpus
+                    if on_gpu and not self.gpus or not on_gpu and (full or self.free < self._takes(job)):
+                        full = full or not on_gpu
                         continue
-                    slot = self.gpus.pop(0) if job.gpu else "cpu"
-                    self.cpu_slots -= 0 if job.gpu else 1
+                    slot = self.gpus.pop(0) if on_gpu else "cpu"
+                    self.free -= self._takes(job)
                     self.state[job.name] = "runs"
                     threads.append(threading.Thread(target=self._one, args=(job, slot), daemon=True))
                     threads[-1].start()
@@ -107,10 +119,9 @@ class Queue:
             job.mark.write_text(f"{time.perf_counter() - start:.1f}\n", encoding="utf-8")
         with self.lock:
             self.state[job.name] = "done" if good else "failed"
-            if job.gpu:
+            if slot != "cpu":
                 self.gpus.append(slot)
-            else:
-                self.cpu_slots += 1
+            self.free += self._takes(job)
             done = sum(s in ("done", "failed") for s in self.state.values())
             spent = time.perf_counter() - self.begun
             print(f"  {done}/{len(self.state)} {job.name} {'done' if good else 'FAILED'} {time.perf_counter() - start:.0f} s; {spent:.0f} s spent", flush=True)
@@ -124,18 +135,17 @@ class Loop:
         self.s, self.out = s, Path(s["out"]).expanduser().resolve()
         self.tasks, self.worlds = s["tasks"].split(","), s["worlds"].split(",")
         self.seeds = list(range(1, int(s["seeds"]) + 1))
-        self.gpus = [g for g in s["gpus"].split(",") if g] or ["cpu"]
+        self.gpus = [g for g in s["gpus"].split(",") if g not in ("", "none")]
         self.episodes = {k: int(v) for k, v in (part.split(":") for part in s["episodes"].split(","))}
         self.running: set[subprocess.Popen] = set()
         self.extra = [x for x in s["train"].split(" ") if x]
-        cores = int(s["cpus"])
-        self.slots = max(cores // 8, 1)
-        self.threads = max(cores // self.slots, 1)
+        self.cores = int(s["cpus"])
+        self.uses = {k: max(1, min(int(s[f"{k}_cores"]), self.cores)) for k in ("train", "judge", "diagnose")}
 
-    def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 1200.0, on_poll=None) -> int:
-        """A command of the product, its output in a file. gpu: the one that it sees."""
+    def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 1200.0, on_poll=None, threads: int = 1) -> int:
+        """A command of the product, its output in a file. gpu: the one that it sees; threads: OMP_NUM_THREADS."""
         log.parent.mkdir(parents=True, exist_ok=True)
-        env = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        env = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
         with open(log, "w", encoding="utf-8") as file:
             process = subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
@@ -184,7 +194,7 @@ class Loop:
                     first.append(time.perf_counter())
                 return bool(first) and time.perf_counter() - first[0] > float(self.s["naive_s"])
 
-            worlds = [] if device == "cpu" else ["worlds=8192"]
+            worlds = ["worlds=128", f"sim.threads={self.uses['train']}"] if device == "cpu" else ["worlds=8192"]
             self.call(["train.py", f"resume={where / 'start.pt'}", "iterations=1000000", f"out={where / 'naive'}", f"device={device}", "final_episodes=0",
                        "save_interval=100000", *worlds, *self.extra], where / "naive.log", slot, on_poll=enough)  # fmt: skip
             return (where / "naive" / "last.pt").is_file()
@@ -207,7 +217,8 @@ class Loop:
             # the same for all variants and seeds of a task whose naive ran as fast; rounded so that it is the same number
             more = max(int(round(float(self.s["tune_s"]) / each, -1)), 5)
             argv = ["train.py", f"resume={base / 'naive' / 'last.pt'}", f"iterations={int(float(rows[-1]['iteration'])) + more}", f"out={where}",
-                    f"device={self.device(slot)}", "final_episodes=0", "save_interval=100000", *self.extra]  # fmt: skip
+                    f"device={self.device(slot)}", "final_episodes=0", "save_interval=100000",
+                    *([f"sim.threads={self.uses['train']}"] if slot == "cpu" else []), *self.extra]  # fmt: skip
             if variant == "wide":
                 argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
             elif variant == "fitted":
@@ -232,7 +243,7 @@ class Loop:
             where = self.folder(task, seed, world) / f"judged_{variant}"
             cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
             status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}", f"episodes={self.episodes[task]}",
-                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.threads}", *cap], where / "log.txt", limit=400)  # fmt: skip
+                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap], where / "log.txt", limit=400)  # fmt: skip
             return status == 0 and (where / "metrics.json").is_file()
 
         return run
@@ -251,7 +262,7 @@ class Loop:
             where.mkdir(parents=True, exist_ok=True)
             cap = ["task.evaluation.cap_s=12"] if task == "rotate" else []
             return self.call(["play.py", f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"reality={world}", "episodes=8", "seed=5", "video=false",
-                              f"out={self.out / f'own_{task}_{world}'}", f"sim.threads={self.threads}", f"record={where / f'own_{task}.mcap'}", "record_worlds=1",
+                              f"out={self.out / f'own_{task}_{world}'}", f"sim.threads={self.uses['judge']}", f"record={where / f'own_{task}.mcap'}", "record_worlds=1",
                               "realistic=true", *cap], self.out / f"own_{task}_{world}.log", limit=200) == 0  # fmt: skip
 
         return run
@@ -271,7 +282,7 @@ class Loop:
             def attempt(device: str) -> None:
                 out = self.out / f"diagnosis_{world}_{device}"
                 status = self.call([*argv, f"out={out}", f"device={device}"], self.out / f"diagnosis_{world}_{device}.log", slot if device == "cuda" else "",
-                                   float(self.s["diagnose_s"]), lambda: bool(first))  # fmt: skip
+                                   float(self.s["diagnose_s"]), lambda: bool(first), threads=self.uses["diagnose"])  # fmt: skip
                 if status == 0 and (out / "servo.yaml").is_file():
                     first.append(out)
 
@@ -291,17 +302,18 @@ class Loop:
         out = []
         for w in self.worlds:
             out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
-            out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0) for t in self.tasks]
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), len(self.gpus) > 1, [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0))
+            out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0, self.uses["judge"]) for t in self.tasks]
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), len(self.gpus) > 1,
+                           [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0, self.uses["diagnose"]))
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
-                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1))
-                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5 + seed))
+                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"]))
+                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5 + seed, self.uses["train"]))
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
-                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank))
+                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"]))
                     add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 9)
                     add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], 2)
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 3 + seed)
@@ -412,7 +424,7 @@ def main(argv: list[str]) -> dict:
     loop = Loop(s)
     loop.out.mkdir(parents=True, exist_ok=True)
     if s["report"] != "true":
-        Queue(loop.jobs(), loop.gpus, loop.slots, float(s["stop_s"]), float(s["kill_s"]), loop.kill).go()
+        Queue(loop.jobs(), loop.gpus, loop.cores, float(s["stop_s"]), float(s["kill_s"]), loop.kill).go()
     data = loop.report()
     (loop.out / "loop.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")

@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
     episodes = int(number(own, "episodes", 2, 1e6, whole=True))
     other = max(2, episodes // 2) if own["other_episodes"] == "null" else int(number(own, "other_episodes", 2, 1e6, whole=True))
     minutes, sitting = (None if own[k] == "null" else number(own, k, 0.01, 1e5) for k in ("minutes", "sitting"))
-    spare = max(1, cores - 2 * len(gpus))  # a training keeps a core or two busy
+    spare = max(1, cores - math.ceil(1.5 * len(gpus)))  # what the trainings leave
     threads = max(1, min(4, spare // (2 * len(gpus))))  # few: a judging of twice the threads is not twice as fast
     plan = jobs.Plan(
         Path(own["out"] if own["out"] != "null" else f"out/reproduce_{table}").expanduser().absolute(), task,

@@ -56,7 +56,7 @@ GRASP = (  # table "Ablation on the rewards R_Force and R_torque"
     Row("both", "R_force + R_torque", (), {"force_low": 44.50, "force_high": 93.92, "torque_low": 1.09, "torque_high": 1.52}),
     Row("force", "R_force only", ("task.rewards.torque=0",),
         {"force_low": 37.29, "force_high": 70.02, "torque_low": 0.69, "torque_high": 0.75}),
-    Row("torque", "R_torque only", ("task.rewards.force=0", "task.rewards.force_near=0"),
+    Row("torque", "R_torque only", ("task.rewards.force=0", "task.rewards.force_near=0", "task.rewards.worst=0"),
         {"force_low": 38.45, "force_high": 47.12, "torque_low": 0.85, "torque_high": 1.02}),
 )
 TABLES = {"rotation": ROTATION, "grasp": GRASP}
