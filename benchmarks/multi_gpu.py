@@ -138,7 +138,8 @@ def draw(results: list[dict], path: Path) -> Path:
     for r in good:
         left.plot(r["curve"]["time_s"], r["curve"]["share"], label=r["name"], linestyle="--" if r["name"].startswith("fixed") else "-")
     left.set(xlabel="seconds of learning", ylabel="share of episodes held to the end", ylim=(0.5, 1))
-    left.legend(fontsize=8)
+    if good:
+        left.legend(fontsize=8)
     weak = [r for r in good if not r["name"].startswith("fixed")]
     if weak:
         x = [r["gpus"] for r in weak]

@@ -271,7 +271,7 @@ def figure(rows: dict[str, dict], path: Path, about: str) -> None:
     names = list(rows)[::-1]
     fig, axes = plt.subplots(1, 4, figsize=(13, 1.2 + 0.24 * len(names)), sharey=True)
     panels = (("steps_per_s", 1e-3, "thousand steps/s that physics\nand servo allow"), ("held", 100.0, "held, palm down (%)"),
-              ("creep_mm_s", 1.0, "creep under load (mm/s):\nmedian, 95 %"), ("other_depth_p95_mm", 1.0, "penetration, 95 % (mm):\nfingertips, all else"))
+              ("creep_mm_s", 1.0, "creep under load (mm/s):\nfilled: median, hollow: 95 %"), ("other_depth_p95_mm", 1.0, "penetration, 95 % (mm):\nfilled: fingertips, hollow: all else"))
     for ax, (key, unit, label) in zip(axes, panels, strict=True):
         for y, name in enumerate(names):
             colour = "C3" if name == "chosen" else "C0"
@@ -284,6 +284,7 @@ def figure(rows: dict[str, dict], path: Path, about: str) -> None:
         ax.set_xlabel(label, fontsize=9)
         ax.grid(alpha=0.3)
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
+    axes[0].set_xlim(left=0.0)
     axes[2].set_xscale("log")
     fig.suptitle(about, fontsize=9)
     fig.tight_layout()
