@@ -110,8 +110,8 @@ def test_what_training_cannot_be_given_is_not_confirmed():
     found = search.fit((Member(EFFECTS["lag"], variant),), np.array([0.03]), none, quick=True)
     c = confirm.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
     engine, plant = c.errors["found"]
-    assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["lag@joint"]
-    assert "Not confirmed" in c.text() and "lag@joint" in c.text()
+    assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["lag (velocity filter)@joint"]
+    assert "Not confirmed" in c.text() and "lag (velocity filter)@joint" in c.text()
 
 
 def test_the_tasks_step_is_that_of_the_configuration():

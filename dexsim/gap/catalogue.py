@@ -60,6 +60,7 @@ class Variant:
     label: str = ""
     fixed: tuple[tuple[str, float], ...] = ()
     note: dict = field(default_factory=dict)
+    refines: bool = False  # adds parameters to the first variant: tried only where that one was found
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,9 @@ def _compliance(s: Scales) -> list[Variant]:
     # not stiffer than a tenth of the loop's own spring is softness that leaves no trace
     top = 3.0 / s.stiffness
     soft = _p("softness", "softness", "set", 0.04 / s.stiffness, top, 0.04 / s.stiffness, "rad/N.m")
-    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.1, 0.15, 0.25, 0.4, 0.65, 1.0, 1.7)))]
+    hard = _p("hardening", "hardening", "set", 0.0, 8.0 / s.tau**2, 0.0, "1/(N.m)2")
+    starts = tuple((0.4 / s.stiffness, h / s.tau**2) for h in (0.1, 0.5, 2.5))
+    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.1, 0.15, 0.25, 0.4, 0.65, 1.0, 1.7))), Variant((soft, hard), starts, "hardening", refines=True)]
 
 
 def _delay(s: Scales) -> list[Variant]:
@@ -256,6 +259,12 @@ def _payload(s: Scales) -> list[Variant]:
     if np.isfinite(unit) and s.load_torque > 0.02 * s.gravity:
         mass = _p("mass", "payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
         out.append(Variant((mass,), tuple((f * unit,) for f in (0.03, 0.08, 0.2, 0.5, 1.0, -0.06, -0.15)), "mass"))
+        reach = np.sqrt(s.load_inertia)  # of the last link's centre from the hinge
+        if not s.slide and reach > 1e-3:
+            params = (_p("mass", "payload", "set", 0.0, 2.0 * unit, 0.0, "kg"), _p("com_out", "com_out", "set", -1.2 * reach, 1.2 * reach, 0.0, "m"),
+                      _p("com_across", "com_across", "set", -1.2 * reach, 1.2 * reach, 0.0, "m"))  # fmt: skip
+            starts = tuple((f * unit, a * reach, b * reach) for f in (0.1, 0.4) for a, b in ((0.0, 0.5), (0.0, -0.5), (-0.4, 0.0), (0.4, 0.0)))
+            out.append(Variant(params, starts, "mass and its centre"))
     for letter, size in s.tilt.items():
         if size > 0.05 * s.tau * 0.1 and size > 0.2 * max(s.tilt.values()):
             p = _p(f"tilt_{letter}", f"tilt_{letter}", "set", -0.8, 0.8, 0.0, "rad")

@@ -23,7 +23,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import judge
-from dexsim.gap.findings import handed, model_changes
+from dexsim.gap.findings import MODEL_COLUMNS, handed, model_changes
 from dexsim.gap.fit import expand
 from dexsim.gap.plant_columns import SERIES_INDEX
 from dexsim.gap.prepare import Case
@@ -142,8 +142,8 @@ def missing_of(h: Hypothesis) -> list[str]:
         for x in trial.members:
             columns = {c for p in x.variant.params for c in p.columns}
             fixed = {name for name, value in x.variant.fixed if value}
-            if (columns - set(SERVO_INDEX) - {"armature", "payload"}) or fixed:
-                out.append(f"{x.id}@{joint}")
+            if (columns - set(SERVO_INDEX) - set(MODEL_COLUMNS)) or fixed:
+                out.append(f"{x.id} ({x.variant.label})@{joint}" if x.variant.label else f"{x.id}@{joint}")
     return sorted(out)
 
 

@@ -13,6 +13,9 @@ from dexsim.gap.fit import Param
 from dexsim.gap.prepare import Case
 
 
+MODEL_COLUMNS = ("armature", "payload", "com_out", "com_across")  # those of the plant that are fields of the model
+
+
 def _entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
     low, high = min(low, high), max(low, high)
     return {"value": float(value), "low": float(low), "high": float(high), "unit": unit}
@@ -40,6 +43,9 @@ def finding_parameters(member, raw: dict[str, float], spread: dict[str, tuple[fl
         value, low, high = get("softness")
         invert = lambda x: 1.0 / max(x, 1e-9)  # noqa: E731
         out["stiffness"] = _entry(invert(value), invert(high), invert(low), f"{force}/{length}")
+        if "hardening" in raw:  # torque k x (1 + hardening x^2)
+            k = invert(value)
+            out["hardening"] = _entry(*(h * k**2 for h in get("hardening")), f"1/{length}2")
     elif e == "command_delay":
         out["delay"] = _entry(*get("delay"), "s")
     elif e == "lag":
@@ -70,6 +76,8 @@ def finding_parameters(member, raw: dict[str, float], spread: dict[str, tuple[fl
     elif e == "payload":
         if "mass" in raw:
             out["mass"] = _entry(*get("mass"), "kg")
+            if "com_out" in raw:
+                out["com"] = centre_of_mass(case, raw, spread)
         else:
             tilt = [raw.get(f"tilt_{k}", 0.0) for k in "xyz"]
             lows = [spread.get(f"tilt_{k}", (0.0, 0.0))[0] for k in "xyz"]
@@ -89,6 +97,16 @@ def finding_parameters(member, raw: dict[str, float], spread: dict[str, tuple[fl
     return out
 
 
+def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[float, float]]) -> dict[str, Any]:
+    """[3] m: where the added mass sits in the last link's frame, with its interval. Along the hinge the joint feels nothing: there it is
+    taken to sit as the link's own centre does."""
+    c = case.constants
+    value = c.centre + raw["com_out"] * c.places[0] + raw["com_across"] * c.places[1]
+    half = np.sqrt(sum((0.5 * np.ptp(spread[k]) * way) ** 2 for k, way in zip(("com_out", "com_across"), c.places, strict=True)))
+    lists = {k: [round(float(v), 6) for v in x] for k, x in (("value", value), ("low", value - half), ("high", value + half))}
+    return lists | {"unit": "m"}
+
+
 def handed(p: Param, case: Case) -> bool:
     """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
     return not (p.nuisance and p.key in ("delay", "lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
@@ -102,7 +120,7 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> l
             continue
         for name in p.columns:
             if name not in INDEX:
-                if not p.nuisance and name not in ("armature", "payload"):
+                if not p.nuisance and name not in MODEL_COLUMNS:
                     left.append(f"{name}@{case.joint}")
                 continue
             column = COLUMNS[INDEX[name]]
@@ -130,21 +148,45 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
         else:
             said.append(f"{case.joint} has {-by_member['inertia']['armature']:.3g} kg.m2 less inertia than the model's links and armature together; "
                         "change its links' inertia")  # fmt: skip
-    mass = by_member.get("payload", {}).get("mass")
-    if mass is not None:
-        from dexsim.gap.mechanics import leaf_of
-
-        model = spec.compile()
-        body = leaf_of(model, int(model.jnt_bodyid[model.joint(case.joint).id]))
-        name = model.body(body).name
-        if mass > 0 and spec.body(name).explicitinertial:  # geoms do not count there
-            spec.body(name).mass += mass
-            said.append(f"model.xml: {mass:.3g} kg added to {name}")
-        elif mass > 0:
-            spec.body(name).add_geom(name=f"payload_{case.joint}", type=2, size=[0.004, 0, 0], mass=mass,
-                                     pos=model.body_ipos[body].tolist(), contype=0, conaffinity=0, group=3)  # fmt: skip
-            said.append(f"model.xml: {mass:.3g} kg added to {name}")
+    payload = by_member.get("payload", {})
+    if payload.get("mass"):
+        place = None
+        if "com_out" in payload:
+            c = case.constants
+            place = c.centre + payload["com_out"] * c.places[0] + payload["com_across"] * c.places[1]
+        said.append(add_mass(spec, case.joint, payload["mass"], place))
     return said
+
+
+def add_mass(spec, joint: str, mass: float, place: np.ndarray | None) -> str:
+    """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint, by default at that link's
+    centre of mass; returns what was done, in words."""
+    import mujoco
+
+    from dexsim.gap.mechanics import leaf_of
+
+    model = spec.compile()
+    leaf = leaf_of(model, int(model.jnt_bodyid[model.joint(joint).id]))
+    name, m0, c0 = model.body(leaf).name, float(model.body_mass[leaf]), model.body_ipos[leaf].copy()
+    place = c0 if place is None else np.asarray(place, float)
+    if m0 + mass < 0.05 * m0:
+        return f"{joint} carries {-mass:.3g} kg less than the model's links after it; change their masses"
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.body_iquat[leaf])
+    rotation = rotation.reshape(3, 3)
+    centre = (m0 * c0 + mass * place) / (m0 + mass)
+    inertia = rotation @ np.diag(model.body_inertia[leaf]) @ rotation.T
+    for m, r in ((m0, c0 - centre), (mass, place - centre)):
+        inertia += m * (r @ r * np.eye(3) - np.outer(r, r))
+    values, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    body = spec.body(name)
+    body.fullinertia = [np.nan] * 6  # not given: principal axes instead
+    body.explicitinertial, body.mass, body.ipos, body.iquat, body.inertia = True, m0 + mass, centre, quat, np.maximum(values, 1e-12)
+    where = "" if np.allclose(place, c0) else f" at {' '.join(f'{x:.4f}' for x in place)} m in its frame"
+    return f"model.xml: {mass:.3g} kg {'added to' if mass > 0 else 'on'} {name}{where}"
 
 
 def save_model(spec, path: Path) -> None:

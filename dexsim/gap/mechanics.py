@@ -25,6 +25,9 @@ class JointConstants:
     armature: float
     inertia: float  # median about the joint, kg.m2
     gravity: float  # largest gravity torque along the motion, N.m
+    leaf: str = ""  # the last link after it
+    centre: np.ndarray | None = None  # [3] m: that link's centre of mass in the link's frame
+    places: np.ndarray | None = None  # [2, 3] in the link's frame: out from the hinge, and along the way it turns there
 
 
 def load_model(path: str) -> mujoco.MjModel:
@@ -89,6 +92,8 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
     diag = np.empty((n, J))
     bias = np.empty((n, J))
     passive = np.empty((n, J))
+    turn = np.empty((n, J, 3, 3))
+    places = _places(model, data, ids, leaves)
     full = np.zeros((nv, nv))
     acc = np.zeros(nv)
     gravity = np.array(model.opt.gravity)
@@ -107,6 +112,7 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
             passive[i] = data.qfrc_spring[dadr]
             axis[i], anchor[i] = data.xaxis[ids], data.xanchor[ids]
             com[i], point[i] = data.subtree_com[bodies], data.xipos[leaves]
+            turn[i] = data.xmat[leaves].reshape(J, 3, 3)
     finally:
         model.opt.gravity[:] = gravity
         model.opt.disableflags = flags
@@ -129,6 +135,14 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
             put(j, f"{prefix}_sin", s)
             if prefix == "load":
                 put(j, "load_inertia", square)
+        lever = np.cross(axis[:, j], point[:, j] - anchor[:, j])
+        for name, way in zip(("out", "across"), places[j], strict=True):
+            arm = turn[:, j] @ way
+            if not slide[j]:
+                c, s, _ = _turned(axis[:, j], arm, 1.0, run.gravity, False)
+                put(j, f"com_{name}_cos", c)
+                put(j, f"com_{name}_sin", s)
+                put(j, f"com_{name}_inertia", 2.0 * (lever * np.cross(axis[:, j], arm)).sum(-1))
         for k, letter in enumerate("xyz"):
             tilted = np.cross(np.eye(3)[k], run.gravity)
             c, s, _ = _turned(axis[:, j], com[:, j] - anchor[:, j], mass[j], tilted, slide[j])
@@ -150,9 +164,28 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
                 armature=float(model.dof_armature[dadr[j]]),
                 inertia=float(np.median(diag[:, j])),
                 gravity=float(np.abs(out[j, :, SERIES_INDEX["gravity_cos"]]).max()),
+                leaf=model.body(int(leaves[j])).name,
+                centre=model.body_ipos[leaves[j]].copy(),
+                places=places[j],
             )
         )
     return times, out, constants
+
+
+def _places(model: mujoco.MjModel, data: mujoco.MjData, ids, leaves) -> np.ndarray:
+    """[J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a joint feels it: out
+    from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a joint feels nothing)."""
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_kinematics(model, data)
+    out = np.empty((len(ids), 2, 3))
+    for j, (i, leaf) in enumerate(zip(ids, leaves, strict=True)):
+        axis, arm = data.xaxis[i], data.xipos[leaf] - data.xanchor[i]
+        arm = arm - (arm @ axis) * axis
+        if np.linalg.norm(arm) < 1e-6:
+            arm = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        arm = arm / np.linalg.norm(arm)
+        out[j] = np.stack([arm, np.cross(axis, arm)]) @ data.xmat[leaf].reshape(3, 3)
+    return out
 
 
 def _turned(axis, arm, mass, gravity, slide):

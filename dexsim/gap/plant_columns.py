@@ -37,7 +37,15 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("coupling_from", 0.0, "1", "which of the draggers"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),
+    ("com_out", 0.0, "m", "centre of the added mass, out from the hinge beyond the last link's centre of mass"),
+    ("com_across", 0.0, "m", "the same, along the way it turns"),
+    ("hardening", 0.0, "1/(N.m)2", "the transmission's torque k x grows to k x (1 + hardening (k x)^2)"),
+    ("late_by", 0.0, "s", "some of the commands act later by as much (to see what one command's time does)"),
+    ("late_at", 0.0, "1", "which: those of group late_at, modulo LATE_GROUPS"),
+    ("late_group", 1.0, "1", "commands in a row that are one group"),
 )
+
+LATE_GROUPS = 128
 
 NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
@@ -56,6 +64,8 @@ SERIES: tuple[str, ...] = (
     "warmth",  # temperature above the reference, degC
     "enabled",
     "drive",  # recorded motor torque (or duty) where a stage is tested with its recorded input
+    "com_out_cos", "com_out_sin", "com_out_inertia",  # what the added mass's place adds: per kg.m, inertia linear in the place
+    "com_across_cos", "com_across_sin", "com_across_inertia",
     "drag0", "drag1", "drag2", "drag3",  # motion of the joints that may drag this one, from its first sample, rad
 )  # fmt: skip
 SERIES_INDEX: dict[str, int] = {name: i for i, name in enumerate(SERIES)}

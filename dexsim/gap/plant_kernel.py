@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import warp as wp
 
-from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
+from dexsim.gap.plant_columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
 ONE_BODY_STEPS = 1
@@ -60,6 +60,9 @@ XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in
 XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKE, P_DEADKIND = INDEX["presliding"], INDEX["brake"], INDEX["deadband_kind"]
+P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
+P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
+XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
 
 @lru_cache(maxsize=None)
@@ -136,6 +139,13 @@ def plant_kernel():
         return m
 
     @wp.func
+    def acts_at(t: f64, i: int, late: f64, at: int, group: int):
+        """When command i acts, but for the delay: its time t, later where it is one of those that are."""
+        if late != f64(0.0) and (i // group) % LATE_GROUPS == at:
+            return t + late
+        return t
+
+    @wp.func
     def giving(free: f64, a: f64, level: f64, z: f64, w: f64):
         """Speed v at the end of a step under Dahl's friction level * z', z' = (z + v / w) / (1 + |v| / w), which gives way
         elastically before it slides (P. Dahl 1968, taken implicitly): a (v - free) + level z' = 0. z: share of the level
@@ -200,6 +210,14 @@ def plant_kernel():
         peak = params[h, P_PEAK]
         tilted = params[h, P_TX] != zero or params[h, P_TY] != zero or params[h, P_TZ] != zero
         speed_lag = params[h, P_SPEEDLAG]
+        load_mass = params[h, P_PAYLOAD]
+        out = params[h, P_COUT]
+        across = params[h, P_CACROSS]
+        off_centre = load_mass != zero and (out != zero or across != zero)
+        hard = params[h, P_HARD]
+        late = params[h, P_LATE]
+        late_at = int(params[h, P_LATEAT])
+        late_group = int(params[h, P_LATEGROUP])
         voltage = consts[C_VOLTAGE]
         base_damping = consts[C_DAMPING]
         base_friction = consts[C_FRICTION]
@@ -245,12 +263,12 @@ def plant_kernel():
 
             # target in force at the end of this step, averaged over it
             end = t + dt - delay
-            while k + 1 < c_end and cmd_t[k + 1] <= end - dt:
+            while k + 1 < c_end and acts_at(cmd_t[k + 1], k + 1, late, late_at, late_group) <= end - dt:
                 k += 1
             target = cmd[k]
             kk = int(k)
-            while kk + 1 < c_end and cmd_t[kk + 1] < end:
-                part = wp.clamp((end - cmd_t[kk + 1]) / dt, zero, one)
+            while kk + 1 < c_end and acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group) < end:
+                part = wp.clamp((end - acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group)) / dt, zero, one)
                 target += part * (cmd[kk + 1] - cmd[kk])
                 kk += 1
             target += params[h, P_COUPLING] * series[g, XDRAG + int(params[h, P_FROM])]
@@ -269,9 +287,13 @@ def plant_kernel():
             if voltage <= zero:
                 eff = eff * torque_factor
 
-            inertia = params[h, P_ISCALE] * series[g, XI] + params[h, P_ARM] + params[h, P_PAYLOAD] * series[g, XLI]
-            gc = params[h, P_GSCALE] * series[g, XGC] + params[h, P_PAYLOAD] * series[g, XLC]
-            gs = params[h, P_GSCALE] * series[g, XGS] + params[h, P_PAYLOAD] * series[g, XLS]
+            inertia = params[h, P_ISCALE] * series[g, XI] + params[h, P_ARM] + load_mass * series[g, XLI]
+            gc = params[h, P_GSCALE] * series[g, XGC] + load_mass * series[g, XLC]
+            gs = params[h, P_GSCALE] * series[g, XGS] + load_mass * series[g, XLS]
+            if off_centre:
+                inertia += load_mass * (out * series[g, XOI] + across * series[g, XAI] + out * out + across * across)
+                gc += load_mass * (out * series[g, XOC] + across * series[g, XAC])
+                gs += load_mass * (out * series[g, XOS] + across * series[g, XAS])
             if tilted:
                 gc += params[h, P_TX] * series[g, XTXC] + params[h, P_TY] * series[g, XTYC] + params[h, P_TZ] * series[g, XTZC]
                 gs += params[h, P_TX] * series[g, XTXS] + params[h, P_TY] * series[g, XTYS] + params[h, P_TZ] * series[g, XTZS]
@@ -422,8 +444,12 @@ def plant_kernel():
                     if wp.abs(twist) >= gap2:
                         engaged = one
                         side = wp.sign(twist) * gap2
-                    kh = engaged * (stiff * dts + damp)
-                    pull = engaged * stiff * (qm - q - side)
+                    stretch = stiff * (qm - q - side)
+                    harder = one
+                    if soft > zero:
+                        harder = one + hard * stretch * stretch
+                    kh = engaged * ((f64(3.0) * harder - f64(2.0)) * stiff * dts + damp)  # its slope at this stretch
+                    pull = engaged * stretch * harder
                     d_m = damping + slope_m
                     d_l = zero
                     if consts[C_LOOP_MOTOR] < half:

@@ -153,7 +153,8 @@ class JointSearch:
         out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
         if not s.voltage and s.nominal["no_load_speed"] < 1e8:
             out.append(Param("brake", ("brake",), "set", -1.0, 1.0, 1.0, nuisance=True))
-        out.append(Param("inertia", ("inertia_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
+        low, high = c.factors.get("inertia", (1 - BELIEF, 1 + BELIEF))
+        out.append(Param("inertia", ("inertia_scale",), "factor", low, high, 0.5 * (low + high), nuisance=True, sd=0.25 * (high - low)))
         if s.gravity > 0.01 * s.tau:
             out.append(Param("gravity", ("gravity_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         if c.constants.damping > 0:
@@ -226,7 +227,7 @@ class JointSearch:
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for variant in effect.variants(case.scales):
-                variant = self._narrow(variant)
+                variant = None if variant.refines else self._narrow(variant)
                 if variant is None:
                     continue
                 member = Member(effect, variant)
@@ -472,7 +473,7 @@ class JointSearch:
             current, level = best, trials
             if len(current.members) > 1:
                 current, level = self._swap(current, pool, level)
-        current = self._drop(current)
+        current = self._refine(self._drop(current))
         final = self.rivals(current, pool)
         if len(current.members) == 1:  # one that only seemed worse before it was fitted in full takes the place
             others, share, _ = final[current.members[0].id]
@@ -507,12 +508,12 @@ class JointSearch:
         n = sum(len(m.variant.params) for m in trial.members)
         return trial.fit.x[:n]
 
-    def _earns(self, new: Trial, old: Trial) -> bool:
+    def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
         a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
         if gain < LEAST:
             return False
-        if old.members:  # what follows must matter beside what was found
+        if old.members and further:  # what follows must matter beside what was found
             rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
             if rms(a) - rms(b) < SECOND * (rms(self.none_loss) - rms(a)):
                 return False
@@ -567,6 +568,28 @@ class JointSearch:
                 less = self.fit(rest, kept, current, quick=True)
                 if not self._earns(current, less):
                     current, changed = less, True
+                    break
+        return current
+
+    def _refine(self, current: Trial) -> Trial:
+        """Members with more parameters (an elasticity that hardens), where those earn their place."""
+        for i, member in enumerate(current.members):
+            for variant in member.effect.variants(self.case.scales):
+                variant = self._narrow(variant) if variant.refines else None
+                if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
+                    continue
+                sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+                values = np.split(self._values(current), sizes)
+                known = dict(zip([p.key for p in member.variant.params], values[i], strict=True))
+                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+                extra = {tuple(v for p, v in zip(variant.params, start, strict=True) if p.key not in known): start for start in variant.starts}
+                tries = []
+                for start in extra.values():
+                    values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
+                    tries.append(self.draft(members, np.concatenate(values), current))
+                more = self.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
+                if self._earns(more, current, further=False) and self._score(more) < self._score(current):
+                    current = more
                     break
         return current
 
