@@ -328,7 +328,9 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     assert set(p) == {"value", "low", "high", "unit"} and p["value"] == pytest.approx(0.02, abs=0.003) and p["low"] <= p["value"] <= p["high"]
     assert all(w["end"] >= w["start"] and w["recording"].endswith(".mcap") for w in f["when"])
     assert data["held_out"]["after"] < 0.4 * data["held_out"]["before"]
-    assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on"}
+    assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on", "not_considered"}
+    assert data["unexplained"]["not_considered"]["joint_coupling"] == "no other joint moves"  # a single joint, no touch
+    assert {"supply_sag", "tactile_gain"} <= set(data["unexplained"]["not_considered"]) and "backlash" not in data["unexplained"]["not_considered"]
 
 
 def test_fitted_servo_loads_again_with_its_interval(answer):

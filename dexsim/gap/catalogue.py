@@ -94,6 +94,9 @@ CONFUSED: tuple[frozenset[str], ...] = tuple(
 """Classes of effects that some recordings cannot tell apart (the only sets that may be reported)."""
 
 
+MIN_WARMTH = 2.0  # degC: a smaller change of temperature tells nothing
+
+
 def _p(key, column, mode, low, high, start=0.0, unit="1"):
     return Param(key, (column,) if isinstance(column, str) else tuple(column), mode, float(low), float(high), float(start), unit)
 
@@ -210,7 +213,7 @@ def _ripple(s: Scales) -> list[Variant]:
 
 
 def _thermal(s: Scales) -> list[Variant]:
-    if s.warm < 2.0:
+    if s.warm < MIN_WARMTH:
         return []
     out = []
     for of, column in (("torque_constant", "thermal_torque"), ("friction", "thermal_friction"), ("resistance", "thermal_resistance")):

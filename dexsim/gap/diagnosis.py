@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, confidence, confirm, ends, inputs, inverse, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
@@ -98,7 +98,7 @@ def empty(verdict: str = "unusable") -> dict[str, Any]:
     zero = {"recordings": [], "error": "position_rmse_rad"}
     zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
     return {"schema": 1, "verdict": verdict, "noise_floor": {"position_rad": None, "how": "quantum"}, "nuisance": {}, "held_out": zero,
-            "findings": [], "unexplained": {"fraction_of_gap": None, "depends_on": []}, "next_recording": None}
+            "findings": [], "unexplained": {"fraction_of_gap": None, "depends_on": [], "not_considered": {}}, "next_recording": None}
 
 
 class Clock:
@@ -183,7 +183,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         if felt.before is None and not felt.findings:
             return _unusable(reason, channel, notes, m)
         notes.append(f"no joint is judged: {reason}")
+        left_out = excluded.reasons((), felt, s.allowed)
+        notes.extend(_cannot(s, left_out))
         out = _touch_only(channel, felt, notes, m)
+        out.data["unexplained"]["not_considered"] = left_out
         out.lengths = lengths
         if s.next_recording:
             _next(out, s, m, (), [r for r in recordings if r is not None])
@@ -216,7 +219,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
     cases = sharpen(model, runs, cases, s.device, _step(runs), only=s.joints)
-    notes += _cannot(s, cases, felt)
+    left_out = excluded.reasons(cases, felt, s.allowed)
+    notes += _cannot(s, left_out)
     if s.joints is not None:
         cases = [c for c in cases if c.joint in s.joints]
         if not cases:
@@ -259,6 +263,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("search")
     result = _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_how, how, channel, notes, rng, clock)
     result.stages = [x.text for x in stages] + behind
+    result.data["unexplained"]["not_considered"] = left_out
     _with_touch(result, felt)
     result.lengths = lengths
     clock.lap("judging on held-out data")
@@ -571,18 +576,12 @@ def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
                 raise UserError(f"held_out: {h.path.name} holds the same readings as {r.path.name}; what is held out must not be fitted")
 
 
-def _cannot(s: Settings, cases: Sequence[Case], felt: touch.TouchResult) -> list[str]:
+def _cannot(s: Settings, left_out: dict[str, str]) -> list[str]:
     """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
     from dexsim.gap.touch_effects import BY_ID
 
-    notes = []
-    for e in sorted(s.allowed or ()):
-        if e in BY_ID and e not in EFFECTS:
-            if not felt.contact:
-                notes.append(f"{e} cannot be seen here: nothing is touched in these recordings; to see it: {BY_ID[e].experiment}")
-        elif not any(EFFECTS[e].variants(c.scales) for c in cases):
-            notes.append(f"{e} cannot be seen on this mechanism with these recordings; to see it: {EFFECTS[e].experiment}")
-    return notes
+    asked = [e for e in sorted(s.allowed or ()) if e in left_out]
+    return [f"{e} cannot be seen here: {left_out[e]}; to see it: {(EFFECTS.get(e) or BY_ID[e]).experiment}" for e in asked]
 
 
 def _still(s: Settings) -> str:

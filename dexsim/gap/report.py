@@ -311,6 +311,10 @@ def _details(d: Diagnosis) -> str:
                        f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}"))  # fmt: skip
     if d.stages:
         folded.append(("Stage by stage", "<ul>" + "".join(f"<li>{_t(x)}</li>" for x in d.stages) + "</ul>"))
+    absent = d.data["unexplained"].get("not_considered", {})
+    if absent:
+        items = "".join(f"<tr><td>{_t(_name(e))}</td><td>{_t(why)}</td></tr>" for e, why in absent.items())
+        folded.append(("Not considered", f"<table>{items}</table>"))
     if d.confirmation is not None:
         folded.append(("In the engine that trains", _confirmed(d)))
     nuisance = ", ".join(f"{_t(k)} {v:.4g}" for k, v in d.data["nuisance"].items())

@@ -57,6 +57,7 @@ class TouchResult:
     recordings: list[str] = field(default_factory=list)
     depends_on: list[str] = field(default_factory=list)
     contact: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # by recording: stretches in touch, s
+    tactile: bool = False  # whether taxels were recorded at all
 
 
 def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: int = 0, allowed: set[str] | None = None,
@@ -66,6 +67,7 @@ def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: in
     touching = [r for r in recordings if r.tactile is not None]
     if not touching:
         return out
+    out.tactile = True
     data = collect(touching, m)
     out.notes += data.notes
     broken = findings(touching)
