@@ -55,7 +55,6 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
         raw = loadmat(data / f"{name}.mat")
         get = lambda key, raw=raw: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
         t, q, target, force = get("t"), get("qm"), get("qg"), float(raw["gtau"].squeeze()) * get("vir")
-        # every second sample of the states is enough, and all commands
-        paths.append(save(out / f"{name.lower()}.mcap", ("carriage",), t, target[:, None], t[::2], q[::2, None], effort=force[::2, None],
+        paths.append(save(out / f"{name.lower()}.mcap", ("carriage",), t, target[:, None], t, q[:, None], effort=force[:, None],
                           robot="emps", gravity="0 0 0"))  # fmt: skip
     return Emps(paths[0], paths[1], model, servo)

@@ -36,6 +36,7 @@ class Case:
     regimes: dict[str, np.ndarray] = field(default_factory=dict)  # what residuals are set against, by measurement row
     moved: bool = True
     loop_rate: float | None = None
+    factors: dict[str, tuple[float, float]] = field(default_factory=dict)  # of what the model says, by nuisance, where more than BELIEF is known
 
 
 def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
