@@ -234,8 +234,11 @@ def _thermal(s: Scales) -> list[Variant]:
 def _coupling(s: Scales) -> list[Variant]:
     out = []
     for k, other in enumerate(s.others[:4]):
-        p = _p("ratio", "coupling", "set", -1.0, 1.0)
-        out.append(Variant((p,), ((-0.2,), (-0.05,), (-0.012,), (0.012,), (0.05,), (0.2,)), other, (("coupling_from", float(k)),), {"from_joint": other}))
+        fixed, note = (("coupling_from", float(k)),), {"from_joint": other}
+        # its target is dragged along; a linkage between motor, joint and the other; and that linkage's pull at its other end
+        for column, label, starts in (("coupling", other, (0.02, 0.15)), ("linkage", f"linkage with {other}", (0.05, 0.4)), ("reaction", f"pull of {other}", (0.1,))):
+            p = _p("ratio", column, "set", -1.0, 1.0)
+            out.append(Variant((p,), tuple((sign * x,) for x in starts for sign in (-1, 1)), label, fixed, note))
     return out
 
 

@@ -27,6 +27,8 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("thermal_friction", 0.0, "1/degC", "relative change of dry and viscous friction per degree"),
     ("thermal_resistance", 0.0, "1/degC", "relative change of the winding resistance per degree"),
     ("coupling", 0.0, "1", "how far the joint is dragged per motion of another"),
+    ("linkage", 0.0, "1", "the same where the link is tied to its motor and the other joint: the motor turns by as much, with its rotor and friction"),
+    ("reaction", 0.0, "1", "the other end of a linkage: share of another joint's load that pulls on this one"),
     ("eccentric_sin", 0.0, "rad", "encoder error, sin of the position"),
     ("eccentric_cos", 0.0, "rad", "encoder error, cos of the position - 1"),
     ("speed_lag", 0.0, "s", "first-order lag of the velocity that the loop's kd acts on"),
@@ -67,5 +69,7 @@ SERIES: tuple[str, ...] = (
     "com_out_cos", "com_out_sin", "com_out_inertia",  # what the added mass's place adds: per kg.m, inertia linear in the place
     "com_across_cos", "com_across_sin", "com_across_inertia",
     "drag0", "drag1", "drag2", "drag3",  # motion of the joints that may drag this one, from its first sample, rad
+    "drag_v0", "drag_v1", "drag_v2", "drag_v3", "drag_a0", "drag_a1", "drag_a2", "drag_a3",  # its rate and acceleration
+    "pull0", "pull1", "pull2", "pull3",  # torque on those joints' links that their own motors give, N.m
 )  # fmt: skip
 SERIES_INDEX: dict[str, int] = {name: i for i, name in enumerate(SERIES)}

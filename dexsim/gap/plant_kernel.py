@@ -58,6 +58,8 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
 )
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
 XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
+XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
+P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKE, P_DEADKIND = INDEX["presliding"], INDEX["brake"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
@@ -271,7 +273,13 @@ def plant_kernel():
                 part = wp.clamp((end - acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group)) / dt, zero, one)
                 target += part * (cmd[kk + 1] - cmd[kk])
                 kk += 1
-            target += params[h, P_COUPLING] * series[g, XDRAG + int(params[h, P_FROM])]
+            dragger = int(params[h, P_FROM])
+            target += params[h, P_COUPLING] * series[g, XDRAG + dragger]
+            carried = params[h, P_LINKAGE] * series[g, XDV + dragger]  # speed at which a linkage turns the motor, the joint at rest
+            if consts[C_LOOP_MOTOR] > zero:
+                target += params[h, P_LINKAGE] * series[g, XDRAG + dragger]
+            elsewhere = params[h, P_REACTION] * series[g, XPULL + dragger]
+            elsewhere -= params[h, P_LINKAGE] * series[g, XDA + dragger] * (params[h, P_ROTOR] + params[h, P_ARM])
 
             warmth = series[g, XWARM]
             torque_factor = one + params[h, P_TTORQUE] * warmth
@@ -312,6 +320,8 @@ def plant_kernel():
             for sub in range(n_sub):
                 q_l = reported
                 v_l = v
+                if not two and consts[C_LOOP_MOTOR] > zero:
+                    v_l = v - carried
                 if two and consts[C_LOOP_MOTOR] > zero:
                     q_l = measured(qm, scale, offset, esin, ecos, round_)
                     v_l = vm
@@ -324,13 +334,13 @@ def plant_kernel():
                 e = target - q_l
                 v_drive = vm
                 if not two:
-                    v_drive = v
+                    v_drive = v - carried
                 # the lag acts on the velocity that kd sees; without it v_f is v_l
                 load = gc
                 if consts[C_SLIDE] < half:
                     dq = q - series[g, XQ]  # the model was evaluated at the measured pose
                     load = gc * wp.cos(dq) + gs * wp.sin(dq)
-                load += series[g, XR]
+                load += series[g, XR] + elsewhere
                 # theta-method: the middle of the step where it is smooth, its end where it is stiff
                 theta = one
                 if not two:
@@ -380,7 +390,7 @@ def plant_kernel():
                     applied += ripple * wp.sin(turn * q + params[h, P_PHASE])
                 applied += params[h, P_BIAS]
 
-                v_fric = v
+                v_fric = v - carried
                 if two:
                     v_fric = vm
                 fraction = params[h, P_LOAD]
@@ -406,26 +416,28 @@ def plant_kernel():
                     level += base_friction
                     damping += slope_m
                     a = inertia / (theta * dts) + damping + visc + stop_d
-                    free = (inertia / (theta * dts) * v + applied + damping * v - load) / a
+                    free = (inertia / (theta * dts) * v + applied + damping * v - load + params[h, P_VISC] * friction_factor * carried) / a
+                    free -= carried  # dry friction acts where the motor turns
                     if i < warm:
                         if preslide > zero:
-                            z = (z + v * dts / preslide) / (one + wp.abs(v) * dts / preslide)
+                            z = (z + v_fric * dts / preslide) / (one + wp.abs(v_fric) * dts / preslide)
                     else:
                         if preslide > zero:
                             free = giving(free, a, level, z, preslide / dts)
                             z = (z + free * dts / preslide) / (one + wp.abs(free) * dts / preslide)
-                            q += dts * free
-                            v = v + (free - v) / theta
-                            if v * free < zero:
-                                v = zero
+                            q += dts * (free + carried)
+                            v = v + (free + carried - v) / theta
+                            if (v - carried) * free < zero:
+                                v = carried
                         elif wp.abs(free) * a <= level:
-                            v = zero
+                            q += dts * carried
+                            v = carried
                         else:
                             free -= wp.sign(free) * level / a
-                            q += dts * free
-                            ahead = v + (free - v) / theta
-                            if ahead * free < zero:  # friction stops the joint within the step
-                                ahead = zero
+                            q += dts * (free + carried)
+                            ahead = v + (free + carried - v) / theta
+                            if (ahead - carried) * free < zero:  # friction stops the joint within the step
+                                ahead = carried
                             v = ahead
                     qm = q
                     vm = v

@@ -119,6 +119,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
                 exact["others_torque"] = np.abs(np.delete(torques[i], j, 1)).sum(1)
             for k, o in enumerate(others[:4]):
                 exact[f"drag{k}"] = run.qs[:, o] - run.qs[0, o]
+                _linked(mech[i][0], mech[i][1][j], mech[i][1][o], k, constants[o].armature)
             if run.duty is not None:
                 exact["drive"] = run.duty[:, j]
             elif run.torque is not None:
@@ -225,6 +226,16 @@ def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[
         if o != j and J <= 16:
             out[f"motion of {runs[0].joints[o]}"] = np.abs(np.concatenate([r.vs[:, o] for r in runs]))
     return out
+
+
+def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, armature: float) -> None:
+    """Writes rate, acceleration and link-side torque of another joint (its series [n, E] at times [n]) as dragger k of a joint."""
+    speed = other[:, SERIES_INDEX["v"]]
+    acceleration = np.gradient(speed, times)
+    series[:, SERIES_INDEX[f"drag_v{k}"]] = speed
+    series[:, SERIES_INDEX[f"drag_a{k}"]] = acceleration
+    load = (other[:, SERIES_INDEX["inertia"]] - armature) * acceleration + other[:, SERIES_INDEX["gravity_cos"]] + other[:, SERIES_INDEX["rest"]]
+    series[:, SERIES_INDEX[f"pull{k}"]] = load
 
 
 def _draggers(model, joints, j, runs) -> list[int]:

@@ -1,0 +1,85 @@
+"""A linkage between two joints in the gap's plant: the rotor that it turns, the friction that it carries along, the pull at its other end."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator.table import ServoTable
+from dexsim.gap.catalogue import EFFECTS
+from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
+from dexsim.gap.prepare import build
+from dexsim.gap.runs import Run
+
+ROTOR, BOB = 5e-4, 0.2 * 0.1**2
+MODEL = """<mujoco><option gravity="0 0 0"/><worldbody>
+<body><joint name="a" axis="0 1 0" armature="5e-4"/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>
+<body pos="1 0 0"><joint name="b" axis="0 1 0" armature="5e-4"/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>
+</worldbody></mujoco>"""
+RATE = 3.0  # rad/s2 of joint b
+
+
+def plant(loop: str = "joint"):
+    """Joint a's plant along a run in which it stands still and b speeds up evenly; its drive does nothing by itself."""
+    t = np.arange(0.0, 1.0, 0.01)
+    servo = {"joints": {"*": {"kp": 0.0, "kd": 0.0, "torque_limit": 1.0}}, "loop_encoder": loop}
+    q = np.stack([0 * t, 0.5 * RATE * t**2], 1)
+    run = Run("x", ("a", "b"), t, np.zeros((len(t), 2)), t, q, ServoTable.from_dict(servo), np.zeros(3))
+    return build(mujoco.MjModel.from_xml_string(MODEL), [run])[0].plant
+
+
+def moved(p, **columns) -> np.ndarray:
+    params = p.base()[None].copy()
+    for name, value in columns.items():
+        params[..., INDEX[name]] = value
+    return p.simulate(params, p.windows(None))[0][0]
+
+
+def test_the_other_joint_is_known_by_rate_acceleration_and_pull():
+    p = plant()
+    inside = slice(200, -200)
+    assert p.series[inside, SERIES_INDEX["drag_a0"]] == pytest.approx(RATE, rel=0.02)
+    assert p.series[inside, SERIES_INDEX["pull0"]] == pytest.approx(BOB * RATE, rel=0.02)  # its link alone, without its rotor
+
+
+def test_a_linkage_turns_the_rotor():
+    p = plant()
+    t = p.t - p.t[0]
+    expected = 0.5 * (ROTOR * 0.5 * RATE / (ROTOR + BOB)) * t**2
+    assert moved(p, linkage=0.5)[-1] == pytest.approx(expected[-1], rel=0.05)
+    assert abs(moved(p)[-1]) < 1e-3 * expected[-1]
+
+
+@pytest.mark.parametrize("give", [0.0, 1e-4])
+def test_dry_friction_of_the_motor_carries_the_joint_along(give):
+    """A motor that cannot turn holds q - ratio * other: the joint follows at its rate."""
+    p = plant()
+    t = p.t - p.t[0]
+    q = moved(p, linkage=0.5, coulomb_friction=5.0, presliding=give)
+    assert q[-1] == pytest.approx(0.5 * 0.5 * RATE * t[-1] ** 2, rel=0.03)
+
+
+def test_what_drags_is_held_back():
+    p = plant()
+    t = p.t - p.t[0]
+    expected = -0.5 * (0.5 * BOB * RATE / (ROTOR + BOB)) * t**2
+    assert moved(p, reaction=0.5)[-1] == pytest.approx(expected[-1], rel=0.05)
+
+
+def test_a_loop_on_the_motor_turns_the_joint_by_the_ratio():
+    p = plant("motor")
+    t = p.t - p.t[0]
+    stiff = moved(p, linkage=0.5, kp=2.0, kd=0.1, torque_limit=10.0)
+    assert stiff[-1] == pytest.approx(0.5 * 0.5 * RATE * t[-1] ** 2, rel=0.05)
+    assert abs(moved(plant(), linkage=0.5, kp=2.0, kd=0.1, torque_limit=10.0)[-1]) < 0.01  # on the joint it holds against it
+
+
+def test_the_catalogue_offers_both_ends_of_a_linkage():
+    t = np.arange(0.0, 1.0, 0.01)
+    q = np.stack([0.3 * np.sin(9 * t), 0.5 * RATE * t**2], 1)
+    servo = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.01, "torque_limit": 1.0}}})
+    run = Run("x", ("a", "b"), t, q.copy(), t, q, servo, np.array([0, 0, -9.81]))
+    variants = EFFECTS["joint_coupling"].variants(build(mujoco.MjModel.from_xml_string(MODEL), [run])[0].scales)
+    assert [v.params[0].columns[0] for v in variants] == ["coupling", "linkage", "reaction"]
+    assert {v.note["from_joint"] for v in variants} == {"b"}
