@@ -8,12 +8,14 @@ import pytest
 from dexsim.gap.inverse import identify
 
 
-def carriage(backward: float = 0.0, seed: int = 0):
-    """Times, noisy positions and forces of 95 kg, 200 N.s/m, 20 N, -3 N; backward: viscous friction more when it goes back."""
+def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):
+    """Times, noisy positions and forces of 95 kg, 200 N.s/m, 20 N, -3 N; backward: viscous friction more when it goes back; late: the
+    force acts so much later than it is logged."""
     t = np.arange(0, 12, 2e-3)
-    v = 0.1 * np.sin(2 * np.pi * 0.4 * t) + 0.04 * np.sin(2 * np.pi * 1.3 * t)
+    v = 0.1 * np.sin(2 * np.pi * 0.4 * t) + 0.04 * np.sin(2 * np.pi * 1.3 * t) + (0.01 * np.sin(2 * np.pi * 5.3 * t) if late else 0)
     q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * 2e-3)])
     force = 95 * np.gradient(v, 2e-3) + (200 + backward * (v < 0)) * v + 20 * np.sign(v) - 3
+    force = np.interp(t + late, t, force)
     rng = np.random.default_rng(seed)
     return t, q + 1e-7 * rng.standard_normal(len(t)), force + 0.5 * rng.standard_normal(len(t))
 
@@ -33,3 +35,17 @@ def test_friction_that_differs_by_direction_is_told_on_other_data():
 def test_too_few_samples():
     with pytest.raises(ValueError, match="too few"):
         identify(np.arange(10.0), np.zeros(10), np.zeros(10))
+
+
+def test_further_effects_are_named_one_after_another():
+    found = identify(*carriage(60.0, late=3e-3), test=carriage(60.0, 1, 3e-3))
+    by = {n.effect: n for n in found.named}
+    assert set(by) == {"viscous_friction", "lag"}
+    assert by["viscous_friction"].value == pytest.approx(-30, rel=0.15)
+    assert by["lag"].value / found.full["inertia"] == pytest.approx(3e-3, rel=0.15)
+    assert by["lag"].low < by["lag"].value < by["lag"].high
+    assert found.named[-1].after < 0.5 * found.named[0].before
+
+
+def test_nothing_further_is_named_where_nothing_is_missing():
+    assert identify(*carriage(), test=carriage(seed=1)).named == []
