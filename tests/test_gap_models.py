@@ -8,13 +8,14 @@ import pytest
 from test_gap import demo, model, plant_run
 
 from dexsim.assets import xhand
+from dexsim.gap import jitter
 from dexsim.gap.catalogue import EFFECTS
 from dexsim.gap.findings import add_mass, finding_parameters
 from dexsim.gap.fit import intervals
 from dexsim.gap.mechanics import leaf_of
 from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
 from dexsim.gap.prepare import build
-from dexsim.gap.runs import conditions
+from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch
 
 OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
@@ -151,3 +152,34 @@ def _scales():
     run = plant_run("a", 0, 2.0, {})
     run.smooth()
     return build(model(), [run])[0].scales
+
+
+def jittered(kind: int, sd: float) -> Run:
+    """A run whose commands act 20 ms and a normal time of `sd` s later than they were sent."""
+    run = plant_run(f"run{kind}", kind, 5.0, {"delay": 0.02}, seed=kind, noisy=False)
+    rng = np.random.default_rng(kind + 50)
+    acts = np.maximum.accumulate(run.cmd_t + 0.02 + np.maximum(sd * rng.standard_normal(len(run.cmd_t)), -0.02))
+    for _ in range(2):
+        run.smooth()
+        moved = Run(run.name, run.joints, acts, run.cmd, run.t, run.q, run.servo, run.gravity)
+        moved.smooth()
+        plant = build(model(), [moved])[0].plant
+        run.q = plant.simulate(plant.base()[None], plant.windows(None))[0][0][:, None].copy()
+        run.qs = None
+    run.q = np.round(run.q / 1.534e-3) * 1.534e-3
+    run.smooth()
+    return run
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.003])
+def test_jitter_of_a_delay_is_found_and_sized(sd):
+    runs = [jittered(k, sd) for k in (0, 1, 3)]
+    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"command_delay"})
+    best = search.run().best
+    found = jitter.estimate(search, best)
+    assert best.ids == ("command_delay",) and best.fit.value("command_delay.delay") == pytest.approx(0.02, abs=0.002)
+    if not sd:
+        assert found is None
+    else:
+        assert found.value == pytest.approx(sd, rel=0.15) and found.low < found.value < found.high and found.low < 1.05 * sd and found.high > 0.95 * sd
+        assert set(found.entry()) == {"value", "low", "high", "unit"}

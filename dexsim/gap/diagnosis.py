@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, jitter, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
@@ -376,7 +376,14 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
                 "held_out": {"before": rms((tau - ew)[ok] ** 2), "after": eff["after"]} if effort_only and eff else
                             {"before": rms((measured - qw) ** 2), "after": rms(after)},
             })  # fmt: skip
+            late = jitter.estimate(search, best) if mm.id == "command_delay" and best.fit.loss > jitter.LEFT else None
+            if late is not None:
+                findings[-1]["parameters"]["jitter"] = late.entry()
             out.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
+        late = jitter.estimate(search, best) if "command_delay" not in by_member and best.fit.loss > jitter.LEFT else None
+        if late is not None:
+            notes.append(f"{case.joint}: when its commands act varies by {1e3 * late.value:.2g} ms ({1e3 * late.low:.2g} to {1e3 * late.high:.2g}), which no fixed figure follows")
+            data["unexplained"]["depends_on"].append(f"jitter of the commands, {1e3 * late.value:.2g} ms ({case.joint})")
         leftover += servo_changes(servo, case, best, bounds)
         mine = model_changes(spec, case, best, by_member)
         changed_model |= bool(mine)

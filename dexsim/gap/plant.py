@@ -139,6 +139,11 @@ class JointPlant:
         self._d = {}
         self._ready = True
 
+    @property
+    def command_times(self) -> list[np.ndarray]:
+        """[K] s of each run: when its targets were sent."""
+        return self._cmd_t
+
     def set_series(self, series: np.ndarray) -> None:
         """Other series [G, E] in the place of those that were added."""
         self.series, self._d = series, {}
