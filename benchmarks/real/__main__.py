@@ -70,42 +70,41 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
               "reference": REFERENCE, "held_out": d.data["held_out"], "joints": d.joints, "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
     found = _emps_parameters(d)
     result["found"] = found
-    result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE if found.get(k) is not None}
-    result["open_loop_mm"] = {}
-    for name in force.FILES:
-        t, q, f = force.load(data, name)
-        given = {k: v for k, v in found.items() if k in ("mass", "viscous", "coulomb", "offset", "peak", "v_s")}
-        result["open_loop_mm"][name] = {"found": round(1e3 * force.open_loop(t, q, f, **given), 3), "reference": round(1e3 * force.open_loop(t, q, f, **REFERENCE), 3)}
-    t, q, f = force.load(data, "estimation")
-    result["least_squares"] = force.least_squares(t, q, f)
+    result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
     # the tool's own stage for a logged motor torque, as its report has it
-    from dexsim.gap.inverse import identify
+    from dexsim.gap.inverse import LAG, SQUARE, identify
 
-    found = identify(t[::2], q[::2], f[::2], test=tuple(x[::2] for x in force.load(data, "pulses")))
+    given = {n: force.load(data, n) for n in force.FILES}
+    tool = identify(*given["estimation"], test=given["pulses"])
     names = {"mass": "inertia", "viscous": "viscous_friction", "coulomb": "coulomb_friction", "offset": "offset"}
-    by = {k: found.value[n] for k, n in names.items()}
-    result["inverse"] = {"value": by, "low": {k: found.low[n] for k, n in names.items()}, "high": {k: found.high[n] for k, n in names.items()},
-                         "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 2) for k in by}, "extra": found.extra[:3], "residual": found.residual,
-                         "open_loop_mm": {n: round(1e3 * force.open_loop(*force.load(data, n), **by), 3) for n in force.FILES}}  # fmt: skip
+    by = {k: tool.value[n] for k, n in names.items()}
+    more = {k: tool.full[n] for k, n in names.items()}
+    for n in tool.named:
+        if n.text == LAG:
+            more["late"] = n.value / tool.full["inertia"]
+        elif n.effect == "viscous_friction":
+            more["by_direction"] = n.value
+        elif n.text != SQUARE and n.speed:
+            more |= {"peak": n.value, "v_s": n.speed}
+    result["inverse"] = {
+        "value": by, "low": {k: tool.low[n] for k, n in names.items()}, "high": {k: tool.high[n] for k, n in names.items()},
+        "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 3) for k in by}, "extra": tool.extra[:3], "residual": tool.residual, "with_named": more,
+        "named": [{"text": n.text, "effect": n.effect, "value": n.value, "low": n.low, "high": n.high, "share": n.share, "before_N": n.before, "after_N": n.after}
+                  for n in tool.named],
+    }  # fmt: skip
+    result["open_loop_mm"] = {name: {label: round(1e3 * force.open_loop(*x, **p), 3) for label, p in
+                                     (("reference", REFERENCE), ("found", found), ("inverse", by), ("named", more))} for name, x in given.items()}  # fmt: skip
     return result
 
 
 def _emps_parameters(d) -> dict[str, float]:
-    """Mass, viscous and dry friction, offset of the fitted drive, in the literature's terms."""
+    """Mass, viscous and dry friction, offset of the fitted drive as servo.yaml and the nuisances have them, in the literature's terms."""
     from dexsim.actuator.columns import INDEX
 
     row = d.servo.nominal(("carriage",))[0]
-    by = {f["effect"]: {k: v["value"] for k, v in f["parameters"].items()} for f in d.data["findings"]}
-    n = d.data["nuisance"]
-    pick = lambda key, default: float(n.get(f"{key}@carriage", n.get(f"{key}_factor@carriage", default)))  # noqa: E731
-    coulomb = by.get("coulomb_friction", {}).get("torque", n.get("coulomb_friction@carriage", float(row[INDEX["coulomb_friction"]])))
-    viscous = by.get("viscous_friction", {}).get("coefficient", n.get("viscous_friction@carriage", float(row[INDEX["viscous_friction"]])))
-    asymmetry = by.get("coulomb_friction", {}).get("asymmetry", n.get("friction_asymmetry@carriage", float(row[INDEX["friction_asymmetry"]])))
-    mass = 95.0 * pick("inertia", 1.0) + by.get("inertia", {}).get("armature", 0.0) + (by.get("payload", {}).get("mass") or 0.0)
-    out = {"mass": float(mass), "viscous": float(viscous), "coulomb": float(coulomb), "offset": 0.5 * float(asymmetry) * float(coulomb)}
-    if "stribeck_friction" in by:
-        out |= {"peak": float(by["stribeck_friction"]["peak"]), "v_s": float(by["stribeck_friction"]["v_s"])}
-    return out
+    get = lambda n: float(row[INDEX[n]])  # noqa: E731
+    mass = 95.0 * float(d.data["nuisance"].get("inertia_factor@carriage", 1.0))
+    return {"mass": mass, "viscous": get("viscous_friction"), "coulomb": get("coulomb_friction"), "offset": 0.5 * get("friction_asymmetry") * get("coulomb_friction")}
 
 
 def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
@@ -143,11 +142,12 @@ def figure(result: dict, path: Path) -> None:
         rows = [(j, v["before_mrad"], v["after_mrad"]) for j, v in result["joints"].items()]
         label = "position RMSE, held-out motions (mrad)"
     else:
-        rows = [(k, v["reference"], v["found"]) for k, v in result["open_loop_mm"].items()]
-        label = "position RMSE, recorded force, no feedback (mm)"
+        n = result["inverse"]["named"]
+        rows = [("as published", n[0]["before_N"], n[0]["before_N"]), *((f"+ {x['text']}", n[0]["before_N"], x["after_N"]) for x in n)]
+        label = "force that is left on the pulses, not fitted (N, rms)"
     fig, ax = plt.subplots(figsize=(6.4, 0.42 * len(rows) + 1.3))
     y = np.arange(len(rows))
-    first = "published parameters" if result["benchmark"] == "emps" else "as believed, refitted within 5 %"
+    first = "published structure" if result["benchmark"] == "emps" else "as believed, refitted within 5 %"
     ax.barh(y - 0.2, [r[1] for r in rows], 0.38, color="#a0aec0", label=first)
     ax.barh(y + 0.2, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
     ax.set_yticks(y, [r[0] for r in rows])
