@@ -308,3 +308,15 @@ def test_baselines_recover_what_they_can(tmp_path, monkeypatch):
     rig = baselines.Rig(tmp_path / "cases" / made["name"])
     error = rig.error({"delay": np.array([0.0, 0.05])}, baselines.HELD)
     assert error[0] < 0.02 and error[1] > 2 * error[0]
+
+
+def test_the_hidden_number_is_compared_where_both_have_it(tmp_path):
+    """mujoco.sysid's armature is of the rotor, the truth's is beyond what is believed; an effect that is not named is 100 % off."""
+    said = tmp_path / "diagnosis.json"
+    said.write_text(json.dumps({"findings": [{"effect": "inertia", "parameters": {"armature": {"value": 1.1e-3, "low": 0, "high": 2e-3}}}]}))
+    effect = {"kind": "inertia", "effect": "inertia", "parameters": {"armature": 1e-3}}
+    found = {"sysid_values": {"armature": 1.8e-3}, "meant": {"armature": 6e-4, "mass": 0.1, "kp": 1.0}}
+    assert baselines._parameter(effect, said, found) == pytest.approx({"sysid": 0.2, "diagnose": 0.1})
+    said.write_text(json.dumps({"findings": []}))
+    assert baselines._parameter(effect, said, found)["diagnose"] == 1.0
+    assert baselines._parameter(effect, said, {}) is None and baselines._parameter({**effect, "kind": "backlash"}, said, found) is None

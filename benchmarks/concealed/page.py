@@ -43,9 +43,10 @@ def tables(data: dict) -> str:
         wrong = ", ".join(f"{k} {n}" for k, n in sorted(taken.items(), key=lambda x: -x[1]))
         out.append(f"| {effect} | " + " | ".join(cells) + f" | {wrong or '-'} |")
     if data.get("baselines"):
-        out += ["", "| held-out error over the floor, median | | 95 % interval | cases |", "|---|---|---|---|"]
+        out += ["", "| | held-out error over the floor, median | 95 % interval | cases | time, median | error of the hidden number, median |", "|---|---|---|---|---|---|"]
         for k, v in data["baselines"]["lines"].items():
-            out.append(f"| {LABELS[k]} | {v['value']:.2f} | {v['low']:.2f} to {v['high']:.2f} | {v['n']} |")
+            number = f"{100 * v['parameter']:.0f} % of {v['parameters']}" if "parameter" in v else "-"
+            out.append(f"| {LABELS[k]} | {v['value']:.2f} | {v['low']:.2f} to {v['high']:.2f} | {v['n']} | {v['seconds']:.0f} s | {number} |")
     return "\n".join(out) + "\n"
 
 

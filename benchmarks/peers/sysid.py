@@ -14,14 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-KINDS = {  # kind of the plant: key in the truth, mujoco.sysid's parameter, what that says about the key
-    "coulomb": ("torque", "frictionloss", lambda x, b: x),
-    "viscous": ("coefficient", "damping", lambda x, b: x),
-    "inertia": ("armature", "armature", lambda x, b: x - b["armature"]),
-    "payload": ("mass", "mass", lambda x, b: x - b["mass"]),
-    "delay": ("delay", "delay", lambda x, b: x),
-    "gain": ("kp_factor", "kp", lambda x, b: x / b["kp"]),
-}
+from benchmarks.concealed.baselines import KINDS
+
 WHO = ("diagnose", "sysid", "sysid_told")
 SEED = 8
 
@@ -51,8 +45,6 @@ def ours(name: str, truth: dict, root: Path, limit: float) -> dict:
 
 def theirs(name: str, truth: dict, root: Path, told: bool) -> dict:
     """mujoco.sysid on the same recordings; told: which parameter to fit."""
-    import mujoco
-
     from benchmarks.concealed import baselines
 
     rig = baselines.Rig(root / "cases" / name)
@@ -62,11 +54,8 @@ def theirs(name: str, truth: dict, root: Path, told: bool) -> dict:
     seconds = time.perf_counter() - start
     if answer is None:
         return {"missing": True}
-    b = rig.believed
-    kp = b["kp"] * b["limit"] if rig.voltage else b["kp"]
-    mass = float(mujoco.MjModel.from_xml_path(str(root / "cases" / name / "rig.xml")).body_mass[1])
     value = truth["effects"][0]["parameters"][key]
-    got = read(answer[0][parameter], {"armature": b["armature"], "mass": mass, "kp": kp})
+    got = read(answer[0][parameter], rig.meant)
     return {"seconds": seconds, "error": abs(got - value) / abs(value), "value": got, "held_out_rad": answer[1]}
 
 
