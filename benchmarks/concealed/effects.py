@@ -55,7 +55,12 @@ def _clipped(L, n, o):
 
 
 def _late(L, n, o):
-    return np.abs(np.gradient(L["command"]))
+    return np.abs(np.gradient(_logged(L["command"])))
+
+
+def _logged(x):
+    """As a log of 100 Hz tells it: commands come, and torque follows them, in steps of 10 ms."""
+    return np.convolve(x, np.ones(10) / 10, "same")
 
 
 def _acceleration(L):
@@ -77,7 +82,7 @@ KINDS: dict[str, Kind] = {
     "backlash": Kind("backlash", (0.0005, 0.4), _plus("play"), lambda n, o: {"gap": n["play"]}, lambda L, n, o: _after(L["free"] > 0, 0.01)),
     "compliance": Kind("compliance", (0.005, 1.5), lambda p, s, u, i: {"spring": 10 * u / s}, lambda n, o: {"stiffness": n["spring"]}, lambda L, n, o: np.abs(L["load"])),
     "delay": Kind("command_delay", (0.000125, 0.1), _plus("delay"), lambda n, o: {"delay": n["delay"] - o["delay"]}, _late),
-    "lag": Kind("lag", (0.000125, 0.1), _plus("lag"), lambda n, o: {"time_constant": n["lag"]}, lambda L, n, o: np.abs(np.gradient(L["torque"]))),
+    "lag": Kind("lag", (0.000125, 0.1), _plus("lag"), lambda n, o: {"time_constant": n["lag"]}, lambda L, n, o: np.abs(np.gradient(_logged(L["torque"])))),
     "speed_filter": Kind("lag", (0.00025, 0.1), _plus("speed_lag"), lambda n, o: {"time_constant": n["speed_lag"]}, lambda L, n, o: _acceleration(L)),
     "torque_limit": Kind("torque_limit", (0.05, 0.9), _less("torque_limit"), lambda n, o: {"torque": n["torque_limit"]}, _clipped),
     "speed_limit": Kind("torque_speed_limit", (0.06, 0.95), _less("no_load_speed"), lambda n, o: {"no_load_speed": n["no_load_speed"]}, _clipped),

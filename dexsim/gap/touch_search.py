@@ -18,6 +18,7 @@ MAP_PRICE = 1.5  # on the squared error of a gain for every taxel
 BOOTSTRAPS = 300
 BLOCK = 0.5  # s
 MODEL = 0.02  # of a reading: finer than that the plant is not to be trusted
+LAW, OF_LAW = 0.06, ("stiffness", "neighbours", "fraction", "c10", "c01")  # how a force spreads over taxels is a model: sizes that hang on it
 TIMING = 3e-3  # s by which a reading's time is uncertain: between two positions of the joints the contact is a guess
 PRIOR = 0.3  # standard deviation of a taxel's gain, before anything is seen
 PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
@@ -492,7 +493,7 @@ class PadSearch:
 
     def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
         """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what whole counts do
-        to the fit and 1.5 % of the value added in squares."""
+        to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in squares."""
         keys = trial.keys
         fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
         J, r = fitted.jac, np.clip(fitted.res[self.train], -3, 3)
@@ -514,7 +515,7 @@ class PadSearch:
         out = {}
         for k, s in zip(fitted.keys, variance, strict=True):
             x = trial.values[k]
-            half = 1.645 * float(np.sqrt(s + (0.015 * x) ** 2))
+            half = 1.645 * float(np.sqrt(s + ((LAW if k in OF_LAW else 0.015) * x) ** 2))
             low, high = self._bounds(k)
             out[k] = (max(x - half, low), min(x + half, high))
         return {k: v for k, v in out.items() if k in keys}
