@@ -1,12 +1,13 @@
 """Memory and time by number of worlds, up to what the device holds.
 
-    python -m benchmarks.scale [counts=1,64,1024,8192] [seconds=400] [limit=true] [out=FOLDER] [any setting of train.py]
+    python -m benchmarks.scale [counts=1,64,1024,8192] [seconds=400] [limit=true] [modes=simulate,train] [out=FOLDER] [any setting of train.py]
 
 Each count runs in a process of its own (a full device leaves nothing behind): the environment of train.py is built, its hands close
 for a second and then hold, a few control steps are timed, then PPO learns one iteration. Memory is what the process adds to the
 device beyond its empty context (CUDA: of the driver's count; CPU: anonymous resident memory); bytes a world are the
 slope of a straight line through all counts of 1,024 and more. `limit=true` (the default on CUDA) then looks for the largest count that
-can be simulated and the largest that can be trained, by bisection to 5 %: a count fits when it runs and all worlds are finite.
+can be simulated and the largest that can be trained (`modes`), in steps of 7 %: a count fits when it runs and all worlds are finite.
+`prior=scale.json` goes on from an earlier run.
 Written after each process: scale.json; at the end scale.png. It stops after `seconds`, with what it has.
 """
 
@@ -24,7 +25,7 @@ from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
 COUNTS = {"cuda": (1, 16, 256, 1024, 4096, 8192, 16384, 32768, 65536, 131072), "cpu": (1, 4, 16, 64, 256)}
-OWN = ("counts", "seconds", "limit", "out", "mode", "prior")
+OWN = ("counts", "seconds", "limit", "modes", "out", "mode", "prior")
 TIMED_S = 3.0  # how long control steps are timed, about
 CLOSING = 48  # control steps in which the hands close, one second
 STEEP = 1024  # counts from which memory grows in proportion
@@ -239,6 +240,9 @@ def main(argv: list[str]) -> int:
         counts = [int(float(x)) for x in own["counts"].split(",")] if "counts" in own else list(COUNTS[kind])
     except ValueError:
         raise UserError(f"counts={own['counts']}: must be whole numbers, e.g. counts=1,1024,8192") from None
+    modes = own.get("modes", "simulate,train").split(",")
+    if not set(modes) <= {"simulate", "train"}:
+        raise UserError(f"modes={own['modes']}: must be simulate, train or both, e.g. modes=train")
     out = folder.make(Path(own.get("out", "out/scale")), "out=")
     about = {"device": machine.describe(device), "memory": machine.memory(device), "versions": machine.versions()}
     bench = Bench(rest, out, float(own.get("seconds", 400)), about)
@@ -257,7 +261,8 @@ def main(argv: list[str]) -> int:
         total = torch.cuda.mem_get_info(device)[1] if kind == "cuda" else 0
         if not total:
             raise UserError("limit=true: the limit is looked for on a CUDA device only; a CPU would swap")
-        for mode, key in zip(("simulate", "train"), keys, strict=True):
+        for mode in modes:
+            key = f"{mode}_bytes"
             good = [r["worlds"] for r in bench.rows if "error" not in r and key in r]
             if good and (fit := line(bench.rows, key)):
                 limits[mode] = search(bench, mode, max(good), int((total - fit["fixed_bytes"]) / fit["bytes_per_world"]))
