@@ -183,3 +183,13 @@ def test_jitter_of_a_delay_is_found_and_sized(sd):
     else:
         assert found.value == pytest.approx(sd, rel=0.15) and found.low < found.value < found.high and found.low < 1.05 * sd and found.high > 0.95 * sd
         assert set(found.entry()) == {"value", "low", "high", "unit"}
+
+
+def test_what_only_looks_like_jitter_is_not_reported():
+    """Free play that nobody fitted leaves residuals that the times of commands could take up, too."""
+    runs = [plant_run(f"run{k}", k, 5.0, {"backlash": 0.1}, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
+    none = search.idle().none
+    assert none.fit.loss > jitter.LEFT and jitter.estimate(search, none) is None

@@ -380,10 +380,6 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             if late is not None:
                 findings[-1]["parameters"]["jitter"] = late.entry()
             out.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
-        late = jitter.estimate(search, best) if "command_delay" not in by_member and best.fit.loss > jitter.LEFT else None
-        if late is not None:
-            notes.append(f"{case.joint}: when its commands act varies by {1e3 * late.value:.2g} ms ({1e3 * late.low:.2g} to {1e3 * late.high:.2g}), which no fixed figure follows")
-            data["unexplained"]["depends_on"].append(f"jitter of the commands, {1e3 * late.value:.2g} ms ({case.joint})")
         leftover += servo_changes(servo, case, best, bounds)
         mine = model_changes(spec, case, best, by_member)
         changed_model |= bool(mine)
