@@ -5,10 +5,13 @@ state: positions, velocities, warm start, servo queues, random numbers. What is 
 
 - C MuJoCo works in float64 and MuJoCo-Warp in float32: a position of 0.1 m resolves to 7e-9 m, 0.02 um of contact depth at
   7 kN/m are 1e-4 N, and Newton stops at 1e-6 instead of 1e-8 of its scale. Without contact the engines agree to that.
-- In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so medians
-  and percentiles are compared, the worst only loosely.
-Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 1e-7, 3e-7, 2e-5 rad; object 1e-8, 6e-8, 6e-6 m; contact
-forces 1e-5, 3e-4, 0.08 N; reward 3e-8, 5e-7, 2e-4.
+- In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so the worst
+  is compared only loosely.
+- Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact. Training stops at 8
+  and 20 (configs/config.yaml: the rest costs 7 % and changes no held grasp, docs/benchmarks.md), and where a solver is cut
+  off depends on rounding: 5 % of impacts then differ by 0.3 mm and more. Here both solvers may finish.
+Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 8e-8, 2e-7, 2e-6 rad; object 7e-9, 7e-8, 2e-7 m; contact
+forces 1e-5, 8e-4, 2e-3 N; reward 1e-7, 2e-6, 1e-5.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ class Twin:
     """A step of each engine from the same state."""
 
     def __init__(self):
-        settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}")  # all shapes alike
+        settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}",  # all shapes alike
+                    "sim.iterations=30", "sim.ls_iterations=50")  # solvers that finish
         self.c, self.w = grasp_env(*settings, worlds=N, engine="mujoco"), grasp_env(*settings, worlds=N, engine="warp")
         self.c.skip_idle_resets = False  # the same random numbers for both
         self.copy()
@@ -131,9 +135,9 @@ def test_there_is_something_to_compare(record):
 
 
 TOLERANCE = {  # median, 95 % and worst over worlds and steps: 10 and 20 times what was measured; the worst, a flip, loosely
-    "hand": (1e-6, 8e-6, 3e-3), "hand_v": (7e-5, 6e-4, 1.0), "object": (1e-7, 1e-6, 1e-3), "turn": (3e-6, 3e-5, 2e-2),
-    "object_v": (6e-6, 1e-4, 0.15), "spin": (3e-4, 5e-3, 5.0), "xpos": (3e-7, 2e-6, 1e-3), "torque": (1e-5, 1e-4, 5e-2),
-    "normal": (1e-4, 8e-3, 10.0), "touch": (1e-4, 1e-3, 3.0), "reward": (3e-7, 5e-5, 0.1),
+    "hand": (1e-6, 4e-6, 3e-3), "hand_v": (3e-5, 5e-4, 0.3), "object": (1e-7, 1.5e-6, 1e-3), "turn": (2e-6, 4e-5, 2e-2),
+    "object_v": (5e-6, 1e-4, 0.15), "spin": (2e-4, 6e-3, 5.0), "xpos": (3e-7, 1.5e-6, 1e-3), "torque": (5e-6, 6e-5, 5e-2),
+    "normal": (1e-4, 1.6e-2, 3.0), "touch": (1e-4, 4e-4, 1.0), "reward": (1.2e-6, 3e-5, 0.03),
 }  # rad, rad/s, m, 1, m/s, rad/s, m, N.m, N, N, a step
 
 
@@ -143,7 +147,7 @@ def test_one_step_maps_agree(record, name):
     assert all(x <= limit for x, limit in zip(got, TOLERANCE[name], strict=True)), (name, got)
 
 
-@pytest.mark.parametrize("name, limit", [("hand", 2e-6), ("hand_v", 2e-4), ("object", 1e-6), ("object_v", 1e-5), ("spin", 2e-3), ("torque", 2e-5)])
+@pytest.mark.parametrize("name, limit", [("hand", 2e-6), ("hand_v", 2e-4), ("object", 1e-6), ("object_v", 5e-5), ("spin", 2e-3), ("torque", 2e-5)])
 def test_free_of_contact_they_agree_to_float32(record, name, limit):
     pressed = (record["normal"][0].amax(-1) > 0) | (record["normal"][1].amax(-1) > 0)
     near = pressed.clone()  # forces are those of a step's end: it may have touched on the way from or to a free step

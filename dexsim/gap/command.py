@@ -40,13 +40,14 @@ settings (key=default):
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
+  replay=auto                 engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp), none; auto: warp on a GPU
   device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits the cores that are used
   demo=false                  make a recording with a hidden effect, diagnose it, then open the answer
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
   remap.OURS=                 their name of a topic or a joint, e.g. remap./joint_states=/xhand/state
 """
-KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "demo", "columns")
+KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "replay", "demo", "columns")
 
 
 def parse(argv: list[str]) -> dict:
@@ -98,6 +99,7 @@ def main(argv: list[str]) -> int:
     from dexsim.gap import inputs
     from dexsim.actuator.columns import did_you_mean
     from dexsim.gap.catalogue import EFFECTS
+    from dexsim.gap.confirm import REPLAY
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.gap.touch_effects import BY_ID
 
@@ -107,6 +109,8 @@ def main(argv: list[str]) -> int:
         raise UserError(f"device={device}: must be cpu or cuda")
     quiet_warp(device)
     device = available(device)
+    if given.get("replay", "auto") not in REPLAY:
+        raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
     demo = None
     out = Path(given.get("out", "out/demo" if given.get("demo") else "out/diagnosis")).expanduser()
     if given.get("demo"):
@@ -126,7 +130,7 @@ def main(argv: list[str]) -> int:
         allowed = set(given["effects"])
     settings = Settings(
         inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
-        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, meta=given["meta"],
+        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "auto"), meta=given["meta"],
         remap=given["remap"],
     )  # fmt: skip
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())

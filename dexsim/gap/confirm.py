@@ -33,6 +33,7 @@ from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
 
 STEP = 5e-4  # s: of the engine; its error is of first order in it
+REPLAY = ("auto", "mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
@@ -179,24 +180,25 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
     return out
 
 
-def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP) -> list[np.ndarray]:
+def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP,
+              engine: str = "auto") -> list[np.ndarray]:
     """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
     out: list[np.ndarray] = [np.zeros((0, len(joints)))] * len(worlds)
     for members in groups.values():
-        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep), strict=True):
+        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine), strict=True):
             out[i] = q
     return out
 
 
-def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float) -> list[np.ndarray]:
+def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float, engine: str) -> list[np.ndarray]:
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     N = len(worlds)
-    engine = make_engine(spec, N, device, fields=FIELDS)
+    engine = make_engine(spec, N, device, engine, fields=FIELDS)
     rows = np.stack([w.rows for w in worlds])
     table = copy.deepcopy(worlds[0].table)
     table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
@@ -247,9 +249,11 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
-            floor: float, device: str = "cpu", timestep: float = STEP) -> Confirmation | None:
+            floor: float, device: str = "cpu", replay: str = "auto", timestep: float = STEP) -> Confirmation | None:
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
     kept out. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+    kind = replay if replay != "auto" else "mujoco" if device == "cpu" else "warp"
+    device = "cpu" if kind == "mujoco" else device
     windows = [c.plant.windows(None, test, span=span_test) for c in cases]
     if not cases or not len(windows[0].window):
         return None
@@ -262,7 +266,7 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     plain = [i for i, (_, changed) in enumerate(parts) if not changed]
     found: dict[int, list[np.ndarray]] = {}
     for group in ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]:
-        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep)
+        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, kind)
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
     def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
@@ -289,11 +293,11 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
                 joints[case.joint] = (rms(square[-1:]), rms(own[-1:]))
                 simulated[case.joint] = there
         errors[h.name] = (rms(square), rms(own))
-    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS)
+    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, kind)
     at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
     engine, plant = errors[hypotheses[final].name]
     if not np.isfinite(engine):
         raise UserError("the engine's state did not stay finite")
     names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
-    return Confirmation("MuJoCo-Warp" if device != "cpu" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
+    return Confirmation("MuJoCo-Warp" if kind == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
                         engine <= APART * max(plant, floor), floor, at_tasks_step, simulated)

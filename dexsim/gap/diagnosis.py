@@ -52,6 +52,7 @@ class Settings:
     joints: set[str] | None = None
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
+    replay: str = "auto"  # see `confirm.REPLAY`
 
 
 @dataclass
@@ -492,6 +493,8 @@ def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, 
 
 def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span_test, floor: float) -> None:
     """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the sentence says so."""
+    if s.replay == "none":
+        return
     named = [f for f in d.data["findings"] if f["where"]["joints"] and f["effect"] in EFFECTS]
     claimed = {j for f in named for j in f["where"]["joints"]}
     searches = {case.joint: (search, outcome) for case, search, outcome in outcomes}
@@ -506,7 +509,7 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
             hypotheses.append(confirm.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}))
             break
     try:
-        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device)
+        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device, s.replay)
     except UserError as error:
         d.notes.append(f"not replayed in the engine that trains: {error}")
         return
