@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_gap import demo, model, plant_run
 
+from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.gap import jitter
 from dexsim.gap.catalogue import EFFECTS
@@ -96,6 +97,43 @@ def test_the_plants_load_off_centre_is_that_of_the_model():
         gravity = mass * (x["load_cos"] + out * x["com_out_cos"] + across * x["com_across_cos"])
         assert inertia == pytest.approx(torques[0][0] - torques[1][0], rel=1e-6)
         assert gravity == pytest.approx(torques[0][1] - torques[1][1], abs=1e-5)
+
+
+CHAIN = """<mujoco><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0" armature="1e-4"/>
+<geom type="sphere" size="0.01" mass="0.1" pos="0 0 -0.08"/><body pos="0 0 -0.1"><joint name="b" axis="1 0 0" armature="1e-4"/>
+<geom type="sphere" size="0.01" mass="0.1" pos="0.01 0 -0.06"/></body></body></worldbody></mujoco>"""
+
+
+def chain_case(spec: mujoco.MjSpec):
+    """Joint a's case along motions of both joints."""
+    t = np.arange(0.0, 3.0, 0.01)
+    q = np.stack([0.6 * np.sin(4 * t), 0.5 * np.sin(3 * t + 1)], 1)
+    servo = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.02, "torque_limit": 1.0, "coulomb_friction": 0.002}}})
+    return build(spec.compile(), [Run("x", ("a", "b"), t, q.copy(), t, q, servo, np.array([0, 0, -9.81]))])[0]
+
+
+def test_a_mass_on_the_joints_own_link_is_that_of_the_model():
+    """A plant with the mass follows the same path as the plant of a model that has it; on the last link it does not."""
+    spec = mujoco.MjSpec.from_string(CHAIN)
+    light = chain_case(spec)
+    variants = {v.label: v for v in EFFECTS["payload"].variants(light.scales)}
+    assert variants["mass on its own link"].params[0].columns == ("own_payload",)
+    assert "kg" in add_mass(spec, "a", 0.05, None, own=True) and spec.compile().body_mass[1] == pytest.approx(0.15)
+    paths = {}
+    for name, case, column in (("model", chain_case(spec), None), ("own", light, "own_payload"), ("last", light, "payload"), ("none", light, None)):
+        params = case.plant.base()[None].copy()
+        if column:
+            params[..., INDEX[column]] = 0.05
+        paths[name] = case.plant.simulate(params, case.plant.windows(None))[0][0]
+    change = np.abs(paths["none"] - paths["model"]).max()
+    assert change > 0.005
+    assert np.abs(paths["own"] - paths["model"]).max() < 0.03 * change
+    assert np.abs(paths["last"] - paths["model"]).max() > 0.3 * change
+
+
+def test_a_last_link_has_no_own_load_beside_it():
+    case = build(model(), [plant_run("a", 0, 2.0, {}, noisy=False)])[0]
+    assert case.scales.own_torque == 0 and "mass on its own link" not in {v.label for v in EFFECTS["payload"].variants(case.scales)}
 
 
 def test_hardening_is_the_cubic_spring_it_says():

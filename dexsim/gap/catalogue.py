@@ -49,6 +49,8 @@ class Scales:
     base_friction: float = 0.0
     base_damping: float = 0.0
     armature: float = 0.0
+    own_torque: float = 0.0  # of one kg on the joint's own link; 0 where that is the last
+    own_inertia: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -271,6 +273,10 @@ def _payload(s: Scales) -> list[Variant]:
                       _p("com_across", "com_across", "set", -1.2 * reach, 1.2 * reach, 0.0, "m"))  # fmt: skip
             starts = tuple((f * unit, a * reach, b * reach) for f in (0.1, 0.4) for a, b in ((0.0, 0.5), (0.0, -0.5), (-0.4, 0.0), (0.4, 0.0)))
             out.append(Variant(params, starts, "mass and its centre"))
+    if s.own_torque > 0.02 * s.gravity and s.own_inertia > 0:
+        unit = min(s.tau / s.own_torque, 3 * s.inertia / s.own_inertia)
+        mass = _p("mass", "own_payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
+        out.append(Variant((mass,), tuple((f * unit,) for f in (0.05, 0.3, -0.1)), "mass on its own link", note={"own": True}))
     for letter, size in s.tilt.items():
         if size > 0.05 * s.tau * 0.1 and size > 0.2 * max(s.tilt.values()):
             p = _p(f"tilt_{letter}", f"tilt_{letter}", "set", -0.8, 0.8, 0.0, "rad")

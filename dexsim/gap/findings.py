@@ -13,7 +13,7 @@ from dexsim.gap.fit import Param
 from dexsim.gap.prepare import Case
 
 
-MODEL_COLUMNS = ("armature", "payload", "com_out", "com_across")  # those of the plant that are fields of the model
+MODEL_COLUMNS = ("armature", "payload", "own_payload", "com_out", "com_across")  # those of the plant that are fields of the model
 
 
 def _entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
@@ -154,20 +154,22 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
         if "com_out" in payload:
             c = case.constants
             place = c.centre + payload["com_out"] * c.places[0] + payload["com_across"] * c.places[1]
-        said.append(add_mass(spec, case.joint, payload["mass"], place))
+        own = trial is not None and any(m.id == "payload" and m.variant.note.get("own") for m in trial.members)
+        said.append(add_mass(spec, case.joint, payload["mass"], place, own))
     return said
 
 
-def add_mass(spec, joint: str, mass: float, place: np.ndarray | None) -> str:
-    """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint, by default at that link's
-    centre of mass; returns what was done, in words."""
+def add_mass(spec, joint: str, mass: float, place: np.ndarray | None, own: bool = False) -> str:
+    """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint (own: of the joint's own),
+    by default at that link's centre of mass; returns what was done, in words."""
     import mujoco
 
     from dexsim.gap.mechanics import leaf_of
 
     model = spec.compile()
-    leaf = leaf_of(model, int(model.jnt_bodyid[model.joint(joint).id]))
-    name, m0, c0 = model.body(leaf).name, float(model.body_mass[leaf]), model.body_ipos[leaf].copy()
+    body = int(model.jnt_bodyid[model.joint(joint).id])
+    leaf = body if own else leaf_of(model, body)
+    name, m0, c0 = model.body(leaf).name or f"the link of {joint}", float(model.body_mass[leaf]), model.body_ipos[leaf].copy()
     place = c0 if place is None else np.asarray(place, float)
     if m0 + mass < 0.05 * m0:
         return f"{joint} carries {-mass:.3g} kg less than the model's links after it; change their masses"
@@ -182,7 +184,7 @@ def add_mass(spec, joint: str, mass: float, place: np.ndarray | None) -> str:
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, axes.ravel())
-    body = spec.body(name)
+    body = next(b for b in spec.bodies if b.id == leaf)  # names may be missing
     body.fullinertia = [np.nan] * 6  # not given: principal axes instead
     body.explicitinertial, body.mass, body.ipos, body.iquat, body.inertia = True, m0 + mass, centre, quat, np.maximum(values, 1e-12)
     where = "" if np.allclose(place, c0) else f" at {' '.join(f'{x:.4f}' for x in place)} m in its frame"

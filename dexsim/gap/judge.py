@@ -101,7 +101,7 @@ def own_signal(effect: str, case: Case, values: dict[str, float], note: dict) ->
     if effect == "supply_sag":
         return m.get("_others", v)
     if effect == "payload":
-        return np.abs(m["_added"] if "mass" in values else m["_gravity"])
+        return np.abs(m["_added_own" if note.get("own") else "_added"] if "mass" in values else m["_gravity"])
     if effect == "position_scale":
         if "scale" in values:
             return np.abs(m["position"])

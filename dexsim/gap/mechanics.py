@@ -92,6 +92,7 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
     diag = np.empty((n, J))
     bias = np.empty((n, J))
     passive = np.empty((n, J))
+    own = np.empty((n, J, 3))
     turn = np.empty((n, J, 3, 3))
     places = _places(model, data, ids, leaves)
     full = np.zeros((nv, nv))
@@ -112,6 +113,7 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
             passive[i] = data.qfrc_spring[dadr]
             axis[i], anchor[i] = data.xaxis[ids], data.xanchor[ids]
             com[i], point[i] = data.subtree_com[bodies], data.xipos[leaves]
+            own[i] = data.xipos[bodies]
             turn[i] = data.xmat[leaves].reshape(J, 3, 3)
     finally:
         model.opt.gravity[:] = gravity
@@ -129,12 +131,13 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
         put(j, "v", v[:, j])
         put(j, "inertia", diag[:, j])
         put(j, "rest", rest[:, j])
-        for prefix, m, where in (("gravity", mass[j], com[:, j]), ("load", 1.0, point[:, j])):
+        loads = (("load", 1.0, point[:, j]), *([("own", 1.0, own[:, j])] if leaves[j] != bodies[j] else []))
+        for prefix, m, where in (("gravity", mass[j], com[:, j]), *loads):
             c, s, square = _turned(axis[:, j], where - anchor[:, j], m, run.gravity, slide[j])
             put(j, f"{prefix}_cos", c)
             put(j, f"{prefix}_sin", s)
-            if prefix == "load":
-                put(j, "load_inertia", square)
+            if prefix != "gravity":
+                put(j, f"{prefix}_inertia", square)
         lever = np.cross(axis[:, j], point[:, j] - anchor[:, j])
         for name, way in zip(("out", "across"), places[j], strict=True):
             arm = turn[:, j] @ way

@@ -15,6 +15,7 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("gravity_scale", 1.0, "1", "factor on the model's gravity torque"),
     ("armature", 0.0, "kg.m2", "reflected rotor inertia beyond the model's"),
     ("payload", 0.0, "kg", "mass added at the centre of mass of the last link"),
+    ("own_payload", 0.0, "kg", "the same on the joint's own link, where others follow it"),
     ("tilt_x", 0.0, "rad", "gravity turned about the world's x"),
     ("tilt_y", 0.0, "rad", "gravity turned about the world's y"),
     ("tilt_z", 0.0, "rad", "gravity turned about the world's z"),
@@ -60,6 +61,7 @@ SERIES: tuple[str, ...] = (
     "gravity_cos", "gravity_sin",  # gravity bias torque = cos * cos(q - q_meas) + sin * sin(q - q_meas)
     "rest",  # bias torque of the other joints' motion (Coriolis, coupling inertia) and springs
     "load_inertia", "load_cos", "load_sin",  # the same of a unit mass on the last link
+    "own_inertia", "own_cos", "own_sin",  # and on the joint's own link; 0 where that is the last
     "tilt_x_cos", "tilt_x_sin", "tilt_y_cos", "tilt_y_sin", "tilt_z_cos", "tilt_z_sin",  # per rad of tilt
     "supply",  # measured supply over nominal
     "others_torque",  # sum of the other joints' |motor torque|, N.m

@@ -58,6 +58,8 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
 )
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
 XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
+P_OWN = INDEX["own_payload"]
+XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
 P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
@@ -298,6 +300,11 @@ def plant_kernel():
             inertia = params[h, P_ISCALE] * series[g, XI] + params[h, P_ARM] + load_mass * series[g, XLI]
             gc = params[h, P_GSCALE] * series[g, XGC] + load_mass * series[g, XLC]
             gs = params[h, P_GSCALE] * series[g, XGS] + load_mass * series[g, XLS]
+            own = params[h, P_OWN]
+            if own != zero:
+                inertia += own * series[g, XOWI]
+                gc += own * series[g, XOWC]
+                gs += own * series[g, XOWS]
             if off_centre:
                 inertia += load_mass * (out * series[g, XOI] + across * series[g, XAI] + out * out + across * across)
                 gc += load_mass * (out * series[g, XOC] + across * series[g, XAC])

@@ -173,6 +173,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"}, warm=warm, slide=constants.slide, voltage=voltage,
         effort=effort_noise > 0, saturates=float(np.mean(np.abs(asked) >= (1.0 if False else limit) * 0.98)),
         base_friction=constants.friction, base_damping=constants.damping, armature=constants.armature,
+        own_torque=big(series("own_cos")), own_inertia=float(np.median(series("own_inertia"))),
     )  # fmt: skip
     table = runs[0].servo
     ranges, unknown = {}, []
@@ -190,7 +191,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     regimes_extra["_speed"] = v
     regimes_extra["_command_rate"] = np.concatenate([np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs])
     regimes_extra["_torque_rate"] = np.concatenate([np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)])
-    regimes_extra["_added"] = load_t
+    regimes_extra["_added"], regimes_extra["_added_own"] = load_t, series("own_cos")
     regimes_extra["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
     moved = scales.span > 6 * sigma
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)

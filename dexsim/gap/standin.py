@@ -75,7 +75,8 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     friction = level * np.sign(v) + 0.5 * p("friction_asymmetry") * level + (p("viscous_friction") + case.constants.damping) * v
     ripple = p("torque_ripple") * np.sin(p("ripple_per_turn") * q + p("ripple_phase"))
     inertia = s("inertia") * p("inertia_scale") + p("armature")
-    needed = inertia * a + p("gravity_scale") * s("gravity_cos") + p("payload") * (s("load_cos") + s("load_inertia") * a) + s("rest")
+    needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
+    needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (s("own_cos") + s("own_inertia") * a)
     on = np.abs(v) > slope
     if r.enabled is not None:
         on &= r.enabled[:, j] > 0.5
