@@ -51,3 +51,16 @@ def test_one_meeting_may_be_a_hand_in_the_way():
     run = run_of(-1.03)
     run = Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[:300], run.q[:300], run.servo, run.gravity)
     assert ends.used(model_of(), [run]) == []
+
+
+def test_an_end_met_only_in_what_is_kept_out_is_neither_used_nor_judged():
+    model, held = model_of(more=' range="-2.7 2.7" limited="true"'), run_of(-1.03)
+    assert ends.used(model, [run_of(None, reach=0.8)]) == []
+    spans = ends.unforeseen(model, [held])["a.mcap"]
+    assert len(spans) == 4 and all(b - a == pytest.approx(1.25, abs=0.4) for a, b in spans)
+    inside = np.zeros(len(held.t), bool)
+    for a, b in spans:
+        inside |= (held.t >= a) & (held.t <= b)
+    assert (held.q[~inside, 0] > -1.03 + 0.01).all() and inside.mean() < 0.35
+    ends.used(model, [held])  # the same end, shown to the fit: nothing is unforeseen about it
+    assert ends.unforeseen(model, [held]) == {}

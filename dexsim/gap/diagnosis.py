@@ -209,7 +209,12 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if s.held_out and not held:
         notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
     model = m.spec.compile()
-    notes += _limits(model, runs) + ends.used(model, runs)
+    notes += _limits(model, runs) + ends.used(model, [r for i, r in enumerate(runs) if i not in held])
+    pressed = ends.unforeseen(model, [runs[i] for i in held])
+    if pressed:
+        runs, held = inputs.free_air(runs, held, inputs.merged_spans(pressed), notes, "presses against an end of its motion that no recording for the fit has shown")
+        if s.held_out and not held:
+            return alone("the recordings kept out do nothing but press against an end of a joint's motion")
     for run in runs:
         run.smooth()
     moving = [j for j, name in enumerate(runs[0].joints) if max(float(np.ptp(r.q[:, j])) for r in runs) > 2e-3]

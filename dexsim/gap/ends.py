@@ -29,7 +29,7 @@ def used(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
             found = _end(model, data, runs, j, side)
             if found is None or side * (limit - found[0]) < 0:
                 continue
-            end, where = found
+            end, where, _ = found
             if not np.isfinite(low) and not np.isfinite(high):
                 low, high = -1e6, 1e6
             low, high = (end, high) if side < 0 else (low, end)
@@ -39,8 +39,25 @@ def used(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
     return said
 
 
-def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str] | None:
-    """(position of the end, names of the recordings) on one side of a joint; None where it meets none."""
+def unforeseen(model: mujoco.MjModel, runs: list[Run]) -> dict[str, list[tuple[float, float]]]:
+    """By recording: the stretches (start, end in s) in which joints of `runs`, which are kept out of the fit, press against ends that
+    the model does not have. What nothing in the fit has shown is not used to simulate them, and not held against a drive either."""
+    out: dict[str, list[tuple[float, float]]] = {}
+    data = mujoco.MjData(model)
+    for j, name in enumerate(runs[0].joints if runs else ()):
+        joint = model.joint(name).id
+        for side, limit in zip((-1, 1), model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf), strict=True):
+            found = _end(model, data, runs, j, side)
+            if found is not None and side * (limit - found[0]) > found[2]:
+                for run in runs:
+                    on = (side * run.q[:, j] > side * found[0] - found[2]).astype(int)
+                    edges = np.flatnonzero(np.diff(np.r_[0, on, 0]))
+                    out.setdefault(run.name, []).extend((float(run.t[a]), float(run.t[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+    return {name: spans for name, spans in out.items() if spans}
+
+
+def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str, float] | None:
+    """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it meets none."""
     outer = max(float((side * r.q[:, j]).max()) for r in runs)
     near = NEAR * (max(float(r.q[:, j].max()) for r in runs) - min(float(r.q[:, j].min()) for r in runs))
     errors = [side * (r.command_at(r.t)[:, j] - r.q[:, j]) for r in runs]
@@ -64,7 +81,7 @@ def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str] |
             names.append(run.name)
     if len(ends) < TIMES:
         return None
-    return side * max(side * e for e in ends), ", ".join(dict.fromkeys(names))
+    return side * max(side * e for e in ends), ", ".join(dict.fromkeys(names)), near
 
 
 def _still(run: Run, j: int, near: float) -> np.ndarray:
