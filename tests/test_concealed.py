@@ -320,3 +320,27 @@ def test_the_hidden_number_is_compared_where_both_have_it(tmp_path):
     said.write_text(json.dumps({"findings": []}))
     assert baselines._parameter(effect, said, found)["diagnose"] == 1.0
     assert baselines._parameter(effect, said, {}) is None and baselines._parameter({**effect, "kind": "backlash"}, said, found) is None
+
+
+def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, monkeypatch):
+    """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong answer; other methods' cases come among them."""
+    made = [{"name": "late", "digest": ""}, {"name": "slow", "digest": ""}]
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    begun = command.time.perf_counter()
+    s = {"budget": 0, "until": 2, "limit": 100}
+    monkeypatch.setattr(command.subprocess, "run", lambda *a, timeout, **k: (_ for _ in ()).throw(command.subprocess.TimeoutExpired("", timeout)))
+    command._diagnose(made[0], s, tmp_path, begun)
+    command._diagnose(made[1], s | {"limit": 1}, tmp_path, begun)
+    assert not (tmp_path / "diagnoses" / "late" / "seconds").exists()
+    assert json.loads((tmp_path / "diagnoses" / "slow" / "diagnosis.json").read_text())["status"] == "out of time"
+    assert command._room(s, begun - 1.5) <= 1.0 and command._room({"until": 0, "limit": 9}, begun) == 9
+    command._others(made[0], s, tmp_path, begun)  # one that is not done has no say
+    assert baselines.compare(made, [], tmp_path)["cases"] == []
+
+
+def test_the_others_are_asked_about_what_stands_out(some):
+    root, made, _ = some
+    kinds = {m["name"]: p["kinds"] for m, p in zip(made, some[2], strict=True)}
+    picked = [kinds[m["name"]] for m in baselines.comparable(made, root, 9)]
+    assert picked and ["cable_spring"] not in picked and [] not in picked
+    assert len(baselines.comparable(made, root, 1)) == 1 and baselines.comparable(made, root, 0) == []

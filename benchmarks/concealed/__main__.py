@@ -1,16 +1,17 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
-    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900] [budget=0]
+    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900] [budget=0] [until=0]
     python -m benchmarks.concealed ci=true                    # twelve cases of one to three joints
     python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight of them
 
 mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take; budget: seconds after which no further
-diagnosis is begun (0: none). Resumable: what is finished is not run again. Writes hashes.txt before any diagnosis,
-results.json and table.txt; prints the table and one JSON line.
+diagnosis is begun, until: after which those under way are stopped and left out too (0: none). Resumable: what is finished is not
+run again. Writes hashes.txt before any diagnosis, results.json and table.txt; prints the table and one JSON line.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -20,10 +21,10 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_compl
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.concealed import generate, score
+from benchmarks.concealed import baselines, generate, score
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0, "baselines": 0, "ci": False, "one_joint": False}
+SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False}
 CI = {"effect": 6, "none": 2, "pair": 1, "outside": 1, "decoy": 2}
 
 
@@ -72,8 +73,9 @@ class Progress:
 def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     """Runs `diagnose.py` on a case as a user would, unless it was done before or the budget is spent."""
     case, out = root / "cases" / m["name"], root / "diagnoses" / m["name"]
-    if (out / "seconds").is_file() or (s["budget"] and time.perf_counter() - begun > s["budget"]):
+    if (out / "seconds").is_file() or _spent(s, begun):
         return
+    room = _room(s, begun)
     out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
@@ -83,8 +85,10 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     with open(out / "log.txt", "w", encoding="utf-8") as log:
         try:
-            status = subprocess.run(argv, cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT, timeout=s["limit"]).returncode
+            status = subprocess.run(argv, cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT, timeout=room).returncode
         except subprocess.TimeoutExpired:
+            if room < s["limit"]:  # the run ends, not its time: left out
+                return
             status = "out of time"
     spent = time.perf_counter() - start
     if status != 0 or not (out / "diagnosis.json").is_file():
@@ -92,6 +96,25 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
         failed = {"verdict": "failed", "findings": [], "held_out": None, "status": status}
         (out / "diagnosis.json").write_text(json.dumps(failed), encoding="utf-8")
     (out / "seconds").write_text(f"{spent:.1f}", encoding="utf-8")
+
+
+def _spent(s: dict, begun: float) -> bool:
+    return bool(s["budget"]) and time.perf_counter() - begun > s["budget"]
+
+
+def _room(s: dict, begun: float) -> float:
+    """Seconds that what begins now may take."""
+    return min(s["limit"], max(s["until"] - (time.perf_counter() - begun), 1.0)) if s.get("until") else s["limit"]
+
+
+def _others(m: dict, s: dict, root: Path, begun: float) -> None:
+    """What other methods leave of a case's error, kept on disk, unless the budget is spent."""
+    kept = root / "baselines" / f"{m['name']}.json"
+    if kept.is_file() or _spent(s, begun):
+        return
+    argv = [sys.executable, "-m", "benchmarks.concealed.baselines", str(root / "cases" / m["name"]), str(kept)]
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        subprocess.run(argv, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=_room(s, begun), check=False)
 
 
 def main(argv: list[str]) -> dict:
@@ -108,9 +131,13 @@ def main(argv: list[str]) -> dict:
             tick()
     (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made, key=lambda m: m["name"])), encoding="utf-8")
     print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}", flush=True)
-    tick = Progress("diagnosed", len(made))
+    work = [(_diagnose, m) for m in made]
+    compared = baselines.comparable(made, root, s["baselines"])
+    for k, m in enumerate(compared):  # among the diagnoses, not after them all: the budget may end before
+        work.insert((k + 1) * len(work) // (2 * len(compared)), (_others, m))
+    tick = Progress("diagnosed", len(work))
     with ThreadPoolExecutor(max(s["jobs"], 1)) as pool:
-        for done in as_completed([pool.submit(_diagnose, m, s, root, begun) for m in made]):
+        for done in as_completed([pool.submit(run, m, s, root, begun) for run, m in work]):
             done.result()
             tick()
     results, seconds = [], []
@@ -123,10 +150,8 @@ def main(argv: list[str]) -> dict:
         seconds.append(float((folder / "seconds").read_text()))
     lines = score.table(results)
     others = None
-    if s["baselines"]:
-        from benchmarks.concealed import baselines
-
-        others = baselines.compare(made, results, root, s["baselines"], s["jobs"])
+    if compared:
+        others = baselines.compare(compared, results, root)
     (root / "results.json").write_text(json.dumps({"seed": s["seed"], "results": results, "lines": lines, "baselines": others}), encoding="utf-8")
     text = score.show(lines, results) + ("\n\n" + baselines.show(others) if others else "")
     (root / "table.txt").write_text(text + "\n", encoding="utf-8")

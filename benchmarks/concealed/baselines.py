@@ -12,9 +12,8 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -252,11 +251,8 @@ def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tupl
     return values, float(np.sqrt(np.mean(np.concatenate([x.ravel() for x in left]) ** 2)))
 
 
-def _one(job: tuple[str, str]) -> dict:
-    """Errors of one case by method; kept on disk."""
-    folder, kept = Path(job[0]), Path(job[1])
-    if kept.is_file():
-        return json.loads(kept.read_text(encoding="utf-8"))
+def one(folder: Path, kept: Path) -> None:
+    """Errors of one case by method, and their times [s]; written to `kept`."""
     rig, out = Rig(folder), {}
     for name, method in (("believed", lambda r: float(r.error({}, HELD)[0])), ("pace", pace), ("network", network), ("sysid", identify)):
         start = time.perf_counter()
@@ -270,17 +266,27 @@ def _one(job: tuple[str, str]) -> dict:
         out[f"{name}_s"] = round(time.perf_counter() - start, 1)
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(out), encoding="utf-8")
+
+
+def comparable(made: list[dict], root: Path, count: int) -> list[dict]:
+    """The first `count` one-joint cases whose effect moves the joint and stands out of the floor, of those made ({name, digest})."""
+    out = []
+    for m in made:
+        if len(out) == count:
+            break
+        truth = generate.reveal(root / "truth" / f"{m['name']}.json", m["digest"])
+        if truth["group"] == "effect" and truth["shape"] == "one" and truth["tier"] in ("easy", "medium") and truth["effects"][0]["effect"] != "current_sensor":
+            out.append(m)
     return out
 
 
-def compare(made: list[dict], results: list[dict], root: Path, count: int, jobs: int) -> dict:
-    """Errors of all methods on the first `count` one-joint cases whose effect moves the joint and stands out of the floor."""
-    pick = [r for r in results if r["group"] == "effect" and r["shape"] == "one" and r["tier"] in ("easy", "medium") and r["hidden"][0][0] != "current_sensor"]
-    pick = sorted(pick, key=lambda r: r["name"])[:count]
-    with ProcessPoolExecutor(max(min(jobs, len(pick)), 1), mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(_one, [(str(root / "cases" / r["name"]), str(root / "baselines" / f"{r['name']}.json")) for r in pick]))
+def compare(compared: list[dict], results: list[dict], root: Path) -> dict:
+    """Errors of all methods on those of the cases `compared` of which the diagnosis and the others' answers are there."""
+    kept = {m["name"]: root / "baselines" / f"{m['name']}.json" for m in compared}
+    pick = [r for r in results if r["name"] in kept and kept[r["name"]].is_file()]
+    found = [json.loads(kept[r["name"]].read_text(encoding="utf-8")) for r in pick]
     rows = []
-    digests = {m["name"]: m["digest"] for m in made}
+    digests = {m["name"]: m["digest"] for m in compared}
     for r, f in zip(pick, found, strict=True):
         truth = generate.reveal(root / "truth" / f"{r['name']}.json", digests[r["name"]])
         h = json.loads((root / "diagnoses" / r["name"] / "diagnosis.json").read_text(encoding="utf-8")).get("held_out") or {}
@@ -321,3 +327,7 @@ def show(others: dict) -> str:
     if others["cases"] and "sysid" not in others["lines"]:
         out.append('mujoco.sysid is not installed: pip install "mujoco[sysid]"')
     return "\n".join(out)
+
+
+if __name__ == "__main__":
+    one(Path(sys.argv[1]), Path(sys.argv[2]))
