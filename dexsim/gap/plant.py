@@ -129,6 +129,7 @@ class JointPlant:
         self.torque = np.concatenate(self._torque)
         self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
         self.series = np.concatenate(self._series)
+        self._series = []  # long recordings of many joints are gigabytes: one copy is enough
         self._consts = np.zeros(pk.CONSTS)
         c = self.constants
         kp = max(float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])), 1e-9)
@@ -258,7 +259,7 @@ class JointPlant:
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
-            self._d[device] = [_up(x, device=device) for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))]
+            self._d[device] = [_up(x, device=device, copy=False) for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))]
         key = (group, device)
         if key not in windows.device:
             pick = np.flatnonzero(np.isin(windows.run, group))
@@ -294,8 +295,8 @@ class JointPlant:
         return np.stack(self.nominal)
 
 
-def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu") -> wp.array:
-    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device)
+def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device, copy=copy or device != "cpu")
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:

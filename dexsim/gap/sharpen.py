@@ -19,13 +19,17 @@ PASSES = 2
 
 
 def sharpen(model: mujoco.MjModel, runs: list[Run], cases: list[Case], device: str, dt: float, progress=None, only: set[str] | None = None) -> list[Case]:
-    """The cases (at last those of `only`) built again along sharpened motions (`Run.fine`); as they are where there is one joint only."""
+    """The cases (at last those of `only`) built again along sharpened motions (`Run.fine`); as they are where there is one joint only.
+
+    Else the list `cases` is emptied: together, long recordings of many joints before and after would not fit into memory.
+    """
     if len(cases) < 2:
         return cases
     for k in range(PASSES):
         for i, run in enumerate(runs):
             columns = [_one(case.plant, i, run.t, run.q[:, j]) for j, case in enumerate(cases)]
             run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
+        cases.clear()
         cases = build(model, runs, device=device, dt=dt, progress=progress, only=only if k == PASSES - 1 else None)
     return cases
 
