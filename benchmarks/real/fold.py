@@ -44,6 +44,7 @@ def joint(job: tuple[Any, Path, str]) -> dict:
     v = d.joints[name]
     return _keep(out, name, {
         "joint": name, "verdict": d.data["verdict"], "before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2),
+        "as_fitted_mrad": round(1e3 * v.get("as_fitted", v["after"]), 2),  # whatever the motions kept out say of it
         "findings": [brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"], "held_out": d.data["held_out"],
         "recordings": {r: [before, after] for (_, r), (before, after) in d.mae.items()}, "notes": d.notes,
         "scanned": [x for o in d.outcomes for x in o.scanned[:8]], "depends_on": d.data["unexplained"]["depends_on"],

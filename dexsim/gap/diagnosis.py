@@ -77,7 +77,7 @@ class Diagnosis:
     notes: list[str]
     curves: list[Curve] = field(default_factory=list)
     spots: list[locate.Spot] = field(default_factory=list)
-    joints: dict[str, dict[str, float]] = field(default_factory=dict)  # by joint: before, after, sigma
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)  # by joint: before, after, sigma; as_fitted: after, where it was taken back
     outcomes: list[Outcome] = field(default_factory=list)
     servo: ServoTable | None = None
     model_spec: Any = None
@@ -418,7 +418,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             notes.append(f"{f['effect']} on {case.joint} earned its place on the training conditions but not on what was kept out; not claimed")
         findings = [f for f in findings if f not in mine]
         squares["after"][k] = squares["before"][k]
-        v["after"], v["mae_after"] = v["before"], v["mae_before"]
+        v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
         servo.entries.pop(case.joint, None)
         if case.joint in m.table.entries:
             servo.entries[case.joint] = copy.deepcopy(m.table.entries[case.joint])
