@@ -324,7 +324,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             effort_squares["before"].append((tau - e0)[ok] ** 2)
             effort_squares["after"].append((tau - e1)[ok] ** 2)
         for i in test:
-            pick = case.plant.run_of[rows] == i
+            pick = np.isin(case.plant.run_of[rows], [k for k in test if runs[k].name == runs[i].name])  # one that was cut is several
             if pick.any():
                 out.mae[case.joint, runs[i].name] = (float(np.abs(measured - q0)[pick].mean()), float(np.abs(measured - q1)[pick].mean()))
         out.outcomes.append(outcome)
