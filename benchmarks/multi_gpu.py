@@ -8,7 +8,7 @@ learning or until the share of held episodes has reached `until`. The share is o
 those that lasted to the time limit. Rates are medians over iterations, the first five left out; efficiency is the rate of a GPU over that
 of the smallest count. `fixed=true` adds the largest count with the same number of worlds in all as one GPU has. `parallel=true` runs
 counts side by side where the GPUs suffice. On a CPU (`device=cpu`) counts are processes: a rehearsal. Written: multi_gpu.json (after each run),
-multi_gpu.png, and each run's progress.csv.
+multi_gpu.png, and each run's progress.csv; the last line printed is the JSON without the curves.
 """
 
 from __future__ import annotations
@@ -210,6 +210,7 @@ def main(argv: list[str]) -> int:
         print(f"  {r['name']:12s} {r['steps_per_s']:>10,.0f} steps/s  efficiency {ratio.get(r['name'], float('nan')):.3f}  collect {r['collect_s']:.3f} s"
               f"  learn {r['learn_s']:.3f} s  ready {r['start_s']:.0f} s  held {levels}")
     print(f"  figure   {draw(results, out / 'multi_gpu.png')}\n  data     {out / 'multi_gpu.json'}")
+    print(json.dumps(about | {"efficiency": ratio, "runs": [{k: v for k, v in r.items() if k != "curve"} for r in results]}), flush=True)
     return 0 if all("error" not in r for r in results) else 1
 
 

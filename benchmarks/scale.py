@@ -8,7 +8,7 @@ device beyond its empty context (CUDA: of the driver's count; CPU: anonymous res
 slope of a straight line through all counts of 1,024 and more. `limit=true` (the default on CUDA) then looks for the largest count that
 can be simulated and the largest that can be trained (`modes`), in steps of 7 %: a count fits when it runs and all worlds are finite.
 `prior=scale.json` goes on from an earlier run.
-Written after each process: scale.json; at the end scale.png. It stops after `seconds`, with what it has.
+Written after each process: scale.json; at the end scale.png and, as one line, the JSON. It stops after `seconds`, with what it has.
 """
 
 from __future__ import annotations
@@ -274,6 +274,7 @@ def main(argv: list[str]) -> int:
     for mode, limit in limits.items():
         print(f"  {mode:9s} largest count that ran {limit['fits']:,}; did not: {limit['fails']} ({limit.get('why')})")
     print(f"  figure   {draw(bench.rows, lines, limits, out / 'scale.png')}\n  data     {out / 'scale.json'}")
+    print(json.dumps({"benchmark": "scale", **about, "lines": lines, "limits": limits, "rows": bench.rows}), flush=True)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""dexsim beside its peers, one command each; quote ratios only.
+"""dexsim beside its peers, one command each; quote ratios only. Each ends in one JSON line.
 
     python -m benchmarks.peers gpu [mjlab=PYTHON] [worlds=8192] [device=cuda:0] [out=FOLDER]
     python -m benchmarks.peers cpu shadow=PYTHON [seconds=20]
@@ -73,6 +73,7 @@ def gpu(own: dict[str, str], out: Path) -> list[dict]:
                                                             "ratios": ratios(rows)}, indent=1))
     for name, ratio in ratios(rows).items():
         print(f"  {name:10s} {ratio:.3f} of dexsim's time for a control step")
+    print(json.dumps({"benchmark": "peers gpu", "worlds": int(worlds), "device": device, "ratios": ratios(rows), "rows": rows}), flush=True)
     return rows
 
 

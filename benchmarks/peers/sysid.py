@@ -79,6 +79,7 @@ def main(own: dict[str, str], out: Path) -> int:
         (out / "sysid.json").write_text(json.dumps({"benchmark": "peers sysid", "rows": rows, "summary": summary(rows)}, indent=1))
     for who, s in summary(rows).items():
         print(f"  {who:10s} median error {100 * s['error']:.0f} % of {s['n']}, median time {s['seconds']:.0f} s")
+    print(json.dumps({"benchmark": "peers sysid", "summary": summary(rows), "rows": rows}), flush=True)
     return 0
 
 
