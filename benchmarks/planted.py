@@ -89,6 +89,7 @@ PLANTS: dict[str, Plant] = {
     "current_sensor": Plant("current_sensor", (0.08, 0.6), lambda r, s: {"effort_gain": 1 - s, "effort_offset": 0.3 * s * r["weight"]},
                             lambda r, s: {"gain": 1 - s, "offset": 0.3 * s * r["weight"]}, "effort"),
 }  # fmt: skip
+STICKS = 'solimpfriction="0.999 0.9999 0.001 0.5 2" solreffriction="0.002 1"'  # dry friction that turns with the motion, not before it
 SERVO = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction")
 
 
@@ -127,7 +128,7 @@ def model_xml(b: dict) -> str:
     """The pendulum(s) as MJCF; a second one hangs beside the first and shares nothing with it but the supply."""
     bodies = "".join(f"""
     <body name="link_{j}" pos="0 {0.3 * k:g} 0">
-      <joint name="{j}" type="hinge" axis="0 1 0" armature="{b["rotor"]:.6g}" range="-3 3" solimpfriction="0.999 0.9999 0.001 0.5 2"/>
+      <joint name="{j}" type="hinge" axis="0 1 0" armature="{b["rotor"]:.6g}" range="-3 3" {STICKS}/>
       <geom name="bob_{j}" type="sphere" size="0.012" pos="0 0 {-b["length"]:.6g}" mass="{b["mass"]:.6g}" contype="0" conaffinity="0"/>
     </body>""" for k, j in enumerate(b["joints"]))  # fmt: skip
     return f"""<mujoco model="rig"><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/><worldbody>{bodies}

@@ -77,8 +77,9 @@ def test_the_answer_is_confirmed_and_the_page_says_so(answer):
     h = json.loads((folder / "out" / "diagnosis.json").read_text())["held_out"]
     c = h["confirmed"]
     assert c["agrees"] is True and c["engine"] == "C MuJoCo" and c["not_handed_on"] == [] and c["recordings"] == h["recordings"]
-    assert c["found"]["plant"] == pytest.approx(h["after"], rel=0.02) and c["found"]["engine"] < 1.3 * max(h["after"], d.data["noise_floor"]["position_rad"])
-    assert c["believed"]["engine"] > 5 * c["found"]["engine"]  # it tells right from wrong
+    assert c["found"]["plant"] == pytest.approx(h["after"], rel=0.02) and c["found"]["engine"] < 2.5 * d.data["noise_floor"]["position_rad"]
+    assert h["after"] < 1.3 * d.data["noise_floor"]["position_rad"]
+    assert c["believed"]["engine"] > 10 * c["found"]["engine"]  # it tells right from wrong
     assert "confirmed" in d.sentence and f"{1e3 * c['found']['engine']:.3g} mrad" in d.sentence
     page = (folder / "out" / "report.html").read_text()
     assert "In the engine that trains" in page and "C MuJoCo" in page
@@ -112,6 +113,13 @@ def test_what_training_cannot_be_given_is_not_confirmed():
     engine, plant = c.errors["found"]
     assert plant < 0.4 * c.errors["believed"][1] and engine > 1.3 * plant and not c.agrees and c.missing == ["lag (velocity filter)@joint"]
     assert "Not confirmed" in c.text() and "lag (velocity filter)@joint" in c.text()
+
+
+@pytest.mark.parametrize(("engine", "word"), [(1.2e-3, True), (1.5e-3, True), (2.6e-3, False)])
+def test_confirmed_is_what_leaves_little_of_the_error_before(engine, word):
+    """Floor 1 mrad, the plant leaves as much, 20 mrad before: within 1.3 x of it, or a tenth of the error before in squares."""
+    assert confirm.agree(engine, 1e-3, 1e-3, 20e-3) is word
+    assert confirm.agree(engine, 1e-3, 1e-3, 1.5e-3) is (engine < 1.3e-3)
 
 
 def test_the_tasks_step_is_that_of_the_configuration():

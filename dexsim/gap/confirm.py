@@ -37,6 +37,7 @@ REPLAY = ("auto", "mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
+LITTLE = 0.1  # of the error before: what the engine may leave beside what the plant leaves, added in squares
 MOST = 120.0  # s of recordings that are replayed, at most
 
 
@@ -72,7 +73,7 @@ class World:
 class Confirmation:
     """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the gap's own
     plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot be given;
-    recordings: replayed; agrees: whether the engine leaves no more than APART times what the plant left."""
+    recordings: replayed; agrees: see `agree`."""
 
     engine: str
     step_s: float
@@ -296,8 +297,15 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, kind)
     at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
     engine, plant = errors[hypotheses[final].name]
+    before = errors[hypotheses[0].name][1] if final else 0.0
     if not np.isfinite(engine):
         raise UserError("the engine's state did not stay finite")
     names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
     return Confirmation("MuJoCo-Warp" if kind == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
-                        engine <= APART * max(plant, floor), floor, at_tasks_step, simulated)
+                        agree(engine, plant, floor, before), floor, at_tasks_step, simulated)
+
+
+def agree(engine: float, plant: float, floor: float, before: float) -> bool:
+    """Whether the engine's replay confirms the plant's: it leaves no more than APART times as much, or what it leaves beyond that is
+    LITTLE beside the error before (the figures by which the plant absorbs its own inaccuracy are not handed on)."""
+    return engine <= max(APART * max(plant, floor), math.hypot(plant, LITTLE * before))

@@ -15,13 +15,15 @@ from dexsim.recording.schema import COMMANDS, Series
 
 DRAWN = """<geom name="base" type="box" size="0.016 0.022 0.012" pos="0 0 0.016" contype="0" conaffinity="0" mass="0" group="2"/>"""
 LINK = """<geom name="link" type="capsule" size="0.009" fromto="0 0 -0.012 0 0 -0.088" contype="0" conaffinity="0" mass="0" group="2"/>"""
+# MuJoCo's dry friction brakes along an exponential of solreffriction's time constant: at its default of 20 ms it turns against
+# the motion before a fast reversal, which no drive does
 MODEL = """<mujoco model="pendulum">
   <compiler angle="radian"/>
   <option timestep="0.002" integrator="implicitfast"/>
   <worldbody>
     <body name="link">
       <joint name="joint" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"
-             solimpfriction="0.999 0.9999 0.001 0.5 2"/>
+             solimpfriction="0.999 0.9999 0.001 0.5 2" solreffriction="0.002 1"/>
       <geom name="bob" type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/>
     </body>
   </worldbody>
