@@ -90,6 +90,15 @@ def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():
     assert drags.confidence == DOUBTED and dragged.confidence == 0.99 and other.confidence == DOUBTED
 
 
+def test_what_hangs_on_a_misread_pose_is_doubted():
+    scale, load, friction = (evidence(effect=e, joint=j, confidence=0.99) for e, j in (("position_scale", "b"), ("payload", "a"), ("coulomb_friction", "a")))
+    confidence.of_the_whole([load, scale, friction], {}, set())
+    assert load.confidence == DOUBTED and "b" in load.reasons[0] and scale.confidence == friction.confidence == 0.99
+    own = evidence(effect="payload", joint="b", confidence=0.99)
+    confidence.of_the_whole([scale, own], {}, set())
+    assert own.confidence == 0.99
+
+
 @pytest.mark.parametrize(("starts", "gains", "what"), [
     ((25, 35, 45, 55), (1, 1, 1, 1), "the clock"), ((45, 25, 55, 35), (1, 1, 1, 1), ""), ((55, 45, 35, 25), (1, 1, 1, 1), "the order of the recordings"),
     ((25, 45, 35, 55), (1, 1, 1, 1), ""), ((25, 45, 35, 55), (8, 32, 16, 64), "the gain")])  # fmt: skip

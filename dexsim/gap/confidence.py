@@ -20,6 +20,7 @@ SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say
 CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
 NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
+FROM_POSES = ("payload", "inertia", "joint_coupling")  # effects told from the pose and the motion of other joints
 ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
 
 
@@ -178,7 +179,11 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
 def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str]) -> None:
     """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that is not
     what it says."""
+    misread = [e.joint for e in all_ if e.effect in ("position_scale", "position_offset")]
     for e in all_:
+        elsewhere = [j for j in misread if j != e.joint]
+        if elsewhere and e.effect in FROM_POSES:
+            _doubt(e, f"the position of {elsewhere[0]} is not what it says, and with it what the other joints load")
         pulls = [j for j, k in coupled.items() if k == e.joint]
         if pulls and e.effect != "joint_coupling":
             _doubt(e, f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
