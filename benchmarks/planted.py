@@ -1,12 +1,12 @@
 """Planted effects: every joint effect of the catalogue, hidden in recordings of our own simulator, and found again.
 
-    python -m benchmarks.planted [cases=0] [first=0] [seed=1] [workers=1] [out=out/planted] [effects=a,b] [limit=600]
+    python -m benchmarks.planted [cases=0] [first=0] [seed=1] [workers=1] [out=out/planted] [effects=a,b] [limit=0]
 
 One round is every entry of PLANTS once, its size drawn round robin from three tiers, and a few cases with nothing planted;
 `cases` counts along the rounds (0: one round). This is the sanity check of `diagnose`: the data come from the simulator it
 fits, with gains, masses and friction a few percent off, an encoder's quantum, noise and a jittered clock. Effects of the
 servo table and of the model are simulated by C MuJoCo with the servo kernel, the others by the gap's own plant at a quarter
-of its step. Size of an effect: its held-out change, with what a refit of the believed figures hides of it taken away, is
+of its step. limit: seconds after which no further case is waited for (0: all are). Size of an effect: its held-out change, with what a refit of the believed figures hides of it taken away, is
 8, 4 or 2 times the measurement noise. Resumable; prints a table and one JSON line.
 """
 
@@ -28,7 +28,7 @@ TIERS = {"large": 8.0, "medium": 4.0, "small": 2.0}
 NONE_EACH = 6  # cases with nothing planted in a round
 SECONDS = 7.0
 QUANTUM = 2 * np.pi / 4096
-SETTINGS = {"cases": 0, "first": 0, "seed": 1, "workers": 1, "out": "out/planted", "effects": "", "limit": 600}
+SETTINGS = {"cases": 0, "first": 0, "seed": 1, "workers": 1, "out": "out/planted", "effects": "", "limit": 0}
 REFIT = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "inertia_scale", "gravity_scale")
 OFF = 0.03  # what every believed figure is off by, at most
 
@@ -461,9 +461,9 @@ def main(argv: list[str]) -> dict:
         _warm(plant_kernel)
         with mp.get_context("spawn").Pool(min(s["workers"], len(jobs)), maxtasksperchild=8) as pool:
             stream = pool.imap_unordered(_one, jobs)
-            results = _watch(stream, len(jobs), start)
+            results = _watch(stream, len(jobs), start, s["limit"])
     else:
-        results = _watch(map(_one, jobs), len(jobs), start)
+        results = _watch(map(_one, jobs), len(jobs), start, s["limit"])
     print("\n" + show(results))
     line = {"benchmark": "planted", "seed": s["seed"], "cases": len(results), "wall": round(time.perf_counter() - start, 1), **table(results)}
     print(json.dumps(line))
@@ -479,10 +479,19 @@ def _warm(kernel) -> None:
     wp.load_module(module=kernel().module, device="cpu")
 
 
-def _watch(stream, total: int, start: float) -> list[dict]:
-    out = []
-    for r in stream:
-        out.append(r)
+def _watch(stream, total: int, start: float, limit: float) -> list[dict]:
+    """Results as they come, until all are there or `limit` [s] is over (0: none)."""
+    out: list[dict] = []
+    while len(out) < total:
+        left = limit - (time.perf_counter() - start) if limit else None
+        try:
+            if left is not None and left <= 0:
+                raise mp.TimeoutError
+            out.append(stream.next(left) if hasattr(stream, "next") else next(stream))
+        except mp.TimeoutError:
+            print(f"  {limit:g} s are over: {len(out)} of {total} cases are done", flush=True)
+            break
+        r = out[-1]
         spent = time.perf_counter() - start
         print(f"  {len(out)}/{total} {r['kind'] or 'nothing'} ({r['tier']}): {' '.join(r['said']) or '-'}; {r['seconds']:.0f} s;"
               f" about {spent / len(out) * (total - len(out)):.0f} s left", flush=True)  # fmt: skip
