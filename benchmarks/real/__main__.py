@@ -147,7 +147,7 @@ def figure(result: dict, path: Path) -> None:
         label = "force that is left on the pulses, not fitted (N, rms)"
     fig, ax = plt.subplots(figsize=(6.4, 0.42 * len(rows) + 1.3))
     y = np.arange(len(rows))
-    first = "published structure" if result["benchmark"] == "emps" else "as believed, refitted within 5 %"
+    first = "published structure" if result["benchmark"] == "emps" else "as believed, refitted within its ranges"
     ax.barh(y - 0.2, [r[1] for r in rows], 0.38, color="#a0aec0", label=first)
     ax.barh(y + 0.2, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
     ax.set_yticks(y, [r[0] for r in rows])
