@@ -143,18 +143,16 @@ def figure(result: dict, path: Path) -> None:
         label = "position RMSE, held-out motions (mrad)"
     else:
         n = result["inverse"]["named"]
-        rows = [("as published", n[0]["before_N"], n[0]["before_N"]), *((f"+ {x['text']}", n[0]["before_N"], x["after_N"]) for x in n)]
-        label = "force that is left on the pulses, not fitted (N, rms)"
-    fig, ax = plt.subplots(figsize=(6.4, 0.42 * len(rows) + 1.3))
-    y = np.arange(len(rows))
-    first = "published structure" if result["benchmark"] == "emps" else "as believed, refitted within its ranges"
-    ax.barh(y - 0.2, [r[1] for r in rows], 0.38, color="#a0aec0", label=first)
-    ax.barh(y + 0.2, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
+        rows = [("as published", n[0]["before_N"], 0.0), *((f"+ {x['text']}", 0.0, x["after_N"]) for x in n)]
+        label = "force left on the pulses, not fitted (N, rms)"
+    fig, ax = plt.subplots(figsize=(7.2, 0.42 * len(rows) + 1.5), layout="constrained")
+    y, pair = np.arange(len(rows)), 0.2 if result["benchmark"] != "emps" else 0.0
+    ax.barh(y - pair, [r[1] for r in rows], 0.38, color="#a0aec0", label="as believed, refitted within its ranges" if pair else "published structure")
+    ax.barh(y + pair, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
     ax.set_yticks(y, [r[0] for r in rows])
     ax.invert_yaxis()
     ax.set_xlabel(label)
-    ax.legend(fontsize=8, frameon=False)
-    fig.tight_layout()
+    fig.legend(loc="outside upper center", ncols=2, fontsize=8, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(path, dpi=120)
     plt.close(fig)
