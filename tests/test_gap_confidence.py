@@ -90,6 +90,17 @@ def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():
     assert drags.confidence == DOUBTED and dragged.confidence == 0.99 and other.confidence == DOUBTED
 
 
+def test_two_torques_of_the_pose_can_be_any():
+    case = SimpleNamespace(scales=SimpleNamespace(span=1.5))
+    assert confidence.of_pose("payload", {"mass": 0.1}, case) and confidence.of_pose("torque_ripple", {"per_turn": 4.9}, case)
+    assert not confidence.of_pose("torque_ripple", {"per_turn": 20}, case) and not confidence.of_pose("lag", {}, case)
+    load, slow, fast = (evidence(effect=e, confidence=0.99, of_pose=o) for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False)))
+    confidence.together([load, fast])
+    assert load.confidence == fast.confidence == 0.99
+    confidence.together([load, slow])
+    assert load.confidence == slow.confidence == DOUBTED and "any torque" in load.reasons[0]
+
+
 def test_what_hangs_on_a_misread_pose_is_doubted():
     scale, load, friction = (evidence(effect=e, joint=j, confidence=0.99) for e, j in (("position_scale", "b"), ("payload", "a"), ("coulomb_friction", "a")))
     confidence.of_the_whole([load, scale, friction], {}, set())

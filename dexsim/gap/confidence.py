@@ -41,6 +41,7 @@ class Evidence:
     place: int
     reasons: list[str] = field(default_factory=list)
     confidence: float = 0.0
+    of_pose: bool = False  # whether it is a torque that changes slowly with the pose alone
 
     def plain(self) -> dict:
         """As it is written."""
@@ -140,6 +141,12 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
     return ""
 
 
+def of_pose(effect: str, values: dict[str, float], case: Case) -> bool:
+    """Whether an effect is a torque that follows the pose and changes slowly along it: a load, an offset of the pose, a ripple of
+    which the motion shows less than two periods. Two of them together are any such torque: a cable, a spring."""
+    return effect in ("payload", "position_offset") or (effect == "torque_ripple" and 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span)
+
+
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
     """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
     c = e.share * (0.3 + 0.7 * e.earned) * trusted(before, after, noise)
@@ -150,8 +157,11 @@ def weigh(e: Evidence, before: float, after: float, without: float, noise: float
 
 def together(mine: list[Evidence]) -> None:
     """What the findings of one joint (the largest first) say of each other."""
+    slow = [e for e in mine if e.of_pose]
     for k, e in enumerate(mine):
         e.place = k
+        if e.of_pose and len(slow) > 1:
+            _doubt(e, f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on the pose")
         doubtful = next((x for x in mine[:k] if x.confidence < DOUBTED), None)
         if doubtful is not None:
             _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")

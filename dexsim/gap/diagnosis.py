@@ -367,6 +367,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             follows = confidence.temperature_follows(case, sorted({*train, *test})) if mm.id == "thermal" else ""
             if follows:
                 evidence.reasons.append(f"temperature follows {follows}, so it may stand for anything that changes with it")
+            evidence.of_pose = confidence.of_pose(mm.id, raw, case)
             evidence.confidence = confidence.weigh(evidence, rms(before), rms(after), rms((measured - qw) ** 2), case.sigma)
             out.evidence.append(evidence)
             findings.append({
