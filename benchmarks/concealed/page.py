@@ -1,4 +1,9 @@
-"""The tables and the figure of docs/concealed.md: python -m benchmarks.concealed.page results=out/concealed/seed_N/results.json [figure=FILE.png]"""
+"""The tables and figures of docs/concealed.md:
+
+    python -m benchmarks.concealed.page results=out/concealed/seed_N/results.json [figure=FILE.png] [limits=FILE.png]
+
+figure: answers by hidden effect and size; limits: how often it is right by size of the effect, and by how sure it is.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.concealed.baselines import LABELS
+from benchmarks.concealed.score import wilson
 
 AIMS = {  # line: (to publish, aim), from the project's judging table
     "right effect first, easy": ("85 %", "95 %"), "right effect first, medium": ("70 %", "88 %"), "right effect first, hard": ("45 %", "65 %"),
@@ -15,6 +21,8 @@ AIMS = {  # line: (to publish, aim), from the project's judging table
     "false alarm, nothing missing": ("8 %", "3 %"), "outside the catalogue: not claimed": ("60 %", "80 %"), "confident and wrong, all cases": ("10 %", "3 %"),
 }  # fmt: skip
 PLAIN = ("(F1)", "mean", "error removed")
+SIZES = (1.0, 1.25, 1.6, 2.2, 3.5, 6.0, 20.0)  # x the floor: edges of the bins of the effect's error
+SURE = (0.0, 0.4, 0.65, 0.8, 0.95, 1.0)  # edges of the bins of confidence
 COLOURS = {"right alone": "#2f855a", "right in a set": "#9ae6b4", "nothing claimed": "#cbd5e0", "another, unsure": "#f6ad55", "another, confident": "#c53030"}
 
 
@@ -97,6 +105,65 @@ def figure(data: dict, path: Path) -> None:
     plt.close(fig)
 
 
+def by_size(results: list[dict]) -> list[tuple[float, float, int, int, int]]:
+    """(from, to, cases, first name right, nothing said) by the size of the one hidden effect, in floors."""
+    mine = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "touch") and r.get("ratio")]
+    out = []
+    for a, b in zip(SIZES, SIZES[1:], strict=False):
+        x = [r for r in mine if a <= r["ratio"] < b]
+        out.append((a, b, len(x), sum(r["right"] for r in x), sum(not r["said"] for r in x)))
+    return out
+
+
+def by_confidence(results: list[dict]) -> list[tuple[float, float, int, int]]:
+    """(from, to, names, of them hidden there) of every single name that was said of physics, sets left out; names are right where the
+    effect is hidden, on any joint."""
+    pairs = [(s[2], s[0] in {h[0] for h in r["hidden"]}) for r in results if r["decoy"] not in ("bad_channel", "confounded", "wrong_mass")
+             for s in r["said"] if s[0] != "bad_channel" and len(s[3]) < 2]  # fmt: skip
+    out = []
+    for a, b in zip(SURE, SURE[1:], strict=False):
+        x = [hit for c, hit in pairs if a <= c < b or (b == 1.0 and c >= a)]
+        out.append((a, b, len(x), sum(x)))
+    return out
+
+
+def limits(data: dict, path: Path) -> None:
+    """Two panels: right and silent by size; right by confidence, beside what was promised."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
+    rows = [r for r in by_size(data["results"]) if r[2]]
+    x = range(len(rows))
+    for values, colour, label in (([r[3] for r in rows], "#2f855a", "first name right"), ([r[4] for r in rows], "#718096", "nothing said")):
+        rate = [v / r[2] for v, r in zip(values, rows, strict=True)]
+        spread = [wilson(v, r[2]) for v, r in zip(values, rows, strict=True)]
+        left.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
+                      fmt="o-", color=colour, label=label, capsize=3)
+    left.set_xticks(list(x), [f"{a:g}-{b:g}\n({n})" for a, b, n, *_ in rows], fontsize=8)
+    left.set_xlabel("error that the effect makes, in floors (cases)")
+    left.set_ylim(-0.02, 1.04)
+    left.legend(frameon=False, fontsize=9)
+    bins = [b for b in by_confidence(data["results"]) if b[2]]
+    x = [0.5 * (a + b) for a, b, *_ in bins]
+    rate = [k / n for *_, n, k in bins]
+    spread = [wilson(k, n) for *_, n, k in bins]
+    right.plot([0, 1], [0, 1], color="#cbd5e0", label="as sure as right")
+    right.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
+                   fmt="o-", color="#2b6cb0", label="names that are hidden there", capsize=3)
+    for at, v, (*_, n, _) in zip(x, rate, bins, strict=True):
+        right.annotate(str(n), (at, v), textcoords="offset points", xytext=(6, -10), fontsize=8)
+    right.set_xlabel("confidence of a name")
+    right.set_ylim(-0.02, 1.04)
+    right.legend(frameon=False, fontsize=9)
+    fig.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
 if __name__ == "__main__":
     given = dict(item.split("=", 1) for item in sys.argv[1:])
     if "results" not in given:
@@ -105,3 +172,5 @@ if __name__ == "__main__":
     print(tables(found))
     if "figure" in given:
         figure(found, Path(given["figure"]))
+    if "limits" in given:
+        limits(found, Path(given["limits"]))
