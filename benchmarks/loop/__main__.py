@@ -30,6 +30,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from dexsim.cli.ending import guard
+from dexsim.errors import UserError
+
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "dry,late", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
@@ -376,13 +379,16 @@ def figure(data: dict, path: Path) -> None:
     plt.close(fig)
 
 
-def main(argv: list[str]) -> dict:
-    """Runs what is not done yet and reports; returns what the JSON line says."""
+def main(argv: list[str]) -> int:
+    """Runs what is not done yet and reports. Raises UserError for a setting that is none."""
+    if any(a in ("-h", "--help", "help") for a in argv):
+        print(__doc__)
+        return 0
     s = dict(SETTINGS)
     for item in argv:
         key, equals, value = item.partition("=")
         if not equals or key not in s:
-            raise SystemExit(f"'{item}' is not a setting; valid: {', '.join(s)} (key=value)")
+            raise UserError(f"{item}: not a setting; valid: {', '.join(s)} (key=value)")
         s[key] = value
     loop = Loop(s)
     loop.out.mkdir(parents=True, exist_ok=True)
@@ -394,8 +400,8 @@ def main(argv: list[str]) -> dict:
     figure(data, loop.out / "loop.png")
     print("\n" + markdown(data))
     print(json.dumps({"benchmark": "loop", "lines": [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]}))
-    return data
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(guard(main, sys.argv[1:]))

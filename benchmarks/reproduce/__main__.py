@@ -45,6 +45,9 @@ def number(own: dict[str, str], key: str, low: float, high: float, whole: bool =
 
 
 def main(argv: list[str]) -> int:
+    if any(a in ("-h", "--help", "help") for a in argv):
+        print(__doc__)
+        return 0
     own, extra = tools.split(argv, OWN)
     table = own["table"]
     if table not in rows.TABLES:

@@ -192,6 +192,9 @@ def main(argv: list[str]) -> int:
 
     from dexsim.cli import start
 
+    if any(a in ("-h", "--help", "help") for a in argv):
+        print(f"{__doc__}\nSettings: {main.__doc__}")
+        return 0
     own = {"out": str(DEFAULT), "count": 2000, "worlds": 256, "seed": 0, "sizes": [0.045, 0.06]}
     rest = []
     for text in argv:
