@@ -320,7 +320,7 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     assert set(data) == KEYS and data["schema"] == 1
     assert data["verdict"] in ("explained", "partly_explained")
     assert set(data["noise_floor"]) == {"position_rad", "how"} and data["noise_floor"]["how"] in ("repeats", "split", "quantum")
-    assert {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"} <= set(data["held_out"])
+    assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"}
     f = data["findings"][0]
     assert set(f) == FINDING and set(f["where"]) == {"joints", "taxels", "topics"}
     assert f["effect"] == "command_delay" and f["where"]["joints"] == ["joint"]
@@ -328,9 +328,12 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     assert set(p) == {"value", "low", "high", "unit"} and p["value"] == pytest.approx(0.02, abs=0.003) and p["low"] <= p["value"] <= p["high"]
     assert all(w["end"] >= w["start"] and w["recording"].endswith(".mcap") for w in f["when"])
     assert data["held_out"]["after"] < 0.4 * data["held_out"]["before"]
-    assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on", "not_considered"}
-    assert data["unexplained"]["not_considered"]["joint_coupling"] == "no other joint moves"  # a single joint, no touch
-    assert {"supply_sag", "tactile_gain"} <= set(data["unexplained"]["not_considered"]) and "backlash" not in data["unexplained"]["not_considered"]
+    assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on"}
+    more = json.loads((out / "details.json").read_text())  # what is known beyond the specification
+    absent = more["unexplained"]["not_considered"]
+    assert absent["joint_coupling"] == "no other joint moves"  # a single joint, no touch
+    assert {"supply_sag", "tactile_gain"} <= set(absent) and "backlash" not in absent
+    assert {"how", "confirmed"} == set(more["held_out"]) and sum(more["seconds"].values()) > 0
 
 
 def test_fitted_servo_loads_again_with_its_interval(answer):

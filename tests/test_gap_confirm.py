@@ -75,7 +75,7 @@ def answer(tmp_path_factory):
 def test_the_answer_is_confirmed_and_the_page_says_so(answer):
     d, folder, _ = answer
     h = json.loads((folder / "out" / "diagnosis.json").read_text())["held_out"]
-    c = h["confirmed"]
+    c = json.loads((folder / "out" / "details.json").read_text())["held_out"]["confirmed"]
     assert c["agrees"] is True and c["engine"] == "C MuJoCo" and c["not_handed_on"] == [] and c["recordings"] == h["recordings"]
     assert c["found"]["plant"] == pytest.approx(h["after"], rel=0.02) and c["found"]["engine"] < 2.5 * d.data["noise_floor"]["position_rad"]
     assert h["after"] < 1.3 * d.data["noise_floor"]["position_rad"]

@@ -90,7 +90,8 @@ class Confirmation:
         """The result in a sentence; unit: what a thousandth of the position's is called."""
         engine, plant = list(self.errors.values())[min(1, len(self.errors) - 1)]
         if self.agrees:
-            return f"Replayed in the engine that trains, all joints at once, {1e3 * engine:.3g} {unit} are left: confirmed."
+            together = ", all joints at once," if len(self.joints) > 1 else ""
+            return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
         because = f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
         return f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own plant leaves {1e3 * plant:.3g} ({because})."
 

@@ -711,21 +711,60 @@ def _sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     if not named:
         depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
         return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
+    of = ""
+    alone = {j for f in named for j in f["where"]["joints"]}
+    if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):  # not thinned by joints that are well
+        of, mine = " of that joint", d.joints[next(iter(alone))]
+        before, after = 1e3 * mine["before"], 1e3 * mine["after"]
     parts = []
     strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
     for f in strong[:2]:
-        words = entry(f).words
+        words = words_of(f, d.mechanism)
         if f["indistinguishable"]:
             words += f" (or it is {' or '.join(x.replace('_', ' ') for x in f['indistinguishable'] if x != f['effect'])}: these recordings cannot tell)"
-        parts.append(f"{place(f)} {words}{_size(f)}")
-    parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] else parts[0]
+        parts.append(f"{spoken(f)} {words}{_size(f)}")
+    parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] or strong[0]["where"]["joints"][0] in spoken(strong[0])[1:] else parts[0]
     left_out = len(named) - len(parts)
     more = f" ({left_out} more, {'smaller or less sure, ' if len(strong) < len(named) else ''}below)" if left_out else ""
     it = "it" if len(named) == 1 else "them"
     if h["before"] is None:
         return prefix + "; ".join(parts) + more + "."
-    tail = f" Without {it} simulation is wrong by {number(before)} {unit}; with {it}, by {number(after)} on recordings not used for the fit"
+    tail = f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on recordings not used for the fit"
     return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
+
+
+ORDER = {"1": "first", "2": "second"}
+
+
+def spoken(f: dict) -> str:
+    """Where a finding sits as a person says it: the xHand's joints by finger, another mechanism's by name."""
+    from dexsim.assets import xhand
+
+    if len(f["where"]["joints"]) != 1:
+        return place(f)
+    joint = f["where"]["joints"][0]
+    if joint not in xhand.JOINTS:
+        return joint if "joint" in joint.lower() else f"joint {joint}"
+    finger, _, rest = joint.partition("_")
+    whose = {"thumb": "the thumb's", "mid": "the middle finger's", "pinky": "the little finger's"}.get(finger, f"the {finger} finger's")
+    kind = "sideways joint" if "bend" in rest and finger != "thumb" else "bending joint" if "bend" in rest else f"{ORDER.get(rest[-1], '')} joint".strip()
+    return f"{whose} {kind} ({joint})"
+
+
+def words_of(f: dict, m: Mechanism | None) -> str:
+    """What an effect does, in words, with its direction where its size tells that."""
+    words, p = entry(f).words, f["parameters"]
+    joint = next(iter(f["where"]["joints"]), None)
+    if f["effect"] == "coulomb_friction" and m is not None and joint in m.joints:
+        believed = float(m.column("coulomb_friction")[m.joints.index(joint)]) + float(np.ravel(m.spec.joint(joint).frictionloss)[0])
+        return words.replace("more (or less)", "more" if p["torque"]["value"] > believed else "less")
+    if f["effect"] == "inertia":
+        return words.replace("more (or less)", "more" if p["armature"]["value"] > 0 else "less")
+    if f["effect"] == "payload" and "mass" in p:
+        return f"carries {'more' if p['mass']['value'] > 0 else 'less'} mass than the model"
+    if f["effect"] == "payload":
+        return "hangs in another direction of gravity than the model"
+    return words
 
 
 def place(f: dict) -> str:
@@ -842,14 +881,19 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
-    """Writes diagnosis.json, report.html, servo.yaml and, where it changed, model.xml; returns what was written."""
+    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where it changed, model.xml; returns what was written."""
     from dexsim.gap.report import page
 
     out.mkdir(parents=True, exist_ok=True)
     written = []
     d.notes = grouped(d.notes)
     path = out / "diagnosis.json"
-    path.write_text(json.dumps(_plain(d.data), indent=1, allow_nan=False), encoding="utf-8")
+    asked, more = specified(d.data)
+    path.write_text(json.dumps(_plain(asked), indent=1, allow_nan=False), encoding="utf-8")
+    written.append(path)
+    more |= {"notes": d.notes, "seconds": d.shares}
+    path = out / "details.json"
+    path.write_text(json.dumps(_plain(more), indent=1, allow_nan=False), encoding="utf-8")
     written.append(path)
     if d.evidence:
         path = out / "evidence.json"
@@ -874,6 +918,19 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     path.write_text(page(d), encoding="utf-8")
     written.append(path)
     return written
+
+
+BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexplained", "not_considered"))
+
+
+def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for details.json)."""
+    asked, more = copy.deepcopy(data), {}
+    for *parents, key in BEYOND:
+        there = asked[parents[0]] if parents else asked
+        if key in there:
+            (more.setdefault(parents[0], {}) if parents else more)[key] = there.pop(key)
+    return asked, more
 
 
 def grouped(notes: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ import html
 import mujoco
 import numpy as np
 
-from dexsim.gap.charts import INK, SOFT, text
+from dexsim.gap.charts import INK, SOFT, number, text
 
 PALE, HOT = (247, 243, 236), (196, 38, 46)
 
@@ -31,6 +31,15 @@ def heat(share: float) -> str:
     """Colour of an error, as a share of the largest."""
     share = float(np.clip(share, 0.0, 1.0)) ** 0.7
     return "#" + "".join(f"{int(a + share * (b - a)):02x}" for a, b in zip(PALE, HOT, strict=True))
+
+
+def scale(most: float, unit: str, width: int = 360) -> str:
+    """The colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
+    left, right, steps = 60, width - 96, 24
+    part = (right - left) / steps
+    out = [f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">', text(left - 8, 14, "0", "end")]
+    out += [f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>' for k in range(steps)]
+    return "".join(out) + text(right + 8, 14, f"{number(1e3 * most)} {unit}") + "</svg>"
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dexsim.gap import charts
 from dexsim.gap.confirm import TASKS
-from dexsim.gap.picture import mechanism, pad
+from dexsim.gap.picture import mechanism, pad, scale
 from dexsim.gap.touch_effects import entry
 
 if TYPE_CHECKING:
@@ -97,7 +97,8 @@ def _bars(d: Diagnosis) -> str:
         rows.append(("noise floor", k * value, None, None, charts.FLOOR))
     how = {"repeats": "repeats of the same commands", "split": "the scatter of single samples", "quantum": "the encoder's step"}[floor["how"]]
     note = "the counts of the taxels" if unit == "mN" else how
-    return (f'<h2>Error on held-out data</h2>{charts.bars(rows, unit)}<p class="soft small">Root mean square, 90 % intervals. Before: the machine as it is believed, its '
+    over = f", all {len(d.joints)} joints" if len(d.joints) > 1 and unit in ("mrad", "mm") else ""
+    return (f'<h2>Error on held-out data{over}</h2>{charts.bars(rows, unit)}<p class="soft small">Root mean square, 90 % intervals. Before: the machine as it is believed, its '
             f"figures refitted within 5 %. Floor: from {note}.</p>")  # fmt: skip
 
 
@@ -110,7 +111,8 @@ def _where(d: Diagnosis) -> str:
     picture = mechanism(d.mechanism.spec.compile(), {j: v["before"] for j, v in d.joints.items()}, named, taxels, marked, unit, height=400 if d.joints else 240)
     words = []
     if d.joints:
-        words.append("Joints coloured by their error before: pale is small, red is large; ringed where something was found.")
+        words.append("Joints by their error before; ringed where something was found.")
+        picture += scale(max(v["before"] for v in d.joints.values()), unit)
     maps = ""
     if taxels is not None:
         from dexsim.assets import xhand
@@ -178,7 +180,11 @@ def _parameters(f: dict) -> str:
     return f"<table>{''.join(out)}</table>" if out else ""
 
 
-def _lost(f: dict) -> str:
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:] if text.startswith(("the ", "joint ")) else text
+
+
+def _lost(f: dict, d: Diagnosis) -> str:
     """The runner-up and why it lost, or the set that cannot be told apart."""
     if f["indistinguishable"]:
         names = _t(" and ".join(_name(x) for x in f["indistinguishable"]))
@@ -194,34 +200,44 @@ def _lost(f: dict) -> str:
                 f"{100 * r['confidence']:.0f} of 100 redraws.</p>")  # fmt: skip
     rest = f" (then {', '.join(_name(a['effect']) for a in rivals[1:])})" if len(rivals) > 1 else ""
     return (f"<p class='soft'>Runner-up: {_t(_name(r['effect']))}{_t(rest)}. Fitted in its place, it wins only {100 * r['confidence']:.0f} of 100 redraws of the "
-            "stretches left out of the fit.</p>")  # fmt: skip
+            f"stretches left out of the fit.{_replayed(r['effect'], d)}</p>")  # fmt: skip
+
+
+def _replayed(effect: str, d: Diagnosis) -> str:
+    """What the runner-up leaves in the engine that trains, where it was replayed there."""
+    errors = d.confirmation.errors if d.confirmation is not None else {}
+    if f"{effect} instead" not in errors or "found" not in errors:
+        return ""
+    unit = "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad"
+    rival, found = errors[f"{effect} instead"][0], errors["found"][0]
+    return f" Over all joints, in the engine that trains, it leaves {charts.number(1e3 * rival)} {unit}, the finding {charts.number(1e3 * found)}."
 
 
 def _findings(d: Diagnosis) -> str:
     findings = d.data["findings"]
     if not findings:
         return _nearest(d)
+    from dexsim.gap.diagnosis import WEAK, spoken, words_of
+
     cards = []
     ends = _ends(d)
     for f in findings:
         e, h = entry(f), f["held_out"]
         bad = f["effect"] == "bad_channel"
         where = _t(_place(f))
-        words = f"{where} {_t(e.words)}; it shows {_t(f['regime'])}." if e is not None else f"{where}: {_t(f['regime'])}."
+        words = f"{_t(_capital(spoken(f)))} {_t(words_of(f, d.mechanism))}; it shows {_t(f['regime'])}." if e is not None else f"{where}: {_t(f['regime'])}."
         unit, k = unit_of(_metric(d, f)) if h else ("", 1.0)
         error = f'<p>Held-out error with everything else but this: <b>{charts.number(k * h["before"])}</b>; with it: <b>{charts.number(k * h["after"])} {unit}</b>.</p>' if h else ""
         strip = ""
         if f["when"]:
             names = list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]
             rows = [(n, ends.get(n, max(w["end"] for w in f["when"] if w["recording"] == n)), [(w["start"], w["end"]) for w in f["when"] if w["recording"] == n]) for n in names]
-            strip = f"<figure>{charts.strips(rows)}<figcaption>when it acts: above a quarter of its most</figcaption></figure>"
-        from dexsim.gap.diagnosis import WEAK
-
+            strip = f"<figure>{charts.strips(rows)}<figcaption>when it acts (dark: more than a quarter of its largest)</figcaption></figure>"
         kind = "bad" if bad else "set" if f["indistinguishable"] or f["confidence"] < WEAK else ""
         left = _parameters(f)
         body = f'<div class="half"><div>{left}</div><div>{strip}</div></div>' if left and strip else f"{left}{strip}"
         cards.append(f'<div class="finding {kind}"><header><h3>{_t(_name(f["effect"]))} &#8212; {where}</h3><span class="conf">confidence <b>{100 * f["confidence"]:.0f} %</b></span></header>'
-                     f"<p>{words}</p>{body}{error}{_lost(f)}</div>")  # fmt: skip
+                     f"<p>{words}</p>{body}{error}{_lost(f, d)}</div>")  # fmt: skip
     return f'<section><h2>What is missing</h2>{"".join(cards)}</section>'
 
 
@@ -285,7 +301,8 @@ def _curves(d: Diagnosis) -> str:
 def _next(d: Diagnosis) -> str:
     n = d.data["next_recording"]
     if not n:
-        return ""
+        sure = d.data["verdict"] in ("explained", "none") and not any(f["indistinguishable"] for f in d.data["findings"])
+        return '<section class="next"><h2>What to record next</h2><p>Nothing is needed to settle this answer.</p></section>' if sure else ""
     send = f" The commands are ready to send: <code>{_t(n['commands'])}</code>." if n["commands"] else ""
     return f'<section class="next"><h2>What to record next</h2><p>{_t(n["why"][:1].upper() + n["why"][1:])}.{send}</p></section>'
 
