@@ -160,6 +160,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     channel = inputs.channel_findings([r for r in recordings if r is not None], m.joints)
     readable = [r for r in recordings if r is not None]
     notes += [f"{r.path.name}: {f.text}" for r in readable for f in r.findings if f.kind == "joint_names" and "left out" in f.text]
+    notes[:0] = [f"{r.path.name}: {f.text}; left out" for r in readable for f in r.findings if f.kind == "nan" and f.joint in ("", *m.joints)]
     absent = [j for j in m.joints if runs and not any(j in r.joints for r in runs)]
     if absent:
         notes.append(f"in the model but in no recording: {', '.join(absent)}; nothing can be said of {'it' if len(absent) == 1 else 'them'}, taken to stand at rest")
@@ -434,7 +435,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
                         "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     only_effort = findings and all(f["effect"] == "current_sensor" for f in findings)
-    structured = any(o.none.fit.loss > 1.3**2 and (len(o.scanned) > 0) for o in out.outcomes)
+    structured = any(o.none.fit.loss > 1.3**2 and (len(o.scanned) > 0 or case.moved) for case, _, o in outcomes)
     word = judge.verdict(data["findings"], floor, b, bl, a, structured)
     if only_effort:
         word = "explained"
@@ -476,7 +477,8 @@ def _behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> N
     data["findings"] += [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
     if not shown:
         judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in findings)]
-        b, a = (float(np.sqrt(sum(y**2 for y in ys))) for ys in ([x.named[0].before for x, _ in judged], [x.named[-1].after for x, _ in judged]))
+        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]  # not what the catalogue has no name for
+        b, a = (float(np.sqrt(sum(y**2 for y in ys))) for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last]))
         data["held_out"] = {"recordings": judged[0][1], "error": findings[0]["held_out"]["error"], "before": b, "after": a, "before_low": None, "before_high": None,
                             "after_low": None, "after_high": None, "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere"}  # fmt: skip
         data["verdict"] = "partly_explained" if a < 0.7 * b else "unknown"

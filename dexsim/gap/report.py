@@ -66,7 +66,7 @@ def _name(effect: str) -> str:
 def unit_of(metric: str) -> tuple[str, float]:
     """(unit in which a metric of `diagnosis.json` is shown, factor)."""
     if metric.startswith("effort"):
-        return ("mA" if metric.endswith("_A") else "mN.m"), 1e3
+        return ("mA" if metric.endswith("_A") else "mN" if metric.endswith("_N") else "mN.m"), 1e3
     if metric.endswith("_N"):
         return "mN", 1e3
     return ("mm" if metric.endswith("_m") else "mrad"), 1e3
@@ -92,11 +92,12 @@ def _bars(d: Diagnosis) -> str:
     if found:
         rows.append(("after", *scaled(h["after"], h["after_low"], h["after_high"]), charts.AFTER))
     floor = d.data["noise_floor"]
-    value = floor.get("tactile_N") if unit == "mN" else floor["position_rad"] if unit in ("mrad", "mm") else None
+    touched = h["error"].startswith("tactile")
+    value = floor.get("tactile_N") if touched else floor["position_rad"] if unit in ("mrad", "mm") else None
     if value is not None:
         rows.append(("noise floor", k * value, None, None, charts.FLOOR))
     how = {"repeats": "repeats of the same commands", "split": "the scatter of single samples", "quantum": "the encoder's step"}[floor["how"]]
-    note = "the counts of the taxels" if unit == "mN" else how
+    note = "the counts of the taxels" if touched else how
     over = f", all {len(d.joints)} joints" if len(d.joints) > 1 and unit in ("mrad", "mm") else ""
     return (f'<h2>Error on held-out data{over}</h2>{charts.bars(rows, unit)}<p class="soft small">Root mean square, 90 % intervals. Before: the machine as it is believed, its '
             f"figures refitted within 5 %. Floor: from {note}.</p>")  # fmt: skip
