@@ -129,6 +129,22 @@ def test_effects_that_cannot_be_there_are_named(rig, tmp_path):
         command.main(["recordings=" + str(rig[1][0]), "effects=[backlas]", f"model={rig[2]}", f"servo={rig[3]}"])
 
 
+def test_an_error_that_no_effect_allowed_could_make_is_unknown(rig, tmp_path):
+    def softer(r):
+        r.states.position.value = 0.8 * r.states.position.value
+
+    d = judged(rig, tmp_path, softer, allowed={"supply_sag"})
+    assert d.data["verdict"] == "unknown" and d.data["held_out"]["before"] > 5 * d.data["noise_floor"]["position_rad"]
+
+
+def test_values_that_are_no_numbers_are_said_and_left_out(rig, tmp_path):
+    def holes(r):
+        r.states.position.value[50:90] = np.nan
+
+    d = judged(rig, tmp_path, holes)
+    assert d.data["verdict"] == "none" and any("not a finite number in 40" in n for n in d.notes)
+
+
 def test_held_out_copies_are_refused(rig, tmp_path):
     folder, paths, model, servo = rig
     copy = tmp_path / "another_name.mcap"
