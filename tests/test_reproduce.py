@@ -90,6 +90,8 @@ def test_averages_orderings_and_intervals(tmp_path):
     assert verdict["full", "quaternion", "average"].startswith("holds (+17.0")
     assert verdict["full", "neither", "average"].startswith("reversed (-10.0")
     assert verdict["full", "no_orientation", "average"].startswith("undecided")
+    assert verdict["no_orientation", "full", "seconds_per_success"].startswith("undecided")  # 2 s a success in every row
+    assert full["seconds_by_seed"] == pytest.approx([2.0, 2.0]) and "| 2.00 (2.00, 2.00) | 40.0 (40.0, 40.0) |" in text
     assert {c["here"] for c in data["orderings"]["reality"]} == {"not judged"}
     assert "| quaternion instead of 6D | 3.0 (" in text and "2.9, 2.5, 5.24, 15.2" in text
 
