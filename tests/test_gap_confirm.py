@@ -122,6 +122,14 @@ def test_confirmed_is_what_leaves_little_of_the_error_before(engine, word):
     assert confirm.agree(engine, 1e-3, 1e-3, 1.5e-3) is (engine < 1.3e-3)
 
 
+def test_what_the_engine_follows_in_the_main_is_said_so():
+    one = {"joint": (1e-3, 5e-4)}
+    c = confirm.Confirmation("C MuJoCo", 5e-4, {"believed": (6e-3, 6e-3), "found": (1e-3, 5e-4)}, one, [], ["a.mcap"], False, 4e-4)
+    assert c.text() == "Replayed in the engine that trains, 1 mrad of 6 are left, more than in the search's own plant."
+    c.errors["found"] = (5e-3, 5e-4)
+    assert c.text().startswith("Not confirmed by the engine that trains: it leaves 5 mrad")
+
+
 def test_the_tasks_step_is_that_of_the_configuration():
     configured = yaml.safe_load((Path(__file__).parents[1] / "configs" / "config.yaml").read_text())
     assert confirm.TASKS == configured["sim"]["timestep"]

@@ -78,7 +78,12 @@ def _hero(d: Diagnosis, word: str, tone: str) -> str:
     line = ""
     if h["before"] is not None:
         line = f'<p class="soft small">Simulated freely from the first sample of what was kept out of the fit: {kept}.</p>'
-    return f'<section class="hero t-{tone}"><span class="tag">{word}</span><h1>{_t(d.sentence)}</h1>{line}</section>'
+    said, replayed = d.sentence, ""
+    if d.confirmation is not None:
+        text = d.confirmation.text(unit_of(h["error"])[0])
+        if said.endswith(text):
+            said, replayed = said[: -len(text)].rstrip(), f"<p>{_t(text)}</p>"
+    return f'<section class="hero t-{tone}"><span class="tag">{word}</span><h1>{_t(said)}</h1>{replayed}{line}</section>'
 
 
 def _bars(d: Diagnosis) -> str:
@@ -294,8 +299,10 @@ def _curves(d: Diagnosis) -> str:
                        f"{', grey: the load cell' if c.load is not None and shown else ''}.</figcaption></figure>")  # fmt: skip
     if not figures:
         return ""
+    loads = d.touch is not None and any(c.load is not None for c in d.touch.curves[:3])
+    grey = f'<span class="key" style="background:#b8c0ca"></span>{"command" if shown else "load cell"}' if shown or loads else ""
     legend = ('<p class="soft small"><span class="key" style="background:#333"></span>measured<span class="key" style="background:var(--before)"></span>simulated before'
-              '<span class="key" style="background:var(--after)"></span>simulated after<span class="key" style="background:#b8c0ca"></span>' + ("command" if shown else "load cell") + "</p>")  # fmt: skip
+              '<span class="key" style="background:var(--after)"></span>simulated after' + grey + "</p>")  # fmt: skip
     return f"<section><h2>Before and after, on data kept out of the fit</h2>{legend}{''.join(figures)}</section>"
 
 
