@@ -8,7 +8,7 @@ from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import next_experiment, touch_rig
-from dexsim.gap.catalogue import EFFECTS
+from dexsim.gap.catalogue import CONFUSED, EFFECTS, SEPARATED, separating
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.prepare import build
 from dexsim.gap.runs import conditions
@@ -42,9 +42,16 @@ def test_the_same_hypothesis_disagrees_nowhere_and_others_do(hypotheses):
     m, search, none, trials = hypotheses
     same = next_experiment.choose(m, search, trials["coulomb_friction"], trials["coulomb_friction"], kinds=("steps", "triangles"))
     assert max(same.scores.values()) < 1e-9
+    assert not same.settles and same.text.startswith("none settles it")
     other = next_experiment.choose(m, search, trials["coulomb_friction"], trials["viscous_friction"], kinds=("steps", "triangles"))
     assert other.scores[other.chosen[0]] == max(other.scores.values()) > 1.0
-    assert f"{max(other.scores.values()):.1f} times the noise" in other.text
+    assert other.settles and f"{max(other.scores.values()):.1f} times the noise" in other.text
+
+
+def test_every_class_has_the_experiment_that_separates_it():
+    joints = [c for c in CONFUSED if c <= set(EFFECTS)]
+    assert len(joints) == len(SEPARATED) and "turned over" in separating(["payload", "position_offset"])
+    assert separating(["lag", "command_delay"]) != EFFECTS["lag"].experiment and separating(["lag", "backlash"]) == EFFECTS["lag"].experiment
 
 
 def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):

@@ -7,7 +7,7 @@ servo table, where training is to have it too).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -351,6 +351,26 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("current_sensor", "shows its effort with a wrong gain or offset", "in the effort alone", _current, "a hold under a known load"),
 )  # fmt: skip
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
+
+
+SEPARATED = (
+    "small reversals about a pose while a load holds the joint to one side, then without it, and very slow ramps (both encoders logged if there are two)",
+    "steps of two sizes and a fast chirp: a delay shifts the motion, a lag rounds it",
+    "constant speeds from slow to fast, and steps against a known load",
+    "static poses while a known weight is held",
+    "the same slow motion under two or more loads",
+    "this joint alone, then with the others loaded, cold and warm in random order",
+    "static poses over the whole range, and the same with the mechanism turned over: what gravity does changes sign, an encoder's zero stays",
+)
+"""What tells the members of a class of `CONFUSED` apart, in its order (touch has its own, see `touch_effects`)."""
+
+
+def separating(effects: Sequence[str]) -> str:
+    """The experiment that tells effects of one class apart; the first one's own where they are of none."""
+    for members, experiment in zip(CONFUSED, SEPARATED, strict=False):
+        if set(effects) <= members:
+            return experiment
+    return EFFECTS[effects[0]].experiment
 
 
 def confusable(a: str, b: str) -> bool:

@@ -17,7 +17,7 @@ from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, jitter, judge, locate, stage, standin, touch
-from dexsim.gap.catalogue import EFFECTS, confusable
+from dexsim.gap.catalogue import EFFECTS, confusable, separating
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
 from dexsim.gap.fit import Fitter, expand, intervals
@@ -376,7 +376,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
                 "confidence": evidence.confidence,  # what the other findings say of it comes last
                 "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
                 "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
-                "separating_experiment": EFFECTS[mm.id].experiment if same else None,
+                "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
                 "where": {"joints": [case.joint], "taxels": [], "topics": []},
                 "regime": EFFECTS[mm.id].shows,
                 "when": judge.intervals_of(active, case, runs, train),
@@ -722,9 +722,8 @@ def _sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
     for f in strong[:2]:
         words = words_of(f, d.mechanism)
-        if f["indistinguishable"]:
-            words += f" (or it is {' or '.join(x.replace('_', ' ') for x in f['indistinguishable'] if x != f['effect'])}: these recordings cannot tell)"
-        parts.append(f"{spoken(f)} {words}{_size(f)}")
+        others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
+        parts.append(f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else ""))
     parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] or strong[0]["where"]["joints"][0] in spoken(strong[0])[1:] else parts[0]
     left_out = len(named) - len(parts)
     more = f" ({left_out} more, {'smaller or less sure, ' if len(strong) < len(named) else ''}below)" if left_out else ""
@@ -820,11 +819,12 @@ def _next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case
         joints = f["where"]["joints"]
         kinds = sorted({k for e in rivals for k in TABLE.get(e, ["steps", "chirp", "triangles"])})
         head = f"to tell {' from '.join(rivals)} on {joints[0]}" if len(rivals) > 1 else f"to make sure of {rivals[0]} on {joints[0]}"
-        why = f"{head}: {EFFECTS[f['effect']].experiment}"
+        experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f["effect"]].experiment
+        why = f"{head}: {experiment}"
         choice = _choice(d, s, m, outcomes, f, rivals)
         if choice is not None:
             kinds = choice.chosen
-            why = f"{head}: {' and '.join(kinds)}, because {choice.text}"
+            why = f"{head}: {' and '.join(kinds)}, because {choice.text}" if choice.settles else f"{why}. Of the motions that can be planned here, {choice.text}"
     elif data["verdict"] in ("unknown", "partly_explained"):
         worst = max(d.joints, key=lambda j: d.joints[j]["after"]) if d.joints else None
         joints, kinds = ([worst] if worst else None), ["triangles", "ladder", "chirp", "steps", "holds"]

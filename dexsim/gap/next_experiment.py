@@ -35,10 +35,15 @@ class Choice:
     def text(self) -> str:
         """The choice in words."""
         ranked = sorted(self.scores.items(), key=lambda s: -s[1])
+        if not self.settles:
+            return f"none settles it: the two differ by {ranked[0][1]:.1f} times the noise on {ranked[0][0]}, and by less on the others"
         first = f"on {ranked[0][0]} the two differ by {ranked[0][1]:.1f} times the noise"
-        if ranked[0][1] < 1.0:
-            first = f"even {first[3:]}: repeat it, or allow larger motions"
         return first + (f" ({', '.join(f'{k} {v:.1f}' for k, v in ranked[1:])})" if len(ranked) > 1 else "")
+
+    @property
+    def settles(self) -> bool:
+        """Whether the best motion shows more than the noise."""
+        return max(self.scores.values()) >= 1.0
 
 
 def rival_of(search: JointSearch, outcome, effect: str, rival: str | None) -> Trial | None:
