@@ -1,4 +1,4 @@
-"""How long a diagnosis takes, and on what: python -m benchmarks.diagnose [joints=12] [seconds=60] [device=cpu] [hidden=true] [replay=auto].
+"""How long a diagnosis takes, and on what: python -m benchmarks.diagnose [joints=12] [seconds=60] [device=cpu] [hidden=true] [replay=mujoco].
 
 Recordings of the xHand are made in simulation (C MuJoCo, sampled as the hardware samples) with one hidden effect, read back and
 diagnosed with the whole catalogue. Kernels are compiled before the clock starts. One JSON line at the end.
@@ -19,7 +19,7 @@ import numpy as np
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
-DEFAULTS = {"joints": "12", "seconds": "60", "device": "cpu", "hidden": "true", "recordings": "4", "seed": "0", "next": "false", "replay": "auto", "out": ""}
+DEFAULTS = {"joints": "12", "seconds": "60", "device": "cpu", "hidden": "true", "recordings": "4", "seed": "0", "next": "false", "replay": "mujoco", "out": ""}
 
 
 def settings(argv: list[str]) -> dict[str, str]:
@@ -97,7 +97,7 @@ def main(argv: list[str]) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         paths, where = make(folder, int(s["joints"]), float(s["seconds"]), int(s["recordings"]), s["hidden"] == "true", int(s["seed"]))
         small, model, servo, _ = demo.make(folder / "warm", seconds=2.0)  # compiles what is compiled once
-        diagnose(Settings(small[:2], folder / "warm", None, str(model), str(servo), device=s["device"], next_recording=False, allowed={"lag"}), say=lambda _: None)
+        diagnose(Settings(small[:2], folder / "warm", None, str(model), str(servo), device=s["device"], next_recording=False, allowed={"lag"}, replay=s["replay"]), say=lambda _: None)
         start = time.perf_counter()
         d = diagnose(Settings(paths, folder / "out", None, device=s["device"], next_recording=s["next"] == "true", replay=s["replay"]), say=lambda text: print(text, flush=True))
         save(d, folder / "out")

@@ -99,7 +99,7 @@ def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):
     monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 0)
     assert command.available("cuda") == "cpu" and "no such GPU" in capsys.readouterr().out
     monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 2)
-    assert command.available("cuda:1") == "cuda:1" and command.available("cuda") == "cuda" and not capsys.readouterr().out
+    assert command.available("cuda:1") == "cuda:1" and command.available("cuda") == "cuda:0" and not capsys.readouterr().out
     assert command.available("cuda:2") == "cpu" and "it has 2" in capsys.readouterr().out
     with pytest.raises(UserError, match="cuda:0"):
         command.available("cuda:x")

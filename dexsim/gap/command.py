@@ -40,7 +40,7 @@ settings (key=default):
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
-  replay=auto                 engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp), none; auto: warp on a GPU
+  replay=mujoco               engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp, on the device), none
   device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits the cores that are used
   demo=false                  make a recording with a hidden effect, diagnose it, then open the answer
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
@@ -109,7 +109,7 @@ def main(argv: list[str]) -> int:
         raise UserError(f"device={device}: must be cpu or cuda")
     quiet_warp(device)
     device = available(device)
-    if given.get("replay", "auto") not in REPLAY:
+    if given.get("replay", "mujoco") not in REPLAY:
         raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
     demo = None
     out = Path(given.get("out", "out/demo" if given.get("demo") else "out/diagnosis")).expanduser()
@@ -130,7 +130,7 @@ def main(argv: list[str]) -> int:
         allowed = set(given["effects"])
     settings = Settings(
         inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
-        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "auto"), meta=given["meta"],
+        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "mujoco"), meta=given["meta"],
         remap=given["remap"],
     )  # fmt: skip
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
@@ -143,7 +143,7 @@ def main(argv: list[str]) -> int:
 
 
 def available(device: str) -> str:
-    """The device, or the CPU with a line that says so where there is no such GPU."""
+    """The device with its number, or the CPU with a line that says so where there is no such GPU."""
     if device == "cpu":
         return device
     import warp as wp
@@ -153,7 +153,7 @@ def available(device: str) -> str:
     if not number.isdigit():
         raise UserError(f"device={device}: must be cpu, cuda or cuda:0, cuda:1, ...")
     if int(number) < count:
-        return device
+        return f"cuda:{number}"  # torch wants the number
     have = f"it has {count}, counted from 0" if count else "no NVIDIA driver or none visible, see nvidia-smi and CUDA_VISIBLE_DEVICES"
     print(f"device={device}: this machine has no such GPU ({have}); the CPU is used", flush=True)
     return "cpu"

@@ -1,8 +1,8 @@
 """The few final hypotheses once more, in the engine and the servo that train policies.
 
 The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out of
-the fit, all joints at once, under the same commands: C MuJoCo on a CPU, MuJoCo-Warp on a GPU, with the servo's columns and
-model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one batch.
+the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's columns
+and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one batch.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
 
 STEP = 5e-4  # s: of the engine; its error is of first order in it
-REPLAY = ("auto", "mujoco", "warp", "none")
+REPLAY = ("mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
@@ -255,11 +255,10 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
-            floor: float, device: str = "cpu", replay: str = "auto", timestep: float = STEP) -> Confirmation | None:
+            floor: float, device: str = "cpu", replay: str = "mujoco", timestep: float = STEP) -> Confirmation | None:
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
     kept out. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
-    kind = replay if replay != "auto" else "mujoco" if device == "cpu" else "warp"
-    device = "cpu" if kind == "mujoco" else device
+    device = "cpu" if replay == "mujoco" else device
     windows = [c.plant.windows(None, test, span=span_test) for c in cases]
     if not cases or not len(windows[0].window):
         return None
@@ -272,7 +271,7 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     plain = [i for i, (_, changed) in enumerate(parts) if not changed]
     found: dict[int, list[np.ndarray]] = {}
     for group in ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]:
-        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, kind)
+        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, replay)
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
     def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
@@ -299,14 +298,14 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
                 joints[case.joint] = (rms(square[-1:]), rms(own[-1:]))
                 simulated[case.joint] = there
         errors[h.name] = (rms(square), rms(own))
-    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, kind)
+    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, replay)
     at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
     engine, plant = errors[hypotheses[final].name]
     before = errors[hypotheses[0].name][1] if final else 0.0
     if not np.isfinite(engine):
         raise UserError("the engine's state did not stay finite")
     names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
-    return Confirmation("MuJoCo-Warp" if kind == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
+    return Confirmation("MuJoCo-Warp" if replay == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
                         agree(engine, plant, floor, before), floor, at_tasks_step, simulated)
 
 

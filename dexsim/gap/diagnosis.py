@@ -52,7 +52,7 @@ class Settings:
     joints: set[str] | None = None
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
-    replay: str = "auto"  # see `confirm.REPLAY`
+    replay: str = "mujoco"  # see `confirm.REPLAY`
 
 
 @dataclass
