@@ -190,6 +190,7 @@ def make_engine(
     no_log_file()
     if engine not in ("auto", "warp", "mujoco"):
         raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
+    device = "cuda:0" if device == "cuda" else device  # torch.cuda.set_device wants a number
     if engine == "auto":
         engine = "warp" if device.startswith("cuda") else "mujoco"
     if engine == "mujoco" and device != "cpu":
