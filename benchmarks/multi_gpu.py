@@ -79,9 +79,8 @@ class Job:
         found = {"name": self.name, "gpus": self.count, "iterations": len(rows), "status": self.process.returncode, "start_s": self.first_row_s}
         if len(rows) <= SKIPPED:
             return found | {"error": "too few iterations: see its log"}
-        rows = rows[: -1] if len(rows) > SKIPPED + 5 else rows  # the last may have met the signal
-        late = rows[SKIPPED:]
         times = series(rows)
+        late = rows[SKIPPED:-1] if len(rows) > SKIPPED + 5 else rows[SKIPPED:]  # the last may have met the signal
         reached = {}
         for level in LEVELS:
             hit = np.flatnonzero(times["share"] >= level)
