@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -29,6 +32,20 @@ def test_first_episodes_that_began_at_random_ages_do_not_count():
 
 def test_no_rows_yet():
     assert all(len(v) == 0 for v in series([]).values())
+
+
+def test_the_iteration_that_reaches_a_level_counts_and_its_rate_does_not(tmp_path):
+    rows = _rows(30) + _rows(10, dropped=0.0)
+    rows[-1]["rate"] = "100000"
+    job = Job.__new__(Job)
+    job.name, job.count, job.folder, job.first_row_s = "1_gpu", 1, tmp_path, 1.0
+    job._log, job.process = open(tmp_path / "log", "w"), SimpleNamespace(returncode=130)
+    with open(tmp_path / "progress.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    found = job.result()
+    assert found["reached"]["0.97"]["iterations"] == 40 and found["steps_per_s"] == 1.0
 
 
 def test_efficiency_is_by_gpu_against_the_smallest_count():

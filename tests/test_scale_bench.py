@@ -51,11 +51,12 @@ def test_why_a_child_failed():
 
 
 @pytest.mark.slow
-def test_one_count_is_measured(tmp_path):
+def test_one_count_is_measured(tmp_path, capsys):
     assert scale.main(["counts=1,2", "device=cpu", "seconds=120", f"out={tmp_path}"]) == 0
     import json
 
     rows = json.loads((tmp_path / "scale.json").read_text())["rows"]
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["rows"] == rows
     assert [r["worlds"] for r in rows] == [1, 2] and all(r["step_s"] > 0 and r["train_bytes"] >= 1e6 for r in rows)
     assert (tmp_path / "scale.png").stat().st_size > 1000
 
