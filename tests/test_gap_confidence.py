@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap import confidence
+from dexsim.gap import confidence, judge
 from dexsim.gap.confidence import DOUBTED, Evidence
 from dexsim.gap.fit import Param
 from dexsim.gap.plant_columns import INDEX
@@ -120,3 +120,10 @@ def test_temperature_that_follows_something_else(starts, gains, what):
     nominal = [np.where(np.arange(len(INDEX)) == INDEX["kp"], g, 0.0) for g in gains]
     case = SimpleNamespace(regimes={"temperature": warm}, plant=SimpleNamespace(rows=rows, t=np.tile(np.linspace(0, 7, n), 4), nominal=nominal))
     assert confidence.temperature_follows(case, range(4)) == what
+
+
+@pytest.mark.parametrize(("before", "low", "structured", "word"), [(1.2, 1.1, True, "none"), (4.0, 1.1, True, "none"), (4.0, 3.0, False, "none"),
+                                                                  (4.0, 3.0, True, "unknown"), (12.0, 1.1, True, "unknown"), (12.0, 9.0, False, "unknown")])  # fmt: skip
+def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
+    """In floors: the error before, the low end of its interval, whether the windows show structure."""
+    assert judge.verdict([], 1.0, before, low, before, structured, judge.FAR) == word

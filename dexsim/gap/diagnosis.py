@@ -24,7 +24,7 @@ from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
-from dexsim.gap.search import JointSearch, Outcome
+from dexsim.gap.search import JointSearch, Outcome, Trial
 from dexsim.gap.sharpen import sharpen
 from dexsim.gap.together import together
 from dexsim.gap.touch_effects import entry
@@ -330,9 +330,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
                 out.mae[case.joint, runs[i].name] = (float(np.abs(measured - q0)[pick].mean()), float(np.abs(measured - q1)[pick].mean()))
         out.outcomes.append(outcome)
         # nuisances
-        for p, x in zip(best.fit.params, best.fit.x, strict=True):
-            if p.nuisance:
-                data["nuisance"][f"{p.key}_factor@{case.joint}" if p.mode == "factor" else f"{p.key}@{case.joint}"] = round(float(x), 6)
+        data["nuisance"] |= _nuisances(case.joint, best)
         bounds = intervals(best.fit, search.blocks, knee=search.r.knee)
         bounds = search.widen(best, bounds)
         by_member: dict[str, dict[str, float]] = {}
@@ -411,7 +409,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     out.spots = locate.control(all_spots)
     out.untrained = sorted(set(leftover))
     # a joint whose findings did not help on what was kept out keeps none of them
-    for k, (case, _, _) in enumerate(outcomes):
+    for k, (case, search, outcome) in enumerate(outcomes):
         mine = [f for f in findings if case.joint in f["where"]["joints"] and f["effect"] != "current_sensor"]
         v = out.joints[case.joint]
         if not mine or v["after"] < 0.98 * v["before"]:
@@ -420,6 +418,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             notes.append(f"{f['effect']} on {case.joint} earned its place on the training conditions but not on what was kept out; not claimed")
         findings = [f for f in findings if f not in mine]
         squares["after"][k] = squares["before"][k]
+        data["nuisance"] = {key: x for key, x in data["nuisance"].items() if not key.endswith(f"@{case.joint}")} | _nuisances(case.joint, search.polish(outcome.none))
         v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
         servo.entries.pop(case.joint, None)
         if case.joint in m.table.entries:
@@ -436,7 +435,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     only_effort = findings and all(f["effect"] == "current_sensor" for f in findings)
     structured = any(o.none.fit.loss > 1.3**2 and (len(o.scanned) > 0 or case.moved) for case, _, o in outcomes)
-    word = judge.verdict(data["findings"], floor, b, bl, a, structured)
+    word = judge.verdict(data["findings"], floor, b, bl, a, structured, judge.FAR)
     if only_effort:
         word = "explained"
         eb, ea = (float(np.sqrt(np.concatenate(effort_squares[k]).mean())) for k in ("before", "after"))
@@ -450,6 +449,12 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     out.model_spec = spec if changed_model else None
     out.sentence = _sentence(data, out, floor)
     return out
+
+
+def _nuisances(joint: str, trial: Trial) -> dict[str, float]:
+    """The refitted beliefs of one joint by the keys of `diagnosis.json`."""
+    return {f"{p.key}_factor@{joint}" if p.mode == "factor" else f"{p.key}@{joint}": round(float(x), 6)
+            for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
 
 
 def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ from dexsim.gap.prepare import REFERENCE, Case
 from dexsim.gap.runs import Run, same_commands
 
 
+FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
 SURE_ENOUGH = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
 
 
@@ -165,11 +166,12 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
     return sorted(out, key=lambda w: (w["recording"], w["start"]))
 
 
-def verdict(findings: list[dict], floor_: float, before: float, before_low: float, after: float, structured: bool) -> str:
-    """The one word. Where every name is doubtful and none stands for a set, an error that is gone is not yet explained."""
+def verdict(findings: list[dict], floor_: float, before: float, before_low: float, after: float, structured: bool, far: float = np.inf) -> str:
+    """The one word. Where every name is doubtful and none stands for a set, an error that is gone is not yet explained; an error
+    before beyond `far` x the floor is unknown even where it lies in too few moments to be sure of."""
     named = [f for f in findings if f["held_out"]]
     if not named:
-        if before_low <= 1.3 * floor_ or not structured:
+        if before <= far * floor_ and (before_low <= 1.3 * floor_ or not structured):
             return "none"
         return "unknown"
     if after <= 1.3 * floor_ and any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named):
