@@ -96,6 +96,20 @@ def test_averages_orderings_and_intervals(tmp_path):
     assert "| quaternion instead of 6D | 3.0 (" in text and "2.9, 2.5, 5.24, 15.2" in text
 
 
+def test_an_ordering_is_not_decided_within_what_seeds_do(tmp_path):
+    """Seeds of one row 30 apart: a difference of 15 between two other rows says nothing, one of 300 does."""
+    p = plan(tmp_path)
+    every = [jobs.Job(r, s) for r in rows.ROTATION for s in (1, 2)]
+    average = {"full": 320, "quaternion": 20, "plain_centre": 305}
+    for job in every:
+        put(job, p, "simulation", [average.get(job.row.key, 100) + (30 * job.seed if job.row.key == "no_force" else 0)] * 20)
+    verdict = {(c["first"], c["second"], c["quantity"]): c["here"] for c in report.rotation(p, every)[1]["orderings"]["simulation"]}
+    assert verdict["full", "plain_centre", "average"].startswith("undecided (+15.0")
+    assert verdict["full", "quaternion", "average"].startswith("holds (+300.0")
+    # by hand: variances 0 in six rows and 450 in one, 7 degrees of freedom, t = 2.3646
+    assert report._between_seeds([[100.0, 100.0]] * 6 + [[130.0, 160.0]]) == pytest.approx(2.3646 * (450 / 7) ** 0.5, rel=1e-4)
+
+
 def test_seeds_that_differ_widen_the_interval(tmp_path):
     p = plan(tmp_path)
     every = [jobs.Job(rows.ROTATION[0], s) for s in (1, 2)]
