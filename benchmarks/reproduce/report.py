@@ -122,6 +122,7 @@ def orderings(table: dict, world: str) -> list[dict[str, str]]:
         else:
             mine, theirs = ([math.inf if v is None else v for v in r["seconds_by_seed"]] for r in (a, b))
             here = "holds" if max(mine) < min(theirs) else "reversed" if min(mine) > max(theirs) else "undecided, the seeds overlap"
+            here = "undecided, one seed" if min(len(mine), len(theirs)) == 1 else here
             here += f" ({a[quantity]:.2f} and {b[quantity]:.2f} s)"
         out.append({"says": says, "here": here, "first": first, "second": second, "quantity": quantity, "word": word})
     return out
@@ -192,6 +193,8 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
             a, b = (table.get(k, {}).get(world, {}).get("force_correlation") or [] for k in (first, second))
             if not a or not b:
                 here = "not judged"
+            elif len(a) == len(b) == 1:
+                here = f"{'so' if a > b else 'not so'} for one seed each ({a[0]:.3f}, {b[0]:.3f})"
             elif min(a) > max(b) or max(a) < min(b):
                 here = "holds in every pair of seeds" if min(a) > max(b) else "reversed in every pair of seeds"
             else:
