@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dexsim.gap import inputs, touch, touch_data, touch_plant, touch_rig
+from dexsim.gap import confidence, inputs, touch, touch_data, touch_plant, touch_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.runs import Run
 from dexsim.gap.touch_effects import TOUCH, confusable
@@ -203,3 +203,13 @@ def test_joints_are_judged_in_free_air_alone():
     assert [(round(p.t[0], 1), round(p.t[-1], 1)) for p in pieces] == [(0.0, 3.9), (6.8, 12.0)]
     assert held == [0, 1] and all(len(p.torque) == len(p.t) and p.name == "a" for p in pieces) and "free air" in notes[0]
     assert inputs.free_air([run], [], {"a": [(0.5, 11.5)]}, notes) == ([], []) and "not judged" in notes[1]
+
+
+def test_a_little_crosstalk_may_be_the_law_of_the_contact():
+    def said(low: float) -> float:
+        f = {"effect": "tactile_crosstalk", "confidence": 0.99, "parameters": {"fraction": {"value": low + 0.05, "low": low, "high": low + 0.1}},
+             "held_out": {"before": 0.06, "after": 0.03}}  # fmt: skip
+        confidence.of_touch([f], 0.06, 0.03)
+        return f["confidence"]
+
+    assert said(0.08) == confidence.DOUBTED and said(0.2) == 0.99

@@ -204,8 +204,8 @@ def _ripple(s: Scales) -> list[Variant]:
         if not s.slide and 1.2 * s.span > period > 6 * s.sigma:
             params = (
                 _p("amplitude", "torque_ripple", "set", 0.0, 1.2 * s.tau, 0.0, "N.m"),
-                # a gear's own periods are whole numbers a turn of the joint; those of a motor before it are many
-                _p("per_turn", "ripple_per_turn", "set", turns * (0.98 if turns < 8 else 0.88), turns * (1.02 if turns < 8 else 1.12), turns),
+                # a gear's own periods are whole numbers a turn of the joint; those of a motor before it are many, and ranges overlap
+                _p("per_turn", "ripple_per_turn", "set", turns * (0.98 if turns < 8 else 0.85), turns * (1.02 if turns < 8 else 1.17), turns),
                 _p("phase", "ripple_phase", "set", -6.3, 6.3, 0.0, "rad"),
             )
             a = 0.1 * s.tau

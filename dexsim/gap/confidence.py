@@ -20,6 +20,7 @@ SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say
 CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
 NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
+SPREAD = 0.15  # share that neighbours may take over because pressure spreads by another law (foundation or half-space) than the plant's
 FROM_POSES = ("payload", "inertia", "joint_coupling")  # effects told from the pose and the motion of other joints
 ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
 
@@ -175,11 +176,14 @@ def _doubt(e: Evidence, reason: str) -> None:
 
 
 def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
-    """Lowers the confidence of touch's findings that are too small; returns why, a line each."""
+    """Lowers the confidence of touch's findings that are too small, or that the law of a contact's pressure may stand for; returns
+    why, a line each."""
     said = []
     for f in findings:
         h = f["held_out"]
         reason = too_small(before, h["before"], h["after"], noise, len(findings) == 1) if h else ""
+        if not reason and f["effect"] == "tactile_crosstalk" and f.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < SPREAD:
+            reason = "a contact's force may spread over the taxels as much wider than its law says"
         if reason:
             f["confidence"] = min(f["confidence"], DOUBTED)
             said.append(f"{f['effect']} is not sure: {reason}")
