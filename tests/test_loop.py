@@ -68,6 +68,14 @@ def test_share_recovered_by_hand():
     assert smaller_is_better["value"] == pytest.approx(0.5)
 
 
+def test_no_share_of_a_gap_that_may_be_none():
+    """By hand: means 4 apart, standard errors 1 and 0, t = 2.7764 with 4 degrees of freedom."""
+    gap = loop._gap(np.array([50.0 - 3**0.5, 50.0, 50.0 + 3**0.5]), np.array([54.0, 54.0, 54.0]))
+    assert gap["sure"] and (gap["low"], gap["high"]) == pytest.approx((4 - 2.7764, 4 + 2.7764), abs=1e-3)
+    assert not loop._gap(np.array([96.0, 97.0, 95.0]), np.array([97.0, 96.0, 98.0]))["sure"]
+    assert not loop._gap(np.array([]), np.array([1.0]))["sure"]
+
+
 def test_report_reads_what_was_judged(tmp_path):
     s = loop.SETTINGS | {"tasks": "grasp", "worlds": "dry", "seeds": "2", "out": str(tmp_path)}
     one = loop.Loop(s)

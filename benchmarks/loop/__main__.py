@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.stats import t as student
 
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
@@ -301,9 +302,10 @@ class Loop:
                             values[v].append(math.nan if row[v] is None else row[v] * unit)
                     x = {v: np.array(values[v]) for v in VARIANTS}
                     line = {"task": task, "world": world, "measure": label, "larger_is_better": larger, "values": values}
+                    line["gap"] = _gap(*(x[v][np.isfinite(x[v])] for v in ("naive", "truth")))
                     for other in ("fitted", "wide"):
                         both = np.isfinite(x["naive"]) & np.isfinite(x["truth"]) & np.isfinite(x[other])
-                        if both.any():
+                        if both.any() and line["gap"]["sure"]:
                             line[f"recovered_{other}"] = _ratio(x["naive"][both], x[other][both], x["truth"][both])
                     lines.append(line)
         found = {}
@@ -323,6 +325,17 @@ class Loop:
         for part in key.split("."):
             node = (node or {}).get(part)
         return None if node is None else float(node)
+
+
+def _gap(naive: np.ndarray, truth: np.ndarray) -> dict:
+    """mean truth - mean naive with its 95 % interval (Student's t over seeds), and whether it is surely not 0: what cannot be told from
+    nothing has no share that could be recovered. One seed each: taken as it is."""
+    if not len(naive) or not len(truth):
+        return {"value": None, "low": None, "high": None, "sure": False}
+    value, free = float(truth.mean() - naive.mean()), len(naive) + len(truth) - 2
+    error = math.sqrt(sum(x.var(ddof=1) / len(x) for x in (naive, truth) if len(x) > 1))
+    half = float(student.ppf(0.975, free)) * error if free else 0.0
+    return {"value": value, "low": value - half, "high": value + half, "sure": abs(value) > half}
 
 
 def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
@@ -348,7 +361,8 @@ def markdown(data: dict) -> str:
         for v in VARIANTS:
             x = np.array([a for a in line["values"][v] if a == a])
             cells.append("-" if not len(x) else f"{x.mean():.3g}" + (f" ± {x.std(ddof=1) / math.sqrt(len(x)):.2g}" if len(x) > 1 else ""))
-        shares = [f"{r['value']:.2f} ({r['low']:.2f} to {r['high']:.2f})" if (r := line.get(f"recovered_{o}")) else "-" for o in ("fitted", "wide")]
+        none = "-" if line["gap"]["sure"] or line["gap"]["value"] is None else "no sure gap"
+        shares = [f"{r['value']:.2f} ({r['low']:.2f} to {r['high']:.2f})" if (r := line.get(f"recovered_{o}")) else none for o in ("fitted", "wide")]
         text.append(f"| {line['task']}, {line['world']} | {line['measure']} | " + " | ".join(cells + shares) + " |")
     return "\n".join(text) + "\n"
 
