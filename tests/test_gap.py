@@ -187,7 +187,9 @@ def test_map_finds_the_regime_and_controls_false_discoveries():
     block = np.arange(n) // 50
     plain = rng.standard_normal(n)
     found = locate.control(locate.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
-    assert found and found[0].regime == "speed" and found[0].low > 0.7
+    assert found and found[0].regime == "speed" and found[0].low > 0.7 and found[0].text == found[0].where
+    both = locate.control(locate.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found)
+    assert both[0].of == "position" and both[-1].of == "effort" and both[-1].text.startswith("effort, speed")
     assert not locate.control(locate.spots("j", plain, block, {"speed": speed, "load": other}, rng))
 
 

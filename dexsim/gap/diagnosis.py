@@ -391,11 +391,16 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
         changed_model |= bool(mine)
         leftover_text = [x for x in mine]
         notes.extend(leftover_text)
-        r = search.fitter.evaluate(none.fit.params, none.fit.x)[: search.long.n]
+        everything = search.fitter.evaluate(none.fit.params, none.fit.x)
+        r = everything[: search.long.n]
         rows_train = search.long.sample_row
         regimes = {k: v[rows_train] for k, v in case.regimes.items()}
         found = locate.spots(case.joint, r * case.sigma, search.blocks[: search.long.n], regimes, rng)
         all_spots += found
+        if search.fitter.use_torque:
+            on, again = search.fitter.tau_on, np.random.default_rng(s.seed + 1)
+            effort = everything[search.long.n :][on] * search.r.sigma_torque
+            all_spots += locate.spots(case.joint, effort, search.blocks[: search.long.n][on], {k: v[on] for k, v in regimes.items()}, again, "effort")
         case_left = search.fitter
         with search._fix(best.members):
             r1 = case_left.evaluate(best.fit.params, best.fit.x)[: search.long.n]

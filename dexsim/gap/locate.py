@@ -27,18 +27,27 @@ class Spot:
     share: float
     p: float
     q: float = 1.0
+    of: str = "position"  # or "effort": whose residual
 
     @property
     def text(self) -> str:
+        return self.where if self.of == "position" else f"{self.of}, {self.where}"
+
+    @property
+    def where(self) -> str:
+        """The bin in words."""
         if self.regime == "time since reversal":
             return f"within {1e3 * self.high:.0f} ms after a reversal" if self.low == 0 else f"from {1e3 * self.low:.0f} ms after a reversal on"
         if self.regime == "direction":
             return "moving positive" if self.high > 0.5 else "moving negative" if self.low < -0.5 else "at rest"
+        if self.regime == "driven against its load":  # the sign of speed times torque
+            return "while the motor drives" if self.high > 1.0 else "while the motor brakes" if self.low < -1.0 else "at rest or without torque"
         return f"{self.regime} {self.low:.3g} to {self.high:.3g}"
 
 
-def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str, np.ndarray], rng: np.random.Generator) -> list[Spot]:
-    """Bins of one joint. residual [n] (in any unit), block [n] which stretch of time, regimes name -> [n]."""
+def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str, np.ndarray], rng: np.random.Generator,
+          of: str = "position") -> list[Spot]:
+    """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name -> [n]."""
     out = []
     _, block = np.unique(block, return_inverse=True)
     count = int(block.max()) + 1
@@ -76,12 +85,12 @@ def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str
             p = 2 * _tail(abs(z))
             top = float(np.max(x)) if not np.isfinite(high) else float(high)
             out.append(Spot(joint, name, float(low), top, float(np.sqrt(inner / max(outer, 1e-300))), float(np.quantile(ratio, 0.05)),
-                            float(np.quantile(ratio, 0.95)), float(np.sqrt(inner)), float(inside.mean()), p))
+                            float(np.quantile(ratio, 0.95)), float(np.sqrt(inner)), float(inside.mean()), p, of=of))
     return out
 
 
 def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:
-    """Benjamini-Hochberg over all bins: those that stand at `rate`, the largest first."""
+    """Benjamini-Hochberg over all bins: those that stand at `rate`, the largest first, positions before efforts."""
     if not found:
         return []
     order = np.argsort([s.p for s in found])
@@ -92,7 +101,7 @@ def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:
         q[order[k]] = last
     for s, value in zip(found, q, strict=True):
         s.q = float(value)
-    return sorted([s for s in found if s.q <= rate and s.ratio > 1.2], key=lambda s: -s.rms * np.sqrt(s.share))
+    return sorted([s for s in found if s.q <= rate and s.ratio > 1.2], key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)))
 
 
 def _tail(z: float) -> float:

@@ -134,14 +134,14 @@ def _spots(d: Diagnosis) -> str:
     """Where the error before lives, beside the picture where there is room for it."""
     if len(d.joints) > 2 or not d.spots:
         return ""
-    rows = [(s.text if len(d.joints) == 1 else f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in _best(d)[:4]]
+    rows = [(s.text if len(d.joints) == 1 else f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for of, most in (("position", 4), ("effort", 2)) for s in [x for x in _best(d) if x.of == of][:most]]
     return f'<h2>Where the error before lives</h2>{charts.ratios(rows, 560, 250)}<p class="soft small">Error inside over error outside, 90 % intervals.</p>'
 
 
 def _best(d: Diagnosis) -> list[Any]:
-    best: dict[tuple[str, str], Any] = {}
+    best: dict[tuple[str, str, str], Any] = {}
     for s in d.spots:
-        best.setdefault((s.joint, s.regime), s)
+        best.setdefault((s.joint, s.of, s.regime), s)
     return list(best.values())
 
 
@@ -331,7 +331,7 @@ def _details(d: Diagnosis) -> str:
     if len(d.joints) > 6:
         folded.append(("Every joint", _rows(d, "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")))
     if d.spots:
-        rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for s in _best(d)[:10]]
+        rows = [(f"{s.joint}: {s.text}", s.ratio, s.ratio_low, s.ratio_high) for of in ("position", "effort") for s in [x for x in _best(d) if x.of == of][:10]]
         folded.append(("Where the error before lives", "<p class='soft small'>Error inside a regime over the error outside it, with 90 % intervals; only what stands after "
                        f"controlling the false discoveries over all regimes of all joints.</p>{charts.ratios(rows)}"))  # fmt: skip
     if d.stages:
