@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.concealed import baselines, effects, generate, plant, score, touch
+from benchmarks.concealed import baselines, effects, generate, page, plant, score, touch
 from benchmarks.concealed import __main__ as command
 from dexsim.recording import read
 
@@ -344,3 +344,12 @@ def test_the_others_are_asked_about_what_stands_out(some):
     picked = [kinds[m["name"]] for m in baselines.comparable(made, root, 9)]
     assert picked and ["cable_spring"] not in picked and [] not in picked
     assert len(baselines.comparable(made, root, 1)) == 1 and baselines.comparable(made, root, 0) == []
+
+
+def test_right_by_size_and_by_confidence_are_counted():
+    r = {"group": "effect", "decoy": "", "right": True, "ratio": 3.0, "hidden": [("lag", "j")], "said": [("lag", "j", 0.99, []), ("payload", "j", 0.7, [])]}
+    silent, as_set = {**r, "right": False, "said": [], "ratio": 39.0}, {**r, "said": [("lag", "j", 0.9, ["command_delay", "lag"])]}
+    sizes = {a: x for a, _, *x in page.by_size([r, silent, as_set])}
+    assert sizes[2.2] == [2, 2, 0] and sizes[6.0] == [1, 0, 1] and sizes[1.25] == [0, 0, 0]
+    sure = {a: x for a, _, *x in page.by_confidence([r, silent, as_set, {**r, "decoy": "bad_channel"}])}
+    assert sure[0.95] == [1, 1] and sure[0.65] == [1, 0] and sure[0.8] == [0, 0]  # a set is no single name

@@ -21,7 +21,7 @@ AIMS = {  # line: (to publish, aim), from the project's judging table
     "false alarm, nothing missing": ("8 %", "3 %"), "outside the catalogue: not claimed": ("60 %", "80 %"), "confident and wrong, all cases": ("10 %", "3 %"),
 }  # fmt: skip
 PLAIN = ("(F1)", "mean", "error removed")
-SIZES = (1.0, 1.25, 1.6, 2.2, 3.5, 6.0, 20.0)  # x the floor: edges of the bins of the effect's error
+SIZES = (1.0, 1.25, 1.6, 2.2, 3.5, 6.0, 1e3)  # x the floor: edges of the bins of the effect's error
 SURE = (0.0, 0.4, 0.65, 0.8, 0.95, 1.0)  # edges of the bins of confidence
 COLOURS = {"right alone": "#2f855a", "right in a set": "#9ae6b4", "nothing claimed": "#cbd5e0", "another, unsure": "#f6ad55", "another, confident": "#c53030"}
 
@@ -97,7 +97,7 @@ def figure(data: dict, path: Path) -> None:
         ax.set_xlim(0, 1)
         ax.set_xticks([0, 0.5, 1], ["0", "50 %", "100 %"])
     axes[0].set_yticks(range(len(names)), names, fontsize=9)
-    axes[0].invert_yaxis()
+    axes[0].set_ylim(len(names) - 0.4, -0.6)
     fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncol=5, fontsize=9, frameon=False)
     fig.tight_layout(rect=(0, 0.06, 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +142,7 @@ def limits(data: dict, path: Path) -> None:
         spread = [wilson(v, r[2]) for v, r in zip(values, rows, strict=True)]
         left.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
                       fmt="o-", color=colour, label=label, capsize=3)
-    left.set_xticks(list(x), [f"{a:g}-{b:g}\n({n})" for a, b, n, *_ in rows], fontsize=8)
+    left.set_xticks(list(x), [(f"{a:g}-{b:g}" if b < SIZES[-1] else f"over {a:g}") + f"\n({n})" for a, b, n, *_ in rows], fontsize=8)
     left.set_xlabel("error that the effect makes, in floors (cases)")
     left.set_ylim(-0.02, 1.04)
     left.legend(frameon=False, fontsize=9)
@@ -152,7 +152,7 @@ def limits(data: dict, path: Path) -> None:
     spread = [wilson(k, n) for *_, n, k in bins]
     right.plot([0, 1], [0, 1], color="#cbd5e0", label="as sure as right")
     right.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
-                   fmt="o-", color="#2b6cb0", label="names that are hidden there", capsize=3)
+                   fmt="o-", color="#2b6cb0", label="names that are true (count)", capsize=3)
     for at, v, (*_, n, _) in zip(x, rate, bins, strict=True):
         right.annotate(str(n), (at, v), textcoords="offset points", xytext=(6, -10), fontsize=8)
     right.set_xlabel("confidence of a name")
