@@ -487,6 +487,7 @@ def test_final_observations_are_those_before_the_reset(env):
     (("task", "contact", "impedance", 1.0), "impedance"),
     (("task", "critic", "oracle"), "task.critic"),
     (("task", "objects", "train", ["cube"]), "cube"),
+    (("task", "objects", "held_out", []), "held_out"),
 ])  # fmt: skip
 def test_impossible_settings_are_user_errors(change, word):
     cfg = grasp_cfg("tactile.others=false", worlds=1)

@@ -55,6 +55,8 @@ class GraspEnv(HandEnv):
         self.tau_max = self.effort[self.roots]
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
         train, held = t["objects"]["train"], t["objects"]["held_out"]
+        if not held:
+            raise UserError("task.objects.held_out=[]: must name a shape, e.g. [cross]; policies are judged on some that they never met")
         names = [v.shape.name for v in self.scene.variants]
         self.train_rows = torch.tensor([i for i, s in enumerate(names) if s in train], device=dev)
         self.held_rows = torch.tensor([i for i, s in enumerate(names) if s in held], device=dev)
