@@ -19,7 +19,7 @@ from dexsim.errors import UserError
 from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, jitter, judge, locate, stage, standin, touch
 from dexsim.gap.catalogue import EFFECTS, confusable, separating
 from dexsim.gap.charts import number
-from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes
+from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes, widen
 from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
@@ -31,6 +31,7 @@ from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
+DOUBTED = 0.5  # confidence below which training is also given what was believed before the fit
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
@@ -432,6 +433,11 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             spec, changed_model = m.spec.copy(), False
     findings.sort(key=lambda f: -_weight(f))
     _doubts(out, findings, channel)
+    members = {(case.joint, m.id): (case, m) for case, _, outcome in outcomes for m in outcome.best.members}
+    for f in findings:
+        key = (f["where"]["joints"][0], f["effect"])
+        if f["confidence"] < DOUBTED and key in members and widen(servo, *members[key]):
+            notes.append(f"{key[1]} on {key[0]} is less likely there than not: in servo.yaml its range holds what was believed as well")
     b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
     a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
     slide = all(c.constants.slide for c in cases)

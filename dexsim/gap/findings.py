@@ -136,6 +136,20 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> l
     return left
 
 
+def widen(table: ServoTable, case: Case, member) -> bool:
+    """Widens the ranges of an effect's columns until they hold what was believed before the fit: training then draws hands with and
+    without an effect that is less likely there than not. The fitted values stay. Returns whether a range changed."""
+    changed = False
+    for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
+        column, now = COLUMNS[INDEX[name]], table.value(case.joint, name)
+        believed = float(np.clip(case.scales.nominal[name], column.low, min(column.high, 1e9)))
+        if now.unknown or now.low <= believed <= now.high:
+            continue
+        table.set(case.joint, name, now.value, round(min(now.low, believed), 9), round(max(now.high, believed), 9))
+        changed = True
+    return changed
+
+
 def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]]) -> list[str]:
     """Writes effects that live in the model into its spec; returns what was changed, in words."""
     said = []
