@@ -141,7 +141,8 @@ def _randomization(table: dict) -> list[str]:
 
 def _rotation_figure(axes, order: list[Row], table: dict) -> None:
     x = np.arange(len(order))
-    for quantity, ax, unit in (("average", axes[0], "consecutive successes"), ("seconds_per_success", axes[1], "s a success")):
+    for quantity, seeds, ax, unit in (("average", "by_seed", axes[0], "consecutive successes; dots: each seed"),
+                                      ("seconds_per_success", "seconds_by_seed", axes[1], "s a success; dots: each seed")):
         series = [("paper, real hand", [r.paper.get(quantity, np.nan) for r in order], None)]
         for world in jobs.WORLDS:
             found = [table.get(r.key, {}).get(world) for r in order]
@@ -150,8 +151,11 @@ def _rotation_figure(axes, order: list[Row], table: dict) -> None:
             if quantity == "average":
                 error = np.array([[np.nan, np.nan] if f is None else [f["average"] - f["interval"][0], f["interval"][1] - f["average"]] for f in found]).T
             series.append((WORLD_NAMES[world], value, error))
+            for i, f in enumerate(found):
+                dots = [v for v in (f or {}).get(seeds, ()) if v is not None]
+                ax.plot([i + 0.27 * (len(series) - 2)] * len(dots), dots, "k.", markersize=5, zorder=3)
         for k, (label, value, error) in enumerate(series):
-            ax.bar(x + 0.27 * (k - 1), value, width=0.25, yerr=error, label=label, capsize=2)
+            ax.bar(x + 0.27 * (k - 1), value, width=0.25, yerr=error, label=label, capsize=2, ecolor="#777777")
         ax.set_ylabel(unit)
         ax.set_xticks(x, [r.key.replace("_", "\n") for r in order], fontsize=7)
     axes[0].legend(fontsize=7)
