@@ -81,7 +81,7 @@ def test_fit_becomes_centre_and_width_of_randomization(hand_servo):
 
 @pytest.mark.parametrize("fitted, low, high, after", [(0.25, 0.2, 0.3, (0.2, 1.09)), (1.5, 1.4, 1.6, (1.09, 1.6)), (1.0, 0.9, 1.2, (0.9, 1.2))])
 def test_what_is_doubted_is_handed_on_beside_what_was_believed(fitted, low, high, after):
-    """An effect that is less likely there than not: its range is widened to the belief, its fitted value stays, other columns do not move."""
+    """An effect that is not sure: its range is widened to the belief, its fitted value stays, other columns do not move."""
     from types import SimpleNamespace
 
     from dexsim.gap.findings import widen

@@ -31,7 +31,7 @@ from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
-DOUBTED = 0.5  # confidence below which training is also given what was believed before the fit
+DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
@@ -437,7 +437,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     for f in findings:
         key = (f["where"]["joints"][0], f["effect"])
         if f["confidence"] < DOUBTED and key in members and widen(servo, *members[key]):
-            notes.append(f"{key[1]} on {key[0]} is less likely there than not: in servo.yaml its range holds what was believed as well")
+            notes.append(f"{key[1]} on {key[0]} is not sure: in servo.yaml its range holds what was believed as well")
     b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
     a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
     slide = all(c.constants.slide for c in cases)

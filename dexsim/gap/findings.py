@@ -138,7 +138,7 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> l
 
 def widen(table: ServoTable, case: Case, member) -> bool:
     """Widens the ranges of an effect's columns until they hold what was believed before the fit: training then draws hands with and
-    without an effect that is less likely there than not. The fitted values stay. Returns whether a range changed."""
+    without an effect that is not sure to be there. The fitted values stay. Returns whether a range changed."""
     changed = False
     for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
         column, now = COLUMNS[INDEX[name]], table.value(case.joint, name)
