@@ -345,9 +345,11 @@ def test_what_is_seen_and_sent_is_recorded(made, tmp_path):
     assert seen["/policy/observation"] == seen["/policy/action"] == seen["/object_seen"] == report.acts
 
 
-def test_a_slow_disk_costs_samples_not_time(tmp_path):
+def test_a_slow_disk_costs_samples_not_time(tmp_path, monkeypatch):
+    from dexsim.recording.writer import Writer
+
+    monkeypatch.setattr(Writer, "add_tactile", lambda *a: time.sleep(0.05))  # before the recorder's thread looks it up
     rec = recorder_at(tmp_path / "slow.mcap", most=50)
-    rec.writer.add_tactile = lambda *a: time.sleep(0.05)
     start = time.perf_counter()
     for k in range(300):
         rec.put("tactile", 100.0 + k * 1e-3, np.zeros((5, 120, 3)))

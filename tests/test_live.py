@@ -169,11 +169,14 @@ def test_pause_step_world_policy_command_and_restart(view, env):
 def test_touch_is_shown_where_it_is_felt(view, env):
     view.wishes.speed = "fastest"
     blank = view._image.image.copy()
-    view.run(seconds=6.0)
-    assert view.steps > 60
-    felt = env.touch.raw[0].numpy()
+    give_up = time.monotonic() + 60.0
+    felt = np.zeros((5, 120))
+    while view.steps <= 60 or felt.sum() == 0:  # how far "fastest" comes is the machine's affair; an object between two throws is not felt
+        assert time.monotonic() < give_up, f"{view.steps} steps, none of the last of a second felt anything"
+        view.run(seconds=1.0)
+        felt = env.touch.raw[0].numpy()
     view.draw(panels_too=True)
-    assert float(felt.sum()) > 0 and (view._image.image != blank).any()
+    assert (view._image.image != blank).any()
     finger = int(felt.sum(1).argmax())
     pressed = view._points[finger].colors.astype(int)
     assert pressed[felt[finger].argmax()].sum() < pressed[felt[finger].argmin()].sum()
