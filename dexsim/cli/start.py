@@ -132,15 +132,16 @@ def _load(path: Any) -> dict[str, Any]:
 
 def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
     cfg = settings.from_files(config_dir, request.choices)
-    return settings.override(_servo_file(cfg, request), request.values)
+    return settings.override(_files(cfg, request), request.values)
 
 
 def _from_checkpoint(data: dict[str, Any], config_dir: Path, request: settings.Request,
                      fresh: dict[str, Any]) -> DictConfig:
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
-    cfg = OmegaConf.create(copy.deepcopy(data["config"]) | fresh)
+    own = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
+    cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
     OmegaConf.set_struct(cfg, True)
-    cfg = _servo_file(settings.choose(cfg, config_dir, request.choices), request)
+    cfg = _files(settings.choose(cfg, config_dir, request.choices), request)
     return settings.override(cfg, request.values)
 
 
@@ -187,16 +188,21 @@ def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
     return overlay(plain)
 
 
-def _servo_file(cfg: DictConfig, request: settings.Request) -> DictConfig:
-    """Put the user's servo file itself into ``servo``, so that overrides reach it and a checkpoint carries it."""
-    given = _last(request, "servo_file")
-    if given is not None:
+def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
+    """Put the content of the user's files into ``servo``, ``tactile`` and ``randomize``, so that overrides reach it and a checkpoint
+    carries it."""
+    servo, tactile = _last(request, "servo_file"), _last(request, "tactile_file")
+    OmegaConf.set_struct(cfg, False)
+    if servo is not None:
         from dexsim.actuator.table import ServoTable
 
-        path = Path(given).expanduser()
+        path = Path(servo).expanduser()
         ServoTable.load(path)  # raises UserError
-        OmegaConf.set_struct(cfg, False)
         cfg["servo"] = yaml.safe_load(path.read_text(encoding="utf-8"))
         cfg["choices"]["servo"] = str(path)
-        OmegaConf.set_struct(cfg, True)
+    if tactile is not None:
+        from dexsim.tactile.file import lay_over
+
+        lay_over(cfg, tactile)
+    OmegaConf.set_struct(cfg, True)
     return cfg

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 
 from dexsim.errors import UserError
 from dexsim.tactile.kernel import LAWS
+from dexsim.tactile.pads import PadConfig, pad_configs
 
 Range = tuple[float, float]
 
@@ -46,6 +47,7 @@ class TactileConfig:
     full_scale: int = 255
     period: float = 0.02
     params: Mapping[str, Range] = field(default_factory=dict)
+    pads: Mapping[str, PadConfig] = field(default_factory=dict)
 
     def range(self, name: str) -> Range:
         return self.params.get(name, (COLUMNS[name][3],) * 2)
@@ -58,7 +60,7 @@ class TactileConfig:
     def measured(self) -> bool:
         """Whether what the sensor reports differs from the clean forces."""
         effects = ("threshold", "noise", "lsb", "delay", "hysteresis", "gain_spread", "dead")
-        return self.shear or self.feel_others or any(self.used(n) for n in effects)
+        return self.shear or self.feel_others or bool(self.pads) or any(self.used(n) for n in effects)
 
 
 def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
@@ -98,6 +100,8 @@ def tactile_config(cfg: Mapping | TactileConfig | None) -> TactileConfig:
         if rubber["c10"] + rubber["c01"] <= 0.0:
             raise UserError("tactile.rubber: c10 + c01 must be positive [Pa]")
         out["rubber"] = rubber
+    if "pads" in out:
+        out["pads"] = pad_configs(out["pads"])
     done = TactileConfig(**out)
     if done.feel_others and not done.others:
         raise UserError("tactile.feel_others=true needs tactile.others=true")

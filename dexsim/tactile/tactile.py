@@ -12,6 +12,7 @@ import warp as wp
 
 from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
+from dexsim.tactile.by_pad import OF_WORLD, ByPad
 from dexsim.tactile.config import COLUMNS, TactileConfig, stiffness_of, tactile_config
 from dexsim.tactile.kernel import MAX_ROUNDS, Law, Pads, touch_kernel
 from dexsim.tactile.lanes import LANES
@@ -118,7 +119,7 @@ class Tactile:
         self.force, self.centre = self.force_clean, self.centre_clean
         self.raw_clean = self.raw = wp.to_torch(a.felt) if store else None
         self.raw3 = None
-        self._m = None
+        self._m = self.by_pad = None
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
@@ -132,6 +133,9 @@ class Tactile:
         if measured:
             if cfg.shear and o != 1:
                 raise UserError(f"tactile.shear=true: works with one object, {o} were given")
+            self.by_pad = ByPad(cfg, layout, n, self.device, seed, {k: self.column(k) for k in OF_WORLD}) if cfg.pads else None
+            if self.by_pad is not None and self.by_pad.rubber and o != 1:
+                raise UserError(f"tactile.pads: rubber works with one object, {o} were given")
             self._measure(seed)
         everyone = torch.ones(n, dtype=torch.bool, device=self.device)
         self.randomize(everyone)
@@ -140,8 +144,10 @@ class Tactile:
     def _measure(self, seed: int) -> None:
         """Arrays and kernels of the imperfect sensor."""
         cfg, (n, f, t) = self.cfg, (self.engine.n, self.layout.pads, self.layout.taxels)
-        slots = 1 if not cfg.used("delay") else int(np.ceil(cfg.range("delay")[1] / cfg.period)) + 2
-        hysteresis, noise = cfg.used("hysteresis"), cfg.used("noise")
+        pad = self.by_pad
+        longest = max(cfg.range("delay")[1], 0.0 if pad is None else pad.longest)
+        slots = 1 if longest == 0.0 else int(np.ceil(longest / cfg.period)) + 2
+        hysteresis, noise = cfg.used("hysteresis") if pad is None else pad.hysteresis, cfg.used("noise")
         with wp.ScopedDevice(self.device):
             e = Effects()
             for name in Effects.vars:
@@ -167,7 +173,8 @@ class Tactile:
                 raw=wp.zeros((n, f, t) if cfg.raw else (1, 1, 1), dtype=float),
                 raw3=wp.zeros((n, f, t) if cfg.raw and cfg.shear else (1, 1, 1), dtype=wp.vec3),
                 seed=int(seed),
-                taxel=taxel_kernel(cfg.shear, hysteresis, noise),
+                # by pad, rubber has relaxed before the taxels are measured
+                taxel=taxel_kernel(cfg.shear, hysteresis and pad is None, noise),
                 report=report_kernel(self.lanes, cfg.shear, cfg.raw),
             )
         self.force, self.centre = wp.to_torch(m.force), wp.to_torch(m.centre)
@@ -195,9 +202,11 @@ class Tactile:
         m = self._m
         if m is not None:
             wp.to_torch(m.episode).add_(mask.to(torch.int32))
-            if self.cfg.used("gain_spread") or self.cfg.used("dead"):
+            if self.cfg.used("gain_spread") or self.cfg.used("dead") or self.by_pad is not None:
                 args = [wp.from_torch(mask), self._row["gain_spread"], self._row["dead"], m.episode, m.seed, m.gain]
                 wp.launch(draw_gains, dim=m.gain.shape, inputs=args, device=self.device)
+            if self.by_pad is not None:
+                self.by_pad.randomize(mask, generator, m.episode, m.gain)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Where mask [N] (bool) holds: forget the past (hysteresis, shear anchors, delayed readings)."""
@@ -232,14 +241,19 @@ class Tactile:
             return
         xpos, xmat = self.engine.wp.xpos, self.engine.wp.xmat
         wp.launch(clock, dim=n, inputs=[self.engine.wp.time, m.now, m.tick], device=self.device)
+        pad = self.by_pad
+        felt = a.felt if pad is None else pad.launch_skin(self, a.felt)
         args = [
-            a.felt, m.gain, m.effects, self._pads, m.axes, xpos, xmat, a.object_body, m.now, m.last, m.tick, m.seed,
+            felt, m.gain, m.effects, self._pads, m.axes, xpos, xmat, a.object_body, m.now, m.last, m.tick, m.seed,
             float(self.cfg.full_scale), m.state, m.anchor, m.ring, m.ring_shear,
         ]  # fmt: skip
         wp.launch(m.taxel, dim=m.gain.shape, inputs=args, device=self.device)
+        if pad is not None:
+            pad.launch_stuck(self)
         args = [m.now, m.effects.delay, m.tick, m.stamps, m.last, m.chosen, m.late]
         wp.launch(stamp, dim=n, inputs=args, device=self.device)
-        args = [m.ring, m.ring_shear, m.chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
+        ring, ring_shear, chosen = (m.ring, m.ring_shear, m.chosen) if pad is None else pad.launch_choice(self)
+        args = [ring, ring_shear, chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
         dim = [n, self.layout.pads]
         if self.lanes:  # a block of one thread per taxel for each world and pad
             width = self._pads.taxel.shape[1]

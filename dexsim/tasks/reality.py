@@ -53,6 +53,7 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     cfg["sim"].update(world["sim"], engine="mujoco")
     cfg["belief"] = {"servo": cfg["servo"], "drive": math.prod(_middle(cfg, c) for c in ("efficiency", "torque_limit"))}
     cfg["servo"] = world["servo"]
+    cfg["tactile"].pop("pads", None)  # what training believes of its own hand's fingertips
     cfg["tactile"].update(world["tactile"])
     cfg["randomize"]["servo"] = {name: 1.0 if name in RELATIVE else 0.0 for name in cfg["randomize"]["servo"]}
     own = world["tasks"][task]

@@ -1,0 +1,385 @@
+"""What is known of single pads (`tactile.pads`), between what a skin feels and what its sensor reports.
+
+Order, that of `dexsim.gap.touch_plant`: spread by rubber -> hysteresis -> neighbours -> exchanged wires -> gain -> (noise,
+threshold, counts: `dexsim.tactile.measure`) -> stuck -> delay by pad. Nothing here is compiled or launched without
+`tactile.pads`. Plain kernels, a thread for each pad or taxel, the same on every device; launches only, on memory that never
+moves, so that they can be recorded.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import warp as wp
+
+from dexsim.errors import UserError
+from dexsim.tactile.config import TactileConfig
+from dexsim.tactile.kernel import LAWS, MAX_STRAIN, Law, Pads, pose_in, spread_level, spread_weight, taxel_force, turn_in, xyz
+from dexsim.tactile.layout import TaxelLayout
+from dexsim.tactile.measure import NEVER, counts, relax, rubber_force
+from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS
+from dexsim.tactile.sdf import Shapes, distance
+
+COLUMNS = tuple(PAD_COLUMNS)
+OF_WORLD = ("hysteresis", "hysteresis_time", "delay")
+"""What a pad has from the world's settings where its own do not say it."""
+BESIDE = 4
+"""Taxels beside one, at most."""
+LEFT = 1.0e-4
+"""N: what other fingers press on a taxel counts from here; under it is rounding."""
+
+
+class ByPad:
+    """Memory and launches of `tactile.pads` on N worlds, F pads, T taxels.
+
+    layout: its names are the keys of cfg.pads. world: the per-world parameters by name, [N] each, of which pads without their
+    own have theirs. values [C, N, F]: the parameters by `COLUMNS`, drawn by `randomize`. Raises UserError for a pad or taxel
+    that the layout lacks.
+    """
+
+    def __init__(self, cfg: TactileConfig, layout: TaxelLayout, n: int, device: str, seed: int, world: dict[str, torch.Tensor]):
+        f, t = layout.pads, layout.taxels
+        self.cfg, self.shape, self.device, self.seed, self._world = cfg, (n, f, t), device, int(seed) + 15485863, world
+        low, high = (np.repeat(np.array([PAD_COLUMNS[c][3] for c in COLUMNS])[:, None], f, 1) for _ in range(2))
+        own = np.zeros((len(COLUMNS), f), dtype=bool)
+        gain = np.ones((f, t, 2))
+        order, beside = np.tile(np.arange(t), (f, 1)), np.full((f, t, BESIDE), -1)
+        stuck: list[tuple[int, int, float]] = []
+        thickness, rubber = np.full(f, THICKNESS), np.zeros(f, dtype=bool)
+        for name, pad in cfg.pads.items():
+            if name not in layout.names:
+                raise UserError(f"tactile.pads.{name}: no such pad; pads: {', '.join(layout.names)}")
+            i = layout.names.index(name)
+            for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
+                if k >= layout.count[i]:
+                    raise UserError(f"tactile.pads.{name}: no taxel {k}; this pad has {layout.count[i]}, counted from 0")
+            for c, (a, b) in pad.params.items():
+                j = COLUMNS.index(c)
+                low[j, i], high[j, i], own[j, i] = a, b, True
+            for k, ends in pad.taxels.items():
+                gain[i, k] = ends
+            for a, b in pad.swapped:
+                order[i, [a, b]] = b, a
+            stuck += [(i, k, v) for k, v in pad.stuck.items()]
+            thickness[i], rubber[i] = pad.thickness, pad.rubber
+        self.crosstalk = bool(high[COLUMNS.index("crosstalk")].any())
+        self.rubber = bool(rubber.any())
+        self.hysteresis = cfg.used("hysteresis") or bool(high[COLUMNS.index("hysteresis")].any())
+        self.mixes = self.crosstalk or bool((order != np.arange(t)).any())
+        self.delayed = bool(own[COLUMNS.index("delay")].any())
+        if self.crosstalk:
+            for i in np.flatnonzero(high[COLUMNS.index("crosstalk")]):
+                beside[i, : layout.count[i]] = layout.beside(int(i))
+        tensor = lambda x, kind=torch.float32: torch.as_tensor(x, dtype=kind, device=device)  # noqa: E731
+        self._low, self._wide, self._own = tensor(low)[:, None], tensor(high - low)[:, None], tensor(own, torch.bool)[:, None]
+        with wp.ScopedDevice(device):
+            self._m = SimpleNamespace(
+                values=wp.zeros((len(COLUMNS), n, f), dtype=float),
+                gain=wp.array(gain.astype(np.float32), dtype=wp.vec2),
+                order=wp.array(order.astype(np.int32), dtype=int),
+                beside=wp.array(beside.astype(np.int32), dtype=int),
+                stuck=wp.array(np.array([s[:2] for s in stuck], dtype=np.int32).reshape(-1, 2), dtype=int),
+                stuck_at=wp.array(np.array([s[2] for s in stuck], dtype=np.float32), dtype=float),
+                thickness=wp.array(thickness.astype(np.float32), dtype=float),
+                rubber=wp.array(rubber.astype(np.int32), dtype=int),
+                depth=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
+                spread=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
+                skin=wp.zeros((n, f, t) if self.hysteresis else (1, 1, 1), dtype=float),
+                mixed=wp.zeros((n, f, t) if self.mixes else (1, 1, 1), dtype=float),
+                slot=wp.zeros((n, f), dtype=int),
+                ring=wp.zeros((1, n, f, t) if self.delayed else (1, 1, 1, 1), dtype=float),
+                ring_shear=wp.zeros((1, n, f, t) if self.delayed and cfg.shear else (1, 1, 1, 1), dtype=wp.vec2),
+                chosen=wp.zeros(n, dtype=int),
+            )
+        self.values: torch.Tensor = wp.to_torch(self._m.values)
+        self._row = {name: self._m.values[i] for i, name in enumerate(COLUMNS)}
+
+    def column(self, name: str) -> torch.Tensor:
+        """View [N, F] of one parameter; see `dexsim.tactile.pads.PAD_COLUMNS`."""
+        return self.values[COLUMNS.index(name)]
+
+    @property
+    def longest(self) -> float:
+        """s, the longest delay of a pad."""
+        j = COLUMNS.index("delay")
+        return float((self._low + self._wide)[j].max())
+
+    def randomize(self, mask: torch.Tensor, generator: torch.Generator | None, episode: wp.array, gain: wp.array) -> None:
+        """Where mask [N] (bool) holds: draw the pads' parameters anew, and lay the gains over `gain` [N, F, T], which was drawn before."""
+        n, f, _ = self.shape
+        u = torch.rand((len(COLUMNS), n, f), generator=generator, device=self.values.device)
+        drawn = self._low + self._wide * u
+        for name in OF_WORLD:
+            j = COLUMNS.index(name)
+            drawn[j] = torch.where(self._own[j], drawn[j], self._world[name][:, None])
+        self.values.copy_(torch.where(mask[None, :, None], drawn, self.values))
+        args = [wp.from_torch(mask), self._row["gain"], self._m.gain, episode, self.seed, gain]
+        wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
+
+    def launch_skin(self, touch, felt: wp.array) -> wp.array:
+        """[N, F, T] N: felt forces as they reach each taxel's wire; `felt` itself where nothing lies between. touch: `Tactile`."""
+        m, n, f = self._m, self.shape[0], self.shape[1]
+        if self.rubber:
+            a, e = touch._a, touch.engine.wp
+            kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
+            args = [e.xpos, e.xmat, touch._pair_normal, touch._pads, touch._law, touch.shapes.wp, a.object_body, a.shape_id, a.shape_size, a.pair_column,
+                    touch._row["stiffness_scale"], touch._row["threshold"], self._row["c10"], self._row["c01"], m.thickness, m.rubber, felt, m.depth, m.spread]  # fmt: skip
+            wp.launch(kernel, dim=(n, f), inputs=args, device=self.device)
+            felt = m.spread
+        if self.hysteresis:
+            args = [felt, self._row["hysteresis"], self._row["hysteresis_time"], touch._m.now, touch._m.last, touch._m.state, m.skin]
+            wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
+            felt = m.skin
+        if self.mixes:
+            wp.launch(mix, dim=self.shape, inputs=[felt, self._row["crosstalk"], m.order, m.beside, m.mixed], device=self.device)
+            felt = m.mixed
+        return felt
+
+    def launch_stuck(self, touch) -> None:
+        """Readings that never change, over those that were just written into the ring."""
+        m = touch._m
+        if self._m.stuck_at.shape[0]:
+            args = [self._m.stuck, self._m.stuck_at, m.effects.lsb, m.tick, float(self.cfg.full_scale), m.ring]
+            wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
+
+    def launch_choice(self, touch) -> tuple[wp.array, wp.array, wp.array]:
+        """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have delays."""
+        m, own = touch._m, self._m
+        if not self.delayed:
+            return m.ring, m.ring_shear, m.chosen
+        n, f, _ = self.shape
+        wp.launch(choose, dim=(n, f), inputs=[m.stamps, m.now, self._row["delay"], own.slot, m.late], device=self.device)
+        wp.launch(pick, dim=self.shape, inputs=[m.ring, m.ring_shear, own.slot, self.cfg.shear, own.ring, own.ring_shear], device=self.device)
+        return own.ring, own.ring_shear, own.chosen
+
+
+@wp.func
+def rubber_pressure(depth: float, thickness: float, c10: float, c01: float):
+    """Pa of a Mooney-Rivlin layer pressed in by `depth` [m]; see `dexsim.tactile.kernel.taxel_force`."""
+    l = 1.0 - wp.min(depth / thickness, wp.static(MAX_STRAIN))
+    return 2.0 * (1.0 / (l * l) - l) * (c10 + c01 / l)
+
+
+@cache
+def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
+    """One thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under each taxel, in
+    place of the law in `dexsim.tactile.kernel`; the sum stays the solver's. A contact that reaches no taxel stays as it is. With
+    sum=spring the taxels' forces are the rubber's own. One object."""
+
+    def spread(
+        xpos: wp.array2d(dtype=wp.vec3),
+        xmat: wp.array2d(dtype=wp.mat33),
+        pair_normal: wp.array2d(dtype=float),
+        pads: Pads,
+        law: Law,
+        shapes: Shapes,
+        object_body: wp.array(dtype=int),
+        shape_id: wp.array2d(dtype=int),
+        shape_size: wp.array2d(dtype=wp.vec3),
+        pair_column: wp.array2d(dtype=int),
+        stiffness: wp.array(dtype=float),
+        threshold: wp.array(dtype=float),
+        c10: wp.array2d(dtype=float),
+        c01: wp.array2d(dtype=float),
+        thickness: wp.array(dtype=float),
+        rubber: wp.array(dtype=int),
+        felt: wp.array3d(dtype=float),
+        scratch: wp.array3d(dtype=float),
+        # out
+        out: wp.array3d(dtype=float),
+    ):
+        w, f = wp.tid()
+        n = pads.count[f]
+        for t in range(felt.shape[2]):
+            out[w, f, t] = felt[w, f, t]
+        shape = shape_id[w, 0]
+        pressed = float(1.0)
+        if wp.static(solver):
+            pressed = pair_normal[w, pair_column[f, 0]]
+        if rubber[f] == 0 or shape < 0 or pressed <= 0.0:
+            return
+        body = pads.body[f]
+        size = shape_size[w, 0]
+        a = turn_in(xmat, w, body, object_body[0])
+        b = pose_in(xpos, xmat, w, body, object_body[0])
+        nearest = float(1.0e9)
+        total = float(0.0)
+        for t in range(n):
+            p = pads.taxel[f, t]
+            d = distance(shapes, shape, size, a * xyz(p) + b)
+            scratch[w, f, t] = d
+            nearest = wp.min(nearest, d)
+            if d < 0.0:
+                total += p[3] * rubber_pressure(-d, thickness[f], c10[w, f], c01[w, f])
+        if total <= 0.0:
+            return
+        share = float(1.0)
+        before = float(0.0)
+        level = spread_level(nearest, law.reach)
+        k = stiffness[w] * law.stiffness[f]
+        if wp.static(solver):
+            share = pressed / total
+            for t in range(n):
+                before += spread_weight(scratch[w, f, t], pads.taxel[f, t][3], level)
+        for t in range(n):
+            d = scratch[w, f, t]
+            area = pads.taxel[f, t][3]
+            z = float(0.0)
+            if d < 0.0:
+                z = share * area * rubber_pressure(-d, thickness[f], c10[w, f], c01[w, f])
+            if wp.static(feel_others):
+                was = float(0.0)
+                if wp.static(solver):
+                    was = pressed / before * spread_weight(d, area, level)
+                else:
+                    if d < 0.0:
+                        was = taxel_force(wp.static(kind), law, k, -d, area, threshold[w])
+                other = felt[w, f, t] - was
+                if other > wp.static(LEFT):
+                    z += other
+            out[w, f, t] = z
+
+    return wp.kernel(spread, enable_backward=False, module="unique")
+
+
+@wp.kernel(enable_backward=False)
+def relax_pads(
+    felt: wp.array3d(dtype=float),
+    fraction: wp.array2d(dtype=float),
+    time_constant: wp.array2d(dtype=float),
+    time: wp.array(dtype=float),
+    last: wp.array(dtype=float),
+    # in and out
+    state: wp.array3d(dtype=float),
+    # out
+    out: wp.array3d(dtype=float),
+):
+    """The standard linear solid of `dexsim.tactile.measure`, its constants by pad."""
+    w, f, t = wp.tid()
+    dt = float(0.0)
+    if last[w] >= 0.0:
+        dt = time[w] - last[w]
+    z = felt[w, f, t]
+    s = relax(state[w, f, t], z, dt, time_constant[w, f])
+    state[w, f, t] = s
+    out[w, f, t] = rubber_force(z, s, fraction[w, f])
+
+
+@wp.kernel(enable_backward=False)
+def mix(
+    felt: wp.array3d(dtype=float),
+    crosstalk: wp.array2d(dtype=float),
+    order: wp.array2d(dtype=int),
+    beside: wp.array3d(dtype=int),
+    # out
+    out: wp.array3d(dtype=float),
+):
+    """A taxel keeps 1 - c of its force and gives c in equal parts to those beside it: the pad's sum stays. Then each wire carries
+    the taxel at order[t]."""
+    w, f, t = wp.tid()
+    k = order[f, t]
+    c = crosstalk[w, f]
+    z = felt[w, f, k]
+    if c > 0.0:
+        got = float(0.0)
+        for i in range(beside.shape[2]):
+            j = beside[f, k, i]
+            if j >= 0:
+                many = float(0.0)
+                for h in range(beside.shape[2]):
+                    if beside[f, j, h] >= 0:
+                        many += 1.0
+                got += felt[w, f, j] / many
+        z = (1.0 - c) * z + c * got
+    out[w, f, t] = z
+
+
+@wp.kernel(enable_backward=False)
+def lay_gains(
+    mask: wp.array(dtype=bool),
+    of_pad: wp.array2d(dtype=float),
+    of_taxel: wp.array2d(dtype=wp.vec2),
+    episode: wp.array(dtype=int),
+    seed: int,
+    # in and out
+    gain: wp.array3d(dtype=float),
+):
+    """Gains that were drawn, times the pad's and the taxel's own (uniform in its range)."""
+    w, f, t = wp.tid()
+    if mask[w]:
+        rng = wp.rand_init(seed + 104729 * episode[w], (w * gain.shape[1] + f) * gain.shape[2] + t)
+        ends = of_taxel[f, t]
+        gain[w, f, t] = gain[w, f, t] * of_pad[w, f] * (ends[0] + (ends[1] - ends[0]) * wp.randf(rng))
+
+
+@wp.kernel(enable_backward=False)
+def stick(
+    where: wp.array2d(dtype=int),
+    value: wp.array(dtype=float),
+    lsb: wp.array(dtype=float),
+    tick: wp.array(dtype=int),
+    full_scale: float,
+    # out
+    ring: wp.array4d(dtype=float),
+):
+    """Taxels [S, 2] (pad, taxel) read what they always read, in whole counts where there are counts."""
+    w, i = wp.tid()
+    ring[tick[0] % ring.shape[0], w, where[i, 0], where[i, 1]] = counts(value[i], lsb[w], 0.0, full_scale)
+
+
+@wp.kernel(enable_backward=False)
+def choose(
+    stamps: wp.array2d(dtype=float),
+    time: wp.array(dtype=float),
+    delay: wp.array2d(dtype=float),
+    # out
+    slot: wp.array2d(dtype=int),
+    late: wp.array(dtype=int),
+):
+    """As `dexsim.tactile.measure.stamp`, which has noted the times: each pad's newest reading that is old enough."""
+    w, f = wp.tid()
+    n = stamps.shape[1]
+    wanted = time[w] - delay[w, f] + 0.5e-6
+    best = int(-1)
+    oldest = int(0)
+    filled = int(1)
+    for i in range(n):
+        s = stamps[w, i]
+        if s == wp.static(NEVER):
+            filled = 0
+        elif s <= wanted:
+            if best < 0 or s > stamps[w, best]:
+                best = i
+        if s < stamps[w, oldest]:
+            oldest = i
+    if best < 0 and filled != 0:
+        best = oldest
+        late[0] = 1
+    slot[w, f] = best
+
+
+@wp.kernel(enable_backward=False)
+def pick(
+    ring: wp.array4d(dtype=float),
+    ring_shear: wp.array4d(dtype=wp.vec2),
+    slot: wp.array2d(dtype=int),
+    shear: bool,
+    # out
+    out: wp.array4d(dtype=float),
+    out_shear: wp.array4d(dtype=wp.vec2),
+):
+    """Each pad's chosen reading into one slot; 0 where there is none yet."""
+    w, f, t = wp.tid()
+    k = slot[w, f]
+    z = float(0.0)
+    xy = wp.vec2(0.0, 0.0)
+    if k >= 0:
+        z = ring[k, w, f, t]
+        if shear:
+            xy = ring_shear[k, w, f, t]
+    out[0, w, f, t] = z
+    if shear:
+        out_shear[0, w, f, t] = xy

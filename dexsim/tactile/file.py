@@ -1,0 +1,92 @@
+"""`tactile.yaml`: what a diagnosis found of touch and contact, as training takes it (`train.py tactile_file=FILE`).
+
+    tactile:                        # over the settings of configs/tactile
+      friction: [0.35, 0.45]
+      pads:                         # by fingertip, see `dexsim.tactile.pads`
+        index: {delay: {value: 0.02, low: 0.018, high: 0.022}}
+    randomize:                      # over the task's ranges
+      object.friction: [0.35, 0.45]
+      contact.stiffness: {value: 4500, low: 4300, high: 4700}   # N/m
+
+A value is a number, [low, high] or {value, low, high}; what has a range is drawn anew in each world at each episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.tactile.config import COLUMNS
+from dexsim.tactile.pads import pad_configs, value_range
+
+RANGES: dict[str, tuple[str, float, float]] = {"object.friction": ("1", 0.05, 3.0), "contact.stiffness": ("N/m", 100.0, 1e5)}
+"""Ranges of `randomize` that the file may set: unit, lowest, highest (what the tasks allow)."""
+
+
+def load(path: str | Path) -> dict[str, dict[str, Any]]:
+    """The file as {"tactile": settings, "randomize": {name: [low, high]}}, checked for the xHand's fingertips.
+
+    Raises UserError in one line naming the file, the field, its value and what is allowed."""
+    path = Path(path).expanduser()
+    where = f"tactile file '{path}'"
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (diagnose.py writes one)") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{where}: cannot be read: {' '.join(str(error).split())}") from None
+    try:
+        return _checked(raw)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+def lay_over(cfg: MutableMapping[str, Any], path: str | Path) -> None:
+    """Puts the file's content into a config with `tactile` and `randomize`, so that a checkpoint carries it. Raises UserError as `load`
+    does, and where the task has no such range."""
+    found = load(path)
+    for key, value in found["tactile"].items():
+        cfg["tactile"][key] = value
+    for name, value in found["randomize"].items():
+        part, _, last = name.partition(".")
+        if part not in cfg["randomize"] or last not in cfg["randomize"][part]:
+            raise UserError(f"tactile file '{path}': randomize.{name}: this task draws no {name}; take it out of the file")
+        cfg["randomize"][part][last] = value
+
+
+def _checked(raw: Any) -> dict[str, dict[str, Any]]:
+    if not isinstance(raw, Mapping) or not raw or set(raw) - {"tactile", "randomize"}:
+        extra = f"{', '.join(str(k) for k in raw if k not in ('tactile', 'randomize'))}: unknown; " if isinstance(raw, Mapping) and raw else ""
+        raise UserError(f"{extra}must map tactile and randomize to what was found")
+    out: dict[str, dict[str, Any]] = {"tactile": {}, "randomize": {}}
+    for part in out:
+        if not isinstance(raw.get(part) or {}, Mapping):
+            raise UserError(f"{part}={raw[part]}: must map settings to values")
+    for key, value in (raw.get("tactile") or {}).items():
+        if key == "pads":
+            out["tactile"]["pads"] = _pads(value)
+        elif key in COLUMNS:
+            out["tactile"][key] = list(value_range(f"tactile.{key}", value, *COLUMNS[key][:3]))
+        else:
+            raise UserError(f"tactile.{key}: unknown setting; valid ones: pads, {', '.join(COLUMNS)}")
+    for name, value in (raw.get("randomize") or {}).items():
+        if name not in RANGES:
+            raise UserError(f"randomize.{name}: not a range that touch sets; valid ones: {', '.join(RANGES)}")
+        out["randomize"][name] = list(value_range(f"randomize.{name}", value, *RANGES[name]))
+    return out
+
+
+def _pads(value: Any) -> dict[str, Any]:
+    """As given, once every pad and taxel is one of the xHand's."""
+    for name, pad in pad_configs(value).items():
+        if name not in xhand.FINGERS:
+            raise UserError(f"tactile.pads.{name}: no such fingertip; fingertips: {', '.join(xhand.FINGERS)}")
+        for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
+            if k >= xhand.TAXELS_PER_FINGER:
+                raise UserError(f"tactile.pads.{name}: no taxel {k}; a fingertip has {xhand.TAXELS_PER_FINGER}, counted from 0")
+    return dict(value)

@@ -1,0 +1,158 @@
+"""Settings of single pads (`tactile.pads`): what a diagnosis finds of one fingertip's sensor and no other's.
+
+    pads:
+      index:                             # a pad of the layout
+        gain: {value: 0.6, low: 0.57, high: 0.63}   # of all its taxels
+        taxels: {17: [0.4, 0.5]}         # gain of single ones, beside that
+        dead: [3]                        # taxels that never answer
+        stuck: {33: 0.4}                 # N that a taxel reads for ever
+        swapped: [[14, 15]]              # taxels whose wires are exchanged
+        crosstalk: [0.2, 0.3]            # share of its force that a taxel loses to those beside it
+        hysteresis: 0.3                  # these three instead of the settings of the same name
+        hysteresis_time: [0.3, 0.5]      # s
+        delay: [0.018, 0.022]            # s
+        rubber: {c10: [9e4, 1.1e5], c01: 2e4, thickness: 2.0e-3}   # Pa, Pa, m: how force spreads over the taxels
+
+A value is a number, [low, high], or {value, low, high}; what has a range is drawn anew in each world at each episode.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from dexsim.errors import UserError
+
+Range = tuple[float, float]
+
+# What is drawn by world and pad: name -> (unit, lowest, highest allowed, value at which it is absent).
+PAD_COLUMNS: dict[str, tuple[str, float, float, float]] = {
+    "gain": ("1", 0.0, 20.0, 1.0),
+    "crosstalk": ("1", 0.0, 1.0, 0.0),
+    "hysteresis": ("1", 0.0, 3.0, 0.0),
+    "hysteresis_time": ("s", 1e-3, 100.0, 0.1),
+    "delay": ("s", 0.0, 1.0, 0.0),
+    "c10": ("Pa", 0.0, 1e12, 0.0),
+    "c01": ("Pa", 0.0, 1e12, 0.0),
+}
+GAIN = PAD_COLUMNS["gain"]
+STUCK = ("N", 0.0, 1e3, 0.0)
+THICKNESS = 2.0e-3  # m, where a pad's rubber states none
+KEYS = ("gain", "taxels", "dead", "stuck", "swapped", "crosstalk", "hysteresis", "hysteresis_time", "delay", "rubber")
+
+
+@dataclass(frozen=True)
+class PadConfig:
+    """One pad. params: ranges by `PAD_COLUMNS`, of what is set. taxels: ranges of single gains (a dead one (0, 0)); stuck:
+    readings in N; swapped: pairs; thickness [m] of its rubber."""
+
+    params: Mapping[str, Range] = field(default_factory=dict)
+    taxels: Mapping[int, Range] = field(default_factory=dict)
+    stuck: Mapping[int, float] = field(default_factory=dict)
+    swapped: tuple[tuple[int, int], ...] = ()
+    thickness: float = THICKNESS
+
+    @property
+    def rubber(self) -> bool:
+        return "c10" in self.params
+
+
+def pad_configs(value: object) -> dict[str, PadConfig]:
+    """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is allowed."""
+    if not isinstance(value, Mapping):
+        raise UserError(f"tactile.pads={value}: must map names of pads to their settings")
+    return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
+
+
+def _pad(where: str, entry: object) -> PadConfig:
+    if not isinstance(entry, Mapping):
+        raise UserError(f"{where}={entry}: must map settings to values; settings: {', '.join(KEYS)}")
+    for key in entry:
+        if key not in KEYS:
+            raise UserError(f"{where}.{key}: unknown setting; a pad has: {', '.join(KEYS)}")
+    params = {k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in KEYS if k in entry and k in PAD_COLUMNS}
+    thickness = THICKNESS
+    if "rubber" in entry:
+        rubber = _mapping(f"{where}.rubber", entry["rubber"], "c10, c01 [Pa] and thickness [m] to values")
+        for key in rubber:
+            if key not in ("c10", "c01", "thickness"):
+                raise UserError(f"{where}.rubber.{key}: unknown; valid: c10, c01, thickness")
+        params |= {k: value_range(f"{where}.rubber.{k}", rubber.get(k, 0.0), *PAD_COLUMNS[k][:3]) for k in ("c10", "c01")}
+        if params["c10"][0] + params["c01"][0] <= 0.0:
+            raise UserError(f"{where}.rubber: the lowest c10 + c01 must be positive [Pa]")
+        thickness = value_range(f"{where}.rubber.thickness", rubber.get("thickness", THICKNESS), "m", 1e-5, 0.1)[0]
+    taxels = {_index(f"{where}.taxels", k): value_range(f"{where}.taxels.{k}", v, *GAIN[:3])
+              for k, v in _mapping(f"{where}.taxels", entry.get("taxels", {}), "taxels to gains").items()}  # fmt: skip
+    taxels |= {_index(f"{where}.dead", k): (0.0, 0.0) for k in _list(f"{where}.dead", entry.get("dead", []), "of taxels")}
+    stuck = {_index(f"{where}.stuck", k): value_range(f"{where}.stuck.{k}", v, *STUCK[:3])[0]
+             for k, v in _mapping(f"{where}.stuck", entry.get("stuck", {}), "taxels to readings [N]").items()}  # fmt: skip
+    return PadConfig(params, taxels, stuck, _swaps(f"{where}.swapped", entry.get("swapped", [])), thickness)
+
+
+def value_range(where: str, value: object, unit: str, low: float, high: float) -> Range:
+    """The range (low, high) of a number, [low, high] or {value, low, high}; UserError starting with `where`."""
+    allowed = f"allowed: {low:g} to {high:g}{'' if unit == '1' else ' ' + unit}"
+    if isinstance(value, Mapping):
+        if set(value) - {"value", "low", "high"} or "value" not in value:
+            raise UserError(f"{where}={dict(value)}: must be a number, [low, high] or {{value, low, high}}; {allowed}")
+        given = [value.get("low", value["value"]), value["value"], value.get("high", value["value"])]
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        given = list(value)
+        if len(given) != 2:
+            raise UserError(f"{where}={given}: must be a number, [low, high] or {{value, low, high}}; {allowed}")
+    else:
+        given = [value]
+    numbers = []
+    for x in given:
+        number = _number(x)
+        if number is None or not low <= number <= high:
+            raise UserError(f"{where}={x}: must be a number; {allowed}")
+        numbers.append(number)
+    if sorted(numbers) != numbers:
+        raise UserError(f"{where}={given}: must rise from low to high; {allowed}")
+    return numbers[0], numbers[-1]
+
+
+def _number(x: object) -> float | None:
+    """x as a finite float, None where it is none (YAML reads 1e-3 as text: that is accepted)."""
+    if isinstance(x, bool) or not isinstance(x, (int, float, str)):
+        return None
+    try:
+        number = float(x)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _index(where: str, k: object) -> int:
+    """A taxel's number; keys of a checkpoint's config are text."""
+    number = _number(k)
+    if number is None or number != int(number) or number < 0:
+        raise UserError(f"{where}: '{k}' is no taxel; taxels are counted from 0")
+    return int(number)
+
+
+def _mapping(where: str, value: object, what: str) -> Mapping:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{where}={value}: must map {what}")
+    return value
+
+
+def _list(where: str, value: object, what: str) -> Sequence:
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise UserError(f"{where}={value}: must be a list {what}")
+    return value
+
+
+def _swaps(where: str, value: object) -> tuple[tuple[int, int], ...]:
+    out, used = [], set()
+    for pair in _list(where, value, "of pairs of taxels"):
+        if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
+            raise UserError(f"{where}: {pair} is no pair of taxels, e.g. [14, 15]")
+        a, b = (_index(where, k) for k in pair)
+        if a == b or {a, b} & used:
+            raise UserError(f"{where}: taxel {a if a == b or a in used else b} is exchanged twice, or with itself")
+        used |= {a, b}
+        out.append((a, b))
+    return tuple(out)
