@@ -22,6 +22,7 @@ writes to out=:
   report.html           one page: open it in a browser
   diagnosis.json        the same for programs
   servo.yaml            the fitted drives with intervals: python train.py servo_file=FILE randomizes inside them
+  tactile.yaml          where something of touch was found: python train.py tactile_file=FILE randomizes inside its intervals
   model.xml             where masses or inertias were fitted: python train.py model_file=FILE
   servo_standin.yaml    servo.yaml with a torque that stands in for what no effect explains, where that helps; it names nothing
   next_recording.mcap   commands to send, where another recording would settle a question

@@ -16,7 +16,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, jitter, judge, locate, stage, standin, touch
+from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, jitter, judge, locate, stage, standin, touch, touch_handed
 from dexsim.gap.catalogue import EFFECTS, confusable, separating
 from dexsim.gap.charts import number
 from dexsim.gap.findings import finding_parameters, model_changes, save_model, servo_changes, widen
@@ -178,6 +178,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     felt = touch.diagnose([r for r in recordings if r is not None], m, held_names, s.seed, s.allowed, progress)
     if felt.before is not None and felt.floor is not None:
         felt.notes += confidence.of_touch(felt.findings, felt.before[0], felt.floor)
+    felt.notes += touch_handed.handed(felt.findings, felt.facts).doubts
     notes += felt.notes
     clock.lap("touch")
 
@@ -899,7 +900,8 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
-    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where it changed, model.xml; returns what was written."""
+    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and tactile.yaml; returns
+    what was written."""
     from dexsim.gap.report import page
 
     out.mkdir(parents=True, exist_ok=True)
@@ -920,6 +922,8 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     if d.servo is not None:
         d.servo.save(out / "servo.yaml")
         written.append(out / "servo.yaml")
+    if d.touch is not None and touch_handed.save(touch_handed.handed(d.touch.findings, d.touch.facts), out / "tactile.yaml"):
+        written.append(out / "tactile.yaml")
     if d.standins:
         standin.write(d.servo, d.standins, out / "servo_standin.yaml")
         written.append(out / "servo_standin.yaml")

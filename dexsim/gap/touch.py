@@ -15,6 +15,7 @@ from dexsim.assets import xhand
 from dexsim.gap.judge import rms_interval
 from dexsim.gap.touch_data import TouchData, collect, newtons
 from dexsim.gap.touch_effects import BY_ID, confusable
+from dexsim.gap.touch_handed import Fit, PadFacts, chord
 from dexsim.gap.touch_plant import contact, readings, shear
 from dexsim.gap.touch_search import GAIN_OFF, PadOutcome, PadSearch, TouchTrial, held_out_rms
 from dexsim.recording.mechanism import Mechanism
@@ -58,6 +59,7 @@ class TouchResult:
     depends_on: list[str] = field(default_factory=list)
     contact: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # by recording: stretches in touch, s
     tactile: bool = False  # whether taxels were recorded at all
+    facts: dict[str, PadFacts] = field(default_factory=dict)  # by name of pad: what `touch_handed` needs beside the findings
 
 
 def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: int = 0, allowed: set[str] | None = None,
@@ -93,7 +95,11 @@ def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: in
         outcome = search.run()
         searched.add(pad)
         _judge(out, search, outcome, data, squares, times, floors, kept)
-    out.findings += [f for f in broken if int(f["where"]["taxels"][0].split(":")[0]) not in searched]
+    for f in broken:
+        pad = int(f["where"]["taxels"][0].split(":")[0])
+        if pad not in searched:
+            out.findings.append(f)
+            out.facts[xhand.FINGERS[pad]] = PadFacts(_readings_of(touching, f["where"]["taxels"]), judged=False)
     if progress and pads:
         progress(len(pads), len(pads), "")
     if times:
@@ -154,6 +160,10 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
         else:
             _merge(gain, dead)
     out.findings += fresh
+    run = search.runs[0]
+    common = (best.values["gain"], *bounds["gain"]) if "gain" in best.keys else None
+    out.facts[name] = PadFacts(dict(search.silent), common, _chord(search, best, bounds), max(float(r.warm.max()) for r in search.runs), run.stiffness, run.friction,
+                               search.shear)  # fmt: skip
     for k in ("scale", "zero", "along", "across", "clock"):
         if k in best.keys:
             out.nuisance[f"touch_{k}@{name}"] = round(best.values[k], 7)
@@ -173,6 +183,30 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     load = None if run.load is None else np.interp(run.t, run.grid, run.load)
     pick = run.t >= (run.t[0] if kept else run.t[0] + 0.75 * (run.t[-1] - run.t[0]))
     out.curves.append(PadCurve(name, run.recording, run.t[pick], run.z[pick].sum(1), p0[pick].sum(1), p1[pick].sum(1), None if load is None else load[pick]))
+
+
+def _chord(search: PadSearch, t: TouchTrial, bounds: dict[str, tuple[float, float]]) -> Fit | None:
+    """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known; None without one."""
+    if "tactile_stiffening" not in t.ids:
+        return None
+    fits = []
+    for k in (None, 0, 1):
+        v = t.values if k is None else t.values | {key: bounds[key][k] for key in ("c10", "c01")}
+        pairs = [(contact(r, v)[0], r.depth + v["zero"]) for r in search.runs]
+        fits.append(chord(*(np.concatenate(x) for x in zip(*pairs, strict=True))))
+    if any(f is None for f in fits):
+        return None
+    return fits[0][0], min(f[1] for f in fits), max(f[2] for f in fits)
+
+
+def _readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, float]:
+    """What constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
+    out = {}
+    for pad, k in (map(int, t.split(":")) for t in taxels):
+        values = [(float(np.median(np.nan_to_num(newtons(r)[0][:, pad, k, 2]))), 2 * (r.tactile_lsb or 0.0)) for r in recordings if r.tactile.value.ndim == 4]
+        value, step = max(values)
+        out[k] = value if value > max(step, 1e-6) else 0.0
+    return out
 
 
 def _stage(search: PadSearch, effect: str) -> int:
