@@ -36,12 +36,18 @@ def motion(kind: int, seconds: float, seed: int = 0):
     return demo.commands(kind, seconds, np.random.default_rng(seed))
 
 
-def plant_run(name: str, kind: int, seconds: float, changes: dict[str, float], seed: int = 0, noisy: bool = True) -> Run:
-    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name')."""
+def plant_run(name: str, kind: int, seconds: float, changes: dict[str, float], seed: int = 0, noisy: bool = True, servo: dict | None = None,
+              temperature: bool = False) -> Run:
+    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name').
+    servo: believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than the one before."""
     t_cmd, cmd = motion(kind, seconds, seed)
     t = np.arange(0.0, seconds - 0.02, 0.01) + (np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01))))
-    table = ServoTable.from_dict({"joints": {"*": SERVO}, "loop_rate": 1000})
+    other = servo or {}
+    sides = {k: v for k, v in other.items() if k.endswith("_encoder")}
+    table = ServoTable.from_dict({"joints": {"*": SERVO | {k: v for k, v in other.items() if k not in sides}}, "loop_rate": 1000} | sides)
     rough = Run(name, ("joint",), t_cmd, cmd[:, None], t, np.interp(t, t_cmd, cmd)[:, None], table, np.array([0, 0, -9.81]))
+    if temperature:
+        rough.temperature = (20.0 + 7.0 * kind + 9.0 * t / seconds)[:, None]
     for _ in range(3):  # the series are those of the motion itself
         rough.qs = None
         rough.smooth()

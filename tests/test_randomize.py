@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from dexsim.actuator import Servo
 from dexsim.actuator.columns import INDEX, NAMES
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -75,6 +76,9 @@ class FakeServo:
         self.nominal = torch.as_tensor(self.table.nominal(JOINTS), dtype=torch.float32)
         self.params = self.nominal.expand(n, *self.nominal.shape).clone()
         self.queue, self.control_period = 8, 0.025
+        self.features = frozenset()
+
+    check_simulated = Servo.check_simulated
 
 
 TABLE = {"joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit": 1.1, "delay": 0.01}, "b": {"kp": {"value": 2.0, "low": 1.8, "high": 2.6}}}}
@@ -110,7 +114,7 @@ def test_only_masked_worlds_get_new_drives():
 
 @pytest.mark.parametrize("cfg, word", [
     ({"kp": [-0.5, 1.0]}, "servo.kp"), ({"delay": [-0.05, 0.0]}, "servo.delay"), ({"delay": [0.0, 0.2]}, "servo.delay"),
-    ({"deadband": [0.0, 2.0]}, "servo.deadband"), ({"backlash": [0.0, 0.1]}, "backlash"), ({"efficiency": [0.5, 3.0]}, "efficiency"),
+    ({"deadband": [0.0, 2.0]}, "servo.deadband"), ({"slop": [0.0, 0.1]}, "slop"), ({"backlash": [0.0, 0.1]}, "not simulated here"), ({"efficiency": [0.5, 3.0]}, "efficiency"),
 ])  # fmt: skip
 def test_values_that_a_servo_cannot_have_are_refused(cfg, word):
     with pytest.raises(UserError, match=word):

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
-from dexsim.actuator.columns import INDEX, column
+from dexsim.actuator.columns import FEATURES, INDEX, column
 from dexsim.actuator.reference import servo as servo_reference
 from dexsim.actuator.reference import target_in_force
 from dexsim.errors import UserError
@@ -89,13 +89,19 @@ def random_params(rng, shape) -> np.ndarray:
         "stribeck_peak": 0.02, "stribeck_speed": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
         "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0,
         "position_offset": 0.05, "position_scale": 0.1,
+        "eccentric_sin": 0.05, "eccentric_cos": 0.05, "speed_lag": 0.02, "deadband_kind": 2.9,
+        "backlash": 0.05, "rebound": 0.5, "softness": 0.2, "hardening": 0.5, "rotor": 3e-3,
+        "thermal_torque": -0.01, "thermal_friction": 0.02, "thermal_resistance": 0.004, "warmth": 40.0,
+        "sag": 0.3, "coupling": 0.3, "coupling_from": 2.9,
         "standin_constant": 0.05, "standin_position": -0.2, "standin_speed": -0.01, "standin_drag": -0.002,
     }  # fmt: skip
     around = ("efficiency", "supply", "position_scale")
     out = np.empty((*shape, len(COLUMNS)))
     for i, c in enumerate(COLUMNS):
         u = rng.uniform(0.05, 1.0, shape) * scale[c.name] + (0.7 if c.name in around else 0.0)
-        out[..., i] = np.where(rng.random(shape) < 0.15, c.neutral, u)
+        out[..., i] = np.where(rng.random(shape) < (0.4 if c.name in ("backlash", "softness") else 0.15), c.neutral, u)
+        if c.name in ("deadband_kind", "coupling_from"):
+            out[..., i] = np.floor(out[..., i])
     return out
 
 
@@ -104,13 +110,16 @@ def test_every_column_is_randomized_here():
 
 
 @pytest.mark.parametrize("voltage", [False, True])
+@pytest.mark.parametrize("features", [(), ("play",), ("play", "sag", "rare")])
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
-def test_kernel_agrees_with_reference(real, tolerance, voltage):
+def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
+    """Also that a kernel built without a feature does not see its columns."""
     rng = np.random.default_rng(1)
     n, j = 400, 3
     engine = StubEngine(n, j, real)
-    raw = {"drive": "voltage" if voltage else "torque", "joints": {"*": {"kp": 1.0, "torque_limit": 1.0}}}
-    servo = Servo(engine, ["j2", "j0", "j1"], ServoTable.from_dict(raw))
+    raw = {"drive": "voltage" if voltage else "torque", "joints": {"*": {"kp": 1.0, "torque_limit": 1.0}}, "loop_encoder": {"j0": "motor"}}
+    servo = Servo(engine, ["j2", "j0", "j1"], ServoTable.from_dict(raw), varied=[FEATURES[f][0] for f in features])
+    assert servo.features == set(features)
     qi, vi = [7 + 2, 7 + 0, 7 + 1], [6 + 2, 6 + 0, 6 + 1]
 
     params = random_params(rng, (n, j))
@@ -123,21 +132,38 @@ def test_kernel_agrees_with_reference(real, tolerance, voltage):
     state[..., slots["enabled"]] = rng.random((n, j)) < 0.9
     state[..., slots["stamp0"] : slots["stamp0"] + queue] = np.sort(rng.uniform(0.9, 1.0, (n, j, queue)))
     state[..., slots["target0"] : slots["target0"] + queue] = rng.normal(0, 0.3, (n, j, queue))
+    servo.base_armature[:] = torch.as_tensor(rng.uniform(0, 2e-3, (n, j)))
+    servo.home[:] = torch.as_tensor(rng.normal(0, 0.1, (n, j)))
+    extra = bool({"play", "rare"} & set(features))
+    if extra:
+        state[..., slots["fresh"]] = rng.random((n, j)) < 0.1
+        state[..., slots["filtered"]], state[..., slots["line_a"]] = rng.normal(0, 6.0, (2, n, j))
+        state[..., slots["line_b"]] = rng.uniform(-0.2, 0.9, (n, j))
     servo.set_state(torch.as_tensor(state, dtype=servo.state.dtype))
     q, v = rng.normal(0, 0.1, (n, j)), rng.normal(0, 6.0, (n, j)) * (rng.random((n, j)) < 0.8)
+    if extra:
+        state[..., slots["rotor"]] = q + rng.normal(0, 0.02, (n, j))
+        servo.set_state(torch.as_tensor(state, dtype=servo.state.dtype))
+    given = rng.normal(0, 0.3, (n, j))
+    servo.torque[:] = torch.as_tensor(given)
     engine.t.qpos[:, qi] = torch.as_tensor(q).to(servo.params)
     engine.t.qvel[:, vi] = torch.as_tensor(v).to(servo.params)
     engine.t.time.fill_(1.0)
     # what the kernel sees is rounded to `real`: the reference starts from the same numbers
     params, state, v = (x.numpy().astype(float) for x in (servo.params, servo.state, engine.t.qvel[:, vi]))
     q = engine.t.qpos[:, qi].numpy().astype(float)
+    given, armature, home = (x.numpy().astype(float) for x in (servo.torque, servo.base_armature, servo.home))
 
     servo.before_each()
 
-    stamps, targets = np.split(state[..., slots["stamp0"] :], 2, axis=-1)
+    stamps, targets = np.split(state[..., slots["stamp0"] : slots["stamp0"] + 2 * queue], 2, axis=-1)
     target = target_in_force(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt)
+    known = {name: state[..., slots[name]] for name in ("filtered", "rotor", "line_a", "line_b", "fresh")} if extra else {}
+    source = np.clip(params[..., INDEX["coupling_from"]].astype(int), 0, j - 1)
     expected = servo_reference(
-        params, target, q, v, dt=engine.dt, voltage=voltage,
+        params, target, q, v, dt=engine.dt, voltage=voltage, features=features, base_armature=armature, **known,
+        dragging=np.take_along_axis(q - home, source, 1), others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
+        loop_motor=np.array([False, True, False]),
         last=state[..., slots["motor"]], enabled=state[..., slots["enabled"]], inertia=servo.inertia.numpy(),
         base_damping=servo.base_damping.numpy(),
     )  # fmt: skip
@@ -147,6 +173,11 @@ def test_kernel_agrees_with_reference(real, tolerance, voltage):
         "dof_damping": engine.field("dof_damping")[:, vi].numpy(),
         "dof_frictionloss": engine.field("dof_frictionloss")[:, vi].numpy(),
     }
+    if extra:
+        got |= {name: servo.state[..., slots[name]].numpy() for name in ("line_a", "line_b") if "play" in features}
+        got |= {"filtered": servo.state[..., slots["filtered"]].numpy()} if "rare" in features else {}
+    if "play" in features:
+        got |= {"rotor": servo.state[..., slots["rotor"]].numpy(), "dof_armature": engine.field("dof_armature")[:, vi].numpy()}
     # a jump of the law (deadband, back-driven) might fall on either side in the other precision: by the seed none does
     for name, value in got.items():
         size = np.abs(expected[name]) + 1.0  # limits are of order one

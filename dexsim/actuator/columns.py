@@ -2,7 +2,8 @@
 
 Each column has a neutral value at which its effect is absent: neutral values with kp and kd set are an ideal PD drive.
 Units are those of a hinge; for a slide joint read m, m/s, N, N/m for rad, rad/s, N.m, N.m/rad.
-To add an effect: one `Column` here, its lines in `kernel.py`, the same lines in `reference.py`.
+To add an effect: one `Column` here, its lines in `kernel.py`, the same lines in `reference.py`. Effects that most drives
+do without are compiled in only where they are used (`FEATURES`): the usual servo does not pay for them.
 """
 
 from __future__ import annotations
@@ -54,6 +55,27 @@ COLUMNS: tuple[Column, ...] = (
     # Encoder of the loop and of the reported position: measured = scale * position + offset.
     Column("position_offset", "rad", 0.0, -7.0, 7.0, "encoder zero error, added to the measured position"),
     Column("position_scale", "1", 1.0, 0.5, 2.0, "encoder scale: measured over true position"),
+    # The same encoder, eccentric: measured = scale * q + offset + eccentric_sin * sin q + eccentric_cos * (cos q - 1).
+    Column("eccentric_sin", "rad", 0.0, -1.0, 1.0, "encoder error, sine of the position"),
+    Column("eccentric_cos", "rad", 0.0, -1.0, 1.0, "encoder error, cosine of the position - 1"),
+    # Firmware.
+    Column("speed_lag", "s", 0.0, 0.0, 1.0, "time constant of the filter on the velocity that kd acts on"),
+    Column("deadband_kind", "1", 0.0, 0.0, 2.0, "inside the deadband 0: no torque, 1: the error counts as zero, 2: it counts from the edge on"),
+    # Between motor and joint: a rotor of its own, joined to the link by a spring with a gap.
+    Column("backlash", "rad", 0.0, 0.0, 2.0, "total free play between motor and joint"),
+    Column("rebound", "1", 0.1, 0.0, 1.0, "damping ratio of the impact at the ends of the play (if backlash)"),
+    Column("softness", "rad/N.m", 0.0, 0.0, 1e4, "1 / stiffness of the transmission"),
+    Column("hardening", "1/(N.m)2", 0.0, 0.0, 1e6, "its stiffness is 1 + hardening * torque^2 times as large under load"),
+    Column("rotor", "kg.m2", 0.0, 0.0, 1e3, "reflected inertia of the rotor (if play or elasticity); 0: the model's armature"),
+    # Temperature: relative changes per degree of `warmth`.
+    Column("thermal_torque", "1/degC", 0.0, -0.2, 0.2, "change of the torque constant"),
+    Column("thermal_friction", "1/degC", 0.0, -0.5, 0.5, "change of dry and viscous friction"),
+    Column("thermal_resistance", "1/degC", 0.0, -0.2, 0.2, "change of the winding's resistance (drive: voltage)"),
+    Column("warmth", "degC", 0.0, -100.0, 200.0, "temperature above that at which the other figures hold"),
+    # Other joints.
+    Column("sag", "1/N.m", 0.0, 0.0, 1e3, "supply lost per N.m that the motors of the other joints give"),
+    Column("coupling", "1", 0.0, -10.0, 10.0, "how far the target is dragged along per rad that another joint moves"),
+    Column("coupling_from", "1", 0.0, 0.0, 1e3, "which joint: its number in the mechanism's order, from 0 (if coupling)"),
     # Torque of nothing that is known: a regression of what a diagnosis could not name, marked as such (gap/standin.py).
     Column("standin_constant", "N.m", 0.0, -1e3, 1e3, "stand-in: constant torque on the joint"),
     Column("standin_position", "N.m/rad", 0.0, -1e3, 1e3, "stand-in: torque per position"),
@@ -63,6 +85,22 @@ COLUMNS: tuple[Column, ...] = (
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
+
+FEATURES: dict[str, tuple[str, ...]] = {
+    "play": ("backlash", "softness"),
+    "sag": ("sag",),
+    "rare": ("eccentric_sin", "eccentric_cos", "speed_lag", "deadband_kind", "thermal_torque", "thermal_friction", "thermal_resistance", "coupling"),
+}
+"""What is compiled into a servo only where one of these columns differs from its neutral value."""
+WITH: dict[str, tuple[str, ...]] = {"play": ("rebound", "hardening", "rotor"), "rare": ("warmth", "coupling_from")}
+"""Columns that say nothing without those of their feature."""
+FEATURE_OF: dict[str, str] = {name: feature for feature, names in FEATURES.items() for name in names}
+
+
+def simulated(features: frozenset[str]) -> list[int]:
+    """Indices of the columns that a servo built with these features looks at."""
+    absent = {name for feature in FEATURES.keys() - features for name in (*FEATURES[feature], *WITH.get(feature, ()))}
+    return [i for i, name in enumerate(NAMES) if name not in absent]
 
 
 def did_you_mean(name: str, valid) -> str:

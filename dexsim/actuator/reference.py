@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexsim.actuator.columns import INDEX
-from dexsim.actuator.kernel import EDGE, SEED, SNAP
+from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
 
 
 def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
@@ -37,63 +37,112 @@ def servo(
     inertia=np.inf,
     base_damping=0.0,
     base_frictionloss=0.0,
+    base_armature=0.0,
+    features=(),
+    dragging=0.0,
+    others=0.0,
+    filtered=0.0,
+    rotor=0.0,
+    line_a=0.0,
+    line_b=0.0,
+    fresh=1.0,
+    loop_motor=False,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
     target [rad]; q [rad], v [rad/s] of the driven joint; q_loop, v_loop of the joint that carries the loop's encoder
     (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint
-    [kg.m2]; base_*: the model's own friction.
-    Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss` as `kernel.py`
-    defines them.
+    [kg.m2]; base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
+    far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered, rotor, line_a,
+    line_b, fresh: the state's slots; loop_motor: the loop's encoder is on the rotor.
+    Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as
+    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`.
     """
+    play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
-    v_m = p["position_scale"] * (v if v_loop is None else np.asarray(v_loop, dtype=float))
-    q_m = p["position_scale"] * (q if q_loop is None else np.asarray(q_loop, dtype=float)) + p["position_offset"]
+    fresh = np.asarray(fresh) != 0.0
+    turned = q if q_loop is None else np.asarray(q_loop, dtype=float)
+    turning = v if v_loop is None else np.asarray(v_loop, dtype=float)
+    two = play & ((p["backlash"] > 0.0) | (p["softness"] > 0.0))
+    v_drive = np.where(two & ~fresh, line_a + np.asarray(line_b) * v, v)
+    rotor_q = np.where(two & ~fresh, rotor + dt * v_drive, q)
+    rotor_inertia = np.where(two, np.maximum(np.where(p["rotor"] == 0.0, base_armature, p["rotor"]), LEAST_ROTOR * inertia), 0.0)
+    on_rotor = two & np.asarray(loop_motor)
+    turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
+    v_m = p["position_scale"] * turning
+    q_m = p["position_scale"] * turned + p["position_offset"]
+    v_d, v_next, kd_blend, kind = v_m, v_m, 1.0, np.zeros_like(v)
+    if rare:
+        q_m = q_m + p["eccentric_sin"] * np.sin(turned) + p["eccentric_cos"] * (np.cos(turned) - 1.0)
+        kd_blend = dt / (p["speed_lag"] + dt)
+        filtered = np.where(fresh, turning, filtered + kd_blend * (turning - filtered))
+        v_d, v_next = p["position_scale"] * filtered, p["position_scale"] * (filtered + kd_blend * (turning - filtered))
+        kind, target = p["deadband_kind"], target + p["coupling"] * dragging
 
     e = target - q_m
-    active = np.abs(e) >= p["deadband"]
-    now = np.where(active, p["kp"] * e - p["kd"] * v_m, 0.0)
-    pd = np.where(active, p["kp"] * e - p["kd"] * v_m - p["kp"] * dt * v_m, 0.0)
-    slope = np.where(active, p["position_scale"] * (p["kp"] * dt + p["kd"]), 0.0)
+    dead = np.abs(e) < p["deadband"]
+    cut = np.where(kind > 1.5, p["kp"] * np.clip(e, -p["deadband"], p["deadband"]), 0.0)
+    now = p["kp"] * e - p["kd"] * v_d - cut
+    pd = p["kp"] * e - p["kd"] * v_next - p["kp"] * dt * v_m - cut
+    slope = p["position_scale"] * (p["kp"] * dt + kd_blend * p["kd"])
+    damped = dead & (kind > 0.5)
+    now = np.where(damped, -p["kd"] * v_d, np.where(dead, 0.0, now))
+    pd = np.where(damped, -p["kd"] * v_next, np.where(dead, 0.0, pd))
+    slope = np.where(damped, p["position_scale"] * kd_blend * p["kd"], np.where(dead, 0.0, slope))
 
-    tau0, supply = p["torque_limit"], p["supply"]
+    tau0, supply, no_load, efficiency = p["torque_limit"], p["supply"], p["no_load_speed"], p["efficiency"]
+    friction_factor = np.ones_like(v)
+    if rare:
+        torque_factor = 1.0 + p["thermal_torque"] * p["warmth"]
+        friction_factor = np.maximum(1.0 + p["thermal_friction"] * p["warmth"], 0.0)
+        tau0 = tau0 * torque_factor
+        if voltage:
+            tau0, no_load = tau0 / np.maximum(1.0 + p["thermal_resistance"] * p["warmth"], 0.1), no_load / torque_factor
+        else:
+            efficiency = efficiency * torque_factor
+    if "sag" in features:
+        supply = supply * np.maximum(1.0 - p["sag"] * others, 0.05)
+    inertia_drive = np.where(two, rotor_inertia, inertia)
     with np.errstate(divide="ignore", invalid="ignore"):  # np.where evaluates the branch not taken
         if voltage:
-            line = tau0 / p["no_load_speed"]
-            motor_now = tau0 * supply * np.clip(now, -1.0, 1.0) - line * v
-            motor = tau0 * supply * np.clip(pd, -1.0, 1.0) - line * v
+            line = tau0 / no_load
+            motor_now = tau0 * supply * np.clip(now, -1.0, 1.0) - line * v_drive
+            motor = tau0 * supply * np.clip(pd, -1.0, 1.0) - line * v_drive
             damping = tau0 * supply * slope + line
-            unlimited = tau0 * supply * pd - line * v
+            unlimited = tau0 * supply * pd - line * v_drive
             ratio = np.where(unlimited != 0.0, np.clip(motor / unlimited, 0.0, 1.0), 0.0)
-            damping = np.where(np.abs(pd) > 1.0, np.maximum(ratio * damping, line), damping)
+            on_drive = np.where(np.abs(pd) > 1.0, np.maximum(ratio * damping, line), line)
+            damping = np.where(np.abs(pd) > 1.0, on_drive, damping)
         else:
-            x = np.abs(v) / (p["no_load_speed"] * supply)
+            x = np.abs(v_drive) / (no_load * supply)
             limit = np.where(x < 1.0, tau0 * (1.0 - x), 0.0)
             motor_now = np.clip(now, -limit, limit)
             motor = np.clip(pd, -limit, limit)
-            line = tau0 / (p["no_load_speed"] * supply)
-            braking = pd * v < 0.0
-            growth = np.minimum(p["efficiency"] * line * dt / inertia, 60.0)
+            line = tau0 / (no_load * supply)
+            braking = pd * v_drive < 0.0
+            growth = np.minimum(efficiency * line * dt / inertia_drive, 60.0)
             grown = np.maximum(limit, SEED * tau0) * (np.exp(growth) - 1.0) / growth
             grown = np.minimum(grown, np.minimum(tau0, np.abs(pd)))
             grows = (np.abs(pd) > limit) & braking & (growth > SNAP) & (x < EDGE)
             size = np.where(grows, grown, limit)
             motor = np.where(grows, np.sign(pd) * size, motor)
             line = np.where(limit == 0.0, 0.0, line)
-            line = np.where(braking, size / (p["no_load_speed"] * supply * (1.0 + x)), line)
-            damping = np.where(np.abs(pd) > limit, np.maximum(slope * size / np.abs(pd), line), slope)
+            line = np.where(braking, size / (no_load * supply * (1.0 + x)), line)
+            on_drive = np.where(np.abs(pd) > limit, np.maximum(slope * size / np.abs(pd), line), 0.0)
+            damping = np.where(np.abs(pd) > limit, on_drive, slope)
 
     on = np.asarray(enabled) != 0.0
-    motor_now, motor, damping = np.where(on, motor_now, 0.0), np.where(on, motor, 0.0), np.where(on, damping, 0.0)
+    motor_now, motor, damping, on_drive = (np.where(on, x, 0.0) for x in (motor_now, motor, damping, on_drive))
 
     blend = dt / (p["lag"] + dt)
     motor_now = last + blend * (motor_now - last)
     motor = last + blend * (motor - last)
     damping = blend * damping
 
-    applied = p["efficiency"] * motor
-    damping = p["efficiency"] * damping
+    applied = efficiency * motor
+    damping = efficiency * damping
+    on_drive = efficiency * blend * on_drive
 
     angle = p["ripple_per_turn"] * q + p["ripple_phase"]
     applied = applied + p["torque_ripple"] * np.sin(angle)
@@ -101,20 +150,63 @@ def servo(
     applied = applied - stiffness * dt * v
     damping = damping + stiffness * dt
 
+    of_motor, slope_motor = applied, damping
     pull = p["standin_position"]
     brake = p["standin_speed"] + p["standin_drag"] * np.abs(v)
     spring = np.maximum(0.0, -pull)
     applied = applied + p["standin_constant"] + pull * q + brake * v - spring * dt * v
     damping = damping + spring * dt + np.maximum(0.0, -brake)
 
-    fraction = np.where(last * v < 0.0, p["load_friction_backdriven"], p["load_friction"])
-    level = base_frictionloss + p["coulomb_friction"]
-    level = level + p["stribeck_peak"] * np.exp(-((v / p["stribeck_speed"]) ** 2)) + fraction * np.abs(last)
-    applied = applied - 0.5 * p["friction_asymmetry"] * level
+    fraction = np.where(last * v_drive < 0.0, p["load_friction_backdriven"], p["load_friction"])
+    own = friction_factor * (p["coulomb_friction"] + p["stribeck_peak"] * np.exp(-((v_drive / p["stribeck_speed"]) ** 2)))
+    own = own + fraction * np.abs(last)
+    level = base_frictionloss + own
+    viscous = friction_factor * p["viscous_friction"]
 
-    return {
-        "torque": motor_now,
-        "qfrc_applied": applied + damping * v,
-        "dof_damping": base_damping + p["viscous_friction"] + damping,
+    one = {
+        "qfrc_applied": applied - 0.5 * p["friction_asymmetry"] * level + damping * v,
+        "dof_damping": base_damping + viscous + damping,
         "dof_frictionloss": level,
-    }
+        "line_a": np.zeros_like(v), "line_b": np.ones_like(v),
+    }  # fmt: skip
+    other = one
+    if play:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            other = _rotor(p, of_motor - 0.5 * p["friction_asymmetry"] * own, slope_motor, on_drive, on_rotor, own, viscous, rotor_q, v_drive,
+                           rotor_inertia, inertia, q, v, dt, p["kp"] * tau0 if voltage else p["kp"])  # fmt: skip
+        rest, rest_slope = applied - of_motor, damping - slope_motor  # of the stand-in: on the link itself
+        other["qfrc_applied"] = other["qfrc_applied"] + rest + rest_slope * v
+        other["dof_damping"] = other["dof_damping"] + base_damping + rest_slope
+        other["dof_frictionloss"] = np.broadcast_to(base_frictionloss, v.shape)
+    out = {name: np.where(two, other[name], one[name]) for name in one}
+    armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) if play else base_armature
+    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q}
+
+
+def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:
+    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and dof_damping of what
+    passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop [N.m/rad]."""
+    on_drive = np.where(on_rotor, slope, on_drive)
+    on_loop = np.where(on_rotor, 0.0, slope - on_drive)
+    soft, gap2 = p["softness"], 0.5 * p["backlash"]
+    link = np.maximum(inertia - rotor_inertia, LEAST_ROTOR * inertia)
+    stop = STOP_GAIN * gain + STOP_RATE**2 * inertia
+    stiff = np.where(soft > 0.0, 1.0 / soft, stop)
+    damp = np.where(soft > 0.0, 0.1 * np.sqrt(stiff * link), 2.0 * p["rebound"] * np.sqrt(stop * rotor_inertia * link / (rotor_inertia + link)))
+    free_a = rotor_inertia / dt + viscous + on_drive
+    push = rotor_inertia / dt * w + of_motor + on_drive * w
+    slides = np.abs(push) > own
+    free = np.where(slides, (push - np.sign(push) * own + on_loop * v) / free_a, 0.0), np.where(slides, -on_loop / free_a, 0.0)
+    twist = rotor_q + dt * (free[0] + free[1] * v) - q - dt * v
+    side = np.sign(twist) * gap2
+    stretch = stiff * (rotor_q - q - side)
+    harder = np.where(soft > 0.0, 1.0 + p["hardening"] * stretch**2, 1.0)
+    k, pull = (3.0 * harder - 2.0) * stiff * dt + damp, stretch * harder
+    push = push - pull
+    slides = np.abs(push + k * v) > own
+    a = np.where(slides, (push - np.sign(push + k * v) * own + on_loop * v) / (free_a + k), 0.0)
+    b = np.where(slides, (k - on_loop) / (free_a + k), 0.0)
+    t, slope_t = pull + k * a, k * (1.0 - b)
+    on = (np.abs(twist) >= gap2) & ((gap2 == 0.0) | ((t - slope_t * v) * side >= 0.0))
+    return {"qfrc_applied": np.where(on, t, 0.0), "dof_damping": np.where(on, slope_t, 0.0),
+            "line_a": np.where(on, a, free[0]), "line_b": np.where(on, b, free[1])}  # fmt: skip

@@ -9,12 +9,12 @@ import mujoco
 import torch
 import warp as wp
 
-from dexsim.actuator.columns import INDEX, NAMES, column, did_you_mean
-from dexsim.actuator.kernel import QUEUE, SLOTS, reset_kernel, send_kernel, servo_kernel
+from dexsim.actuator.columns import COLUMNS, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
+from dexsim.actuator.kernel import EXTRA_SLOTS, QUEUE, SLOTS, given_kernel, reset_kernel, send_kernel, servo_kernel
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 
-FIELDS = ("dof_damping", "dof_frictionloss")  # per-world model fields that the engine must declare
+FIELDS = ("dof_damping", "dof_frictionloss", "dof_armature")  # per-world model fields that the engine must declare
 
 
 class Servo:
@@ -27,15 +27,23 @@ class Servo:
         control_period: shortest time between targets [s], so that the queue outlasts the longest delay (else 8).
         driven, loop, reported: names of the joints that the motor drives, that the loop's encoder reads and that
             `position()` reports, where a mechanism has separate rotor joints; default `joints`.
+        varied: names of the columns that will be given values other than the table's (by randomization, say): what of the
+            kernel is left out where no drive needs it (`columns.FEATURES`) follows from the table and from these.
+
+    Where the table states play or elasticity (`backlash`, `softness`), a rotor of its own is simulated, and the table's
+    `loop_encoder` and `position_encoder` say on which side of it the encoders are.
 
     Tensors share memory with the kernel; write them in place:
         params [N, J, C] columns of `columns.py`, SI; nominal [J, C] as the table states them;
         state [N, J, S] slots `slots`: motor torque of the last step [N.m], enabled (1 driven, 0 free), then the queue's
-            stamps [s] and targets [rad], oldest first;
+            stamps [s] and targets [rad], oldest first, then what the features need;
         torque [N, J] motor torque as its current shows it, at the start of the last physics step: after clipping and
             lag, before efficiency and friction, positive along positive joint position [N.m];
-        base_damping, base_frictionloss [N, J] the model's own joint damping and friction, to which the servo's are
-            added. Randomize these, not the model fields, which the servo overwrites before each physics step;
+        base_damping, base_frictionloss, base_armature [N, J] the model's own joint damping, friction and armature, to
+            which the servo's are added (an armature loses its rotor where there is play). Randomize these, not the model
+            fields: the servo overwrites them before each physics step, the armature only where play is simulated;
+        misread: whether the encoders may report other positions than the joints have;
+        home [N, J] positions [rad] from which a joint that drags another is counted (default: the model's qpos0);
         inertia [N, J] about the joints [kg.m2], for the integration only: an estimate serves.
     """
 
@@ -49,6 +57,7 @@ class Servo:
         driven: Sequence[str] | None = None,
         loop: Sequence[str] | None = None,
         reported: Sequence[str] | None = None,
+        varied: Sequence[str] = (),
     ):
         self.engine = engine
         self.joints = tuple(joints)
@@ -63,6 +72,7 @@ class Servo:
             raise UserError(f"servo: a joint is driven twice in {list(driven or joints)}; each joint has one drive.")
 
         nominal = table.nominal(self.joints)
+        _check_drags(table, self.joints, nominal)
         self.queue, self.control_period = 8, control_period
         if control_period:  # the newest entry, one a period through the longest delay, and one before
             longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
@@ -71,12 +81,20 @@ class Servo:
         for k in range(self.queue):
             self.slots[f"stamp{k}"] = QUEUE + k
             self.slots[f"target{k}"] = QUEUE + self.queue + k
+        named = {*_stated(table, self.joints), *varied}
+        self.features = frozenset(FEATURE_OF[name] for name in named if name in FEATURE_OF)
+        before_play = "play" in self.features and "motor" in table.encoder("position", self.joints)
+        self.misread = before_play or bool(named & {"position_offset", "position_scale", "eccentric_sin", "eccentric_cos"})
+        extended = bool(self.features & {"play", "rare"})
+        if extended:
+            self.slots |= {name: QUEUE + 2 * self.queue + i for i, name in enumerate(EXTRA_SLOTS)}
 
-        j, c, s = len(self.joints), len(NAMES), QUEUE + 2 * self.queue
+        j, c, s = len(self.joints), len(NAMES), len(self.slots)
         zeros = lambda *shape: wp.zeros(shape, dtype=real, device=device)  # noqa: E731
         index = lambda values: wp.array(values, dtype=int, device=device)  # noqa: E731
         self._params, self._state, self._torque = zeros(n, j, c), zeros(n, j, s), zeros(n, j)
         self._inertia, self._base_damping, self._base_frictionloss = zeros(n, j), zeros(n, j), zeros(n, j)
+        self._base_armature, self._home, self._given = zeros(n, j), zeros(n, j), zeros(n)
         self._target, self._stamp = zeros(n, j), zeros(n)
         self._mask = wp.zeros(n, dtype=wp.bool, device=device)
         self._dof, self._dof_q, self._loop_q, self._loop_dof = index(dof), index(dof_q), index(loop_q), index(loop_dof)
@@ -84,6 +102,7 @@ class Servo:
         self.params, self.state, self.torque = (wp.to_torch(a) for a in (self._params, self._state, self._torque))
         self.base_damping = wp.to_torch(self._base_damping)
         self.base_frictionloss = wp.to_torch(self._base_frictionloss)
+        self.base_armature, self.home = wp.to_torch(self._base_armature), wp.to_torch(self._home)
         self._target_t, self._stamp_t, self._mask_t = (wp.to_torch(a) for a in (self._target, self._stamp, self._mask))
         as_tensor = lambda x: torch.as_tensor(x, dtype=self.params.dtype, device=self.params.device)  # noqa: E731
         self._as_tensor = as_tensor
@@ -96,11 +115,17 @@ class Servo:
         self.inertia[:] = as_tensor(1.0 / mjm.dof_invweight0[dof])
         self.base_damping[:] = as_tensor(mjm.dof_damping[dof])
         self.base_frictionloss[:] = as_tensor(mjm.dof_frictionloss[dof])
+        self.base_armature[:] = as_tensor(mjm.dof_armature[dof])
+        self.home[:] = as_tensor(mjm.qpos0[dof_q])
+        rotor_inside = driven is None and loop is None
+        sides = {which: [rotor_inside and side == "motor" for side in table.encoder(which, self.joints)] for which in ("loop", "position")}
+        self._loop_motor = index([int(x) for x in sides["loop"]])
+        self._position_motor = torch.as_tensor(sides["position"], device=self.params.device) if any(sides["position"]) else None
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
-        self._servo = servo_kernel(real, table.drive == "voltage")
-        self._send, self._reset = send_kernel(real), reset_kernel(real)
+        self._servo = servo_kernel(real, table.drive == "voltage", *(name in self.features for name in ("play", "sag", "rare")))
+        self._send, self._reset, self._sum = send_kernel(real), reset_kernel(real, extended), given_kernel(real)
         self._period = 1.0 / table.control_rate if table.control_rate else 0.0
         self._shape = (n, j)
         self._wp = engine.wp
@@ -112,6 +137,12 @@ class Servo:
     def column(self, name: str) -> torch.Tensor:
         """[N, J] view of one column of `params`; UserError with the valid names for another name."""
         return self.params[:, :, INDEX[column(name).name]]
+
+    def check_simulated(self, name: str) -> None:
+        """UserError if the kernel was built without what a column needs: neither the table nor `varied` names it."""
+        feature = FEATURE_OF.get(column(name).name)
+        if feature and feature not in self.features:
+            raise UserError(f"servo column '{name}' is not simulated here: state one of {', '.join(FEATURES[feature])} in the servo's file.")
 
     # -- targets ------------------------------------------------------------
 
@@ -142,23 +173,50 @@ class Servo:
     # -- the step ------------------------------------------------------------
 
     def before_each(self) -> None:
-        """Launches the servo for one physics step: the engine's `before_each` (one launch, capturable)."""
+        """Launches the servo for one physics step: the engine's `before_each` (capturable; one launch, two where a supply sags)."""
         w = self._wp
+        if "sag" in self.features:
+            wp.launch(self._sum, dim=self._shape[0], inputs=[self._shape[1], self._torque, self._given], device=self.engine.device)
         self._launch(
             self._servo, self.engine.dt, self.queue, self._dof, self._dof_q, self._loop_q, self._loop_dof,
-            self._params, self._inertia, self._base_damping, self._base_frictionloss, w.time, w.qpos, w.qvel,
-            self._state, w.qfrc_applied, self._fields["dof_damping"], self._fields["dof_frictionloss"], self._torque,
+            self._params, self._inertia, self._base_damping, self._base_frictionloss, self._base_armature, self._home,
+            self._loop_motor, w.time, w.qpos, w.qvel, self._given, self._state, w.qfrc_applied,
+            *(self._fields[name] for name in FIELDS), self._torque,
         )  # fmt: skip
 
     # -- what an observer reads ------------------------------------------------------------
 
     def position(self) -> torch.Tensor:
         """[N, J] position that the encoders report: scale * position + offset of the reported joints [rad]."""
-        return self.column("position_scale") * self.engine.t.qpos[:, self._reported_q] + self.column("position_offset")
+        return self.measured(self._turned()[0])
 
     def velocity(self) -> torch.Tensor:
         """[N, J] velocity that the encoders report [rad/s]."""
-        return self.column("position_scale") * self.engine.t.qvel[:, self._reported_dof]
+        return self.column("position_scale") * self._turned()[1]
+
+    def measured(self, q: torch.Tensor) -> torch.Tensor:
+        """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
+        out = self.column("position_scale") * q + self.column("position_offset")
+        if "rare" in self.features:
+            out = out + self.column("eccentric_sin") * torch.sin(q) + self.column("eccentric_cos") * (torch.cos(q) - 1.0)
+        return out
+
+    def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
+        """The position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
+        q = (reported - self.column("position_offset")) / self.column("position_scale")
+        for _ in range(6 if "rare" in self.features else 0):  # an eccentricity is a small part of the position: each turn wins a digit or more
+            q = q + (reported - self.measured(q)) / self.column("position_scale")
+        return q
+
+    def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a play."""
+        q, v = self.engine.t.qpos[:, self._reported_q], self.engine.t.qvel[:, self._reported_dof]
+        if self._position_motor is None or "play" not in self.features:
+            return q, v
+        rotor, a, b, fresh = (self.state[:, :, self.slots[name]] for name in ("rotor", "line_a", "line_b", "fresh"))
+        w = torch.where(fresh != 0, v, a + b * v)
+        here = self._position_motor
+        return torch.where(here & (fresh == 0), rotor + self.engine.dt * w, q), torch.where(here, w, v)
 
     # -- state ------------------------------------------------------------
 
@@ -182,6 +240,23 @@ class Servo:
 
     def _launch(self, kernel, *args) -> None:
         wp.launch(kernel, dim=self._shape, inputs=list(args), device=self.engine.device)
+
+
+def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None:
+    """UserError where `coupling_from` is no other joint's number."""
+    for j, joint in enumerate(joints):
+        source, bounds = nominal[j, INDEX["coupling_from"]], table.value(joint, "coupling")
+        used = not bounds.unknown and (bounds.low != 0.0 or bounds.high != 0.0)
+        if used and (source not in range(len(joints)) or source == j):
+            raise UserError(f"{table.source}: joints.{joint}.coupling_from is {source:g}; it must be the number of another joint, 0 to {len(joints) - 1}: "
+                            + ", ".join(f"{k} {name}" for k, name in enumerate(joints) if k != j))  # fmt: skip
+
+
+def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
+    """Columns that the table gives a value, or a range, other than the neutral one for some joint; unknown ones are neutral."""
+    nominal, (low, high), unknown = table.nominal(joints), table.bounds(joints), table.unknown(joints)
+    return [c.name for i, c in enumerate(COLUMNS)
+            if ((~unknown[:, i]) & ((nominal[:, i] != c.neutral) | (low[:, i] != c.neutral) | (high[:, i] != c.neutral))).any()]
 
 
 def _addresses(mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int):

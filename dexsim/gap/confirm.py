@@ -23,10 +23,10 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import judge
-from dexsim.gap.findings import MODEL_COLUMNS, handed, model_changes
+from dexsim.gap.findings import MODEL_COLUMNS, columns_beside, handed, model_changes
 from dexsim.gap.fit import expand
 from dexsim.gap.plant_columns import SERIES_INDEX
-from dexsim.gap.prepare import Case
+from dexsim.gap.prepare import REFERENCE, Case
 from dexsim.gap.runs import Run
 from dexsim.gap.search import Trial
 from dexsim.recording.mechanism import Mechanism
@@ -35,6 +35,7 @@ from dexsim.sim import make_engine
 STEP = 5e-4  # s: of the engine; its error is of first order in it
 REPLAY = ("mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
+WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
 LITTLE = 0.1  # of the error before: what the engine may leave beside what the plant leaves, added in squares
@@ -56,7 +57,8 @@ class World:
 
     rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first position
     and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K, J] (NaN
-    keeps the last); enabled: None or (times, [n, J])."""
+    keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]: from where a joint
+    that drags another is counted (None: q)."""
 
     rows: np.ndarray
     table: ServoTable
@@ -68,6 +70,8 @@ class World:
     stamps: np.ndarray
     targets: np.ndarray
     enabled: tuple[np.ndarray, np.ndarray] | None = None
+    warmth: tuple[np.ndarray, np.ndarray] | None = None
+    home: np.ndarray | None = None
 
 
 @dataclass
@@ -121,6 +125,8 @@ def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hyp
                 if name in SERVO_INDEX:
                     c = COLUMNS[SERVO_INDEX[name]]
                     rows[j, SERVO_INDEX[name]] = np.clip(plant[SERVO_INDEX[name]], c.low, c.high)
+        for name, value in columns_beside(case, trial, m.joints).items():
+            rows[j, SERVO_INDEX[name]] = value
     if run.supply is not None and run.servo.supply_voltage:
         rows[:, SERVO_INDEX["supply"]] *= float(np.mean(run.supply)) / run.servo.supply_voltage
     return rows
@@ -149,7 +155,7 @@ def missing_of(h: Hypothesis) -> list[str]:
         for x in trial.members:
             columns = {c for p in x.variant.params for c in p.columns}
             fixed = {name for name, value in x.variant.fixed if value}
-            if (columns - set(SERVO_INDEX) - set(MODEL_COLUMNS)) or fixed:
+            if (columns | fixed) - set(SERVO_INDEX) - set(MODEL_COLUMNS):
                 out.append(f"{x.id} ({x.variant.label})@{joint}" if x.variant.label else f"{x.id}@{joint}")
     return sorted(out)
 
@@ -164,7 +170,7 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
         run, start = runs[r], float(windows.window_t[w])
         rows = servo_rows(m, run, r, cases, h)
         scale, offset = rows[:, SERVO_INDEX["position_scale"]], rows[:, SERVO_INDEX["position_offset"]]
-        q, v = scale * rest + offset, np.zeros(len(m.joints))
+        q, v, home = scale * rest + offset, np.zeros(len(m.joints)), scale * rest + offset
         for case in cases:
             series = case.plant.series[windows.window[w, 0]]
             j = m.joints.index(case.joint)
@@ -180,9 +186,15 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
             on = np.ones((len(run.t), len(m.joints)))
             on[:, place] = run.enabled
             enabled = (run.t - start, on)
+        warmth = None
+        if run.temperature is not None:
+            heat = np.zeros((len(run.t), len(m.joints)))
+            heat[:, place] = np.nan_to_num(run.temperature - REFERENCE)
+            warmth = (run.t - start, heat)
+        home[place] = run.qs[0] if run.qs is not None else run.q[0]
         samples = windows.sample_row[windows.sample_window == w]
         end = float(cases[0].plant.t[samples[-1]])
-        out.append(World(rows, run.servo, np.asarray(run.gravity, float), end - start, q, v, target, run.cmd_t[first:] - start, targets, enabled))
+        out.append(World(rows, run.servo, np.asarray(run.gravity, float), end - start, q, v, target, run.cmd_t[first:] - start, targets, enabled, warmth, home))
     return out
 
 
@@ -210,21 +222,23 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
     spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
     spacing = spacing[spacing > 1e-6]
-    servo = Servo(engine, joints, table, control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None)
+    varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]
+    servo = Servo(engine, joints, table, control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None, varied=varied)
     real = engine.t.qpos.dtype
     up = lambda x, dtype=real: torch.as_tensor(np.asarray(x), dtype=dtype, device=engine.t.qpos.device)  # noqa: E731
     servo.params.copy_(up(rows))
-    scale, offset = rows[:, :, SERVO_INDEX["position_scale"]], rows[:, :, SERVO_INDEX["position_offset"]]
+    scale = rows[:, :, SERVO_INDEX["position_scale"]]
     address, dofs = engine.qpos_index(joints), engine.dof_index(joints)
     qpos, qvel = np.tile(engine.mjm.qpos0, (N, 1)), np.zeros((N, engine.mjm.nv))
-    qpos[:, address] = (np.stack([w.q for w in worlds]) - offset) / scale
+    qpos[:, address] = servo.unmeasured(up(np.stack([w.q for w in worlds]))).cpu().numpy()
     qvel[:, dofs] = np.stack([w.v for w in worlds]) / scale
+    servo.home.copy_(servo.unmeasured(up(np.stack([w.q if w.home is None else w.home for w in worlds]))))
     engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
     now = np.stack([w.target for w in worlds])
     servo.reset(None, up(now))
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
-    pick = torch.as_tensor(address, dtype=torch.int64, device=seen.device)
+    warm = [i for i, w in enumerate(worlds) if w.warmth is not None] if "warmth" in varied or "rare" in servo.features else []
     sent = [0] * N
     freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
     for k in range(steps):
@@ -248,10 +262,14 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
                 if (on != freed[i]).any():
                     freed[i] = on
                     servo.state[i, :, servo.slots["enabled"]] = up(on)
-        torch.index_select(engine.t.qpos, 1, pick, out=seen[k])
+        if warm and k % max(1, round(WARM_EVERY / timestep)) == 0:
+            for i in warm:
+                at, heat = worlds[i].warmth
+                servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(t, at, x) for x in heat.T])
+        seen[k].copy_(servo.position())
         engine.step(1, servo.before_each)
     q = seen.cpu().numpy().astype(float)
-    return [scale[i] * q[:, i] + offset[i] for i in range(N)]
+    return [q[:, i] for i in range(N)]
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,

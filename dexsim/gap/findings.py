@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from dexsim.actuator.columns import COLUMNS, INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.fit import Param
+from dexsim.gap.plant_columns import INDEX as PLANT_INDEX
+from dexsim.gap.plant_columns import SERIES_INDEX
 from dexsim.gap.prepare import Case
 
 
@@ -109,11 +112,25 @@ def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[fl
 
 def handed(p: Param, case: Case) -> bool:
     """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
-    return not (p.nuisance and p.key in ("delay", "lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
+    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
 
 
-def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> list[str]:
-    """Writes what was fitted into the servo table, with intervals; returns what the table has no column for."""
+def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]:
+    """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of the mechanism's
+    joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it from."""
+    out, fitted = {}, {name for p in trial.fit.params for name in p.columns}
+    for x in trial.members:
+        for name, value in x.variant.fixed:
+            if name in INDEX:
+                out[name] = float(joints.index(x.variant.note["from_joint"])) if name == "coupling_from" else value
+    if fitted & {"backlash", "softness"} and "rotor" not in fitted and case.constants.armature <= 0:
+        out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
+    return out
+
+
+def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
+    """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the table has no
+    column for. Where something changes with temperature, training is given the temperatures that were recorded."""
     left = []
     for p, x, (low, high) in zip(trial.fit.params, trial.fit.x, bounds, strict=True):
         if not handed(p, case):
@@ -133,6 +150,11 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray) -> l
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
+    for name, value in columns_beside(case, trial, joints).items():
+        table.set(case.joint, name, value)
+    if any(x.id == "thermal" for x in trial.members):
+        warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
+        table.set(case.joint, "warmth", *(round(float(v), 2) for v in (np.median(warmth), warmth.min(), warmth.max())))
     return left
 
 

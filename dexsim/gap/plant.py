@@ -300,10 +300,10 @@ def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu", copy: bool = True)
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:
-    """[C] plant parameters of a servo table's row [21] (infinite limits made large), all extras neutral."""
+    """[C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor [kg.m2]: where the row has none."""
     row = NEUTRAL.copy()
     row[: len(servo_row)] = servo_row
-    row[INDEX["rotor"]] = rotor
+    row[INDEX["rotor"]] = row[INDEX["rotor"]] or rotor
     row[~np.isfinite(row)] = 1e9
     assert len(row) == len(NAMES)
     return row

@@ -190,7 +190,8 @@ def drive(
     scale, offset = (servo.column(f"position_{name}")[0].double().numpy().copy() for name in ("scale", "offset"))
     start = qpos[0, address].numpy().copy()
     if initial is not None:
-        start = np.where(np.isfinite(initial), (initial - offset) / scale, start)
+        known = servo.unmeasured(torch.as_tensor(np.nan_to_num(initial))[None])[0].numpy()
+        start = np.where(np.isfinite(initial), known, start)
     qpos[0, address] = torch.as_tensor(start)
     lead = None
     if follow is not None:
@@ -227,8 +228,11 @@ def drive(
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
             engine.t.qvel[0, v : v + 6] = torch.as_tensor(lead_speed[k])
         # views of the engine's memory: `servo.position()` and the like, without a tensor a step
-        out["position"][k] = scale * q_view[address] + offset
-        out["velocity"][k] = scale * v_view[dofs]
+        if servo.features:  # an eccentric encoder, or one before a play
+            out["position"][k], out["velocity"][k] = servo.position()[0].numpy(), servo.velocity()[0].numpy()
+        else:
+            out["position"][k] = scale * q_view[address] + offset
+            out["velocity"][k] = scale * v_view[dofs]
         out["target"][k] = now
         servo.before_each()
         out["torque"][k] = torque_view

@@ -96,7 +96,8 @@ class HandEnv(VecEnv):
             spec, n_worlds, device, engine, fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
             pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"])
         self.scene = scene
-        self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt)
+        self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt,
+                           varied=list(cfg["randomize"].get("servo", {})))
         self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
         if self.reality is not None:
             self.objects.friction_factor = self.reality.friction_factor(self.engine.mjm, self.objects.hand_geoms.tolist())
@@ -307,6 +308,9 @@ class HandEnv(VecEnv):
         self.object_pose.copy_(clean(t.qpos[:, self.object_q]))
         self.object_velocity.copy_(clean(t.qvel[:, self.object_v]))
         self.torque.copy_(clean(self.servo.torque))
+        if self.servo.misread:  # what a hand's own sensors say is all that a policy will know of them
+            self.q.copy_(clean(self.servo.position()))
+            self.qd.copy_(clean(self.servo.velocity()))
         if self.reality is not None:
             self.reality.read(self)
         normal = clean(t.pair_normal)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from dexsim.actuator.columns import INDEX, column
+from dexsim.actuator.columns import INDEX, column, simulated
 from dexsim.actuator.servo import Servo
 from dexsim.errors import UserError
 from dexsim.tasks.randomize import Sampler
@@ -30,6 +30,7 @@ class ServoRandomizer:
         self.low = torch.where(fitted, torch.as_tensor(low, device=dev, dtype=dtype), servo.nominal)
         self.high = torch.where(fitted, torch.as_tensor(high, device=dev, dtype=dtype), servo.nominal)
         self.fitted = fitted
+        self.simulated = torch.as_tensor(simulated(servo.features), device=dev)
         self.columns = [name.removeprefix("servo.") for name in sampler.ranges if name.startswith("servo.")]
         for name in self.columns:
             self._check(name)
@@ -37,6 +38,7 @@ class ServoRandomizer:
     def _check(self, name: str) -> None:
         """Raise UserError unless every value that a range can give is one that the servo can have."""
         col, (low, high, _) = column(name), self.sampler.range(f"servo.{name}")
+        self.servo.check_simulated(name)
         value = self.servo.nominal[:, INDEX[name]]
         value = value[torch.isfinite(value)].double()
         if len(value) == 0:
@@ -58,7 +60,8 @@ class ServoRandomizer:
             c = INDEX[name]
             r = self.sampler.draw(f"servo.{name}", J).to(new.dtype)
             new[..., c] = new[..., c] * r if name in RELATIVE else new[..., c] + r
-        u = self.sampler.uniform(J, new.shape[2]).to(new.dtype)
+        u = torch.zeros_like(new)
+        u[..., self.simulated] = self.sampler.uniform(J, len(self.simulated)).to(new.dtype)
         # infinite bounds (an absent limit) have no width: their product with u would be NaN
         width = torch.where(self.fitted, self.high - self.low, torch.zeros_like(self.low))
         new = torch.where(self.fitted, self.low + u * width, new)
