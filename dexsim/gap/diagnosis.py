@@ -388,7 +388,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
             if late is not None:
                 findings[-1]["parameters"]["jitter"] = late.entry()
             out.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
-        leftover += servo_changes(servo, case, best, bounds)
+        leftover += servo_changes(servo, case, best, bounds, m.joints)
         mine = model_changes(spec, case, best, by_member)
         changed_model |= bool(mine)
         leftover_text = [x for x in mine]
