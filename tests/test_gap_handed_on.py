@@ -96,6 +96,49 @@ def test_what_is_doubted_is_handed_on_beside_what_was_believed(fitted, low, high
     assert (now.value, now.low, now.high) == (fitted, *after) and (other.low, other.high) == (0.018, 0.022)
 
 
+PLAY = {
+    "backlash": {"value": 0.03, "low": 0.02, "high": 0.04}, "rebound": 0.1, "speed_lag": {"value": 0.01, "low": 0.005, "high": 0.02},
+    "eccentric_sin": {"value": 0.05, "low": 0.04, "high": 0.06}, "sag": {"value": 0.05, "low": 0.02, "high": 0.08},
+    "coupling": {"value": 0.1, "low": 0.05, "high": 0.15}, "coupling_from": 4, "thermal_friction": 0.02, "warmth": {"value": 10.0, "low": 0.0, "high": 25.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_training_has_the_play_and_the_rest_of_it(engine, tmp_path):
+    """A servo.yaml with all of it trains: drawn inside the intervals at each episode, on that joint alone; the joint hangs in its play;
+    the policy sees what the eccentric encoder reports; no host synchronisation."""
+    from test_nosync import NoSync, _strict
+
+    table = xhand_table()
+    for name, value in PLAY.items():
+        table.set(JOINT, name, *((value["value"], value["low"], value["high"]) if isinstance(value, dict) else (value,)))
+    table.loop_encoder = "motor"
+    table.save(tmp_path / "servo.yaml")
+    env = grasp_env(f"servo_file={tmp_path / 'servo.yaml'}", worlds=16, engine=engine)
+    assert env.servo.features == {"play", "sag", "rare"} and env.servo.misread
+    j = xhand.JOINTS.index(JOINT)
+    for name, value in PLAY.items():
+        if isinstance(value, dict):
+            x = env.servo.column(name)
+            assert value["low"] - 1e-6 <= float(x[:, j].min()) < float(x[:, j].max()) <= value["high"] + 1e-6
+    assert not env.servo.column("backlash")[:, [k for k in range(12) if k != j]].any()
+    for _ in range(3):
+        env.step(torch.zeros(16, 12))
+    if engine == "warp":
+        with pytest.MonkeyPatch.context() as strict, NoSync():
+            _strict(strict)
+            for _ in range(3):
+                env.step(torch.zeros(16, 12))
+    q = env.engine.t.qpos[:, env.joint_q[j]]
+    rotor = env.servo.state[:, j, env.servo.slots["rotor"]]
+    gap = env.servo.column("backlash")[:, j]
+    assert ((rotor - q).abs() < 0.5 * gap + 0.02).all() and ((rotor - q).abs() > 1e-4).any()
+    seen = env.servo.measured(env.engine.t.qpos[:, env.joint_q])[:, j]
+    torch.testing.assert_close(env.q[:, j].double(), seen.double(), atol=1e-6, rtol=0)
+    assert (env.q[:, j] - q).abs().max() > 1e-3
+    assert torch.isfinite(env.q).all() and not env.nan.any()
+
+
 def test_model_file_is_the_hand_that_trains(tmp_path):
     from types import SimpleNamespace
 
@@ -119,6 +162,10 @@ def test_model_file_is_the_hand_that_trains(tmp_path):
     for text, word in (("nowhere.xml", "no such file"), (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not the xHand")):
         with pytest.raises(UserError, match=word):
             grasp_env(f"model_file={text}", worlds=2)
+
+
+def xhand_table() -> ServoTable:
+    return ServoTable.from_dict(grasp_cfg()["servo"])
 
 
 def _write(path, text):
