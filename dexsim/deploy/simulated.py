@@ -53,7 +53,7 @@ class SimulatedHand:
         control = float(cfg["sim"]["control_period"])
         self.dt = control / max(1, round(control / TIMESTEP))
         cfg["sim"] |= {"timestep": self.dt, "threads": 1, "engine": "mujoco"}
-        cfg["tactile"]["raw"] = True
+        cfg["tactile"] |= {"raw": True, "period": 0.5 * BUS_PERIOD}  # felt once a bus cycle: as many readings are kept as a delay needs
         cfg["device"], cfg["worlds"] = "cpu", 1
         if shape is not None:
             cfg["task"]["objects"]["train"] = [shape]
