@@ -217,6 +217,12 @@ def test_a_gain_that_drifts_and_is_wrong():
     assert ranges(h.tactile["pads"]["index"])["gain"] == pytest.approx((0.63, 0.65 * 0.76, 0.75))
 
 
+def test_taxels_that_hardly_felt_anything_have_what_the_others_agree_on():
+    f = finding("tactile_gain", on=["1:17"], gain=(0.5, 0.45, 0.55))
+    pad = handed([f, EVERY["thermal"][0]], {"index": PadFacts(rest=(0.7, 0.66, 0.74), warmest=10.0)}).tactile["pads"]["index"]
+    assert ranges(pad) == {"gain": pytest.approx((0.665, 0.66 * 0.88, 0.74)), "taxels": {17: pytest.approx((0.475, 0.45 * 0.88, 0.55))}}
+
+
 def test_chord_of_a_law():
     depth = np.linspace(1e-5, 1e-3, 400)
     value, low, high = chord(7000.0 * depth, depth)
@@ -237,13 +243,17 @@ def test_nothing_found_writes_nothing_and_takes_an_earlier_file_away(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("planted", [{"gains": {54: 0.5, 66: 1.5}, "stuck": {80: 2.0}, "swapped": [(55, 65)]}, {"stiffness": 4500.0},
-                                     {"rubber": (1e5, 2e4)}], ids=["taxels", "stiffness", "rubber"])  # fmt: skip
+                                     {"rubber": (1e5, 2e4)}, {"gains": dict.fromkeys(range(120), 0.7) | {67: 0.0}}],
+                         ids=["taxels", "stiffness", "rubber", "all"])  # fmt: skip
 def test_more_round_trips(tmp_path, planted):
     _, path = diagnosed(tmp_path, **planted)
     found = load(path)
     env = grasp_env(f"tactile_file={path}", worlds=48)
     pad = found["tactile"].get("pads", {}).get("index", {})
-    if "gains" in planted:
+    if len(planted.get("gains", ())) == 120:  # one dead taxel hides that all have one gain: those that felt little have it too
+        assert pad["gain"]["low"] - 0.03 < 0.7 < pad["gain"]["high"] + 0.03 and pad["taxels"][67]["value"] < 0.05
+        assert within(env.touch.gain[:, INDEX, 5], pad["gain"]) and (env.touch.gain[:, MID] == 1.0).all()
+    elif "gains" in planted:
         assert pad["stuck"] == {80: 2.0} and pad["swapped"] == [[55, 65]]
         for k, true in planted["gains"].items():
             gain, p = env.touch.gain[:, INDEX, k], pad["taxels"][k]

@@ -76,7 +76,7 @@ def test_gains_dead_stuck_and_exchanged_taxels():
     touch, press, _ = ball({"pads": {"index": {"gain": 0.5, "taxels": {str(a): [0.4, 0.6]}, "dead": [b], "stuck": {far: 2.0}, "swapped": [[c, d]]}}}, n=200)
     press()
     z = touch.raw[:, INDEX].double().numpy()
-    share = z[:, a] / (0.5 * x[a])
+    share = z[:, a] / x[a]
     assert share.min() >= 0.4 - 1e-6 and share.max() <= 0.6 + 1e-6 and np.ptp(share) > 0.17  # drawn in each world
     assert (z[:, b] == 0).all() and np.allclose(z[:, far], 2.0)
     np.testing.assert_allclose(z[:, [c, d]], np.tile(0.5 * x[[d, c]], (200, 1)), rtol=1e-5)

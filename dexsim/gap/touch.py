@@ -23,6 +23,7 @@ from dexsim.recording.schema import Recording
 
 ROWS = xhand.ROWS  # k = column * 12 + row
 SET_SHARE = 0.12  # of the bootstraps: a rival of the same class with as much belongs to the set
+AGREE = 5  # taxels with one gain from which on those that hardly felt anything are taken to have it too
 SHORT = 3.0  # s of touch on a pad, at least, before anything but broken taxels is looked for
 
 
@@ -162,7 +163,7 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     out.findings += fresh
     run = search.runs[0]
     common = (best.values["gain"], *bounds["gain"]) if "gain" in best.keys else None
-    out.facts[name] = PadFacts(dict(search.silent), common, _chord(search, best, bounds), max(float(r.warm.max()) for r in search.runs), run.stiffness, run.friction,
+    out.facts[name] = PadFacts(dict(search.silent), common, _rest(search, best), _chord(search, best, bounds), max(float(r.warm.max()) for r in search.runs), run.stiffness, run.friction,
                                search.shear)  # fmt: skip
     for k in ("scale", "zero", "along", "across", "clock"):
         if k in best.keys:
@@ -183,6 +184,19 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     load = None if run.load is None else np.interp(run.t, run.grid, run.load)
     pick = run.t >= (run.t[0] if kept else run.t[0] + 0.75 * (run.t[-1] - run.t[0]))
     out.curves.append(PadCurve(name, run.recording, run.t[pick], run.z[pick].sum(1), p0[pick].sum(1), p1[pick].sum(1), None if load is None else load[pick]))
+
+
+def _rest(search: PadSearch, t: TouchTrial) -> Fit | None:
+    """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where they do not."""
+    if t.gains is None:
+        return None
+    moved = np.zeros(len(t.gains), bool) if t.order is None else t.order != np.arange(len(t.gains))
+    sure = (_gain_width(search, t) < 0.1) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
+    sure[list(search.silent)] = False
+    if sure.sum() < AGREE:
+        return None
+    low, value, high = (float(x) for x in np.quantile(t.gains[sure], [0.05, 0.5, 0.95]))
+    return (value, low, high) if abs(value - 1) > GAIN_OFF and high - low < abs(value - 1) else None
 
 
 def _chord(search: PadSearch, t: TouchTrial, bounds: dict[str, tuple[float, float]]) -> Fit | None:

@@ -42,12 +42,13 @@ HEAD = """\
 @dataclass
 class PadFacts:
     """Of a judged pad, beside its findings: silent: constant taxels and their reading [N] (0: dead); common: gain of all its taxels;
-    chord: contact stiffness [N/m] that
+    rest: of those that a map of single gains does not name; chord: contact stiffness [N/m] that
     stands for a fitted rubber; warmest: where a drift ends (degC above the coldest, or s); stiffness [N/m], friction: what was
     believed; slid: whether friction could be judged."""
 
     silent: dict[int, float] = field(default_factory=dict)
     common: Fit | None = None
+    rest: Fit | None = None
     chord: Fit | None = None
     warmest: float = 0.0
     stiffness: float = STIFFNESS
@@ -72,22 +73,32 @@ def doubted(finding: dict[str, Any]) -> bool:
 
 def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts]) -> Handed:
     """The settings that findings of touch ask for. facts: by name of pad."""
-    out, pads = Handed(), {}
+    out, pads, drifts = Handed(), {}, {}
     shared: dict[str, dict[str, Fit]] = {"object.friction": {}, "contact.stiffness": {}}
     for f in findings:
         if not f["where"]["taxels"]:
             continue
         name = xhand.FINGERS[int(f["where"]["taxels"][0].split(":")[0])]
         pad, fact, doubt = pads.setdefault(name, {}), facts.get(name) or PadFacts(judged=False), doubted(f)
+        if f["effect"] == "thermal":
+            ends = [1.0 + f["parameters"]["per_degree"][k] * fact.warmest for k in ("value", "low", "high")]
+            drifts[name] = (0.5 * (1.0 + ends[0]), min(1.0, *ends[1:]), max(1.0, *ends[1:]))
         lost = _one(f, name, pad, fact, shared, doubt)
         either = " or ".join(f["indistinguishable"] or [f["effect"]])
         out.said.append(f"{name}: {either}, confidence {f['confidence']:.2f}" + (", not sure: its range holds what was believed" if doubt else ""))
         if doubt:
             out.doubts.append(f"{f['effect']} on the {name}'s pad is not sure: in tactile.yaml its range holds what was believed as well{lost}")
+    for name, drift in drifts.items():
+        pad = pads[name]
+        pad["gain"] = _times(pad.get("gain"), drift)
+        if "taxels" in pad:
+            pad["taxels"] = {k: _times(g, drift) for k, g in pad["taxels"].items()}
     for name, pad in pads.items():
         if pad:
             for key in [k for k in pad if k in PAD_COLUMNS]:
                 pad[key] = _entry(pad[key], *PAD_COLUMNS[key][1:3])
+            if "taxels" in pad:
+                pad["taxels"] = {k: _entry(g, *PAD_COLUMNS["gain"][1:3]) for k, g in pad["taxels"].items()}
             out.tactile.setdefault("pads", {})[name] = pad
     for name, by_pad in shared.items():
         if by_pad:
@@ -122,10 +133,6 @@ def _one(f: dict[str, Any], name: str, pad: dict[str, Any], fact: PadFacts, shar
         pad["crosstalk"] = fit("fraction", 0.0)
     elif e == "tactile_delay":
         pad["delay"] = fit("delay", 0.0)
-    elif e == "thermal":
-        ends = [1.0, *(1.0 + p["per_degree"][k] * fact.warmest for k in ("low", "high"))]
-        drift = (1.0 + 0.5 * p["per_degree"]["value"] * fact.warmest, min(ends), max(ends))
-        pad["gain"] = _times(pad.get("gain"), drift)
     elif e == "contact_friction":
         shared["object.friction"][name] = fit("mu", fact.friction)
     elif e == "contact_stiffness":
@@ -138,11 +145,12 @@ def _one(f: dict[str, Any], name: str, pad: dict[str, Any], fact: PadFacts, shar
 def _gains(f: dict[str, Any], pad: dict[str, Any], fact: PadFacts, doubt: bool) -> str:
     """Gains into a pad's settings; returns what is left out, in words."""
     p, taxels = f["parameters"]["gain"], f["parameters"].get("taxels", {})
-    if fact.common is not None:
-        pad["gain"] = _times(pad.get("gain"), _wide(fact.common, 1.0 if doubt else None))
+    whole = fact.common or fact.rest
+    if whole is not None:
+        pad["gain"] = _times(pad.get("gain"), _wide(whole, 1.0 if doubt else None))
     numbers = [int(t.split(":")[1]) for t in f["where"]["taxels"]]
     lists = {k: np.broadcast_to(np.atleast_1d(p[k]), len(numbers)) for k in ("value", "low", "high")}
-    gains: dict[int, Any] = {}
+    gains: dict[int, Fit] = {}
     for k, v, low, high in zip(numbers, *lists.values(), strict=True):
         if fact.common is not None and k not in fact.silent:
             continue  # the pad's
@@ -152,7 +160,7 @@ def _gains(f: dict[str, Any], pad: dict[str, Any], fact: PadFacts, doubt: bool) 
             else:
                 pad.setdefault("stuck", {})[k] = round(fact.silent[k], 6)
             continue
-        gains[k] = _entry(_fit({"value": v, "low": low, "high": high}, 1.0 if doubt else None), *PAD_COLUMNS["gain"][1:3])
+        gains[k] = _fit({"value": v, "low": low, "high": high}, 1.0 if doubt else None)
     if gains:
         pad["taxels"] = gains
     swapped = [[int(t.split(":")[1]) for t in pair] for pair in taxels.get("swapped", [])]

@@ -28,6 +28,8 @@ OF_WORLD = ("hysteresis", "hysteresis_time", "delay")
 """What a pad has from the world's settings where its own do not say it."""
 BESIDE = 4
 """Taxels beside one, at most."""
+THE_PADS = -1.0
+"""Gain of a taxel that has none of its own."""
 LEFT = 1.0e-4
 """N: what other fingers press on a taxel counts from here; under it is rounding."""
 
@@ -45,7 +47,7 @@ class ByPad:
         self.cfg, self.shape, self.device, self.seed, self._world = cfg, (n, f, t), device, int(seed) + 15485863, world
         low, high = (np.repeat(np.array([PAD_COLUMNS[c][3] for c in COLUMNS])[:, None], f, 1) for _ in range(2))
         own = np.zeros((len(COLUMNS), f), dtype=bool)
-        gain = np.ones((f, t, 2))
+        gain = np.full((f, t, 2), THE_PADS)
         order, beside = np.tile(np.arange(t), (f, 1)), np.full((f, t, BESIDE), -1)
         stuck: list[tuple[int, int, float]] = []
         thickness, rubber = np.full(f, THICKNESS), np.zeros(f, dtype=bool)
@@ -307,12 +309,15 @@ def lay_gains(
     # in and out
     gain: wp.array3d(dtype=float),
 ):
-    """Gains that were drawn, times the pad's and the taxel's own (uniform in its range)."""
+    """Gains that were drawn, times the taxel's own (uniform in its range), or the pad's."""
     w, f, t = wp.tid()
     if mask[w]:
-        rng = wp.rand_init(seed + 104729 * episode[w], (w * gain.shape[1] + f) * gain.shape[2] + t)
+        g = of_pad[w, f]
         ends = of_taxel[f, t]
-        gain[w, f, t] = gain[w, f, t] * of_pad[w, f] * (ends[0] + (ends[1] - ends[0]) * wp.randf(rng))
+        if ends[0] >= 0.0:
+            rng = wp.rand_init(seed + 104729 * episode[w], (w * gain.shape[1] + f) * gain.shape[2] + t)
+            g = ends[0] + (ends[1] - ends[0]) * wp.randf(rng)
+        gain[w, f, t] = gain[w, f, t] * g
 
 
 @wp.kernel(enable_backward=False)

@@ -3,7 +3,7 @@
     pads:
       index:                             # a pad of the layout
         gain: {value: 0.6, low: 0.57, high: 0.63}   # of all its taxels
-        taxels: {17: [0.4, 0.5]}         # gain of single ones, beside that
+        taxels: {17: [0.4, 0.5]}         # gain of single ones, instead
         dead: [3]                        # taxels that never answer
         stuck: {33: 0.4}                 # N that a taxel reads for ever
         swapped: [[14, 15]]              # taxels whose wires are exchanged
