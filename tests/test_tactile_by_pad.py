@@ -153,13 +153,30 @@ def test_delay_of_one_pad():
     touch.check()
 
 
+def test_a_delay_between_two_readings_lies_between_them():
+    touch, press, _ = ball({"lsb": 0.001, "full_scale": 20000, "threshold": 0.0005, "pads": {"index": {"delay": 0.025}}}, n=1)
+    seen = []
+    for k in range(8):
+        press(time=0.01 * k, force=1.0 + k)
+        seen.append(touch.force[0, INDEX].item())
+    assert seen[:3] == [0.0, 0.0, 0.0]  # nothing is as old yet
+    np.testing.assert_allclose(seen[3:], 1.5 + np.arange(5), atol=0.01)
+    counts = touch.raw[0, INDEX].double().numpy() / 0.001
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-3)
+    touch.check()
+    for k in range(40):
+        press(time=0.1 + 0.001 * k)  # ten times more often than told
+    with pytest.raises(UserError, match="tactile.period"):
+        touch.check()
+
+
 def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the counts."""
     from test_gap_touch import collected
 
     from dexsim.gap import touch_rig
 
-    pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 1.5 / 90}}  # the second reading before is the newest as old
+    pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 2 / 90}}
     paths = touch_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})
     run = collected(*paths)[0].runs[0]
     v = touch_plant.neutral() | {"gain": 0.8, "neighbours": 0.25, "fraction": 0.3, "time_constant": 0.4, "delay": 2 / 90}

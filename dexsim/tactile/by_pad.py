@@ -91,7 +91,9 @@ class ByPad:
                 spread=wp.zeros((n, f, t) if self.rubber else (1, 1, 1), dtype=float),
                 skin=wp.zeros((n, f, t) if self.hysteresis else (1, 1, 1), dtype=float),
                 mixed=wp.zeros((n, f, t) if self.mixes else (1, 1, 1), dtype=float),
-                slot=wp.zeros((n, f), dtype=int),
+                older=wp.zeros((n, f), dtype=int),
+                newer=wp.zeros((n, f), dtype=int),
+                part=wp.zeros((n, f), dtype=float),
                 ring=wp.zeros((1, n, f, t) if self.delayed else (1, 1, 1, 1), dtype=float),
                 ring_shear=wp.zeros((1, n, f, t) if self.delayed and cfg.shear else (1, 1, 1, 1), dtype=wp.vec2),
                 chosen=wp.zeros(n, dtype=int),
@@ -153,8 +155,9 @@ class ByPad:
         if not self.delayed:
             return m.ring, m.ring_shear, m.chosen
         n, f, _ = self.shape
-        wp.launch(choose, dim=(n, f), inputs=[m.stamps, m.now, self._row["delay"], own.slot, m.late], device=self.device)
-        wp.launch(pick, dim=self.shape, inputs=[m.ring, m.ring_shear, own.slot, self.cfg.shear, own.ring, own.ring_shear], device=self.device)
+        wp.launch(choose, dim=(n, f), inputs=[m.stamps, m.now, self._row["delay"], own.older, own.newer, own.part, m.late], device=self.device)
+        args = [m.ring, m.ring_shear, own.older, own.newer, own.part, m.effects.threshold, m.effects.lsb, float(self.cfg.full_scale), self.cfg.shear]
+        wp.launch(pick, dim=self.shape, inputs=[*args, own.ring, own.ring_shear], device=self.device)
         return own.ring, own.ring_shear, own.chosen
 
 
@@ -341,50 +344,80 @@ def choose(
     time: wp.array(dtype=float),
     delay: wp.array2d(dtype=float),
     # out
-    slot: wp.array2d(dtype=int),
+    older: wp.array2d(dtype=int),
+    newer: wp.array2d(dtype=int),
+    part: wp.array2d(dtype=float),
     late: wp.array(dtype=int),
 ):
-    """As `dexsim.tactile.measure.stamp`, which has noted the times: each pad's newest reading that is old enough."""
+    """The two readings between which each pad's delayed moment lies, and how far along; `dexsim.tactile.measure.stamp` has noted the
+    times. older -1: none is as old yet."""
     w, f = wp.tid()
     n = stamps.shape[1]
-    wanted = time[w] - delay[w, f] + 0.5e-6
-    best = int(-1)
+    wanted = time[w] - delay[w, f]
+    a = int(-1)
+    b = int(-1)
     oldest = int(0)
     filled = int(1)
     for i in range(n):
         s = stamps[w, i]
         if s == wp.static(NEVER):
             filled = 0
-        elif s <= wanted:
-            if best < 0 or s > stamps[w, best]:
-                best = i
+        elif s <= wanted + 0.5e-6:
+            if a < 0 or s > stamps[w, a]:
+                a = i
+        elif b < 0 or s < stamps[w, b]:
+            b = i
         if s < stamps[w, oldest]:
             oldest = i
-    if best < 0 and filled != 0:
-        best = oldest
+    x = float(0.0)
+    if a < 0 and filled != 0:
+        # the ring is too short for this delay: reported by `Tactile.check`
+        a = oldest
         late[0] = 1
-    slot[w, f] = best
+    elif a >= 0 and b >= 0:
+        x = wp.clamp((wanted - stamps[w, a]) / (stamps[w, b] - stamps[w, a]), 0.0, 1.0)
+        if x < 1.0e-3:  # rounding of the times
+            x = 0.0
+        if x > 0.999:
+            x = 1.0
+    if b < 0:
+        b = a
+    older[w, f] = a
+    newer[w, f] = b
+    part[w, f] = x
 
 
 @wp.kernel(enable_backward=False)
 def pick(
     ring: wp.array4d(dtype=float),
     ring_shear: wp.array4d(dtype=wp.vec2),
-    slot: wp.array2d(dtype=int),
+    older: wp.array2d(dtype=int),
+    newer: wp.array2d(dtype=int),
+    part: wp.array2d(dtype=float),
+    threshold: wp.array(dtype=float),
+    lsb: wp.array(dtype=float),
+    full_scale: float,
     shear: bool,
     # out
     out: wp.array4d(dtype=float),
     out_shear: wp.array4d(dtype=wp.vec2),
 ):
-    """Each pad's chosen reading into one slot; 0 where there is none yet."""
+    """Each pad's delayed reading into one slot, interpolated and again in whole counts; 0 where there is none yet."""
     w, f, t = wp.tid()
-    k = slot[w, f]
+    a = older[w, f]
+    b = newer[w, f]
+    x = part[w, f]
     z = float(0.0)
     xy = wp.vec2(0.0, 0.0)
-    if k >= 0:
-        z = ring[k, w, f, t]
+    if a >= 0:
+        z = (1.0 - x) * ring[a, w, f, t] + x * ring[b, w, f, t]
+        if z <= threshold[w]:
+            z = 0.0
+        z = counts(z, lsb[w], 0.0, full_scale)
         if shear:
-            xy = ring_shear[k, w, f, t]
+            half = wp.floor(0.5 * full_scale)
+            xy = (1.0 - x) * ring_shear[a, w, f, t] + x * ring_shear[b, w, f, t]
+            xy = wp.vec2(counts(xy[0], lsb[w], -half, half), counts(xy[1], lsb[w], -half, half))
     out[0, w, f, t] = z
     if shear:
         out_shear[0, w, f, t] = xy

@@ -10,7 +10,7 @@
         crosstalk: [0.2, 0.3]            # share of its force that a taxel loses to those beside it
         hysteresis: 0.3                  # these three instead of the settings of the same name
         hysteresis_time: [0.3, 0.5]      # s
-        delay: [0.018, 0.022]            # s
+        delay: [0.018, 0.022]            # s; of all pads once one has it: interpolated between readings
         rubber: {c10: [9e4, 1.1e5], c01: 2e4, thickness: 2.0e-3}   # Pa, Pa, m: how force spreads over the taxels
 
 A value is a number, [low, high], or {value, low, high}; what has a range is drawn anew in each world at each episode.
