@@ -455,7 +455,7 @@ def test_user_errors_are_one_line(rig, tmp_path):
     broken.write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
     with pytest.raises(UserError, match="broken.xml"):
         diagnose(Settings(paths, tmp_path, None, str(broken), str(servo)), say=lambda _: None)
-    for argv, text in ((["recording=a"], "Did you mean 'recordings'"), (["--out=x"], "Did you mean 'out'"), (["demo=perhaps"], "true or false"), (["out=x"], "recordings")):
+    for argv, text in ((["recording=a"], "Did you mean 'recordings'"), (["--out=x"], "Did you mean 'out'"), (["demo=perhaps"], "true, false or one of backlash"), (["out=x"], "recordings")):
         with pytest.raises(UserError, match=text):
             command.main(argv)
     with pytest.raises(UserError, match="does not exist"):
@@ -468,9 +468,12 @@ def test_help_and_columns(capsys):
 
 
 @pytest.mark.slow
-def test_demo_finds_what_it_hid(tmp_path):
+@pytest.mark.parametrize(("demo", "effect", "key", "true"), [("true", "command_delay", "delay", 0.02), ("backlash", "backlash", "gap", 0.06)])
+def test_demo_finds_what_it_hid(demo, effect, key, true, tmp_path):
+    """Recorded from the engine and the servo that train, found by the search's own plant, and confirmed by the engine again."""
     folder = tmp_path / "demo"
-    assert command.main(["demo=true", f"out={folder}"]) == 0
-    data = json.loads((folder / "diagnosis.json").read_text())
-    assert data["findings"][0]["effect"] == "command_delay"
+    assert command.main([f"demo={demo}", f"out={folder}"]) == 0
+    found = json.loads((folder / "diagnosis.json").read_text())["findings"][0]
+    assert found["effect"] == effect and found["parameters"][key]["low"] <= true <= found["parameters"][key]["high"]
+    assert json.loads((folder / "details.json").read_text())["held_out"]["confirmed"]["agrees"]
     shutil.rmtree(folder)

@@ -43,7 +43,8 @@ settings (key=default):
   seed=0                      of the bootstraps
   replay=mujoco               engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp, on the device), none
   device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits the cores that are used
-  demo=false                  make a recording with a hidden effect, diagnose it, then open the answer
+  demo=false                  make recordings with a hidden effect, diagnose them, then open the answer: true (command_delay), or backlash,
+                              compliance, coulomb_friction, deadband, load_friction, stribeck_friction
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
   remap.OURS=                 their name of a topic or a joint, e.g. remap./joint_states=/xhand/state
@@ -71,7 +72,9 @@ def parse(argv: list[str]) -> dict:
             text = text.strip()
             items = text[1:-1].split(",") if text.startswith("[") and text.endswith("]") else [text]
             out[key] = [i.strip().strip("'\"") for i in items if i.strip()]
-        elif key in ("demo", "columns", "next"):
+        elif key == "demo":
+            out[key] = _hidden(text)
+        elif key in ("columns", "next"):
             value = yaml.safe_load(text)
             if not isinstance(value, bool):
                 raise UserError(f"{key}={text}: must be true or false")
@@ -83,6 +86,16 @@ def parse(argv: list[str]) -> dict:
         else:
             out[key] = text
     return out
+
+
+def _hidden(text: str) -> str | None:
+    """The effect that a demo hides; None for no demo."""
+    from dexsim.gap.demo import HIDDEN
+
+    value = {"true": "command_delay", "false": None}.get(text.lower(), text)
+    if value is not None and value not in HIDDEN:
+        raise UserError(f"demo={text}: must be true, false or one of {', '.join(sorted(HIDDEN))}")
+    return value
 
 
 def main(argv: list[str]) -> int:
@@ -118,7 +131,7 @@ def main(argv: list[str]) -> int:
         from dexsim.gap import demo as maker
 
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
-        paths, model, servo, demo = maker.make(out / "recordings", "command_delay", seed=given.get("seed", 0), joint="knuckle")
+        paths, model, servo, demo = maker.make(out / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle")
         given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")

@@ -36,7 +36,8 @@ BELIEVED = {
 }
 HIDDEN = {"stribeck_friction": {"stribeck_peak": 0.06, "stribeck_speed": 0.25}, "command_delay": {"delay": 0.02},
           "load_friction": {"load_friction": 0.25, "load_friction_backdriven": 0.25}, "coulomb_friction": {"coulomb_friction": 0.06},
-          "deadband": {"deadband": 0.03}}  # fmt: skip
+          "deadband": {"deadband": 0.03}, "backlash": {"backlash": 0.06}, "compliance": {"softness": 0.5}}  # fmt: skip
+ON_MOTOR = ("backlash", "compliance")  # hidden behind a loop whose encoder sits on the motor, as most hands have it
 
 
 def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -54,14 +55,15 @@ def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.nd
 
 
 def make(folder: Path, effect: str = "stribeck_friction", seed: int = 0, seconds: float = 6.0, joint: str = "joint") -> tuple[list[Path], Path, Path, dict]:
-    """Writes four recordings of one joint, the model and the believed servo; returns their paths and the hidden columns."""
+    """Writes four recordings of one joint that hides an effect of HIDDEN (another name: nothing), the model and the believed servo; returns their paths and the hidden columns."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     model, servo = folder / "rig.xml", folder / "rig.yaml"
     drawn = MODEL.replace("<worldbody>", f"<worldbody>{DRAWN}").replace('name="joint"', f'name="{joint}"').replace('<geom name="bob"', f'{LINK}<geom name="bob"')
     model.write_text(drawn, encoding="utf-8")
-    servo.write_text(yaml.safe_dump(BELIEVED, sort_keys=False), encoding="utf-8")
-    true = yaml.safe_load(yaml.safe_dump(BELIEVED))
+    believed = BELIEVED | ({"loop_encoder": "motor"} if effect in ON_MOTOR else {})
+    servo.write_text(yaml.safe_dump(believed, sort_keys=False), encoding="utf-8")
+    true = yaml.safe_load(yaml.safe_dump(believed))
     for name in ("kp", "kd", "torque_limit", "coulomb_friction", "viscous_friction"):  # as real machines are: a little off
         true["joints"]["*"][name] *= 1 + 0.03 * rng.uniform(-1, 1)
     hidden = HIDDEN.get(effect, {})
