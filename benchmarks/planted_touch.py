@@ -2,7 +2,8 @@
 
 Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch_rig`: MuJoCo's contact geometry, the taxel kernels
 that train policies, counts of 0.1 N, a load cell with 20 mN of noise). Right: named first, or in a set of its class. One JSON line
-at the end. The sanity check of the method on our own simulator, not a proof.
+at the end. Then the same motion is felt by the sensor that trains, first as believed, then with what tactile.yaml hands on: the rms
+difference of all readings of a taxel that reads anything (of a rubber, at the force that the cell measured). The sanity check of the method on our own simulator, not a proof.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ def main(argv: list[str]) -> int:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
     from dexsim.cli.build import quiet_warp
-    from dexsim.gap import touch, touch_rig
+    from dexsim.gap import touch, touch_handed, touch_rig
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
 
     quiet_warp("cpu")
     right: dict[str, list[bool]] = {}
-    sets, covered, errors, false, seconds = 0, [], [], [], []
+    sets, covered, errors, false, seconds, again = 0, [], [], [], [], []
     for seed in range(int(s["seeds"])):
         for effect, planted, values in CASES:
             if s["only"] and s["only"] != effect:
@@ -62,6 +63,7 @@ def main(argv: list[str]) -> int:
                 start = time.perf_counter()
                 out = touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set(), seed)
                 seconds.append(time.perf_counter() - start)
+                felt = "" if not out.findings else _felt_again(Path(folder), paths, touch_handed.handed(out.findings, out.facts), planted, 10 + seed, again)
             first = out.findings[0] if out.findings else None
             names = [f["effect"] for f in out.findings]
             if effect is None:
@@ -78,15 +80,37 @@ def main(argv: list[str]) -> int:
                     covered.append(p["low"] <= value <= p["high"])
                     errors.append(abs(p["value"] / value - 1))
                     line += f" {key} {p['value']:.4g} ({p['low']:.4g} to {p['high']:.4g}), planted {value:.4g};"
-            print(f"{effect}: {', '.join(names) or 'nothing'}{' as a set' if good and first['indistinguishable'] else ''};{line} {1e3 * out.before[0]:.0f} -> {1e3 * out.after[0]:.0f} mN",
-                  flush=True)  # fmt: skip
+            print(f"{effect}: {', '.join(names) or 'nothing'}{' as a set' if good and first['indistinguishable'] else ''};{line} {1e3 * out.before[0]:.0f} -> {1e3 * out.after[0]:.0f} mN"
+                  f"{felt}", flush=True)  # fmt: skip
     print(json.dumps({
         "benchmark": "planted_touch", "load_cell": s["load_cell"] == "true", "cases": sum(map(len, right.values())), "right": {e: f"{sum(r)}/{len(r)}" for e, r in right.items()},
         "sets": sets, "covered": round(float(np.mean(covered)), 3) if covered else None, "parameters": len(covered),
         "median_error": round(float(np.median(errors)), 4) if errors else None, "false_alarms": f"{sum(false)}/{len(false)}",
-        "seconds_a_case": round(float(np.mean(seconds)), 1),
+        "felt_again_mN": [round(1e3 * float(np.median(x)), 1) for x in zip(*again, strict=True)] if again else None, "seconds_a_case": round(float(np.mean(seconds)), 1),
     }))  # fmt: skip
     return 0
+
+
+def _felt_again(folder: Path, paths: list[Path], h, planted: dict, seed: int, again: list) -> str:
+    """The recorded motion felt by the sensor that trains, as believed and with what is handed on; in words."""
+    from dexsim.gap import touch_rig
+    from dexsim.recording import read
+
+    shape = {k: v for k, v in planted.items() if k in ("slides", "shear")}
+    said = {"tactile": h.tactile, "randomize": h.randomize}
+    recorded = [read(p, audit=False) for p in paths]
+    true = [r.tactile.value for r in recorded]
+    # training's contact is a straight line: of a rubber it has the spread over the taxels, at the force that the cell measured
+    given = {"pressed": [np.maximum(r.external_force.value[:, 0], 0.0) for r in recorded]} if "rubber" in planted and recorded[0].external_force else {}
+    rms = []
+    for k, settings in enumerate(({}, touch_rig.as_trained(said))):
+        other, _, _ = touch_rig.record(folder / f"again{k}", len(paths), 8.0, seed=seed, **shape, **settings, **given)
+        pairs = [(a, read(p, audit=False).tactile.value) for a, p in zip(true, other, strict=True)]
+        rms.append([(a - b) * touch_rig.LSB for a, b in pairs])
+    on = [np.abs(a) > 0 for a in true]
+    before, after = (float(np.sqrt(np.mean(np.concatenate([d[o] for d, o in zip(e, on, strict=True)]) ** 2))) for e in rms)
+    again.append((before, after))
+    return f"; in the sensor that trains {1e3 * before:.0f} -> {1e3 * after:.0f} mN"
 
 
 if __name__ == "__main__":

@@ -78,12 +78,13 @@ def path(kind: int, seconds: float, rng: np.random.Generator, slides: bool) -> t
 def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, finger: str = "index", load_cell: bool = True, stiffness: float = 7000.0,
            friction: float = 0.8, sensor: dict | None = None, gains: dict[int, float] | None = None, swapped: Sequence[tuple[int, int]] = (),
            stuck: dict[int, float] | None = None, crosstalk: float = 0.0, rubber: tuple[float, float] | None = None, drift: float = 0.0,
-           slides: bool = False, shear: bool = False) -> tuple[list[Path], Path, Path]:  # fmt: skip
+           slides: bool = False, shear: bool = False, pressed: Sequence[np.ndarray] = ()) -> tuple[list[Path], Path, Path]:  # fmt: skip
     """Writes `count` recordings, the rig's model and its servo; returns their paths.
 
     stiffness N/m, friction: of the contact. sensor: settings of `dexsim.tactile` (hysteresis, delay, ...). gains: taxel -> gain;
     swapped: pairs of taxels; stuck: taxel -> N; crosstalk: share of its force that a taxel gives its neighbours; rubber: (c10,
     c01) Pa of a Mooney-Rivlin skin in place of the linear contact; drift: relative gain lost or won a second over all recordings.
+    pressed: contact forces [T] N of each recording that are given, in place of what the spring makes of the depth.
     """
     import yaml
 
@@ -96,7 +97,7 @@ def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, fi
     paths = []
     for k in range(count):
         t, q = path(k, seconds, rng, slides)
-        recording = _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor or {}, rubber, slides or shear, crosstalk)
+        recording = _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor or {}, rubber, slides or shear, crosstalk, pressed[k] if len(pressed) else None)
         z = recording.tactile.value
         f = _finger(finger)
         z[:, f] *= 1 + drift * (recording.tactile.t + k * seconds)[:, None, None]
@@ -114,13 +115,25 @@ def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, fi
     return paths, folder / "rig.xml", folder / "rig.yaml"
 
 
+def as_trained(content: dict) -> dict:
+    """The settings of `record` for the rig that training would have with a tactile.yaml (its content): every best guess, and what
+    was believed elsewhere."""
+    value = lambda x: {k: value(v) for k, v in x.items()} if isinstance(x, dict) and "value" not in x else x["value"] if isinstance(x, dict) else x  # noqa: E731
+    tactile, shared = content.get("tactile", {}), content.get("randomize", {})
+    out: dict = {"sensor": {"pads": value(tactile["pads"])}} if "pads" in tactile else {}
+    for name, key in (("contact.stiffness", "stiffness"), ("object.friction", "friction")):
+        if name in shared:
+            out[key] = value(shared[name])
+    return out
+
+
 def _finger(finger: str) -> int:
     from dexsim.assets import xhand
 
     return xhand.FINGERS.index(finger)
 
 
-def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk) -> Recording:
+def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk, pressed) -> Recording:
     import torch
 
     from dexsim.assets import xhand
@@ -161,7 +174,7 @@ def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, ru
         data.qpos[:] = now[i]
         mujoco.mj_kinematics(model, data)
         gap = mujoco.mj_geomDistance(model, data, tip, ball, 0.01, away) - model.geom_margin[tip]
-        force[i] = stiffness * max(-gap, 0.0)
+        force[i] = stiffness * max(-gap, 0.0) if pressed is None else pressed[i]
         posed.t.xpos[0, f] = torch.as_tensor(data.xpos[body], dtype=torch.float32)
         posed.t.xmat[0, f] = torch.as_tensor(data.xmat[body].reshape(3, 3), dtype=torch.float32)
         posed.t.xpos[0, 5] = torch.as_tensor(data.geom_xpos[ball], dtype=torch.float32)
