@@ -109,14 +109,14 @@ def replayed(effect: str, label: str, hidden: dict[str, float], x: list[float], 
     search = JointSearch(case, [0, 2], None, conditions(runs))
     none = search.start()
     variant = next(v for v in EFFECTS[effect].variants(case.scales) if v.label == label)
-    found = search.fit((Member(EFFECTS[effect], variant),), np.array(x), none, quick=True)
+    found = search.fit((Member(EFFECTS[effect], variant),), np.array(x), none)
     return confirm.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
 
 
 @pytest.mark.parametrize(("effect", "label", "hidden", "x", "servo", "temperature"), [
     ("backlash", "", {"backlash": 0.05}, [0.05, 0.1], {"loop_encoder": "motor"}, False),
     ("backlash", "", {"backlash": 0.05}, [0.05, 0.1], {"loop_encoder": "motor", "position_encoder": "motor"}, False),
-    ("compliance", "", {"softness": 0.4}, [0.4], {"loop_encoder": "motor"}, False),
+    ("compliance", "", {"softness": 0.4}, [0.4, 0.1], {"loop_encoder": "motor"}, False),
     ("lag", "velocity filter", {"speed_lag": 0.03}, [0.03], None, False),
     ("position_scale", "eccentricity", {"eccentric_sin": 0.15, "eccentric_cos": 0.15}, [0.15, 0.15], {"kp": 0.8, "kd": 0.02}, False),
     ("deadband", "counted from its edge", {"deadband": 0.03, "deadband_kind": 2.0}, [0.03], None, False),
@@ -127,7 +127,7 @@ def test_what_the_search_found_the_engine_does_too(effect, label, hidden, x, ser
     c = replayed(effect, label, hidden, x, servo, temperature)
     engine, plant = c.errors["found"]
     assert c.missing == [] and "Not confirmed" not in c.text()
-    assert c.errors["believed"][0] > 3 * engine and engine < max(1.5 * plant, 0.8e-3), c.errors  # half the encoder's quantum
+    assert c.errors["believed"][0] > 3 * engine and engine < max(1.7 * plant, 0.8e-3), c.errors  # half the encoder's quantum
 
 
 def test_what_training_cannot_be_given_is_not_confirmed():

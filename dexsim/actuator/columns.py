@@ -63,7 +63,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("deadband_kind", "1", 0.0, 0.0, 2.0, "inside the deadband 0: no torque, 1: the error counts as zero, 2: it counts from the edge on"),
     # Between motor and joint: a rotor of its own, joined to the link by a spring with a gap.
     Column("backlash", "rad", 0.0, 0.0, 2.0, "total free play between motor and joint"),
-    Column("rebound", "1", 0.1, 0.0, 1.0, "damping ratio of the impact at the ends of the play (if backlash)"),
+    Column("rebound", "1", 0.1, 0.0, 1.0, "damping ratio of the transmission: of its elasticity, or of the impact at the ends of its play"),
     Column("softness", "rad/N.m", 0.0, 0.0, 1e4, "1 / stiffness of the transmission"),
     Column("hardening", "1/(N.m)2", 0.0, 0.0, 1e6, "its stiffness is 1 + hardening * torque^2 times as large under load"),
     Column("rotor", "kg.m2", 0.0, 0.0, 1e3, "reflected inertia of the rotor (if play or elasticity); 0: the model's armature"),

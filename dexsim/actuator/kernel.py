@@ -352,10 +352,9 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
                 if wp.static(voltage):
                     stiff = kp * tau0
                 stiff = real(STOP_GAIN) * stiff + wp.static(real(STOP_RATE * STOP_RATE)) * inertia[w, j]
-                damp = real(2.0) * params[w, j, REBOUND] * wp.sqrt(stiff * rotor_inertia * link / (rotor_inertia + link))
                 if soft > zero:
                     stiff = one / soft
-                    damp = wp.static(real(0.1)) * wp.sqrt(stiff * link)
+                damp = real(2.0) * params[w, j, REBOUND] * wp.sqrt(stiff * rotor_inertia * link / (rotor_inertia + link))
                 # without the spring: rotor_inertia (w' - w) / dt = of_motor - on_drive (w' - w) - on_loop (v' - v) - viscous w' -+ own
                 free_a = rotor_inertia / dt + viscous + on_drive
                 push = rotor_inertia / dt * v_drive + of_motor + on_drive * v_drive

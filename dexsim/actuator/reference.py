@@ -192,7 +192,7 @@ def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rot
     link = np.maximum(inertia - rotor_inertia, LEAST_ROTOR * inertia)
     stop = STOP_GAIN * gain + STOP_RATE**2 * inertia
     stiff = np.where(soft > 0.0, 1.0 / soft, stop)
-    damp = np.where(soft > 0.0, 0.1 * np.sqrt(stiff * link), 2.0 * p["rebound"] * np.sqrt(stop * rotor_inertia * link / (rotor_inertia + link)))
+    damp = 2.0 * p["rebound"] * np.sqrt(stiff * rotor_inertia * link / (rotor_inertia + link))
     free_a = rotor_inertia / dt + viscous + on_drive
     push = rotor_inertia / dt * w + of_motor + on_drive * w
     slides = np.abs(push) > own

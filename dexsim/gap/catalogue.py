@@ -96,6 +96,7 @@ CONFUSED: tuple[frozenset[str], ...] = tuple(
 """Classes of effects that some recordings cannot tell apart (the only sets that may be reported)."""
 
 
+RINGS = (0.1, 0.3)  # damping ratios of a transmission that are tried: whether a loop rattles with it hangs on them
 MIN_WARMTH = 2.0  # degC: a smaller change of temperature tells nothing
 
 
@@ -142,10 +143,10 @@ def _backlash(s: Scales) -> list[Variant]:
     gap = _p("gap", "backlash", "set", low, top, low, "m" if s.slide else "rad")
     starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 7.0, 12.0, 20.0, 40.0, 70.0, 120.0)})
     rebound = _p("rebound", "rebound", "set", 0.02, 0.7, 0.1)
-    params, extra = (gap, rebound), (0.1,)
+    params, extra = (gap, rebound), ()
     if s.armature <= 0:  # how much of the inertia is the rotor's is not known
-        params, extra = (*params, _p("rotor", "rotor", "set", 0.05 * s.inertia, 0.95 * s.inertia, 0.3 * s.inertia)), (0.1, 0.3 * s.inertia)
-    return [Variant(params, tuple((x, *extra) for x in starts))]
+        params, extra = (*params, _p("rotor", "rotor", "set", 0.05 * s.inertia, 0.95 * s.inertia, 0.3 * s.inertia)), (0.3 * s.inertia,)
+    return [Variant(params, tuple((x, ring, *extra) for x in starts for ring in RINGS))]
 
 
 def _compliance(s: Scales) -> list[Variant]:
@@ -153,8 +154,10 @@ def _compliance(s: Scales) -> list[Variant]:
     top = 3.0 / s.stiffness
     soft = _p("softness", "softness", "set", 0.04 / s.stiffness, top, 0.04 / s.stiffness, "rad/N.m")
     hard = _p("hardening", "hardening", "set", 0.0, 8.0 / s.tau**2, 0.0, "1/(N.m)2")
-    starts = tuple((0.4 / s.stiffness, h / s.tau**2) for h in (0.1, 0.5, 2.5))
-    return [Variant((soft,), tuple((f / s.stiffness,) for f in (0.06, 0.1, 0.15, 0.25, 0.4, 0.65, 1.0, 1.7))), Variant((soft, hard), starts, "hardening", refines=True)]
+    ring = _p("rebound", "rebound", "set", 0.02, 0.7, 0.1)
+    starts = tuple((0.4 / s.stiffness, 0.1, h / s.tau**2) for h in (0.1, 0.5, 2.5))
+    sizes = tuple((f / s.stiffness, r) for f in (0.06, 0.1, 0.15, 0.25, 0.4, 0.65, 1.0, 1.7) for r in RINGS)
+    return [Variant((soft, ring), sizes), Variant((soft, ring, hard), starts, "hardening", refines=True)]
 
 
 def _delay(s: Scales) -> list[Variant]:
@@ -257,6 +260,9 @@ def _scale(s: Scales) -> list[Variant]:
         e = min(0.2, 0.3 * s.span)
         params = (_p("ecc_sin", "eccentric_sin", "set", -e, e, 0.0, "rad"), _p("ecc_cos", "eccentric_cos", "set", -e, e, 0.0, "rad"))
         out.append(Variant(params, ((0.2 * e, 0.0), (-0.2 * e, 0.0), (0.0, 0.2 * e), (0.0, -0.2 * e)), "eccentricity"))
+        # its zero may have been set anywhere along the turn, and not where the model has it
+        params = (params[0], _p("ecc_cos", ("eccentric_cos", "position_offset"), "add", -e, e, 0.0, "rad"))
+        out.append(Variant(params, ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)), "eccentricity, its zero elsewhere"))
     return out
 
 

@@ -23,7 +23,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap import judge
-from dexsim.gap.findings import MODEL_COLUMNS, columns_beside, handed, model_changes
+from dexsim.gap.findings import MODEL_COLUMNS, columns_beside, handed, model_changes, undamped
 from dexsim.gap.fit import expand
 from dexsim.gap.plant_columns import SERIES_INDEX
 from dexsim.gap.prepare import REFERENCE, Case
@@ -125,6 +125,8 @@ def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hyp
                 if name in SERVO_INDEX:
                     c = COLUMNS[SERVO_INDEX[name]]
                     rows[j, SERVO_INDEX[name]] = np.clip(plant[SERVO_INDEX[name]], c.low, c.high)
+        kd = SERVO_INDEX["kd"]
+        rows[j, kd] = max(rows[j, kd] - undamped(trial, rows[j, SERVO_INDEX["kp"]]), 0.0)
         for name, value in columns_beside(case, trial, m.joints).items():
             rows[j, SERVO_INDEX[name]] = value
     if run.supply is not None and run.servo.supply_voltage:

@@ -115,6 +115,12 @@ def handed(p: Param, case: Case) -> bool:
     return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
 
 
+def undamped(trial, kp: float) -> float:
+    """What the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) = kp q - kp age v. The loop
+    that trains acts on the position of now, so it is given kd without it."""
+    return next((kp * float(x) for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.columns == ("feedback_delay",)), 0.0)
+
+
 def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]:
     """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of the mechanism's
     joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it from."""
@@ -150,6 +156,10 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
+    lost = undamped(trial, table.value(case.joint, "kp").value)
+    if lost > 0.0:
+        kd = table.value(case.joint, "kd")
+        table.set(case.joint, "kd", *(round(max(x - lost, 0.0), 9) for x in (kd.value, kd.low, kd.high)))
     for name, value in columns_beside(case, trial, joints).items():
         table.set(case.joint, name, value)
     if any(x.id == "thermal" for x in trial.members):

@@ -45,11 +45,11 @@ P_ISCALE, P_GSCALE, P_ARM, P_PAYLOAD, P_TX, P_TY, P_TZ, P_GAP, P_SOFT, P_ROTOR, 
         "rotor", "sag",
     )
 )  # fmt: skip
-P_TTORQUE, P_TFRICTION, P_TRES, P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS = (
+P_TTORQUE, P_TFRICTION, P_TRES, P_COUPLING, P_ESIN, P_ECOS, P_SPEEDLAG, P_BIAS, P_AGE, P_LIMITSPEED = (
     INDEX[n]
     for n in (
         "thermal_torque", "thermal_friction", "thermal_resistance", "coupling", "eccentric_sin", "eccentric_cos",
-        "speed_lag", "bias",
+        "speed_lag", "bias", "feedback_delay", "limit_speed",
     )
 )  # fmt: skip
 X = SERIES_INDEX
@@ -76,7 +76,7 @@ def plant_kernel():
     @wp.func
     def law(
         e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
-        dt: f64, voltage: f64, gain: f64, drift: f64, brake: f64, kind: f64,
+        dt: f64, voltage: f64, gain: f64, drift: f64, brake: f64, kind: f64, age: f64, v_lim: f64,
     ):  # fmt: skip
         """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
         motor's speed). gain, drift: the change of speed in this step is gain * torque + drift.
@@ -87,7 +87,7 @@ def plant_kernel():
         half = f64(0.5)
         now = kp * e - kd * v_m
         pd = now - kp * dt * v_m
-        slope = scale * (kp * dt + kd)
+        slope = scale * (kp * (dt - age) + kd)
         if kind > f64(1.5):  # a dead zone: the error counts from its edge on
             cut = kp * wp.clamp(e, -deadband, deadband)
             now -= cut
@@ -116,8 +116,8 @@ def plant_kernel():
                     slope = slope / wp.abs(pd)
             slope = tau0 * supply * slope
         else:
-            x = wp.abs(v) / (nls * supply)
-            if pd * v < zero:  # what a drive gives while it brakes differs between makes
+            x = wp.abs(v_lim) / (nls * supply)
+            if pd * v_lim < zero:  # what a drive gives while it brakes differs between makes
                 x = x * brake
             limit = zero
             if x < one:
@@ -128,7 +128,7 @@ def plant_kernel():
                 end = pd - slope * (gain * motor + drift)
                 if end * wp.sign(pd) >= limit:
                     slope = zero
-                    if pd * v > zero and limit > zero:
+                    if pd * v_lim > zero and limit > zero:
                         line = tau0 / (nls * supply)
                 else:
                     slope = slope * limit / wp.abs(pd)
@@ -244,6 +244,7 @@ def plant_kernel():
         fresh = int(1)
         prev_tau = zero
         preslide = params[h, P_PRESLIDE]
+        age = params[h, P_AGE]
         z = zero  # share of the friction that is taken up
 
         for i in range(steps):
@@ -338,7 +339,7 @@ def plant_kernel():
                     v_f = v_l
                 else:
                     v_f += dts / (speed_lag + dts) * (v_l - v_f)
-                e = target - q_l
+                e = target - q_l + age * scale * v_l  # a sampled loop acts on where the joint was
                 v_drive = vm
                 if not two:
                     v_drive = v - carried
@@ -361,7 +362,8 @@ def plant_kernel():
                 step = theta * dts
                 torque = law(
                     e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
-                    eff * step / body, -load * step / body, params[h, P_BRAKE], params[h, P_DEADKIND],
+                    eff * step / body, -load * step / body, params[h, P_BRAKE], params[h, P_DEADKIND], age,
+                    v_drive + params[h, P_LIMITSPEED] * (scale * v_f - v_drive),
                 )
                 now = torque[0]
                 motor = torque[1]
@@ -454,9 +456,7 @@ def plant_kernel():
                     stiff = one / wp.max(soft, f64(1.0e-9))
                     if soft <= zero:
                         stiff = consts[C_STIFF]
-                    damp = f64(0.1) * wp.sqrt(stiff * link)
-                    if soft <= zero:
-                        damp = f64(2.0) * params[h, P_REBOUND] * wp.sqrt(stiff * rotor * link / inertia)  # how gear teeth rebound
+                    damp = f64(2.0) * params[h, P_REBOUND] * wp.sqrt(stiff * rotor * link / inertia)  # how gear teeth rebound, an elasticity rings
                     twist = qm + dts * vm - q - dts * v
                     engaged = zero
                     side = zero
@@ -527,7 +527,7 @@ def plant_kernel():
             while s < s_end and sample_step[s] == i:
                 p = sample_part[s]
                 out_q[h, s] = shown + p * (nxt - shown)
-                out_torque[h, s] = prev_tau + p * (last - prev_tau)
+                out_torque[h, s] = last
                 s += 1
             prev_tau = last
             t += dt

@@ -25,6 +25,7 @@ SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.15  # x the noise: an error within it needs no effect
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
 MOST = 4  # effects on one joint
+PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
 
@@ -147,12 +148,16 @@ class JointSearch:
             out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=0.5 / rate))
         # a drive tells its speed from its encoder through some filter
         if s.nominal["kd"] > 0:
-            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 0.5 / rate, "s", nuisance=True, sd=0.3 * FILTER))
+            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 1.0 / rate, "s", nuisance=True, sd=0.3 * FILTER))
+        # what it acts on was sampled up to a period ago, and acts until the next sample: half a period on average
+        out.append(Param("feedback_delay", ("feedback_delay",), "set", 0.0, 1.5 / rate, 0.5 / rate, "s", nuisance=True, sd=0.5 / rate))
         # what holds a joint gives a little before it slides
         give = GIVE_SLIDE if s.slide else GIVE
         out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
         if not s.voltage and s.nominal["no_load_speed"] < 1e8:
             out.append(Param("brake", ("brake",), "set", -1.0, 1.0, 1.0, nuisance=True))
+            if s.nominal["kd"] > 0:  # a limit of the motor, or of a firmware that goes by its own reading
+                out.append(Param("limit_speed", ("limit_speed",), "set", 0.0, 1.0, 0.5, nuisance=True))
         low, high = c.factors.get("inertia", (1 - BELIEF, 1 + BELIEF))
         out.append(Param("inertia", ("inertia_scale",), "factor", low, high, 0.5 * (low + high), nuisance=True, sd=0.25 * (high - low)))
         if s.gravity > 0.01 * s.tau:
@@ -178,7 +183,9 @@ class JointSearch:
         """Effects' parameters, then the nuisances that act on no column of theirs."""
         mine = [p for m in members for p in _named(m)]
         taken = {c for p in mine for c in p.columns}
-        return mine + [p for p in self.nuisances if not taken & set(p.columns)]
+        # what left no trace without them may with them: a motor that rattles behind its joint turns faster than the loop knows
+        others = self.all_nuisances if any(m.id in PARTING for m in members) else self.nuisances
+        return mine + [p for p in others if not taken & set(p.columns)]
 
     def _fix(self, members: tuple[Member, ...]):
         """Constants of the variants, written to the plant's nominal for the time of a fit."""
