@@ -3,7 +3,8 @@
 Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch_rig`: MuJoCo's contact geometry, the taxel kernels
 that train policies, counts of 0.1 N, a load cell with 20 mN of noise). Right: named first, or in a set of its class. One JSON line
 at the end. Then the same motion is felt by the sensor that trains, first as believed, then with what tactile.yaml hands on: the rms
-difference of all readings of a taxel that reads anything (of a rubber, at the force that the cell measured). The sanity check of the method on our own simulator, not a proof.
+difference where a taxel reads anything (of a rubber, at the force that the cell measured). The sanity check of the method on our
+own simulator, not a proof.
 """
 
 from __future__ import annotations

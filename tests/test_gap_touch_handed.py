@@ -20,6 +20,7 @@ from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.touch_effects import TOUCH
 from dexsim.gap.touch_handed import HEAD, PadFacts, chord, handed
 from dexsim.gap.touch_handed import save as write
+from dexsim.recording import read
 from dexsim.tactile.file import load
 
 INDEX, MID = 1, 2
@@ -61,6 +62,14 @@ def test_from_a_recording_to_the_worlds_that_train(late):
     for _ in range(3):
         env.step(torch.zeros(64, 12))
     env.touch.check()
+
+
+def test_the_sensor_that_trains_reads_what_was_recorded(late, tmp_path):
+    """The same motion felt by training's own kernels: with the file's best guess the readings are those of the recording."""
+    recorded, plain, same = (read(touch_rig.record(tmp_path / str(k), 1, 7.0, seed=5, **settings)[0][0], audit=False).tactile.value * touch_rig.LSB
+                             for k, settings in enumerate(({"sensor": {"delay": 0.06}}, {}, touch_rig.as_trained(yaml.safe_load(late[1].read_text())))))  # fmt: skip
+    rms = [float(np.sqrt(np.mean((x - recorded)[recorded > 0] ** 2))) for x in (plain, same)]
+    assert rms[0] > 0.15 and rms[1] < 0.02, rms
 
 
 def test_what_is_doubted_holds_what_was_believed(late, tmp_path):
