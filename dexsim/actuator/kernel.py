@@ -28,8 +28,9 @@ Play and elasticity. The motor turns a rotor of inertia J_r, which leaves the jo
 rotor and link. Backward Euler over the step, with the link's velocity v' at its end still open:
     J_r (w' - w) / dt = motor(w', v') - viscous w' - level sign(w') - tau',   tau' = K (stretch + dt (w' - v')) + C (w' - v').
 Friction and the side of the gap are taken from the step's start with v' = v; what remains is a line w' = A + B v', so that the link
-feels tau' = T - D v', as above, and MuJoCo solves link, contact and spring together. The rotor's step is completed with the v' it
-found when the next begins: what the rotor loses the link receives. With K -> inf, D -> J_r / dt: the armature again.
+feels tau' = T - D v'. D dt goes to dof_armature and T - D v to qfrc_applied, so that MuJoCo solves link, contact and spring together (its
+contacts know the inertia, not the damping). The rotor's step is completed with the v' it
+found when the next begins: what the rotor loses the link receives. With K -> inf, D dt -> J_r: the armature again.
 Rotors carry the motor's friction and turn the torque-speed line; the model's own friction stays on the link.
 Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking. How hard it sticks is
 the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 does not.
@@ -139,6 +140,7 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
         rotor_q = zero
         rotor_inertia = zero
         gap2 = zero
+        armature = zero
         if wp.static(play):
             rotor_q = qpos[w, dof_q[j]]
             gap2 = real(0.5) * params[w, j, BACKLASH]
@@ -157,7 +159,8 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
                     turned = rotor_q
                     turning = v_drive
             state[w, j, x0 + ROTOR] = rotor_q
-            dof_armature[w, d] = wp.max(base_armature[w, j] - rotor_inertia, -real(BORROWED) * inertia[w, j])
+            armature = wp.max(base_armature[w, j] - rotor_inertia, -real(BORROWED) * inertia[w, j])
+            dof_armature[w, d] = armature
 
         q_m = scale * turned + params[w, j, OFFSET]
         v_m = scale * turning
@@ -391,8 +394,10 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
                 state[w, j, x0 + LINE_A] = line_a
                 state[w, j, x0 + LINE_B] = line_b
                 damping += brake
-                qfrc_applied[w, d] = applied + damping * v + pulls
-                dof_damping[w, d] = base_damping[w, j] + damping + spring_t
+                # D goes to the armature, D (v' - v) = D dt a: contacts are solved with the inertia, which a damping is no part of
+                qfrc_applied[w, d] = applied + damping * v + pulls - spring_t * v
+                dof_armature[w, d] = armature + spring_t * dt
+                dof_damping[w, d] = base_damping[w, j] + damping
                 dof_frictionloss[w, d] = base_frictionloss[w, j]
                 return
             state[w, j, x0 + LINE_A] = zero

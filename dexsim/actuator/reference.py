@@ -176,15 +176,15 @@ def servo(
                            rotor_inertia, inertia, q, v, dt, p["kp"] * tau0 if voltage else p["kp"])  # fmt: skip
         rest, rest_slope = applied - of_motor, damping - slope_motor  # of the stand-in: on the link itself
         other["qfrc_applied"] = other["qfrc_applied"] + rest + rest_slope * v
-        other["dof_damping"] = other["dof_damping"] + base_damping + rest_slope
+        other["dof_damping"] = base_damping + rest_slope
         other["dof_frictionloss"] = np.broadcast_to(base_frictionloss, v.shape)
     out = {name: np.where(two, other[name], one[name]) for name in one}
-    armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) if play else base_armature
+    armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) + np.where(two, other.get("armature", 0.0), 0.0) if play else base_armature
     return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q}
 
 
 def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:
-    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and dof_damping of what
+    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and armature of what
     passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop [N.m/rad]."""
     on_drive = np.where(on_rotor, slope, on_drive)
     on_loop = np.where(on_rotor, 0.0, slope - on_drive)
@@ -208,5 +208,5 @@ def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rot
     b = np.where(slides, (k - on_loop) / (free_a + k), 0.0)
     t, slope_t = pull + k * a, k * (1.0 - b)
     on = (np.abs(twist) >= gap2) & ((gap2 == 0.0) | ((t - slope_t * v) * side >= 0.0))
-    return {"qfrc_applied": np.where(on, t, 0.0), "dof_damping": np.where(on, slope_t, 0.0),
+    return {"qfrc_applied": np.where(on, t - slope_t * v, 0.0), "armature": np.where(on, slope_t * dt, 0.0),
             "line_a": np.where(on, a, free[0]), "line_b": np.where(on, b, free[1])}  # fmt: skip
