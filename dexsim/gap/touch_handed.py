@@ -115,7 +115,7 @@ def _one(f: dict[str, Any], name: str, pad: dict[str, Any], fact: PadFacts, shar
     if e == "tactile_gain":
         lost = _gains(f, pad, fact, doubt)
         if "contact_stiffness" in f["indistinguishable"] and fact.common is not None:  # without a load cell they are one factor
-            shared["contact.stiffness"][name] = _times((fact.stiffness,) * 3, _wide(fact.common, 1.0))
+            shared["contact.stiffness"][name] = _instead(_times((fact.stiffness,) * 3, fact.common), fact.stiffness)
     elif e == "tactile_stiffening":
         if doubt:
             lost = "; its rubber is left out"
@@ -138,7 +138,7 @@ def _one(f: dict[str, Any], name: str, pad: dict[str, Any], fact: PadFacts, shar
     elif e == "contact_stiffness":
         shared["contact.stiffness"][name] = fit("stiffness", fact.stiffness)
         if "tactile_gain" in f["indistinguishable"]:
-            pad["gain"] = _times(pad.get("gain"), _fit(p["stiffness"], fact.stiffness, 1.0 / fact.stiffness))
+            pad["gain"] = _times(pad.get("gain"), _instead(_fit(p["stiffness"], None, 1.0 / fact.stiffness), 1.0))
     return lost
 
 
@@ -172,6 +172,11 @@ def _gains(f: dict[str, Any], pad: dict[str, Any], fact: PadFacts, doubt: bool) 
 def _wide(fit: Fit, believed: float | None) -> Fit:
     """A fit whose range also holds what was believed."""
     return fit if believed is None else (fit[0], min(fit[1], believed), max(fit[2], believed))
+
+
+def _instead(fit: Fit, believed: float) -> Fit:
+    """What the other effect of a set would be in the place of the one named: best guess that it is not there, in a range that holds it."""
+    return believed, min(fit[1], believed), max(fit[2], believed)
 
 
 def _fit(p: dict[str, Any], believed: float | None, times: float = 1.0) -> Fit:
