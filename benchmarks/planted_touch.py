@@ -97,9 +97,9 @@ def _felt_again(folder: Path, paths: list[Path], h, planted: dict, seed: int, ag
     from dexsim.gap import touch_rig
     from dexsim.recording import read
 
-    shape = {k: v for k, v in planted.items() if k in ("slides", "shear")}
-    said = {"tactile": h.tactile, "randomize": h.randomize}
     recorded = [read(p, audit=False) for p in paths]
+    shape = {k: v for k, v in planted.items() if k in ("slides", "shear")} | {"load_cell": recorded[0].external_force is not None}
+    said = {"tactile": h.tactile, "randomize": h.randomize}
     true = [r.tactile.value for r in recorded]
     # training's contact is a straight line: of a rubber it has the spread over the taxels, at the force that the cell measured
     given = {"pressed": [np.maximum(r.external_force.value[:, 0], 0.0) for r in recorded]} if "rubber" in planted and recorded[0].external_force else {}
