@@ -169,6 +169,8 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
         kd_blend = one
         if wp.static(rare):
             q_m += params[w, j, ECC_SIN] * wp.sin(turned) + params[w, j, ECC_COS] * (wp.cos(turned) - one)
+            scale += params[w, j, ECC_SIN] * wp.cos(turned) - params[w, j, ECC_COS] * wp.sin(turned)  # what it shows of a speed here
+            v_m = scale * turning
             kd_blend = dt / (params[w, j, SPEED_LAG] + dt)
             filtered = turning
             if not fresh:

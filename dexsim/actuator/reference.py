@@ -70,14 +70,15 @@ def servo(
     rotor_inertia = np.where(two, np.maximum(np.where(p["rotor"] == 0.0, base_armature, p["rotor"]), LEAST_ROTOR * inertia), 0.0)
     on_rotor = two & np.asarray(loop_motor)
     turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
-    v_m = p["position_scale"] * turning
+    scale = p["position_scale"] + (p["eccentric_sin"] * np.cos(turned) - p["eccentric_cos"] * np.sin(turned) if rare else 0.0)  # of a speed here
+    v_m = scale * turning
     q_m = p["position_scale"] * turned + p["position_offset"]
     v_d, v_next, kd_blend, kind = v_m, v_m, 1.0, np.zeros_like(v)
     if rare:
         q_m = q_m + p["eccentric_sin"] * np.sin(turned) + p["eccentric_cos"] * (np.cos(turned) - 1.0)
         kd_blend = dt / (p["speed_lag"] + dt)
         filtered = np.where(fresh, turning, filtered + kd_blend * (turning - filtered))
-        v_d, v_next = p["position_scale"] * filtered, p["position_scale"] * (filtered + kd_blend * (turning - filtered))
+        v_d, v_next = scale * filtered, scale * (filtered + kd_blend * (turning - filtered))
         kind, target = p["deadband_kind"], target + p["coupling"] * dragging
 
     e = target - q_m
@@ -85,11 +86,11 @@ def servo(
     cut = np.where(kind > 1.5, p["kp"] * np.clip(e, -p["deadband"], p["deadband"]), 0.0)
     now = p["kp"] * e - p["kd"] * v_d - cut
     pd = p["kp"] * e - p["kd"] * v_next - p["kp"] * dt * v_m - cut
-    slope = p["position_scale"] * (p["kp"] * dt + kd_blend * p["kd"])
+    slope = scale * (p["kp"] * dt + kd_blend * p["kd"])
     damped = dead & (kind > 0.5)
     now = np.where(damped, -p["kd"] * v_d, np.where(dead, 0.0, now))
     pd = np.where(damped, -p["kd"] * v_next, np.where(dead, 0.0, pd))
-    slope = np.where(damped, p["position_scale"] * kd_blend * p["kd"], np.where(dead, 0.0, slope))
+    slope = np.where(damped, scale * kd_blend * p["kd"], np.where(dead, 0.0, slope))
 
     tau0, supply, no_load, efficiency = p["torque_limit"], p["supply"], p["no_load_speed"], p["efficiency"]
     friction_factor = np.ones_like(v)

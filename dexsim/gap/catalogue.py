@@ -174,12 +174,14 @@ def _lag(s: Scales) -> list[Variant]:
 
 def _torque_limit(s: Scales) -> list[Variant]:
     believed = s.nominal["torque_limit"]
-    top = min(believed, 1.5 * s.demand) if s.saturates < 0.002 else believed
+    top = min(believed, 8 * s.demand)  # one in a thousand moments asks for far more than the rest, and it is there that a limit shows
     low = 0.05 * s.demand
     if top <= low or s.voltage:
         top = believed * 1.0
     limit = _p("torque", "torque_limit", "set", min(low, 0.5 * top), top, top, "N.m")
-    return [Variant((limit,), tuple((max(f * min(s.demand, believed), 1.05 * low),) for f in (0.95, 0.88, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)))]
+    sizes = [f * min(s.demand, believed) for f in (0.95, 0.88, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)] + [f * top for f in (0.9, 0.78, 0.65, 0.5, 0.35)]
+    starts = sorted({round(max(x, 1.05 * low), 12) for x in sizes if x < top}, reverse=True)
+    return [Variant((limit,), tuple((x,) for x in starts))] if starts else []
 
 
 def _speed_limit(s: Scales) -> list[Variant]:

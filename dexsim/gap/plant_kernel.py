@@ -143,6 +143,14 @@ def plant_kernel():
         return m
 
     @wp.func
+    def rate_of(q: f64, scale: f64, esin: f64, ecos: f64, round_: bool):
+        """What the encoder shows of a speed at position q, over that speed."""
+        k = scale
+        if round_:
+            k += esin * wp.cos(q) - ecos * wp.sin(q)
+        return k
+
+    @wp.func
     def acts_at(t: f64, i: int, late: f64, at: int, group: int):
         """When command i acts, but for the delay: its time t, later where it is one of those that are."""
         if late != f64(0.0) and (i // group) % LATE_GROUPS == at:
@@ -233,7 +241,7 @@ def plant_kernel():
         q = (m0 - offset) / scale
         q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
         q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
-        v = series[g0, XV] / scale
+        v = series[g0, XV] / rate_of(q, scale, esin, ecos, round_)
         if warm == 0:
             q += inits[h, 0]
             v += inits[h, 1]
@@ -255,7 +263,7 @@ def plant_kernel():
                 if round_:
                     m1 = m1 - esin * wp.sin(q) - ecos * (wp.cos(q) - one)
                 q = (m1 - offset) / scale
-                v = series[g, XV] / scale
+                v = series[g, XV] / rate_of(q, scale, esin, ecos, round_)
                 if i == warm:
                     q += inits[h, 0]
                     v += inits[h, 1]
@@ -335,11 +343,15 @@ def plant_kernel():
                     v_l = vm
                 elif sub > 0:
                     q_l = measured(q, scale, offset, esin, ecos, round_)
+                q_e = q
+                if two and consts[C_LOOP_MOTOR] > zero:
+                    q_e = qm
+                shows = rate_of(q_e, scale, esin, ecos, round_)
                 if fresh == 1 or speed_lag <= zero:
                     v_f = v_l
                 else:
                     v_f += dts / (speed_lag + dts) * (v_l - v_f)
-                e = target - q_l + age * scale * v_l  # a sampled loop acts on where the joint was
+                e = target - q_l + age * shows * v_l  # a sampled loop acts on where the joint was
                 v_drive = vm
                 if not two:
                     v_drive = v - carried
@@ -361,9 +373,9 @@ def plant_kernel():
                     body = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
                 step = theta * dts
                 torque = law(
-                    e, scale * v_f, v_drive, kp, kd, scale, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
+                    e, shows * v_f, v_drive, kp, kd, shows, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
                     eff * step / body, -load * step / body, params[h, P_BRAKE], params[h, P_DEADKIND], age,
-                    v_drive + params[h, P_LIMITSPEED] * (scale * v_f - v_drive),
+                    v_drive + params[h, P_LIMITSPEED] * (shows * v_f - v_drive),
                 )
                 now = torque[0]
                 motor = torque[1]
