@@ -480,7 +480,7 @@ def test_final_observations_are_those_before_the_reset(env):
     (("randomize", "object", "mass", [-0.1, 0.3]), "object.mass"),
     (("randomize", "servo", "delay", [0.0, 0.4]), "delay"),
     (("randomize", "servo", "kp", [-1.0, 1.0]), "kp"),
-    (("randomize", "servo", "backlash", [0.0, 0.1]), "backlash"),
+    (("randomize", "servo", "slop", [0.0, 0.1]), "slop"),
     (("sim", "control_period", 0.0123), "control_period"),
     (("task", "command", "low", 0.9), None),
     (("task", "command", "high", 1.5), "command"),

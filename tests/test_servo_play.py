@@ -168,6 +168,9 @@ def test_an_eccentric_encoder_is_believed_by_the_loop_and_by_who_reads_it():
     assert q[0] + 0.1 * math.sin(q[0]) + 0.05 * (math.cos(q[0]) - 1) == pytest.approx(0.8, abs=1e-6)
     assert servo.position()[0, 0].item() == pytest.approx(0.8, abs=1e-6)
     assert servo.unmeasured(servo.position())[0, 0].item() == pytest.approx(q[0], abs=1e-7)
+    seen = servo.position()[0, 0].item()
+    servo.engine.t.qvel[0, 0], servo.engine.t.qpos[0, 0] = 2.0, q[0] + 2e-6
+    assert servo.velocity()[0, 0].item() == pytest.approx((servo.position()[0, 0].item() - seen) / 1e-6, rel=1e-4)
 
 
 def test_a_joint_is_dragged_by_another():

@@ -192,7 +192,11 @@ class Servo:
 
     def velocity(self) -> torch.Tensor:
         """[N, J] velocity that the encoders report [rad/s]."""
-        return self.column("position_scale") * self._turned()[1]
+        q, v = self._turned()
+        slope = self.column("position_scale")
+        if "rare" in self.features:
+            slope = slope + self.column("eccentric_sin") * torch.cos(q) - self.column("eccentric_cos") * torch.sin(q)
+        return slope * v
 
     def measured(self, q: torch.Tensor) -> torch.Tensor:
         """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
