@@ -25,7 +25,7 @@ from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch, Outcome, Trial
-from dexsim.gap.sharpen import sharpen
+from dexsim.gap.sharpen import again, coupled, sharpen
 from dexsim.gap.together import together
 from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
@@ -33,6 +33,7 @@ from dexsim.recording.mechanism import Mechanism
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
+UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
 
@@ -243,6 +244,28 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     floor, floor_how = judge.floor(runs, cases)
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
+    def begun(k: int) -> JointSearch:
+        return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed)
+
+    def search_of(k: int) -> tuple[JointSearch, Outcome | None]:
+        search = begun(k)
+        if len(search.long.window) == 0:
+            return search, None
+        found = search.run() if cases[k].moved else search.idle()
+        search.polish(found.best), search.polish(found.none)  # kept for the judgement
+        return search, found
+
+    def start_of(k: int) -> Trial | None:
+        search = begun(k)
+        return search.start() if len(search.long.window) else None
+
+    joints = [c.joint for c in cases]
+    linked = len(cases) > 1 and s.joints is None and coupled(cases)
+    if linked:
+        first = together(joints, start_of, s.device)
+        if all(t is not None for t in first):
+            cases = again(model, runs, cases, first, s.device, _step(runs))
+        clock.lap("model along the motion")
     stages = stage.tests(cases, runs, train, s.seed)
     for x in stages[:4]:
         say(f"  {x.text}")
@@ -255,17 +278,15 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
     rng = np.random.default_rng(s.seed)
-
-    def search_of(k: int) -> tuple[JointSearch, Outcome | None]:
-        case = cases[k]
-        search = JointSearch(case, train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed)
-        if len(search.long.window) == 0:
-            return search, None
-        found = search.run() if case.moved else search.idle()
-        search.polish(found.best), search.polish(found.none)  # kept for the judgement
-        return search, found
-
-    for case, (search, found) in zip(cases, together([c.joint for c in cases], search_of, s.device, progress), strict=True):
+    answers = together(joints, search_of, s.device, progress)
+    unsettled = [k for k, (_, found) in enumerate(answers) if found is not None and (found.best.members or found.best.fit.loss > UNSETTLED)]
+    if linked and len(unsettled) > 1 and all(found is not None for _, found in answers):
+        # what was found in one joint moves the others otherwise than was thought
+        cases = again(model, runs, cases, [found.best for _, found in answers], s.device, _step(runs))
+        for k, answer in zip(unsettled, together([joints[k] for k in unsettled], lambda i: search_of(unsettled[i]), s.device, progress), strict=True):
+            answers[k] = answer
+    for search, found in answers:
+        case = search.case
         if not case.moved:
             notes.append(f"{case.joint} does not move: nothing can be said of it")
         if found is None:
