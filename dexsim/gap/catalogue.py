@@ -63,6 +63,7 @@ class Variant:
     fixed: tuple[tuple[str, float], ...] = ()
     note: dict = field(default_factory=dict)
     refines: bool = False  # adds parameters to the first variant: tried only where that one was found
+    dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ def _scale(s: Scales) -> list[Variant]:
         out.append(Variant(params, ((0.2 * e, 0.0), (-0.2 * e, 0.0), (0.0, 0.2 * e), (0.0, -0.2 * e)), "eccentricity"))
         # its zero may have been set anywhere along the turn, and not where the model has it
         params = (params[0], _p("ecc_cos", ("eccentric_cos", "position_offset"), "add", -e, e, 0.0, "rad"))
-        out.append(Variant(params, ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)), "eccentricity, its zero elsewhere"))
+        out.append(Variant(params, ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)), "eccentricity, its zero elsewhere", dear=0.2))
     return out
 
 

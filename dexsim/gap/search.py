@@ -24,6 +24,7 @@ BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.08  # x the noise: an error within it needs no effect
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
+TIE = 0.05  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
 MOST = 4  # effects on one joint
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
@@ -341,7 +342,7 @@ class JointSearch:
 
     def _score(self, trial: Trial) -> float:
         """Left-out loss with a price on parameters: 3 % each."""
-        return float(self._left(trial).sum()) * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
+        return float(self._left(trial).sum()) * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members)) * _dear(trial)
 
     def _left(self, trial: Trial) -> np.ndarray:
         """Losses by block [B] on what was left out, and what the beliefs had to give for them, spread over the blocks."""
@@ -466,7 +467,12 @@ class JointSearch:
                     self.fitted[frozenset(trial.ids)] = trial
             for trial in trials:
                 self.cross(trial)
-            best = min(trials, key=self._score)
+            best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
+            if close.fit.loss < (1 - TIE) * best.fit.loss:  # what follows best seems to last less: fits of their own decide
+                two = [self.refold(t) for t in (best, close)]
+                for t in two:
+                    self.fitted[frozenset(t.ids)] = t
+                best = min(two, key=self._score)
             if not self._earns(best, current):  # a good fit that seems not to last: is it the fit's, or the step's from it?
                 close = min(trials, key=lambda t: t.fit.loss)
                 if close.fit.loss < (1 - LEAST) * current.fit.loss:
@@ -518,7 +524,7 @@ class JointSearch:
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
         a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
-        if gain < LEAST:
+        if gain < LEAST or self._shrunk(new):
             return False
         if old.members and further:  # what follows must matter beside what was found
             rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
@@ -526,6 +532,15 @@ class JointSearch:
                 return False
         # what only a few moments show (a limit, a sag) varies much between draws, and more of the error goes with it
         return bool(np.quantile(self._boot(a - b), CHANCE if old.members or gain < 2 * LEAST else 2.5 * CHANCE) > 0)
+
+    def _shrunk(self, trial: Trial) -> bool:
+        """Whether an effect was fitted down to the size at which it begins: what it gained is another's."""
+        at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
+        for m in trial.members:
+            first = m.variant.params[0]
+            if first.mode == "set" and first.start == first.low and at[f"{m.id}.{first.key}"] <= first.low + 1e-3 * first.span:
+                return True
+        return False
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
         """Sums of a block bootstrap of x [B]: 2-s stretches of neighbouring half-second blocks."""
@@ -626,7 +641,7 @@ class JointSearch:
                 if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
                     self.cross(trial)
                     others.append(trial)
-            table = np.stack([mine, *[self._left(t) for t in others], lost])
+            table = np.stack([mine * _dear(current), *[self._left(t) * _dear(t) for t in others], lost])
             n = table.shape[1]
             size = min(4, n)
             starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
@@ -736,6 +751,11 @@ class _Fixed:
 def _named(member: Member) -> list[Param]:
     """The member's parameters with keys unique in a hypothesis."""
     return [replace(p, key=f"{member.id}.{p.key}") for p in member.variant.params]
+
+
+def _dear(trial: Trial) -> float:
+    """Factor on the losses of a hypothesis that can imitate simpler ones."""
+    return float(np.prod([1 + m.variant.dear for m in trial.members]))
 
 
 def _compatible(a: Member, b: Member) -> bool:
