@@ -491,7 +491,7 @@ class JointSearch:
         if len(current.members) == 1:  # one that only seemed worse before it was fitted in full takes the place
             others, share, _ = final[current.members[0].id]
             better = self.fitted.get(frozenset((others[0][0],))) if others and others[0][1] > share + 0.1 else None
-            if better is not None:
+            if better is not None and not self._shrunk(better):
                 self.fitted[frozenset(current.ids)] = current
                 current = better
                 final = self.rivals(current, pool)
@@ -524,7 +524,9 @@ class JointSearch:
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
         a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
-        if gain < LEAST or self._shrunk(new):
+        # what was left out may be lost by the step to it alone: what is fitted must be followed better too
+        here = lambda t: t.fit.loss + disbelief(t.fit.params, t.fit.x) / len(self.blocks)  # noqa: E731
+        if gain < LEAST or here(new) > (1 - 0.5 * LEAST) * here(old) or self._shrunk(new):
             return False
         if old.members and further:  # what follows must matter beside what was found
             rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
@@ -574,7 +576,7 @@ class JointSearch:
                 if key in current.ids or not confusable(key, member.id) or any(not _compatible(other, m) for m in rest):
                     continue
                 trial = self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
-                if trial.fit.loss < best.fit.loss and self._left(trial).sum() < self._left(best).sum():
+                if trial.fit.loss < best.fit.loss and self._left(trial).sum() < self._left(best).sum() and not self._shrunk(trial):
                     best = trial
         return best, level
 
@@ -690,8 +692,9 @@ class JointSearch:
             f = fitter.fit(params, x0=trial.fit.x, iterations=5, tolerance=5e-3)
             if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
                 again = self.fitter.fit(params, x0=f.x, iterations=0)
-                if again.loss < 1.5 * trial.fit.loss:
-                    return Trial(trial.members, again, trial.left_out, trial.folds)
+                polished = Trial(trial.members, again, trial.left_out, trial.folds)
+                if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
+                    return polished
         return trial
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
