@@ -184,6 +184,22 @@ def test_model_file_is_the_hand_that_trains(tmp_path):
             grasp_env(f"model_file={text}", worlds=2)
 
 
+@pytest.mark.parametrize(("kd", "after"), [(0.1, 0.096), (0.002, 0.0), ("unknown", None)])
+def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
+    """kp (q - age v): a loop that acts on where the joint was 1 ms ago has kp * age less damping; where kd is unknown there is none to take it from."""
+    from types import SimpleNamespace
+
+    from dexsim.gap.findings import servo_changes
+    from dexsim.gap.fit import Param
+
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
+    age = Param("feedback_delay", ("feedback_delay",), "set", 0.0, 0.003, 0.0, "s", nuisance=True)
+    case = SimpleNamespace(joint=JOINT, ranges={}, constants=SimpleNamespace(armature=1e-4), scales=SimpleNamespace(nominal={}))
+    trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=(age,), x=np.array([0.001])))
+    assert servo_changes(table, case, trial, np.array([[0.0, 0.002]]), xhand.JOINTS) == []
+    assert table.value(JOINT, "kd").value == (None if after is None else pytest.approx(after))
+
+
 def xhand_table() -> ServoTable:
     return ServoTable.from_dict(grasp_cfg()["servo"])
 

@@ -157,8 +157,8 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
     lost = undamped(trial, table.value(case.joint, "kp").value)
-    if lost > 0.0:
-        kd = table.value(case.joint, "kd")
+    kd = table.value(case.joint, "kd")
+    if lost > 0.0 and not kd.unknown:
         table.set(case.joint, "kd", *(round(max(x - lost, 0.0), 9) for x in (kd.value, kd.low, kd.high)))
     for name, value in columns_beside(case, trial, joints).items():
         table.set(case.joint, name, value)
