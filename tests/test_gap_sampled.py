@@ -99,3 +99,18 @@ def test_the_search_finds_the_age_and_nothing_else_is_missing():
     search = JointSearch(case, [0], None, [0])
     x = {p.key: v for p, v in zip(*(lambda f: (f.params, f.x))(search.start().fit), strict=True)}
     assert x["feedback_delay"] == pytest.approx(0.5e-3, abs=0.25e-3) and x["kd"] == pytest.approx(1.0, abs=0.015)
+
+
+@pytest.mark.parametrize(("believed", "low", "high"), [(0.0, 0.0, 0.003), (0.02, 0.017, 0.023), ({"value": 0.02, "low": 0.01, "high": 0.04}, 0.01, 0.04)])
+def test_a_speed_filter_that_is_believed_is_refitted_about_its_belief(believed, low, high):
+    """A servo.yaml of an earlier diagnosis states it: it is kept, once, and not replaced by what any drive may have."""
+    from test_gap import conditions, plant_run
+
+    value = believed["value"] if isinstance(believed, dict) else believed
+    runs = [plant_run(f"r{k}", k, 2.0, {}, seed=k, servo={"speed_lag": believed} if value else None) for k in (0, 1)]
+    for r in runs:
+        r.smooth()
+    search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs))
+    mine = [p for p in search._nuisances() if p.columns == ("speed_lag",)]
+    assert len(mine) == 1 and (mine[0].low, mine[0].high) == (pytest.approx(low), pytest.approx(high))
+    assert search.case.plant.base()[0, INDEX["speed_lag"]] == value

@@ -124,7 +124,7 @@ class JointSearch:
         out = []
         for name in ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
                      "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
-                     "position_offset", "position_scale"):
+                     "position_offset", "position_scale", "speed_lag", "backlash", "softness"):
             value = s.nominal[name]
             if name in c.unknown:
                 guess = self._unknown(name)
@@ -148,8 +148,9 @@ class JointSearch:
         if "lag" not in taken:
             out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=0.5 / rate))
         # a drive tells its speed from its encoder through some filter
-        if s.nominal["kd"] > 0:
-            out.append(Param("speed_lag", ("speed_lag",), "set", 0.0, max(FILTER, 2.0 / rate), 1.0 / rate, "s", nuisance=True, sd=0.3 * FILTER))
+        if s.nominal["kd"] > 0 and "speed_lag" not in taken:
+            f, most = s.nominal["speed_lag"], max(FILTER, 2.0 / rate)
+            out.append(Param("speed_lag", ("speed_lag",), "set", max(f - most, 0.0), f + most, f + 1.0 / rate, "s", nuisance=True, sd=0.3 * FILTER))
         # what it acts on was sampled up to a period ago, and acts until the next sample: half a period on average
         out.append(Param("feedback_delay", ("feedback_delay",), "set", 0.0, 1.5 / rate, 0.5 / rate, "s", nuisance=True, sd=0.5 / rate))
         # what holds a joint gives a little before it slides
