@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from dexsim.gap.mechanics import JointConstants
 from dexsim.gap.plant_columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
 
 THREADS = 2  # CPU launches release the interpreter: two run side by side
+BLOCK = 32  # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there are
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
@@ -22,31 +24,38 @@ class Lane:
     """One thread's way to a GPU: a stream of its own, so that the launches of several joints overlap, and memory that is
     allocated once (an allocation or a release in between would wait for every stream)."""
 
+    pinned = True  # memory of the CPU that the GPU copies by itself
+
     def __init__(self, device: str):
         self.device = device
         self.stream = wp.Stream(device)
-        self._there: dict[object, wp.array] = {}
-        self._host: wp.array | None = None
+        wp.get_device(device).context_guard.__enter__()  # for the thread's life: it also waits for its stream outside of the lock
+        self._room: dict[str, wp.array] = {}
+        self._host: dict[str, wp.array] = {}
 
-    def room(self, name: object, shape: tuple[int, ...]) -> wp.array:
-        """Memory of the device for `shape` numbers, the same for the same name."""
-        size = int(np.prod(shape))
-        if name not in self._there or self._there[name].shape[0] < size:
-            self._there[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device=self.device)
-        return wp.array(ptr=self._there[name].ptr, shape=shape, dtype=wp.float64, device=self.device)
+    def room(self, name: str, size: int) -> wp.array:
+        """Memory of the device for `size` numbers, the same for the same name."""
+        if name not in self._room or self._room[name].shape[0] < size:
+            self._room[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device=self.device)
+        return self._room[name]
 
-    def up(self, name: object, x: np.ndarray) -> wp.array:
-        """The numbers on the device, valid until `name` is used again."""
-        x = np.ascontiguousarray(x, dtype=np.float64)
-        out = self.room(name, x.shape)
-        wp.copy(out, wp.array(x, dtype=wp.float64, device="cpu", copy=False))
-        return out
+    def host(self, name: str, size: int) -> wp.array:
+        """Page-locked memory of the CPU for `size` numbers."""
+        if name not in self._host or self._host[name].shape[0] < size:
+            self._host[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device="cpu", pinned=self.pinned)
+        return self._host[name]
 
-    def back(self, size: int) -> wp.array:
-        """Page-locked memory for `size` numbers."""
-        if self._host is None or self._host.shape[0] < size:
-            self._host = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device="cpu", pinned=True)
-        return self._host
+    def part(self, of: wp.array, at: int, shape: tuple[int, ...]) -> wp.array:
+        """`shape` numbers of an array, from number `at` on."""
+        return wp.array(ptr=of.ptr + 8 * at, shape=shape, dtype=wp.float64, device=self.device)
+
+    def up(self, given: Sequence[np.ndarray]) -> list[wp.array]:
+        """The arrays on the device, by one copy; valid until this is called again, which must not be before the stream was waited for."""
+        ends = np.cumsum([0, *(x.size for x in given)])
+        here, there = self.host("in", int(ends[-1])), self.room("in", int(ends[-1]))
+        np.concatenate([np.ravel(x) for x in given], out=here.numpy()[: ends[-1]])
+        wp.copy(there, here, count=int(ends[-1]))
+        return [self.part(there, int(at), x.shape) for at, x in zip(ends, given, strict=False)]
 
 
 def lane(device: str) -> Lane:
@@ -233,14 +242,14 @@ class JointPlant:
         with _GPU:
             mine = lane(self.device)
             with wp.ScopedStream(mine.stream, sync_enter=False):
-                host, out = mine.back(2 * H * n), mine.room("out", (2 * H * n,))
+                host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
+                moves, constants, *guesses = mine.up([inits, consts, *(params[:, group[0]] for group in groups.values())])
                 at, parts = 0, []
-                for g, group in enumerate(groups.values()):
+                for group, guess in zip(groups.values(), guesses, strict=True):
                     keep, count, rest = self._inputs(windows, tuple(group), self.device)
                     size = H * len(keep)
-                    given = [mine.up((k, g), x) for k, x in enumerate((params[:, group[0]], inits, consts))]
-                    oq, ot = (wp.array(ptr=out.ptr + 8 * (at + k * size), shape=(H, len(keep)), dtype=wp.float64, device=self.device) for k in (0, 1))
-                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, *given, *rest, oq, ot], device=self.device)
+                    oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
+                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, guess, moves, constants, *rest, oq, ot], device=self.device, block_dim=BLOCK)
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
