@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import torch
 
 from benchmarks.reproduce import __main__ as command
 from benchmarks.reproduce import jobs, pack, report, rows
+from benchmarks.reproduce.schedule import Schedule
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -68,7 +71,8 @@ def test_the_torque_row_is_paid_for_no_contact_force():
 def test_the_command_line_is_checked():
     for argv, text in ((["table=chess"], "table=chess"), (["table=rotation", "rows=full,half"], "rows=full,half"),
                        (["table=rotation", "budget=-1"], "budget=-1"), (["table=grasp", "seeds=0.5"], "seeds=0.5"),
-                       (["table=rotation", "judge=me"], "judge=me")):
+                       (["table=rotation", "judge=me"], "judge=me"), (["table=rotation", "fit=true"], "fit=true"),
+                       (["table=rotation", "stages=0.5,0.2"], "stages=0.5,0.2")):
         with pytest.raises(UserError, match=text):
             command.main([*argv, "device=cpu"])
 
@@ -148,6 +152,7 @@ class Children:
         return self
 
     def play(self, command, **kw):
+        command = command[command.index(sys.executable):]
         said = dict(c.split("=", 1) for c in command[2:])
         self.commands.append(command)
         (Path(said["out"]) / "metrics.json").write_text(json.dumps({"of": said["checkpoint"], "episodes": int(said["episodes"])}))
@@ -155,6 +160,7 @@ class Children:
 
     def wait(self, timeout=None):
         if self.reach is not None and self.commands[-1][1] == "train.py" and timeout != 60:
+            time.sleep(timeout)
             raise subprocess.TimeoutExpired("train.py", timeout)
         return 0
 
@@ -192,7 +198,7 @@ def test_a_larger_budget_goes_on_from_the_smaller(tmp_path, monkeypatch):
     assert f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in more[0]
     assert jobs.read(job, p, "reality")["trained_iterations"] == 12
 
-    other, limited = jobs.Job(rows.ROTATION[1], 1), replace(p, minutes=2.0)
+    other, limited = jobs.Job(rows.ROTATION[1], 1), replace(p, minutes=0.002)
     children.reach = 3
     del children.commands[:]
     jobs.run([other], limited, [None], 1)
@@ -215,6 +221,79 @@ def test_a_sitting_ends_and_the_next_goes_on(tmp_path, monkeypatch):
     children.reach = None
     jobs.run(pair, replace(p, sitting=None), [None], 1)
     assert [c[1] for c in children.commands].count("train.py") == 3 and all(jobs.read(j, p, w) for j in pair for w in jobs.WORLDS)
+
+
+def lanes_at_work(schedule: Schedule, lanes: int, until: float = math.inf) -> list[tuple[float, int, float]]:
+    """(time of its end, training, steps) of each piece, on `lanes` lanes of one step a second."""
+    ends, out, now = [], [], 0.0
+    while True:
+        while len(ends) < lanes and (taken := schedule.take()) is not None:
+            ends.append((now + taken[1] - schedule.steps[taken[0]], *taken))
+        if not ends or min(ends)[0] > until:
+            return out
+        ends.sort()
+        now, k, steps = ends.pop(0)
+        out.append((now, k, steps))
+        schedule.give_back(k, steps)
+
+
+def test_every_row_reaches_a_stage_before_any_goes_on():
+    schedule = Schedule([20.0] * 11 + [11.0] * 3, [50.0, 90.0], 3)
+    ends = lanes_at_work(schedule, 3)
+    assert schedule.steps == [90.0] * 14
+    begins_last = min(t - 40 for t, _, steps in ends if steps == 90.0)
+    assert begins_last >= max(t for t, _, steps in ends if steps == 50.0) - 40  # lanes do not wait idle for one another
+
+
+def test_cut_trainings_end_together():
+    """14 trainings on 3 lanes: in one go two lanes work at the end while the third idles; with 5 of them in pieces none does."""
+    idle = {}
+    for cut in (False, True):
+        ends = lanes_at_work(Schedule([50.0] * 14, [50.0, 90.0], 3, cut=cut), 3)
+        idle[cut] = 3 * max(ends)[0] - 14 * 40
+        assert sum(steps == 90.0 for _, _, steps in ends) == 14
+    assert idle[False] == 40.0 and idle[True] <= 10.0
+    assert sorted(t for t, _, steps in ends if steps == 90.0)[4] < 80  # the ones in pieces come first
+
+
+def test_the_budget_that_fits_a_sitting():
+    schedule = Schedule([0.0] * 4, [50.0, 1000.0], 2, cut=True)
+    reached = [50.0, 50.0, 30.0, 40.0]
+    assert schedule.settle(reached, rate=2.0, seconds=100.0, per=10) == 90.0  # (170 + 200) / 4 = 92.5
+    assert Schedule([0.0], [50.0, 60.0], 1).settle([50.0], 1.0, 100.0, 10) == 60.0  # not more than was asked
+    assert Schedule([0.0], [50.0, 60.0], 1).settle([20.0], 1.0, 1.0, 10) == 50.0  # nor less than the stage before
+    schedule = Schedule([0.0], [1.0], 1)
+    assert schedule.take() == (0, 1.0) and schedule.take() is None
+    schedule.give_back(0, 0.5, failed=True)
+    assert schedule.take() is None and not schedule.busy
+
+
+def test_stages_are_judged_and_told_apart(tmp_path, monkeypatch):
+    """Two rows, a stage at half: trained and judged there, then at the end; the stage has a table of its own and is packed."""
+    p, children = plan(tmp_path / "a", stages=(200.0,)), Children(monkeypatch)
+    pair = [jobs.Job(r, 1) for r in rows.ROTATION[:2]]
+    ended = jobs.run(pair, p, [None], 1)
+    trained = [next(c for c in command if c.startswith("iterations=")) for command in children.commands if command[1] == "train.py"]
+    assert trained == ["iterations=2", "iterations=2", "iterations=4", "iterations=4"] and ended.steps == 400.0
+    for stage, steps in zip(ended.each(), (200, 400), strict=True):
+        assert all(jobs.read(j, stage, w)["trained_steps"] == steps for j in pair for w in jobs.WORLDS)
+    before = len(children.commands)
+    jobs.run(pair, p, [None], 1)
+    assert len(children.commands) == before
+    pack.main([f"out={p.out}", f"into={tmp_path / 'state'}"])
+    pack.main([f"unpack={tmp_path / 'state'}", f"out={tmp_path / 'b'}"])
+    elsewhere = replace(p, out=tmp_path / "b")
+    assert all(jobs.read(j, s, w) for j in pair for s in elsewhere.each() for w in jobs.WORLDS)
+    jobs.run(pair, elsewhere, [None], 1)
+    assert len(children.commands) == before
+
+
+def test_the_end_of_a_running_training_is_seen(tmp_path):
+    """The last whole line of progress.csv counts, also of a long file, also while a line is being written."""
+    assert jobs.progress(tmp_path) is None
+    lines = [f"{i},{100 * i},{'x' * 300},{0.7},{0.1}" for i in range(1, 60)]
+    (tmp_path / "progress.csv").write_text("iteration,steps,what,collect_s,learn_s\n" + "\n".join(lines) + "\n60,60")
+    assert jobs.progress(tmp_path) == (59, 5900.0, pytest.approx(0.8))
 
 
 def test_pack_takes_along_what_the_next_sitting_needs(tmp_path):

@@ -47,7 +47,7 @@ def pack(out: Path, into: Path, part: float) -> list[Path]:
     for folder in jobs:
         last = done(folder).last
         files = {last: slim(last)} | {p: p.read_bytes() for n in BESIDE if (p := last.parent / n).exists()}
-        files |= {p: p.read_bytes() for n in JUDGED for p in sorted(folder.glob(f"*/{n}"))}
+        files |= {p: p.read_bytes() for n in JUDGED for g in (f"*/{n}", f"at_*/*/{n}") for p in sorted(folder.glob(g))}
         files |= {p: p.read_bytes() for p in folder.glob("stopped_by_limit.json")}
         more = sum(len(b) for b in files.values())
         if archive is None or size + more > part:

@@ -224,7 +224,7 @@ def _grasp_figure(axes, order: list[Row], table: dict) -> None:
 
 
 def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> Path:
-    """<table>.md, .json and .png in the plan's folder; returns the Markdown's path."""
+    """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage); returns the Markdown's path."""
     from matplotlib.figure import Figure
 
     text, data, draw = {"rotation": rotation, "grasp": grasp}[table](plan, all_jobs)
@@ -234,10 +234,10 @@ def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) ->
             f"{len({j.seed for j in all_jobs})} seed(s) a row of the paper's, one for ours; "
             + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
             + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
-    path = plan.out / f"{table}.md"
+    path = plan.out / (table + ("" if plan.level is None else f"_at_{plan.level / 1e6:g}M") + ".md")
     path.write_text(head + text)
-    (plan.out / f"{table}.json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
+    path.with_suffix(".json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     draw(figure.subplots(1, 2))
-    figure.savefig(plan.out / f"{table}.png", dpi=110)
+    figure.savefig(path.with_suffix(".png"), dpi=110)
     return path

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -417,7 +418,11 @@ class HandEnv(VecEnv):
         return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.rng.set_state(state["rng"].cpu())
+        rng = state["rng"].cpu()
+        if rng.shape == self.rng.get_state().shape:
+            self.rng.set_state(rng)
+        else:  # learned until now on another kind of device, whose generator is another one
+            self.rng.manual_seed(zlib.crc32(rng.numpy().tobytes()))
         self.nan_count.copy_(state["nan_count"])
         self.reset_all()
 
