@@ -32,6 +32,8 @@ WORLDS = ("simulation", "reality")
 """Where a policy is judged: the training's physics, and the other world."""
 START_S = 15.0
 """From the start of a training on a GPU to its first iteration, until one has been seen."""
+LONGEST_START_S = 40.0
+"""A first start also compiles kernels; the next ones do not."""
 NICE = ("nice", "-n", "5") if shutil.which("nice") else ()
 """Judging leaves the cores to the trainings where they are too few."""
 
@@ -169,7 +171,7 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
                 at = progress(out)
                 if at is not None and at[0] > so_far.iteration:
                     if not seen:
-                        seen, lead[0] = True, time.monotonic() - began
+                        seen, lead[0] = True, min(time.monotonic() - began, LONGEST_START_S)
                     if not told and (iterations - at[0]) * at[2] < lead[0]:
                         told = True
                         nearly()
