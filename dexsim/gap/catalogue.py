@@ -232,7 +232,7 @@ def _thermal(s: Scales) -> list[Variant]:
         top = min(0.03 if of != "friction" else 0.1, 0.7 / s.warm)
         # copper gains 0.39 % of resistance per degree: ten times that is a proxy of something else
         # friction may grow several times over; what falls cannot fall below nothing
-        low, high = (0.0, 0.008) if of == "resistance" else (-top, top if of != "friction" else min(0.1, 2.5 / s.warm))
+        low, high = (0.0, 0.008) if of == "resistance" else (-top, top) if of != "friction" else (-min(0.1, 0.95 / s.warm), min(0.1, 2.5 / s.warm))
         p = _p("per_degree", column, "set", low, high, 0.0, "1/degC")
         starts = tuple((f,) for f in ((0.25 * high, 0.7 * high) if low == 0 else (-0.5 * top, -0.15 * top, 0.15 * top, 0.5 * high)))
         out.append(Variant((p,), starts, of, note={"of": of}))

@@ -230,7 +230,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     cases = build(model, runs, device=s.device, dt=_step(runs))
     cases = sharpen(model, runs, cases, s.device, _step(runs), only=s.joints)
     left_out = excluded.reasons(cases, felt, s.allowed)
-    notes += _cannot(s, left_out)
+    notes += _cannot(s, left_out) + excluded.not_fitted(cases)
     if s.joints is not None:
         cases = [c for c in cases if c.joint in s.joints]
         if not cases:

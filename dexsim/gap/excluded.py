@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from dexsim.gap.catalogue import EFFECTS, MIN_WARMTH, Scales
+from dexsim.gap.search import unknown
 from dexsim.gap.touch import TouchResult
 from dexsim.gap.touch_effects import BY_ID
 
@@ -68,4 +69,14 @@ def reasons(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None)
     return out
 
 
-__all__ = ["reasons", "why"]
+def not_fitted(cases: Sequence) -> list[str]:
+    """Columns that the servo's file says are unknown and that are not refitted, by joints: what is done instead."""
+    by: dict[str, list[str]] = {}
+    for c in cases:
+        for name in c.unknown:
+            if unknown(name, c.scales) is None:
+                by.setdefault(name, []).append(c.joint)
+    return [f"{name} is unknown on {', '.join(joints)} and cannot be fitted to these recordings by itself: it is taken as absent" for name, joints in by.items()]
+
+
+__all__ = ["not_fitted", "reasons", "why"]

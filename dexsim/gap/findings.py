@@ -112,7 +112,7 @@ def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[fl
 
 def handed(p: Param, case: Case) -> bool:
     """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
-    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges)
+    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges and p.key not in case.unknown)
 
 
 def undamped(trial, kp: float) -> float:
@@ -162,7 +162,7 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
         table.set(case.joint, "kd", *(round(max(x - lost, 0.0), 9) for x in (kd.value, kd.low, kd.high)))
     for name, value in columns_beside(case, trial, joints).items():
         table.set(case.joint, name, value)
-    if any(x.id == "thermal" for x in trial.members):
+    if any(name.startswith("thermal_") for p in trial.fit.params for name in p.columns):
         warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
         table.set(case.joint, "warmth", *(round(float(v), 2) for v in (np.median(warmth), warmth.min(), warmth.max())))
     return left

@@ -89,7 +89,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         import yaml
 
         table = ServoTable.from_dict(merged(table.to_dict(), yaml.safe_load(recording.meta["servo"])), source=f"servo of {name}")
-    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[])
+    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
     run.v = _at(recording.states.velocity, t, column)
     effort = recording.signed_effort()
     if effort is not None and recording.effort_is != "none" and not _bad(recording, "/joint_states", "effort"):

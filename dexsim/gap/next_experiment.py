@@ -74,7 +74,7 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
     column = m.joints.index(case.joint)
     gravity = np.asarray(m.spec.option.gravity, float)
     joints = tuple(m.joints)
-    run = Run("plan", joints, p.t, p.value, t, p.run.position[::every].copy(), m.table, gravity)
+    run = Run("plan", joints, p.t, p.value, t, p.run.position[::every].copy(), m.table, gravity, counted=joints)
     run.smooth()
     there = build(m.spec.compile(), [run])[column]
     plant, windows = there.plant, there.plant.windows(None)

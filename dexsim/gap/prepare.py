@@ -107,6 +107,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
         servo = runs[0].servo
         plant = JointPlant(joint, c, dt, voltage, servo.encoder("loop", [joint])[0], servo.encoder("position", [joint])[0], device)
         others = _draggers(model, joints, j, runs)
+        believed = [_drags(run, rows[i][j], others) for i, run in enumerate(runs)]
         for i, run in enumerate(runs):
             exact = {}
             if run.supply is not None and servo.supply_voltage:
@@ -125,7 +126,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
             elif run.torque is not None:
                 exact["drive"] = np.nan_to_num(run.torque[:, j])
             effort = None if run.torque is None else run.torque[:, j]
-            plant.add(run.name, nominal_row(rows[i][j], rotor), mech[i][0], mech[i][1][j], run.cmd_t, run.cmd[:, j], run.t,
+            plant.add(run.name, nominal_row(believed[i], rotor), mech[i][0], mech[i][1][j], run.cmd_t, run.cmd[:, j], run.t,
                       run.q[:, j], effort, exact)  # fmt: skip
         plant.finish()
         cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
@@ -259,6 +260,22 @@ def _draggers(model, joints, j, runs) -> list[int]:
         return (len(own) - shared) + (len(other) - shared) - 0.1 * shared, o
 
     return sorted(moved, key=far)
+
+
+def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
+    """A joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of which the first four are
+    simulated, and the one that is believed to drag goes first), not among the mechanism's joints."""
+    row = row.copy()
+    if row[SERVO_INDEX["coupling"]]:
+        name = (run.counted or run.joints)[int(row[SERVO_INDEX["coupling_from"]])]
+        source = run.joints.index(name) if name in run.joints else -1
+        if source in others:
+            others.remove(source)
+            others.insert(0, source)
+        else:  # it stands still
+            row[SERVO_INDEX["coupling"]] = 0.0
+    row[SERVO_INDEX["coupling_from"]] = 0.0
+    return row
 
 
 def _mean(x: np.ndarray, t: np.ndarray, seconds: float) -> np.ndarray:

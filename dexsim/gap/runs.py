@@ -16,7 +16,8 @@ class Run:
     cmd_t [K], cmd [K, J]: targets, held until the next; t [S], q [S, J]: measured positions.
     Optional, None where not logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or
     the plain current in A where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V.
-    gravity: the world's, m/s2, [3]. servo: the table believed for this recording.
+    gravity: the world's, m/s2, [3]. servo: the table believed for this recording; counted: the mechanism's joints, by whose number its
+    `coupling_from` counts (empty: `joints`).
     """
 
     name: str
@@ -36,6 +37,7 @@ class Run:
     supply: np.ndarray | None = None
     tactile: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    counted: tuple[str, ...] = ()
     # filled by `smooth`
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None

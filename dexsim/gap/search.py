@@ -7,12 +7,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Variant, confusable
+from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Scales, Variant, confusable
 from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, disbelief, prior_weight
 from dexsim.gap.plant import Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
 
+USUAL = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
+         "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
+         "position_offset", "position_scale", "speed_lag", "backlash", "softness")  # fmt: skip
+WITH_OTHERS = ("torque_ripple", "ripple_per_turn", "ripple_phase", "deadband_kind", "coupling", "coupling_from", "warmth")
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 CHANCE = 0.03  # of the bootstraps in which an effect may be of no use to what was left out
@@ -74,6 +78,21 @@ class Outcome:
     note: str = ""
 
 
+def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
+    """How a servo column that is said to be unknown is fitted with every hypothesis, as the effect that writes it would be, and from where.
+    None where no effect does, or where the column says nothing without others (`WITH_OTHERS`): it is taken as absent, and the effect
+    looked for."""
+    if name in WITH_OTHERS:
+        return None
+    for effect in CATALOGUE:
+        for v in effect.variants(s):
+            for i, p in enumerate(v.params):
+                if p.columns == (name,):
+                    starts = list(dict.fromkeys(x[i] for x in v.starts))
+                    return Param(name, p.columns, p.mode, p.low, p.high, starts[min(1, len(starts) - 1)], p.unit, nuisance=True), starts
+    return None
+
+
 class JointSearch:
     """The search on one joint. train: run indices; span: part of each run to use; folds [R]: condition of each run."""
 
@@ -122,14 +141,12 @@ class JointSearch:
         """What is refitted with every hypothesis: believed figures inside +- 5 %, stated ranges, unknowns."""
         c, s = self.case, self.case.scales
         out = []
-        for name in ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
-                     "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
-                     "position_offset", "position_scale", "speed_lag", "backlash", "softness"):
+        for name in (*USUAL, *(n for n in c.unknown if n not in USUAL)):
             value = s.nominal[name]
             if name in c.unknown:
-                guess = self._unknown(name)
+                guess = unknown(name, s)
                 if guess is not None:
-                    out.append(guess)
+                    out.append(guess[0])
             elif name in c.ranges:
                 low, high = c.ranges[name]
                 if name in ("kp", "kd") or (value > 0 and name in ("torque_limit", "no_load_speed")):
@@ -171,16 +188,6 @@ class JointSearch:
             out.append(Param("effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         return out
 
-    def _unknown(self, name: str) -> Param | None:
-        for effect in CATALOGUE:
-            if name in effect.columns or name in ("kp", "kd"):
-                for v in effect.variants(self.case.scales):
-                    for i, p in enumerate(v.params):
-                        if p.columns == (name,):
-                            start = v.starts[min(1, len(v.starts) - 1)][i]
-                            return Param(name, p.columns, p.mode, p.low, p.high, start, p.unit, nuisance=True)
-        return None
-
     def _params(self, members: tuple[Member, ...]) -> list[Param]:
         """Effects' parameters, then the nuisances that act on no column of theirs."""
         mine = [p for m in members for p in _named(m)]
@@ -197,7 +204,7 @@ class JointSearch:
     def start(self) -> Trial:
         """No effect: the nuisances alone. Those without a trace are left out from here on."""
         params = self.all_nuisances
-        f = self.scan_fitter.fit(params, iterations=6)
+        f = self.scan_fitter.fit(params, x0=self._begin(params), iterations=6)
         if self.scan_fitter.use_torque:  # neither signal drowns the other: what is missing shows in both
             n = self.scan_fitter.w.n
             parts = [float(np.sqrt(np.mean(x**2))) for x in (f.residual[:n], f.residual[n:][self.scan_fitter.tau_on])]
@@ -214,6 +221,18 @@ class JointSearch:
         self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8)
         return Trial((), self._shaken(self.nuisances, fit))
+
+    def _begin(self, params: list[Param]) -> np.ndarray:
+        """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the next."""
+        x = np.array([p.start for p in params], float)
+        for i, p in enumerate(params):
+            found = unknown(p.key, self.case.scales) if p.key in self.case.unknown else None
+            if found is not None and len(found[1]) > 1:
+                tries = np.repeat(x[None], len(found[1]), 0)
+                tries[:, i] = np.clip(found[1], p.low, p.high)
+                s = self.scan_fitter.init_directions(params, x)[1] if self.scan_fitter.eliminate else None
+                x = tries[int(np.argmin(self.scan_fitter.loss(self.scan_fitter.eliminated(self.scan_fitter.residuals(params, tries), s))))]
+        return x
 
     def _shaken(self, params: list[Param], fit: Fitted) -> Fitted:
         """The fit, looked for nearby too, where it does not follow the data yet."""
@@ -299,7 +318,8 @@ class JointSearch:
         keep = [i for i, p in enumerate(variant.params) if not set(p.columns) & self.wide]
         if len(keep) == len(variant.params):
             return variant
-        if not keep or all(variant.params[i].key in ("per_turn", "phase", "v_s") for i in keep):
+        # without its size nothing is left of an effect, but for friction (its directions may differ) and gains (there are two)
+        if not keep or (keep[0] > 0 and variant.params[0].key not in ("torque", "kp_factor")):
             return None
         starts = tuple(dict.fromkeys(tuple(s[i] for i in keep) for s in variant.starts))
         return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)
