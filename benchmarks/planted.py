@@ -4,7 +4,7 @@
 
 One round is every entry of PLANTS once, its size drawn round robin from three tiers, and a few cases with nothing planted;
 `cases` counts along the rounds (0: one round). This is the sanity check of `diagnose`: the data come from the simulator that
-trains policies, C MuJoCo with the servo kernel, at a half or (play, elasticity) a quarter of a millisecond, with gains, masses and
+trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity) 0.1 ms, with gains, masses and
 friction a few percent off, an encoder's quantum, noise and a jittered clock. limit: seconds after which no further case is waited
 for (0: all are). Size of an effect: its held-out change in the search's own plant, with what a refit of the believed figures hides
 of it taken away, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out
@@ -91,7 +91,7 @@ PLANTS: dict[str, Plant] = {
                             lambda r, s: {"gain": 1 - s, "offset": 0.3 * s * r["weight"]}, "effort"),
 }  # fmt: skip
 STICKS = 'solimpfriction="0.999 0.9999 0.001 0.5 2" solreffriction="0.002 1"'  # dry friction that turns with the motion, not before it
-STEP, FINE = 5e-4, 2.5e-4  # s: of the engine; with play or elasticity
+STEP, FINE = 2e-4, 1e-4  # s: of the engine; with play or elasticity
 SERVO = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction")
 
 
@@ -232,9 +232,8 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
 
     from dexsim.actuator.columns import INDEX as SERVO_INDEX
     from dexsim.actuator.table import ServoTable
+    from dexsim.gap.confirm import World, free_runs
     from dexsim.gap.prepare import REFERENCE
-    from dexsim.recording.mechanism import Mechanism, drive
-    from dexsim.recording.schema import COMMANDS, STATES, Series
 
     table = servo(b)
     true = {}
@@ -255,18 +254,19 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
     spec = mujoco.MjSpec.from_string(model_xml(b, true))
     tilt = change.get("tilt_y", 0.0)
     spec.option.gravity = [-9.81 * np.sin(tilt), 0.0, -9.81 * np.cos(tilt)]
-    m = Mechanism(spec, b["joints"], ServoTable.from_dict(table), "rig")
+    drives, J = ServoTable.from_dict(table), len(b["joints"])
+    rows = drives.nominal(b["joints"])
+
+    def world(r, start: float) -> World:
+        warmth = None if r.temperature is None else (r.t, r.temperature - REFERENCE)
+        return World(rows, drives, np.asarray(spec.option.gravity), SECONDS, np.full(J, start), np.zeros(J), r.cmd[0].copy(), r.cmd_t, r.cmd, None, warmth)
+
     step = FINE if change.get("backlash") or change.get("softness") else STEP
-
-    def once(r, start: float) -> tuple[np.ndarray, np.ndarray]:
-        warmth = None if r.temperature is None else Series(r.t, r.temperature - REFERENCE, STATES, r.t)
-        run = drive(m, Series(r.cmd_t, r.cmd, COMMANDS, r.cmd_t), list(b["joints"]), SECONDS, np.full(len(b["joints"]), start), timestep=step, warmth=warmth)
-        return tuple(np.stack([np.interp(r.t, run.t, x) for x in y.T], 1) for y in (run.position, run.torque))
-
-    for r in runs:
-        r.q, r.torque = once(r, 0.0)
-    again = once(runs[-1], QUANTUM)[0]
-    return float(np.sqrt(np.mean((again - runs[-1].q)[:, 0] ** 2) / 2))
+    made = free_runs(spec, b["joints"], [*(world(r, 0.0) for r in runs), world(runs[-1], QUANTUM)], "cpu", step, "mujoco", torque=True)
+    at = lambda x, r: np.stack([np.interp(r.t, step * np.arange(len(y)), y) for y in x.T], 1)  # noqa: E731
+    for r, (q, tau) in zip(runs, made, strict=False):
+        r.q, r.torque = at(q, r), at(tau, r)
+    return float(np.sqrt(np.mean((at(made[-1][0], runs[-1]) - runs[-1].q)[:, 0] ** 2) / 2))
 
 
 def _hidden(change: np.ndarray, slopes: np.ndarray, keep: slice) -> float:

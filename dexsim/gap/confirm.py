@@ -201,19 +201,20 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
 
 
 def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP,
-              engine: str = "auto") -> list[np.ndarray]:
-    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity."""
+              engine: str = "auto", torque: bool = False) -> list:
+    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity;
+    torque: (positions, motor torques [T, J] as their current shows them) instead."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
-    out: list[np.ndarray] = [np.zeros((0, len(joints)))] * len(worlds)
+    out: list = [np.zeros((0, len(joints)))] * len(worlds)
     for members in groups.values():
-        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine), strict=True):
+        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True):
             out[i] = q
     return out
 
 
-def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float, engine: str) -> list[np.ndarray]:
+def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float, engine: str, torque: bool) -> list:
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -240,6 +241,7 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     servo.reset(None, up(now))
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
+    given = torch.zeros_like(seen) if torque else None
     warm = [i for i, w in enumerate(worlds) if w.warmth is not None] if "warmth" in varied or "rare" in servo.features else []
     sent = [0] * N
     freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
@@ -270,8 +272,10 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
                 servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(t, at, x) for x in heat.T])
         seen[k].copy_(servo.position())
         engine.step(1, servo.before_each)
-    q = seen.cpu().numpy().astype(float)
-    return [q[:, i] for i in range(N)]
+        if given is not None:
+            given[k].copy_(servo.torque)
+    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
+    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,

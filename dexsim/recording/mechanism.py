@@ -168,15 +168,13 @@ def drive(
     frame_s: float = 0.02,
     pairs: Sequence[ContactPair] = (),
     follow: tuple[str, Series] | None = None,
-    warmth: Series | None = None,
 ) -> Run:
     """Simulate `duration` s of the mechanism under time-stamped commands, from rest.
 
     commands: value [T, len(columns)], targets of the joints named in `columns`; NaN keeps the last. initial [J]:
     start and first target of the mechanism's joints (NaN or None: the model's own). enabled: like commands, 0 frees
     a joint. pairs: contact pairs to measure. follow: (name of a free joint, poses [T, 7]): a body that is led along
-    a recorded path. warmth: value [T, J], degC of the mechanism's drives above the temperature at which the table holds, taken
-    every 50 ms. Deterministic. Engine: C MuJoCo.
+    a recorded path. Deterministic. Engine: C MuJoCo.
     """
     spec = m.spec.copy()
     spec.option.timestep = timestep
@@ -209,8 +207,6 @@ def drive(
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
     q_view, v_view, torque_view = engine.t.qpos[0].numpy(), engine.t.qvel[0].numpy(), servo.torque[0].numpy()
     on = None if enabled is None else np.nan_to_num(enabled.value, nan=1.0) > 0.5
-    warm = None if warmth is None else servo.column("warmth")[0]
-    warm_every = max(1, round(0.05 / timestep))
     state = {"k": 0, "command": 0, "enabled": 0}
 
     def before_each() -> None:
@@ -228,8 +224,6 @@ def drive(
                 servo.state.dtype
             )
             state["enabled"] += 1
-        if warm is not None and k % warm_every == 0:
-            warm.copy_(torch.as_tensor([np.interp(t, warmth.t, x) for x in warmth.value.T]))
         if lead is not None:
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
             engine.t.qvel[0, v : v + 6] = torch.as_tensor(lead_speed[k])
