@@ -1,6 +1,6 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=dry,late] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,soft] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
                               [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
 
@@ -35,7 +35,7 @@ from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"tasks": "grasp,rotate", "worlds": "dry,late", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
+SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,soft", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
             "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8"}  # fmt: skip
 # what is judged: file key, larger is better
@@ -45,6 +45,7 @@ FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "effic
          "torque_ripple": 0.0}  # fmt: skip
 WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
+TASK = 100  # between the ranks of two tasks
 JUDGING = 75.0  # s that judging may be begun after the last training
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
@@ -272,21 +273,22 @@ class Loop:
             out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0, self.uses["judge"]) for t in self.tasks]
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False,
                            [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0, self.uses["diagnose"]))
-        for task in self.tasks:
+        for k, task in enumerate(self.tasks):  # one task's trainings before the next one's
+            first = TASK * k
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
-                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"]))
-                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5 + seed, self.uses["train"]))
+                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], first + 1, self.uses["train"]))
+                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], first + 5 + seed, self.uses["train"]))
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
                         Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"]))
-                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 9)
-                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], 2)
-                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 3 + seed)
-                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
+                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], first + 8)
+                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], first + 2)
+                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], first + 3 + seed)
+                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], first + 9)
                     for variant in ("fitted", "truth"):
-                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], 8)
+                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], first + 8)
         return out
 
     def report(self) -> dict:

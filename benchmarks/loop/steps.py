@@ -1,7 +1,7 @@
 """The steps of the loop that no entry script does: a start that may be trained on, and recordings of the hand in its reality.
 
     python -m benchmarks.loop.steps start checkpoint=FILE out=last.pt device=cuda [any setting of train.py]
-    python -m benchmarks.loop.steps record world=dry out=DIR seed=1 [count=3] [seconds=19]
+    python -m benchmarks.loop.steps record world=soft out=DIR seed=1 [count=3] [seconds=19]
 """
 
 from __future__ import annotations
