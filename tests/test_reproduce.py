@@ -286,6 +286,16 @@ def test_stages_are_judged_and_told_apart(tmp_path, monkeypatch):
     assert all(jobs.read(j, s, w) for j in pair for s in elsewhere.each() for w in jobs.WORLDS)
     jobs.run(pair, elsewhere, [None], 1)
     assert len(children.commands) == before
+    jobs.run(pair, replace(elsewhere, steps=600.0), [None], 1)  # beside train_1, the only one that was packed
+    assert [p.name for p in sorted(pair[0].folder(elsewhere).glob("train_*"))] == ["train_1", "train_2"]
+
+
+def test_a_training_that_fails_is_tried_once_more(tmp_path, monkeypatch):
+    p, children = plan(tmp_path), Children(monkeypatch)
+    began = []
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **kw: began.append(command) or children)  # writes nothing
+    jobs.run([jobs.Job(rows.ROTATION[0], 1)], p, [None], 1)
+    assert len(began) == 2
 
 
 def test_the_end_of_a_running_training_is_seen(tmp_path):

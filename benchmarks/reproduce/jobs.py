@@ -142,7 +142,8 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
     so_far, to = done(folder), plan.steps if to is None else to
     if so_far.last is not None and (so_far.steps >= to or _ended_by_limit(folder, plan)):
         return so_far.last
-    out = folder / f"train_{len(list(folder.glob('train_*')))}"
+    numbers = [int(n) for p in folder.glob("train_*") if (n := p.name.removeprefix("train_")).isdigit()]
+    out = folder / f"train_{max(numbers, default=-1) + 1}"
     start = [f"task={plan.task}", f"seed={job.seed}", *plan.extra, *job.row.settings] if so_far.last is None else [f"resume={so_far.last}", *plan.extra]
     iterations = so_far.iteration + math.ceil((to - so_far.steps) / plan.per)
     command = [sys.executable, "train.py", *start, f"iterations={iterations}", "final_episodes=0", f"out={out}"]
@@ -296,9 +297,9 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
                 return
             gained, spent = statistics.median(each) * len(gpus), 1.0
         rate = gained / spent
-        left = (until - time.monotonic()) * 0.97 - lead[0]
-        piece = max(plan.steps - (plan.stages[-1] if plan.stages else 0.0), 0.0) / PIECES
-        left -= min(0.04 * left, 0.5 * piece * len(gpus) / rate)  # GPUs end apart by a part of a piece
+        left = 0.97 * (until - time.monotonic())
+        ahead = (sum(now) + rate * left) / len(jobs) - (plan.stages[-1] if plan.stages else 0.0)
+        left -= min(0.1 * left, 0.5 * max(ahead, 0.0) / PIECES * len(gpus) / rate)  # GPUs end apart by a part of a piece
         plans[-1] = replace(plan, steps=schedule.settle(now, rate, left, plan.per))
         settled[0] = True
         say(f"{rate / 1e3:.0f}k steps/s, {duration(left)} left for training: every row to {plans[-1].steps / 1e6:.4g} M steps", counts=False)
@@ -320,6 +321,7 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
                     pool.add(job, p, policy, world)
 
     handed: set[tuple[int, float | None]] = set()
+    tries: dict[int, int] = {}
 
     def piece(k: int, to: float, gpu: str | None, free: threading.Event) -> None:
         job, reached, failed = jobs[k], schedule.steps[k], True
@@ -328,7 +330,10 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
                 counts = to in [p.steps for p in plans]
                 policy = train(job, plans[-1], gpu, lambda text: say(text, counts), until, to, free.set if plan.overlap else lambda: None, lead)
                 reached = done(job.folder(plan)).steps
-                failed = policy is None or reached < to  # by the sitting's end, by `minutes`, or in truth
+                failed = policy is None or reached < to  # by the sitting's end, by `minutes`, or in truth: that once more
+                if failed and policy is None and time.monotonic() < until:
+                    tries[k] = tries.get(k, 0) + 1
+                    failed = tries[k] > 1
         except UserError as error:
             say(f"{job.name}: FAILED, {error}")
         with changed:
