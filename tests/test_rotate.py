@@ -204,6 +204,17 @@ def test_curriculum_widens_what_is_drawn_and_evaluation_gets_it_whole():
         make("task.curriculum.start=1.5")
 
 
+def test_a_training_of_another_kind_of_device_goes_on(env):
+    """A GPU's generator state is of 16 bytes: the episodes drawn after it are this machine's, the same each time."""
+    state = env.state_dict()
+    drawn = []
+    for byte in (1, 1, 2):
+        env.load_state_dict(state | {"rng": torch.full((16,), byte, dtype=torch.uint8)})
+        drawn.append(env.objects.size.clone())
+    env.load_state_dict(state)
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+
+
 def test_tilt_does_not_accumulate(env):
     """Forty goals, each reached with a new lean of 0.2 rad."""
     q = rotation.upright(env.object_pose[:1, 3:], env.axis)
