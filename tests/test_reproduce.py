@@ -100,6 +100,19 @@ def test_averages_orderings_and_intervals(tmp_path):
     assert "| quaternion instead of 6D | 3.0 (" in text and "2.9, 2.5, 5.24, 15.2" in text
 
 
+def test_learning_curves_are_those_of_the_longest_training(tmp_path):
+    p, job = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1)
+    for k, count in ((0, 2), (1, 5)):
+        folder = job.folder(p) / f"train_{k}"
+        folder.mkdir(parents=True)
+        (folder / "progress.csv").write_text("iteration,steps,task/successes_per_minute\n1,1000000,\n"
+                                             + "".join(f"{i},{i}000000,{3 * i}\n" for i in range(2, count + 1)))
+    steps, successes = report.learning(p, [job, jobs.Job(rows.ROTATION[1], 1)])[job.row][0]
+    assert steps.tolist() == [2.0, 3.0, 4.0, 5.0] and successes.tolist() == [6.0, 9.0, 12.0, 15.0]
+    report.write("rotation", p, [job], {"command": "x", "device": "y"})
+    assert (tmp_path / "rotation_learning.png").stat().st_size > 1000
+
+
 def test_an_ordering_is_not_decided_within_what_seeds_do(tmp_path):
     """Seeds of one row 30 apart: a difference of 15 between two other rows says nothing, one of 300 does."""
     p = plan(tmp_path)

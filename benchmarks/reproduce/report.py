@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from pathlib import Path
@@ -223,8 +224,35 @@ def _grasp_figure(axes, order: list[Row], table: dict) -> None:
     axes[0].legend(fontsize=6)
 
 
+def learning(plan: Plan, all_jobs: list[Job]) -> dict[Row, list[tuple[np.ndarray, np.ndarray]]]:
+    """(millions of steps, successes a minute while training) of each training of each row, as far as there are any: rotation."""
+    out: dict[Row, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for job in all_jobs:
+        files = list(job.folder(plan).glob("train_*/progress.csv"))
+        if not files:
+            continue
+        longest = max(files, key=lambda f: f.stat().st_size)  # a resumed training's holds its past
+        with open(longest, newline="") as file:
+            rows_ = [r for r in csv.DictReader(file) if r.get("task/successes_per_minute")]
+        if rows_:
+            out.setdefault(job.row, []).append((np.array([float(r["steps"]) / 1e6 for r in rows_]),
+                                                np.array([float(r["task/successes_per_minute"]) for r in rows_])))
+    return out
+
+
+def _learning_figure(ax, curves: dict[Row, list[tuple[np.ndarray, np.ndarray]]]) -> None:
+    for k, (row, seeds) in enumerate(curves.items()):
+        for i, (steps, successes) in enumerate(seeds):
+            ax.plot(steps, successes, "-" if i % 2 == 0 else "--", color=f"C{k}", linewidth=1.1, label=row.label if i == 0 else None)
+    ax.set_xlabel("environment steps [million]; dashed: the second seed")
+    ax.set_ylabel("successes a minute, while training")
+    ax.legend(fontsize=7)
+    ax.grid(alpha=0.3)
+
+
 def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> Path:
-    """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage); returns the Markdown's path."""
+    """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage), and the learning curves of the rotation,
+    rotation_learning.png; returns the Markdown's path."""
     from matplotlib.figure import Figure
 
     text, data, draw = {"rotation": rotation, "grasp": grasp}[table](plan, all_jobs)
@@ -240,4 +268,8 @@ def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) ->
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     draw(figure.subplots(1, 2))
     figure.savefig(path.with_suffix(".png"), dpi=110)
+    if table == "rotation" and plan.level is None and (curves := learning(plan, all_jobs)):
+        figure = Figure(figsize=(8, 4), layout="constrained")
+        _learning_figure(figure.subplots(), curves)
+        figure.savefig(plan.out / f"{table}_learning.png", dpi=110)
     return path
