@@ -5,7 +5,8 @@
 One round is every entry of PLANTS once, its size drawn round robin from three tiers, and a few cases with nothing planted;
 `cases` counts along the rounds (0: one round). This is the sanity check of `diagnose`: the data come from the simulator that
 trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity) 0.1 ms, with gains, masses and
-friction a few percent off, an encoder's quantum, noise and a jittered clock. limit: seconds after which no further case is waited
+friction a few percent off, an encoder's quantum, noise and a jittered clock. Of a case's four recordings the one that asks for the
+second most is kept out. limit: seconds after which no further case is waited
 for (0: all are). Size of an effect: its held-out change in the search's own plant, with what a refit of the believed figures hides
 of it taken away, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out
 recording differs by when it is made again from one encoder count away. Resumable; prints a table and one JSON line.
@@ -269,6 +270,18 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
     return float(np.sqrt(np.mean((at(made[-1][0], runs[-1]) - runs[-1].q)[:, 0] ** 2) / 2))
 
 
+def _not_the_hardest_last(b: dict, runs: list) -> list:
+    """The runs such that the one that is kept out asks for the second most of them all: a limit that only it reaches could be known by
+    nobody. Ranked by the largest errors of the loop as believed."""
+    _simulate(b, runs, [b["off"]], 1e-3, 2)
+    asked = [float(np.percentile(np.abs(r.command_at(r.t) - r.q)[:, 0], 99.5)) for r in runs]
+    order = np.argsort(asked)
+    out = [runs[k] for k in order if k != order[-2]] + [runs[order[-2]]]
+    for name, r in zip("abcd", out, strict=True):
+        r.name = f"{name}.mcap"
+    return out
+
+
 def _hidden(change: np.ndarray, slopes: np.ndarray, keep: slice) -> float:
     """RMS of a change [n] over the held-out rows, what a refit of the believed figures by 5 % takes away taken away."""
     q, r = np.linalg.qr(slopes)
@@ -288,7 +301,7 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
     b["off"] = {f"*{k}": 1 + rng.uniform(-OFF, OFF) for k in REFIT}
     extra = rng.uniform(2e-4, 5e-4)
     noise = float(np.hypot(QUANTUM / np.sqrt(12), extra))
-    runs = _runs(b, rng, needs)
+    runs = _not_the_hardest_last(b, _runs(b, rng, needs))
     size, ratio, change = 0.0, 1.0, dict(b["off"])
     if kind:
         sizes = np.geomspace(*kind.span, 20)
