@@ -79,9 +79,10 @@ def test_fit_becomes_centre_and_width_of_randomization(hand_servo):
     assert not ((other >= value.low) & (other <= value.high)).all()
 
 
-@pytest.mark.parametrize("fitted, low, high, after", [(0.25, 0.2, 0.3, (0.2, 1.09)), (1.5, 1.4, 1.6, (1.09, 1.6)), (1.0, 0.9, 1.2, (0.9, 1.2))])
-def test_what_is_doubted_is_handed_on_beside_what_was_believed(fitted, low, high, after):
-    """An effect that is not sure: its range is widened to the belief, its fitted value stays, other columns do not move."""
+@pytest.mark.parametrize("fitted, low, high, sure, after", [(0.25, 0.2, 0.3, 0.14, (0.2, 1.09)), (1.5, 1.4, 1.6, 0.5, (1.09, 1.6)), (1.0, 0.9, 1.2, 0.3, (0.9, 1.2)),
+                                                            (0.25, 0.2, 0.3, 0.75, (0.2, 0.67)), (1.0, 0.99, 1.01, 0.999, (0.99, 1.01))])
+def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fitted, low, high, sure, after):
+    """An effect that is not sure: its range is widened to the belief (1.09), half of the way at 0.75; its fitted value stays, other columns do not move."""
     from types import SimpleNamespace
 
     from dexsim.gap.findings import widen
@@ -91,7 +92,7 @@ def test_what_is_doubted_is_handed_on_beside_what_was_believed(fitted, low, high
     table.set(JOINT, "delay", 0.02, 0.018, 0.022)
     case = SimpleNamespace(joint=JOINT, scales=SimpleNamespace(nominal={"torque_limit": 1.09, "delay": 0.01}))
     member = SimpleNamespace(variant=SimpleNamespace(params=[SimpleNamespace(columns=("torque_limit",))]))
-    assert widen(table, case, member) == (after != (low, high))
+    assert widen(table, case, member, sure) == (after != (low, high))
     now, other = table.value(JOINT, "torque_limit"), table.value(JOINT, "delay")
     assert (now.value, now.low, now.high) == (fitted, *after) and (other.low, other.high) == (0.018, 0.022)
 

@@ -458,8 +458,8 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_test, floor, floor_
     members = {(case.joint, m.id): (case, m) for case, _, outcome in outcomes for m in outcome.best.members}
     for f in findings:
         key = (f["where"]["joints"][0], f["effect"])
-        if f["confidence"] < DOUBTED and key in members and widen(servo, *members[key]):
-            notes.append(f"{key[1]} on {key[0]} is not sure: in servo.yaml its range holds what was believed as well")
+        if f["confidence"] < DOUBTED and key in members and widen(servo, *members[key], f["confidence"]):
+            notes.append(f"{key[1]} on {key[0]} is not sure: in servo.yaml its range reaches towards what was believed")
     b, bl, bh = judge.rms_interval(squares["before"], times, s.seed)
     a, al, ah = judge.rms_interval(squares["after"], times, s.seed)
     slide = all(c.constants.slide for c in cases)

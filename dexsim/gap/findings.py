@@ -168,16 +168,20 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
     return left
 
 
-def widen(table: ServoTable, case: Case, member) -> bool:
-    """Widens the ranges of an effect's columns until they hold what was believed before the fit: training then draws hands with and
-    without an effect that is not sure to be there. The fitted values stay. Returns whether a range changed."""
-    changed = False
+def widen(table: ServoTable, case: Case, member, confidence: float) -> bool:
+    """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of a half and
+    less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the belief as the effect is sure.
+    The fitted values stay. Returns whether a range changed."""
+    changed, share = False, min(1.0, 2.0 * (1.0 - confidence))
     for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
         column, now = COLUMNS[INDEX[name]], table.value(case.joint, name)
         believed = float(np.clip(case.scales.nominal[name], column.low, min(column.high, 1e9)))
         if now.unknown or now.low <= believed <= now.high:
             continue
-        table.set(case.joint, name, now.value, round(min(now.low, believed), 9), round(max(now.high, believed), 9))
+        reach = now.value + share * (believed - now.value)
+        if now.low <= reach <= now.high:
+            continue
+        table.set(case.joint, name, now.value, round(min(now.low, reach), 9), round(max(now.high, reach), 9))
         changed = True
     return changed
 
