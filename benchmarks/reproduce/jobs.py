@@ -84,7 +84,7 @@ class Job:
         return plan.out / self.row.key / f"seed{self.seed}"
 
     def metrics(self, plan: Plan, world: str) -> Path:
-        stage = () if plan.level is None else (f"at_{plan.level / 1e6:g}M",)
+        stage = () if plan.level is None else (f"at_{plan.level / 1e6:.4g}M",)
         return self.folder(plan).joinpath(*stage, world, "metrics.json")
 
 

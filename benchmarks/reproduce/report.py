@@ -262,7 +262,7 @@ def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) ->
             f"{len({j.seed for j in all_jobs})} seed(s) a row of the paper's, one for ours; "
             + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
             + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
-    path = plan.out / (table + ("" if plan.level is None else f"_at_{plan.level / 1e6:g}M") + ".md")
+    path = plan.out / (table + ("" if plan.level is None else f"_at_{plan.level / 1e6:.4g}M") + ".md")
     path.write_text(head + text)
     path.with_suffix(".json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
     figure = Figure(figsize=(11, 3.6), layout="constrained")
