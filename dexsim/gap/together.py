@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ from dexsim.gap.plant import THREADS
 
 T = TypeVar("T")
 MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
+SWITCH = 2e-4  # s that a lane may keep the interpreter while another waits for it after a launch (Python: 5 ms, as long as a launch of few guesses)
 
 
 def lanes(device: str, jobs: int) -> int:
@@ -42,11 +44,13 @@ def together(names: Sequence[str], work: Callable[[int], T], device: str, progre
     if at_once <= 1:
         out = [one(k) for k in range(len(names))]
     else:
-        pool = ThreadPoolExecutor(at_once)
+        pool, switch = ThreadPoolExecutor(at_once), sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH)
         try:
             out = list(pool.map(one, range(len(names))))
         finally:
             pool.shutdown(cancel_futures=True)  # what has begun ends, nothing else begins
+            sys.setswitchinterval(switch)
     if progress:
         progress(len(names), len(names), "")
     return out
