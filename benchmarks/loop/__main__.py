@@ -379,8 +379,11 @@ def figure(data: dict, path: Path) -> None:
     lines = [x for x in data["lines"] if any(a == a for v in x["values"].values() for a in v)]
     if not lines:
         return
-    fig, axes = plt.subplots(1, len(lines), figsize=(3.0 * len(lines), 3.2), squeeze=False)
-    for ax, line in zip(axes[0], lines, strict=True):
+    rows, columns = -(-len(lines) // 3), min(len(lines), 3)
+    fig, axes = plt.subplots(rows, columns, figsize=(3.2 * columns, 3.1 * rows), squeeze=False)
+    for ax in axes.flat[len(lines) :]:
+        ax.set_visible(False)
+    for ax, line in zip(axes.flat, lines, strict=False):
         for k, v in enumerate(VARIANTS):
             y = [a for a in line["values"][v] if a == a]
             ax.plot([k] * len(y), y, "o", color=("#888888", "#c98f2b", "#2b6cb0", "#2f855a")[k], alpha=0.8)
