@@ -120,7 +120,7 @@ def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
         rows[done["joint"]] = done
         print(f"{done['joint']:<12} {done['before_mrad']:>7} -> {done['after_mrad']:>6} mrad  {', '.join(_named(f) for f in done['findings']) or '-'} "
               f"({done['seconds']:.0f} s)", flush=True)  # fmt: skip
-    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "joints": {j: rows[j] for j in JOINTS},
+    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "commands_logged_late": made.late, "joints": {j: rows[j] for j in JOINTS},
             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from benchmarks.real import sage_clock
 from benchmarks.real.common import dump, save
 from dexsim.errors import UserError
 
 JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-JAW = 2.34  # rad per unit of the jaw's 0..1
 # From the servo's datasheet at 12 V (30 kg.cm, 45 rpm): a motor on its firmware's duty, whose back-EMF (2.94 N.m at 4.7 rad/s) is
 # the 0.6 N.m.s/rad of damping that others use for this arm. Dry friction and armature are theirs too; none was measured on this
 # one. What duty the firmware makes of an error or of a speed is not stated: believed only within a factor of ten or more.
@@ -34,10 +34,12 @@ class Sage:
     held_out: list[Path]
     model: Path
     servo: Path
+    late: list[str]  # motions whose commands were logged a period late, and are put right
 
 
 def convert(data: Path, out: Path, held: int = 10) -> Sage:
-    """Converts the npz files of the motions; every third, up to `held`, is kept out."""
+    """Converts the npz files of the motions; every third, up to `held`, is kept out. Commands that the current shows to be logged
+    a period late (`sage_clock`) are put where they acted, in what is kept out as in the rest."""
     files = sorted(data.glob("*.npz"))
     if not files or not (data / "so101.xml").is_file():
         raise UserError(f"{data}: needs the motions (*.npz) and so101.xml")
@@ -50,10 +52,12 @@ def convert(data: Path, out: Path, held: int = 10) -> Sage:
     model.write_text(spec.to_xml(), encoding="utf-8")
     servo = dump(out / "so101.yaml", SERVO)
     made = []
+    late = sorted(name for name, evidence in sage_clock.late(data).items() if evidence > sage_clock.SURE)
     for path in files:
         raw = np.load(path)
-        scale = np.r_[np.ones(5), JAW]
-        made.append(save(out / f"{path.stem}.mcap", JOINTS, raw["t_cmd"], raw["cmd"] * scale, raw["t"], raw["pos"] * scale, robot="so101",
+        sent = raw["t_cmd"] - (np.median(np.diff(raw["t_cmd"])) if path.stem in late else 0.0)
+        scale = np.r_[np.ones(5), sage_clock.JAW]
+        made.append(save(out / f"{path.stem}.mcap", JOINTS, sent, raw["cmd"] * scale, raw["t"], raw["pos"] * scale, robot="so101",
                          gravity="0 0 -9.81"))  # fmt: skip
     kept = made[2::3][:held]
-    return Sage([p for p in made if p not in kept], kept, model, servo)
+    return Sage([p for p in made if p not in kept], kept, model, servo, late)
