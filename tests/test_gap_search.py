@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
-from dexsim.gap import judge
-from dexsim.gap.fit import Fitter
+from dexsim.gap import diagnosis, judge
+from dexsim.gap.fit import Fitter, Param
 from dexsim.gap.prepare import REFERENCE, build
 from dexsim.gap.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
@@ -30,6 +33,65 @@ def test_refold_fits_each_condition_left_out_better_than_one_step_does():
         loss = [fitter.loss(fitter.evaluate(step.fit.params, g)[None])[0] for g in (x, y)]
         assert loss[1] <= 1.02 * loss[0]
     assert own.left_out.sum() <= 1.15 * step.left_out.sum()  # what is free to fit noise does, a little
+
+
+def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
+    """What a guess saves is the bounded least squares of residuals and beliefs with it and without it."""
+    rng = np.random.default_rng(3)
+    n, P, H = 200, 5, 3
+    params = [Param(f"p{i}", ("kp",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025 if i < 3 else 0.0) for i in range(P)]
+    span, x = 0.1, np.array([1.05, 0.96, 1.0, 0.95, 1.02])  # the first and the fourth stand at their bounds
+    J, d = rng.standard_normal((n, P)), rng.standard_normal((H, n))
+    d[0] += 2 * J[:, 0]  # does what the first belief does
+    r = 0.8 * d[0] - 0.6 * J[:, 0] + 0.3 * rng.standard_normal(n)
+    weight = np.array([30.0 / 0.025**2 * span**2] * 3 + [0.0] * 2)
+    owners = [(SimpleNamespace(id=str(i)), np.zeros(1)) for i in range(H)]
+    got = {m.id: g for g, m, _ in JointSearch._saved(None, owners, d @ r, (d * d).sum(1), d @ J, J, r, params, x)}
+    off = (x - 1.0) / span
+
+    def least(column: np.ndarray | None) -> float:
+        # r - c d + J z, and the beliefs' own residuals
+        A = np.vstack([J, np.diag(np.sqrt(weight))])
+        b = np.r_[-r, -np.sqrt(weight) * off]
+        low, high = (0.95 - x) / span, (1.05 - x) / span + 1e-12
+        if column is not None:
+            A = np.column_stack([A, np.r_[-column, np.zeros(P)]])
+            low, high = np.r_[low, 0.0], np.r_[high, 2.0]
+        return 2 * lsq_linear(A, b, (low, high), tol=1e-14).cost
+
+    for i in range(H):
+        assert got[str(i)] == pytest.approx(1 - least(d[i]) / least(None), abs=1e-6)
+    assert max(got, key=got.get) == "0"
+
+
+def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
+    """before, after: in windows of what was kept out; ratio: of a free run over it; gain: where it was fitted and on conditions left out."""
+
+    def reason(before: float, after: float, ratio: float, gain: float, loss: float) -> str:
+        none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
+        search = SimpleNamespace(polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
+        return diagnosis._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
+
+    assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
+    assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
+    assert "does not show it" in reason(1.0, 1.0, 1.0, 0.6, 2.1)  # a limit that was not reached there
+    assert reason(1.0, 1.1, 1.02, 0.6, 2.1) == "" and reason(1.0, 1.0, 1.0, 0.15, 2.1) == ""
+    assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found
+
+
+def test_a_half_of_what_was_kept_out_is_fitted_where_it_alone_shows_something():
+    runs = [SimpleNamespace(name=n, duration=6.0) for n in "abc"]
+    train, test, fitted, kept, how = diagnosis._split(runs, [2], [0, 1, 2], part=1)
+    assert (train, test) == ([0, 1, 2], [2]) and fitted == {2: (3.0, 6.0)} and kept == {2: (0.0, 3.0)} and "first half of c" in how
+    assert diagnosis._split(runs, [2], [0, 1, 2])[:4] == ([0, 1], [2], None, None)
+
+    def alone(before: float, fitted: float, *found: dict) -> bool:
+        joint = {"before": before, "fitted": fitted, "sigma": 1.0}
+        return diagnosis._shown_there_alone(SimpleNamespace(data={"findings": list(found)}, joints={"a": joint}))
+
+    assert alone(16.0, 1.0)
+    assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing
+    assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}, "held_out": {"before": 1.0}})
 
 
 @pytest.mark.parametrize(("confidence", "group", "word"), [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")])

@@ -199,7 +199,7 @@ def _sag(s: Scales) -> list[Variant]:
     if not s.others or s.others_torque <= 0:
         return []
     top = 0.9 / s.others_torque
-    sag = _p("sag", "sag", "set", 0.0, top, 0.0, "1/N.m")
+    sag = _p("sag", "sag", "set", 0.0, 1.5 * top, 0.0, "1/N.m")  # at the others' peaks nothing of the supply may be left
     return [Variant((sag,), tuple((f * top,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)))]
 
 

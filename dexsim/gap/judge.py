@@ -177,6 +177,6 @@ def verdict(findings: list[dict], floor_: float, before: float, before_low: floa
     if after <= 1.3 * floor_ and any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named):
         return "explained"
     gap = max(before - floor_, 1e-12)
-    if (before - after) / gap >= 0.3:
+    if after <= 1.3 * floor_ or (before - after) / gap >= 0.3:
         return "partly_explained"
     return "unknown"

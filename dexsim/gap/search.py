@@ -27,8 +27,11 @@ BUDGET = 100.0  # s of a joint's recordings that the search simulates
 BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.08  # x the noise: an error within it needs no effect
+HINT = 0.03  # of the squared error with what the beliefs give for it: an effect that the scan sees to save as much is tried, whatever its price
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
 TIE = 0.02  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
+CLEAR = 0.15  # of the squared error: what an effect must remove where the error is within the noise without it
+SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
@@ -268,12 +271,13 @@ class JointSearch:
                         p.apply(g[None], np.array([value]), case.plant.base())
                     guesses.append(_legal(g))
                     owners.append((member, np.array(start)))
-        rows = []
+        rows, dots, squares, cross = [], [], [], []
         J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
         k = self.r.knee
         weight = np.minimum(1.0, k / np.maximum(np.abs(r0), 1e-9)) if k > 0 else np.ones_like(r0)
         sw = np.sqrt(weight)
         Jw, rw = J * sw[:, None], r0 * sw
+        all_J = Jw
         # nuisances absorb what they may: a prior of a quarter of their span
         low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
         inside = (x > low + 0.02 * (high - low)) & (x < high - 0.02 * (high - low)) if params else np.zeros(0, bool)
@@ -301,10 +305,15 @@ class JointSearch:
                 gain = (2 * c * dot - c * c * dd) / total
                 null = np.maximum(null, np.maximum(flips @ part, 0.0) ** 2 / dd / total)
                 member, start = owners[a + i]
-                rows.append((gain, member, start))
+                rows.append((gain, member, start, len(rows)))
+                raw_d = (r0 - res) * sw
+                dots.append(float(raw_d @ rw))
+                squares.append(float(raw_d @ raw_d))
+                cross.append(all_J.T @ raw_d)
+        self.saved = self._saved([(m, st) for _, m, st, _ in rows], np.array(dots), np.array(squares), np.array(cross), all_J, rw, params, x)
         best: dict[tuple, tuple] = {}
         self.other_start: dict[str, np.ndarray] = {}
-        for gain, member, start in sorted(rows, key=lambda r: -r[0]):
+        for gain, member, start, _ in sorted(rows, key=lambda r: -r[0]):
             key = (member.id, member.variant.label)
             if key not in best:
                 best[key] = (gain, member, start)
@@ -312,6 +321,37 @@ class JointSearch:
                 self.other_start[member.id] = start
         out = [(g, float(np.mean(null >= g)), m, st) for g, m, st in best.values()]
         return sorted(out, key=lambda o: -o[0])
+
+    def _saved(self, owners, dots: np.ndarray, squares: np.ndarray, cross: np.ndarray, J: np.ndarray, r: np.ndarray, params: list[Param], x: np.ndarray):
+        """What each guess of the scan would save where beliefs, moved out to follow the data, may go back: [(share of the squared error
+        with what beliefs gave for it, member, start)] by member, the best first.
+
+        owners [H]: (member, start); dots, squares [H]: of the residuals' change d by the guess with the residuals and itself; cross [H, P]:
+        J' d. Least squares over the guess's size (0 to 2) and every belief inside its bounds, by coordinates."""
+        if not owners:
+            return []
+        P = len(params)
+        span = np.array([p.span for p in params])
+        centre, believed = np.array([p.start for p in params], float), prior_weight(params) * span**2
+        low, high = (np.array([p.low for p in params]) - x) / span, (np.array([p.high for p in params]) - x) / span
+        off = (x - centre) / span
+        A = J.T @ J + np.diag(believed + 1e-9 * max(float(r @ r), 1e-12))
+        b = -(J.T @ r) - believed * off  # of the beliefs' moves z: A z = b + c * cross
+        total = float(r @ r) + float(believed @ off**2)
+        H = len(owners)
+        z, c = np.zeros((H + 1, P)), np.zeros(H + 1)  # the last: without any guess
+        d_r, d_d, d_J = np.r_[dots, 0.0], np.r_[squares, 1.0], np.vstack([cross, np.zeros((1, P))])
+        for _ in range(SWEEPS):
+            for i in range(P):
+                push = b[i] + c * d_J[:, i] - z @ A[:, i] + A[i, i] * z[:, i]
+                z[:, i] = np.clip(push / A[i, i], low[i], high[i])
+            c[:-1] = np.clip((d_r + (z * d_J).sum(1)) / d_d, 0.0, 2.0)[:-1]
+        left = total - 2 * c * d_r + c * c * d_d - 2 * c * (z * d_J).sum(1) - 2 * z @ b + np.einsum("hi,ij,hj->h", z, A, z)
+        saved = (left[-1] - left[:-1]) / max(left[-1], 1e-30)
+        best: dict[str, tuple] = {}
+        for gain, (member, start) in sorted(zip(saved.tolist(), owners, strict=True), key=lambda o: -o[0]):
+            best.setdefault(member.id, (gain, member, start))
+        return sorted(best.values(), key=lambda o: -o[0])
 
     def _narrow(self, variant: Variant) -> Variant | None:
         """The variant without parameters that are fitted anyway, because nothing in particular is believed of them."""
@@ -454,7 +494,8 @@ class JointSearch:
         level: list[Trial] = []
         for _ in range(MOST):
             loss = self._left(current).sum() / per
-            if loss < ENOUGH**2:
+            enough = loss < ENOUGH**2
+            if enough and current.members:
                 break
             scan = self.scan(current)
             if not scanned:
@@ -462,6 +503,8 @@ class JointSearch:
             if not scan:
                 break
             listed = self._shortlist(scan, shortlist, loss, current.members)
+            if loss < ROUGH:
+                listed = self._hinted([] if enough else listed, current.members, 0.5 * CLEAR if enough else HINT)
             if not listed:
                 break
             drafts = []
@@ -499,9 +542,11 @@ class JointSearch:
                 if close.fit.loss < (1 - LEAST) * current.fit.loss:
                     best = self.refold(close)
                     self.fitted[frozenset(best.ids)] = best
+            if enough and self.gain(best, current) < CLEAR:
+                break
             if not self._earns(best, current):
                 # a pair may be there where neither of its halves is seen alone
-                best = self._pair(current, listed[:4]) or current
+                best = current if enough else self._pair(current, listed[:4]) or current
                 if best is current:
                     break
             current, level = best, trials
@@ -538,6 +583,13 @@ class JointSearch:
                 out.append(row)
         return out
 
+    def _hinted(self, listed, members, least: float):
+        """The list, and up to four more that, by the scan, save at least `least` of the squared error with what the beliefs give for it: where
+        those moved out to follow the data, what is left shows little, and the right effect lets them go back."""
+        known = {row[2].id for row in listed}
+        more = [row for row in self.saved if row[0] >= least and row[1].id not in known and all(_compatible(row[1], m) for m in members)]
+        return listed + [(gain, 1.0, member, start) for gain, member, start in more[:4]]
+
     def _values(self, trial: Trial) -> np.ndarray:
         n = sum(len(m.variant.params) for m in trial.members)
         return trial.fit.x[:n]
@@ -546,15 +598,15 @@ class JointSearch:
         a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
         # what was left out may be lost by the step to it alone: what is fitted must be followed better too
-        here = lambda t: t.fit.loss + disbelief(t.fit.params, t.fit.x) / len(self.blocks)  # noqa: E731
-        if gain < LEAST or here(new) > (1 - 0.5 * LEAST) * here(old) or self._shrunk(new):
+        if gain < LEAST or self._here(new) > (1 - 0.5 * LEAST) * self._here(old) or self._shrunk(new):
             return False
         if old.members and further:  # what follows must matter beside what was found
             rms = lambda x: np.sqrt(x.sum() / len(self.blocks))  # noqa: E731
             if rms(a) - rms(b) < SECOND * (rms(self.none_loss) - rms(a)):
                 return False
         # what only a few moments show (a limit, a sag) varies much between draws, and more of the error goes with it
-        return bool(np.quantile(self._boot(a - b), CHANCE if old.members or gain < 2 * LEAST else 2.5 * CHANCE) > 0)
+        chance = CHANCE if old.members or gain < 2 * LEAST else (2.5 if gain < 4 * LEAST else 5.0) * CHANCE
+        return bool(np.quantile(self._boot(a - b), chance) > 0)
 
     def _shrunk(self, trial: Trial) -> bool:
         """Whether an effect was fitted down to the size at which it begins: what it gained is another's."""
@@ -717,6 +769,24 @@ class JointSearch:
                 if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
                     return polished
         return trial
+
+    def gain(self, new: Trial, old: Trial) -> float:
+        """Share of the squared error that `new` removes, with what the beliefs give for it: on conditions left out or where it was
+        fitted, whichever is less."""
+        return 1 - max(float(self._left(new).sum() / self._left(old).sum()), self._here(new) / self._here(old))
+
+    def _here(self, trial: Trial) -> float:
+        """Mean square where it was fitted, with what the beliefs give for it."""
+        return trial.fit.loss + disbelief(trial.fit.params, trial.fit.x) / len(self.blocks)
+
+    def in_windows(self, trial: Trial, runs: list[int], span: dict[int, tuple[float, float]] | None) -> float:
+        """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
+        windows = self.case.plant.windows(LONG, runs, span=span)
+        if not len(windows.window):
+            return np.nan
+        fitter = Fitter(self.case.plant, windows, self.r)
+        with self._fix(trial.members):
+            return float(fitter.loss(fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
 
     def widen(self, trial: Trial, bounds: np.ndarray) -> np.ndarray:
         """Intervals that also hold what the residuals do not show, added in squares: the disagreement of the fits without
