@@ -85,3 +85,21 @@ def test_the_joint_that_drags_is_the_one_the_servo_names():
     assert slope == pytest.approx(0.3, abs=0.06)
     short = case({"j0": {"coupling": 0.3, "coupling_from": 2}}, order=(0, 1))  # the joint that drags was not recorded
     assert short.plant.base()[0][INDEX["coupling"]] == 0
+
+
+def test_a_plant_in_shorter_steps_is_the_same_joint():
+    runs = [plant_run(f"run{k}", k, 4.0, {"coulomb_friction": 0.05}, seed=k) for k in RUNS]
+    for r in runs:
+        r.smooth()
+    plant = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0].plant
+    fine = plant.refined(4)
+    a, b = plant.windows(None), fine.windows(None)
+    assert fine.dt == pytest.approx(plant.dt / 4) and np.array_equal(a.sample_row, b.sample_row) and np.array_equal(a.sample_window, b.sample_window)
+    for r, (g, h) in enumerate(zip(a.window[:, 0], b.window[:, 0], strict=True)):
+        k = a.window[r, 1] - 2
+        assert np.allclose(plant.series[g : g + k], fine.series[h : h + 4 * k : 4], atol=1e-12)
+        assert b.window_t[r] == a.window_t[r]
+    params = plant.base()[None].copy()
+    params[:, :, INDEX["coulomb_friction"]] = 0.05
+    q, p = (x.simulate(params, w)[0][0] for x, w in ((plant, a), (fine, b)))
+    assert 0 < np.abs(q - p).max() < 3e-3 and np.sqrt(np.mean((q - p) ** 2)) < 3e-4

@@ -279,9 +279,9 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
-            floor: float, device: str = "cpu", replay: str = "mujoco", timestep: float = STEP) -> Confirmation | None:
+            floor: float, device: str = "cpu", replay: str = "mujoco", timestep: float = STEP, finer: Sequence[Case] = ()) -> Confirmation | None:
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
-    kept out. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+    kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
     device = "cpu" if replay == "mujoco" else device
     windows = [c.plant.windows(None, test, span=span_test) for c in cases]
     if not cases or not len(windows[0].window):
@@ -312,9 +312,10 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     rms = lambda x: float(np.sqrt(np.mean(np.concatenate(x))))  # noqa: E731
     for i, h in enumerate(hypotheses):
         square, own = [], []
-        for case, ws in zip(cases, windows, strict=True):
+        for case, ws, fine in zip(cases, windows, finer or cases, strict=True):
             trial, on = h.trials[case.joint], np.isin(ws.sample_window, use)
-            fast = judge.free_run(case, trial.fit.params, trial.fit.x, ws, [f for x in trial.members for f in x.variant.fixed])[0][on]
+            same = ws if fine is case else fine.plant.windows(None, test, span=span_test)
+            fast = judge.free_run(fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed])[0][on]
             there, miss = error(found[i], timestep, case, ws)
             square.append(miss)
             own.append((case.plant.q[ws.sample_row[on]] - fast) ** 2)

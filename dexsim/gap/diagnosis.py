@@ -276,7 +276,7 @@ def _diagnose(s: Settings, say: Callable[[str], None], progress: Callable[[int, 
         if len(search.long.window) == 0:
             return search, None
         found = search.run() if cases[k].moved else search.idle()
-        search.polish(found.best), search.polish(found.none)  # kept for the judgement
+        search.settle(found)
         return search, found
 
     def start_of(k: int) -> Trial | None:
@@ -351,10 +351,11 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
     times, all_spots, leftover = [], [], []
     for case, search, outcome in outcomes:
         best, none = search.polish(outcome.best), search.polish(outcome.none)
-        windows = case.plant.windows(None, test, span=span_test)
-        q0, e0 = judge.free_run(case, none.fit.params, none.fit.x, windows)
+        whole = replace(case, plant=search.whole)
+        windows = whole.plant.windows(None, test, span=span_test)
+        q0, e0 = judge.free_run(whole, none.fit.params, none.fit.x, windows)
         fixed = [f for mm in best.members for f in mm.variant.fixed]
-        q1, e1 = judge.free_run(case, best.fit.params, best.fit.x, windows, fixed) if best.members else (q0, e0)
+        q1, e1 = judge.free_run(whole, best.fit.params, best.fit.x, windows, fixed) if best.members else (q0, e0)
         rows = windows.sample_row
         measured, t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
         before, after = (measured - q0) ** 2, (measured - q1) ** 2
@@ -392,7 +393,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
             by_member[mm.id] = raw
             rest = tuple(x for x in best.members if x is not mm)
             without = judge_without(search, best, mm) if rest else none
-            qw, ew = judge.free_run(case, without.fit.params, without.fit.x, windows, [f for x in rest for f in x.variant.fixed])
+            qw, ew = judge.free_run(whole, without.fit.params, without.fit.x, windows, [f for x in rest for f in x.variant.fixed])
             rivals = outcome.rivals.get(mm.id, [])
             same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
             signal = judge.own_signal(mm.id, case, raw, mm.variant.note)
@@ -606,7 +607,8 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
             hypotheses.append(confirm.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}))
             break
     try:
-        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device, s.replay)
+        finer = [replace(case, plant=search.whole) for case, search, _ in outcomes]
+        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device, s.replay, finer=finer)
     except UserError as error:
         d.notes.append(f"not replayed in the engine that trains: {error}")
         return

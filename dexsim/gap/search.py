@@ -9,7 +9,7 @@ import numpy as np
 
 from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Scales, Variant, confusable
 from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, disbelief, prior_weight
-from dexsim.gap.plant import Windows
+from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
 
@@ -33,6 +33,7 @@ TIE = 0.02  # of the loss: nearer than this the one that lasts better on what wa
 CLEAR = 0.15  # of the squared error: what an effect must remove where the error is within the noise without it
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
+FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
@@ -105,7 +106,7 @@ class JointSearch:
         self.rng = np.random.default_rng(seed)
         self.allowed = allowed
         self.say = say or (lambda _: None)
-        plant = case.plant
+        plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
         self.long = plant.windows(long, train, span=span)
         self.short, self.long = (_thin(w, plant) for w in (self.short, self.long))
@@ -199,9 +200,9 @@ class JointSearch:
         others = self.all_nuisances if any(m.id in PARTING for m in members) else self.nuisances
         return mine + [p for p in others if not taken & set(p.columns)]
 
-    def _fix(self, members: tuple[Member, ...]):
+    def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None):
         """Constants of the variants, written to the plant's nominal for the time of a fit."""
-        return _Fixed(self.case.plant, [f for m in members for f in m.variant.fixed])
+        return _Fixed(plant or self.case.plant, [f for m in members for f in m.variant.fixed])
 
     # -- stages ------------------------------------------------------------------------------------------------------------
     def start(self) -> Trial:
@@ -746,6 +747,13 @@ class JointSearch:
         self.none_loss = self._left(none)
         return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
 
+    def settle(self, found: Outcome) -> None:
+        """What was found, and nothing, as they are judged: on whole recordings, in shorter steps where an effect was found (where a joint
+        sticks, or rattles in a dead zone, a millisecond leaves errors beyond the noise)."""
+        if found.best.members:
+            self.whole = self.case.plant.refined(FINER)
+        self.polish(found.best), self.polish(found.none)  # kept for the judgement
+
     def polish(self, trial: Trial) -> Trial:
         """The trial refitted on whole training recordings run free from their first sample, where that follows them
         better than the windows' fit: state carried over windows is right there. Done once a trial."""
@@ -754,20 +762,21 @@ class JointSearch:
         return self._polished[id(trial)][1]
 
     def _polish(self, trial: Trial) -> Trial:
-        plant = self.case.plant
+        plant = self.whole
         whole = plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, knee=max(self.r.knee, 3.0))
         fitter = Fitter(plant, whole, r)
         params = trial.fit.params
-        with self._fix(trial.members):
+        with self._fix(trial.members, plant):
             here = fitter.residuals(params, trial.fit.x[None])[0]
             fitter.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
             f = fitter.fit(params, x0=trial.fit.x, iterations=5, tolerance=5e-3)
-            if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
+        if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
+            with self._fix(trial.members):
                 again = self.fitter.fit(params, x0=f.x, iterations=0)
-                polished = Trial(trial.members, again, trial.left_out, trial.folds)
-                if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
-                    return polished
+            polished = Trial(trial.members, again, trial.left_out, trial.folds)
+            if again.loss < 1.5 * trial.fit.loss and not self._shrunk(polished):
+                return polished
         return trial
 
     def gain(self, new: Trial, old: Trial) -> float:
