@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -334,6 +335,50 @@ def test_pack_takes_along_what_the_next_sitting_needs(tmp_path):
         assert checkpoint.load(jobs.done(job.folder(q)).last)["optimizer"] == {"state": {}, "param_groups": []}
     with pytest.raises(UserError, match="holds no training"):
         pack.main([f"out={tmp_path / 'none'}", f"into={tmp_path / 'x'}"])
+
+
+TRAIN = """
+import json, signal, sys, time
+from pathlib import Path
+said = dict(a.split("=", 1) for a in sys.argv[1:])
+out, stop = Path(said["out"]), []
+out.mkdir(parents=True)
+signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
+done = json.loads(Path(said["resume"]).read_text())["iteration"] if "resume" in said else 0
+time.sleep(0.2)
+with open(out / "progress.csv", "w") as file:
+    file.write("iteration,steps,collect_s,learn_s\\n")
+    while done < int(said["iterations"]) and not stop:
+        time.sleep(0.02)
+        done += 1
+        file.write(f"{done},{100 * done},0.012,0.008\\n")
+        file.flush()
+(out / "last.pt").write_text(json.dumps({"iteration": done, "steps": 100 * done}))
+"""
+PLAY = """
+import json, sys
+from pathlib import Path
+said = dict(a.split("=", 1) for a in sys.argv[1:])
+(Path(said["out"]) / "metrics.json").write_text(json.dumps({"episodes": 2}))
+"""
+
+
+@pytest.mark.slow
+def test_a_sitting_is_shared_by_all_rows(tmp_path, monkeypatch):
+    """Seven trainings on three lanes for 12 s: all judged at the stage, all settled on one budget within the sitting, none beyond it."""
+    for name, text in (("train.py", TRAIN), ("play.py", PLAY)):
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(jobs.tools, "ROOT", tmp_path)
+    monkeypatch.setattr(jobs, "checkpoint", SimpleNamespace(load=lambda path: json.loads(Path(path).read_text())))
+    every = [jobs.Job(r, 1) for r in rows.ROTATION]
+    p = plan(tmp_path / "out", steps=1e6, stages=(2000.0,), sitting=0.2, fit=True, overlap=True)
+    began = time.monotonic()
+    ended = jobs.run(every, p, ["0", "1", "2"], 2)
+    steps = [jobs.done(j.folder(p)).steps for j in every]
+    assert 2000 < ended.steps < 1e6 and max(steps) <= ended.steps and min(steps) > 2000
+    assert sum(s == ended.steps for s in steps) >= 4  # all of them on a machine that is as fast at the end as at the beginning
+    assert all(jobs.read(j, ended.each()[0], w)["trained_steps"] == 2000 for j in every for w in jobs.WORLDS)
+    assert time.monotonic() - began < 40
 
 
 @pytest.mark.slow

@@ -134,8 +134,8 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
           nearly: Callable[[], None] = lambda: None, lead: list[float] | None = None) -> Path | None:
     """Train, or go on training, until `to` (the plan's steps) or the plan's minutes are over, or time.monotonic() reaches `until`.
 
-    Calls `nearly` as many seconds before the end as a training takes to start (`lead`, which it measures). Returns the checkpoint
-    to judge; None if there is none, or less was learned than is asked.
+    Calls `nearly` as many seconds before the end as a training takes to start (`lead[0]`, which it measures; `lead[1]` becomes
+    the time of the first iteration of all). Returns the checkpoint to judge; None if there is none, or less was learned than asked.
     """
     folder = job.folder(plan)
     folder.mkdir(parents=True, exist_ok=True)
@@ -173,6 +173,7 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
                 if at is not None and at[0] > so_far.iteration:
                     if not seen:
                         seen, lead[0] = True, min(time.monotonic() - began, LONGEST_START_S)
+                        lead[1:] = lead[1:] or [time.monotonic()]
                     if not told and (iterations - at[0]) * at[2] < lead[0]:
                         told = True
                         nearly()
@@ -290,7 +291,7 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
     def settle() -> None:
         """Before the first piece of the last stage: how far all can come in what is left of the sitting."""
         now = [steps_now(k) for k in range(len(jobs))]
-        spent, gained = time.monotonic() - began - lead[0], sum(now) - sum(first)
+        spent, gained = time.monotonic() - (lead[1] if len(lead) > 1 else math.inf), sum(now) - sum(first)
         if gained <= 0 or spent <= 0:  # nothing learned in this sitting yet: as fast as in the one before
             each = [plan.per / p[2] for job in jobs for f in job.folder(plan).glob("train_*") if (p := progress(f)) is not None and p[2] > 0]
             if not each:
