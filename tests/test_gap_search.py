@@ -85,11 +85,11 @@ def test_a_half_of_what_was_kept_out_is_fitted_where_it_alone_shows_something():
     assert (train, test) == ([0, 1, 2], [2]) and fitted == {2: (3.0, 6.0)} and kept == {2: (0.0, 3.0)} and "first half of c" in how
     assert diagnosis._split(runs, [2], [0, 1, 2])[:4] == ([0, 1], [2], None, None)
 
-    def alone(before: float, fitted: float, *found: dict) -> bool:
+    def alone(before: float, fitted: float, *found: dict) -> set[str]:
         joint = {"before": before, "fitted": fitted, "sigma": 1.0}
         return diagnosis._shown_there_alone(SimpleNamespace(data={"findings": list(found)}, joints={"a": joint}))
 
-    assert alone(16.0, 1.0)
+    assert alone(16.0, 1.0) == {"a"}
     assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing
     assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}, "held_out": {"before": 1.0}})
 

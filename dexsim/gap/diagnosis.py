@@ -24,7 +24,7 @@ from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
-from dexsim.gap.search import LEAST, JointSearch, Outcome, Trial
+from dexsim.gap.search import CLEAR, LEAST, JointSearch, Outcome, Trial
 from dexsim.gap.sharpen import again, coupled, sharpen
 from dexsim.gap.together import together
 from dexsim.gap.touch_effects import entry
@@ -36,7 +36,7 @@ WEAK = 0.3  # confidence below which a finding is not in the first sentence
 NEUTRAL = 1.005  # x the error before on what was kept out: not more than this is not against a finding
 HALVES = ("first", "second")
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
-FEW = 2  # joints up to which that is looked into: it takes the time of one or two more diagnoses
+FEW = 4  # joints up to which that is looked into: it takes the time of one or two more diagnoses
 UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
@@ -125,21 +125,28 @@ class Clock:
 def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[[int, int, str], None] | None = None) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
     first = _diagnose(s, say, progress)
-    if not s.held_out or s.part >= 0 or not _shown_there_alone(first):
-        return first
-    for part in (0, 1):
+    shown = _shown_there_alone(first) if s.held_out and s.part < 0 else set()
+    for part in (0, 1) if shown else ():
         say(f"what was kept out shows what the others do not: its {HALVES[part]} half is fitted too, and the other judges")
+        if len(first.joints) > 1 and not _named(_diagnose(replace(s, part=part, joints=shown, replay="none", next_recording=False), say, progress)):
+            continue  # those joints alone tell whether it is worth the time of all
         again = _diagnose(replace(s, part=part), say, progress)
-        if any(f["where"]["joints"] and f["held_out"] for f in again.data["findings"]):
+        if _named(again):
             return again
     return first
 
 
-def _shown_there_alone(d: Diagnosis) -> bool:
-    """Whether nothing was found, and yet a recording that was kept out is followed far worse than those that were fitted: what is missing
-    (a limit, a sag) shows there alone."""
-    named = any(f["where"]["joints"] and f["held_out"] for f in d.data["findings"])
-    return not named and len(d.joints) <= FEW and any(v["before"] > max(judge.FAR * v["sigma"], ALONE * v["fitted"]) for v in d.joints.values())
+def _named(d: Diagnosis) -> bool:
+    """Whether an effect of a joint was found."""
+    return any(f["where"]["joints"] and f["held_out"] for f in d.data["findings"])
+
+
+def _shown_there_alone(d: Diagnosis) -> set[str]:
+    """Joints of which a recording that was kept out is followed far worse than those that were fitted, where nothing was found: what is
+    missing (a limit, a sag) shows there alone."""
+    if _named(d) or len(d.joints) > FEW:
+        return set()
+    return {j for j, v in d.joints.items() if v["before"] > max(judge.FAR * v["sigma"], ALONE * v["fitted"])}
 
 
 def _diagnose(s: Settings, say: Callable[[str], None], progress: Callable[[int, int, str], None] | None) -> Diagnosis:
@@ -469,7 +476,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
         v = out.joints[case.joint]
         if not mine or v["after"] < 0.98 * v["before"]:
             continue
-        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
+        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test, s.part >= 0)
         if reason:
             for e in out.evidence:
                 if e.joint == case.joint and e.effect != "current_sensor":
@@ -524,15 +531,17 @@ def _followed(case: Case, none: Trial, train: Sequence[int], span: dict | None) 
     return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, none.fit.params, none.fit.x, windows)[0]) ** 2)))
 
 
-def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
+def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None, half: bool = False) -> str:
     """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are doubted, not dropped; empty
-    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there."""
+    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there (`half`: in
+    the half that judges, where the whole is known to show something)."""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     needed = confidence.NEEDED**2
     if before > needed and after < (1 - 2 * LEAST) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
-    plain = outcome.none.fit.loss > needed and search.gain(outcome.best, outcome.none) >= 2 * LEAST
+    gain = search.gain(outcome.best, outcome.none)
+    plain = gain >= CLEAR if half else gain >= 2 * LEAST and outcome.none.fit.loss > needed
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 
