@@ -33,7 +33,7 @@ from dexsim.recording.mechanism import Mechanism
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
-NEUTRAL = 1.005  # x the error before on what was kept out: not more than this is not against a finding
+NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
 HALVES = ("first", "second")
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 FEW = 4  # joints up to which that is looked into: it takes the time of one or two more diagnoses
