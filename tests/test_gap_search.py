@@ -79,19 +79,13 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found
 
 
-def test_a_half_of_what_was_kept_out_is_fitted_where_it_alone_shows_something():
-    runs = [SimpleNamespace(name=n, duration=6.0) for n in "abc"]
-    train, test, fitted, kept, how = diagnosis._split(runs, [2], [0, 1, 2], part=1)
-    assert (train, test) == ([0, 1, 2], [2]) and fitted == {2: (3.0, 6.0)} and kept == {2: (0.0, 3.0)} and "first half of c" in how
-    assert diagnosis._split(runs, [2], [0, 1, 2])[:4] == ([0, 1], [2], None, None)
+def test_what_only_the_recording_kept_out_shows_is_said():
+    def alone(before: float, fitted: float, *found: dict) -> list[str]:
+        return diagnosis._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
 
-    def alone(before: float, fitted: float, *found: dict) -> set[str]:
-        joint = {"before": before, "fitted": fitted, "sigma": 1.0}
-        return diagnosis._shown_there_alone(SimpleNamespace(data={"findings": list(found)}, joints={"a": joint}))
-
-    assert alone(16.0, 1.0) == {"a"}
+    assert alone(16.0, 1.0) == ["a"]
     assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing
-    assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}, "held_out": {"before": 1.0}})
+    assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}})
 
 
 @pytest.mark.parametrize(("confidence", "group", "word"), [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")])

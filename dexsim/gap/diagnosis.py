@@ -24,7 +24,7 @@ from dexsim.gap.fit import Fitter, expand, intervals
 from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.prepare import Case, build
 from dexsim.gap.runs import Run, conditions
-from dexsim.gap.search import CLEAR, LEAST, JointSearch, Outcome, Trial
+from dexsim.gap.search import LEAST, JointSearch, Outcome, Trial
 from dexsim.gap.sharpen import again, coupled, sharpen
 from dexsim.gap.together import together
 from dexsim.gap.touch_effects import entry
@@ -34,9 +34,7 @@ KEEP_OUT = 0.25  # of the time of each recording, where there are too few to kee
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
 WEAK = 0.3  # confidence below which a finding is not in the first sentence
 NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
-HALVES = ("first", "second")
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
-FEW = 4  # joints up to which that is looked into: it takes the time of one or two more diagnoses
 UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 
@@ -59,7 +57,6 @@ class Settings:
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
     replay: str = "mujoco"  # see `confirm.REPLAY`
-    part: int = -1  # 0, 1: this half of each held-out recording is fitted too, and the other judges; -1: none of it (see `_shown_there_alone`)
 
 
 @dataclass
@@ -124,32 +121,6 @@ class Clock:
 
 def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[[int, int, str], None] | None = None) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
-    first = _diagnose(s, say, progress)
-    shown = _shown_there_alone(first) if s.held_out and s.part < 0 else set()
-    for part in (0, 1) if shown else ():
-        say(f"what was kept out shows what the others do not: its {HALVES[part]} half is fitted too, and the other judges")
-        if len(first.joints) > 1 and not _named(_diagnose(replace(s, part=part, joints=shown, replay="none", next_recording=False), say, progress)):
-            continue  # those joints alone tell whether it is worth the time of all
-        again = _diagnose(replace(s, part=part), say, progress)
-        if _named(again):
-            return again
-    return first
-
-
-def _named(d: Diagnosis) -> bool:
-    """Whether an effect of a joint was found."""
-    return any(f["where"]["joints"] and f["held_out"] for f in d.data["findings"])
-
-
-def _shown_there_alone(d: Diagnosis) -> set[str]:
-    """Joints of which a recording that was kept out is followed far worse than those that were fitted, where nothing was found: what is
-    missing (a limit, a sag) shows there alone."""
-    if _named(d) or len(d.joints) > FEW:
-        return set()
-    return {j for j, v in d.joints.items() if v["before"] > max(judge.FAR * v["sigma"], ALONE * v["fitted"])}
-
-
-def _diagnose(s: Settings, say: Callable[[str], None], progress: Callable[[int, int, str], None] | None) -> Diagnosis:
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
 
@@ -270,7 +241,7 @@ def _diagnose(s: Settings, say: Callable[[str], None], progress: Callable[[int, 
     group = conditions(runs)
     drives = [json.dumps(_plain(r.servo.to_dict()), sort_keys=True) for r in runs]
     fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
-    train, test, span_train, span_test, how = _split(runs, held, group, s.part)
+    train, test, span_train, span_test, how = _split(runs, held, group)
     say(f"kept out of the fit: {how}")
     floor, floor_how = judge.floor(runs, cases)
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
@@ -415,8 +386,6 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
             small = "" if effort_only else confidence.too_small(rms(before), rms((measured - qw) ** 2), rms(after), case.sigma, len(best.members) == 1)
             if small:
                 evidence.reasons.append(small)
-            if s.part >= 0:
-                evidence.reasons.append("a part of one recording alone shows it")
             stopped = confidence.at_bound(mm.variant.params, raw, case)
             if stopped:
                 evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
@@ -476,7 +445,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
         v = out.joints[case.joint]
         if not mine or v["after"] < 0.98 * v["before"]:
             continue
-        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test, s.part >= 0)
+        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
         if reason:
             for e in out.evidence:
                 if e.joint == case.joint and e.effect != "current_sensor":
@@ -494,6 +463,10 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
             servo.entries[case.joint] = copy.deepcopy(m.table.entries[case.joint])
         if any(f["effect"] in ("inertia", "payload") for f in mine):
             spec, changed_model = m.spec.copy(), False
+    for joint in _shown_there_alone(out.joints, findings) if s.held_out else ():
+        v = out.joints[joint]
+        notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
+                     "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
     findings.sort(key=lambda f: -_weight(f))
     _doubts(out, findings, channel)
     members = {(case.joint, m.id): (case, m) for case, _, outcome in outcomes for m in outcome.best.members}
@@ -531,17 +504,22 @@ def _followed(case: Case, none: Trial, train: Sequence[int], span: dict | None) 
     return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, none.fit.params, none.fit.x, windows)[0]) ** 2)))
 
 
-def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None, half: bool = False) -> str:
+def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
+    """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing (a limit, a sag) shows
+    there alone, and what is kept out must not be fitted."""
+    found = {j for f in findings for j in f["where"]["joints"]}
+    return [j for j, v in joints.items() if j not in found and v["before"] > max(judge.FAR * v["sigma"], ALONE * v["fitted"])]
+
+
+def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
     """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are doubted, not dropped; empty
-    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there (`half`: in
-    the half that judges, where the whole is known to show something)."""
+    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there."""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     needed = confidence.NEEDED**2
     if before > needed and after < (1 - 2 * LEAST) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
-    gain = search.gain(outcome.best, outcome.none)
-    plain = gain >= CLEAR if half else gain >= 2 * LEAST and outcome.none.fit.loss > needed
+    plain = outcome.none.fit.loss > needed and search.gain(outcome.best, outcome.none) >= 2 * LEAST
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 
@@ -657,13 +635,8 @@ def _step(runs: list[Run]) -> float:
     return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
 
 
-def _split(runs, held, group, part: int = -1):
+def _split(runs, held, group):
     """(training runs, test runs, spans of both, in words)."""
-    if held and part >= 0:
-        cut = {i: 0.5 * runs[i].duration for i in held}
-        halves = [{i: (0.0, cut[i]) for i in held}, {i: (cut[i], runs[i].duration) for i in held}]
-        names = ", ".join(runs[i].name for i in held)
-        return list(range(len(runs))), held, halves[part], halves[1 - part], f"the {HALVES[1 - part]} half of {names}, whose other half alone shows something"
     if held:
         train = [i for i in range(len(runs)) if i not in held]
         return train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held)
