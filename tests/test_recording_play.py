@@ -282,6 +282,24 @@ def played(tmp_path_factory):
     return env, seen, paths, folder
 
 
+def test_a_play_in_another_world_does_not_tell_its_drives(tmp_path):
+    """What such a recording says of the drives is what the policy believes of them, as one of a real hand would."""
+    from worlds import grasp_env
+
+    from dexsim.recording.tap import PlayRecorder
+
+    env = grasp_env(worlds=2)
+    said = []
+    for config in ({}, {"belief": {"servo": {"joints": {"*": {"kp": 3.25}}}}}):
+        recorder = PlayRecorder(env, 1, config)
+        env.reset_all()
+        for _ in range(8):
+            env.step(torch.zeros(2, 12))
+        said.append(yaml.safe_load(read(recorder.save(tmp_path / f"{len(said)}.mcap")[0]).meta["servo"])["joints"])
+        recorder.detach()
+    assert said[1] == {"*": {"kp": 3.25}} and said[0]["mid_joint1"]["kp"] > 2.0  # its own: 4.0, randomized
+
+
 def test_a_play_is_recorded_as_it_was(played):
     env, seen, paths, _ = played
     assert [p.name for p in paths] == ["p_w0.mcap", "p_w1.mcap"] and len(seen) > 5

@@ -14,6 +14,7 @@ import warp as wp
 import yaml
 
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
+from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.recording.realistic import realistic as as_hardware
 from dexsim.recording.schema import COMMANDS, DEFAULTS, IMU, OBJECT_POSE, STATES, TACTILE, Recording, Series, States
@@ -218,7 +219,7 @@ class PlayRecorder:
             "tactile_lsb": "1",
             "gravity": gravity,
             "notes": "; ".join([notes, *e.notes]),
-            "servo": yaml.safe_dump(self.env.servo.table.to_dict() | {"joints": servo}, sort_keys=False),
+            "servo": yaml.safe_dump(self._believed() or self.env.servo.table.to_dict() | {"joints": servo}, sort_keys=False),
         }
         tactile, imu = None, None
         if e.touch:
@@ -243,6 +244,12 @@ class PlayRecorder:
             config=config,
             start_ns=1_000_000_000,
         )
+
+    def _believed(self) -> dict[str, Any] | None:
+        """The drives as the policy believes them, where it plays in another world (reality=), which does not tell its own: a recording
+        from there says no more than one of a real hand."""
+        belief = self.config.get("belief")
+        return ServoTable.from_dict(belief["servo"]).to_dict() if belief else None
 
     def _world(self, index: int, about: list[np.ndarray]) -> tuple[dict[str, Any], dict[str, Any]]:
         """What differs in a world: object and drives, as plain data."""
