@@ -4,7 +4,7 @@
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
                               [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
 
-A reality is one hand: it is recorded (safe excitation, and the included policies' own runs in it) and diagnosed once. For each task
+A reality is one hand: it is recorded under safe excitation and diagnosed once. For each task
 and seed: the included policy goes on for `naive` iterations in the believed simulator without randomization of the drives. Then three
 fine-tunes of the naive checkpoint of `tune` iterations each: with the servo table that `diagnose` fitted (its intervals
 are the randomization), with wide randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
@@ -240,25 +240,13 @@ class Loop:
 
         return run
 
-    def own_run(self, task: str, world: str):
-        """Recordings of the policy's own runs in the reality: of the included policy, which naive training goes on from."""
-        def run(slot: str) -> bool:
-            where = self.out / f"excited_{world}"
-            where.mkdir(parents=True, exist_ok=True)
-            cap = ["task.evaluation.cap_s=12"] if task == "rotate" else []
-            return self.call(["play.py", f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"reality={world}", "episodes=8", "seed=5", "video=false",
-                              f"out={self.out / f'own_{task}_{world}'}", f"sim.threads={self.uses['judge']}", f"record={where / f'own_{task}.mcap'}", "record_worlds=1",
-                              "realistic=true", *cap], self.out / f"own_{task}_{world}.log", limit=200) == 0  # fmt: skip
-
-        return run
-
     def diagnose(self, world: str):
-        """One reality is one hand: it is diagnosed once, from what was excited and from the policies' own runs."""
+        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs are of no use to it: a joint is
+        judged while nothing is touched, and most of what they touch carries no taxels."""
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            own = sorted((self.out / f"excited_{world}").glob("own_*.mcap"))
-            fit, held = [*excited[:-1], *own], excited[-1:]
+            fit, held = excited[:-1], excited[-1:]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()
@@ -270,9 +258,8 @@ class Loop:
         out = []
         for w in self.worlds:
             out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
-            out += [Job(f"own {t} {w}", self.out / f"own_{t}_{w}.done", self.own_run(t, w), False, [], 0, self.uses["judge"]) for t in self.tasks]
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False,
-                           [f"excite {w}", *(f"own {t} {w}" for t in self.tasks)], 0, self.uses["diagnose"]))
+                           [f"excite {w}"], 0, self.uses["diagnose"]))
         for k, task in enumerate(self.tasks):  # one task's trainings before the next one's
             first = TASK * k
             for seed in self.seeds:
