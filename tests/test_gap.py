@@ -176,7 +176,7 @@ def test_floor_from_repeats_of_the_same_commands():
     rng = np.random.default_rng(2)
     runs = []
     for k in range(2):
-        r = plant_run("a", 0, 3.0, {}, noisy=False)
+        r = plant_run("ab"[k], 0, 3.0, {}, noisy=False)
         r.q = r.q + 3e-3 * rng.standard_normal(r.q.shape)
         r.qs = None
         r.smooth()
@@ -184,6 +184,8 @@ def test_floor_from_repeats_of_the_same_commands():
     assert conditions(runs) == [0, 0]
     value, how = judge.floor(runs, build(model(), runs))
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
+    runs[1].name = "a"  # two pieces of one recording
+    assert judge.floor(runs, build(model(), runs))[1] != "repeats"
 
 
 def test_map_finds_the_regime_and_controls_false_discoveries():
