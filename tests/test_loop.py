@@ -69,11 +69,12 @@ def test_share_recovered_by_hand():
 
 
 def test_no_share_of_a_gap_that_may_be_none():
-    """By hand: means 4 apart, standard errors 1 and 0, t = 2.7764 with 4 degrees of freedom."""
-    gap = loop._gap(np.array([50.0 - 3**0.5, 50.0, 50.0 + 3**0.5]), np.array([54.0, 54.0, 54.0]))
-    assert gap["sure"] and (gap["low"], gap["high"]) == pytest.approx((4 - 2.7764, 4 + 2.7764), abs=1e-3)
+    """By hand: by seed 3, 4 and 5 apart, standard error 1 / sqrt(3), t = 4.3027 with 2 degrees of freedom; however far the seeds lie from
+    each other."""
+    gap = loop._gap(np.array([50.0, 20.0, 80.0]), np.array([53.0, 24.0, 85.0]))
+    assert gap["sure"] and (gap["low"], gap["high"]) == pytest.approx((4 - 4.3027 / 3**0.5, 4 + 4.3027 / 3**0.5), abs=1e-3)
     assert not loop._gap(np.array([96.0, 97.0, 95.0]), np.array([97.0, 96.0, 98.0]))["sure"]
-    assert not loop._gap(np.array([]), np.array([1.0]))["sure"]
+    assert not loop._gap(np.array([]), np.array([]))["sure"] and loop._gap(np.array([1.0]), np.array([2.0]))["sure"]
 
 
 def test_report_reads_what_was_judged(tmp_path):

@@ -291,7 +291,8 @@ class Loop:
                             values[v].append(math.nan if row[v] is None else row[v] * unit)
                     x = {v: np.array(values[v]) for v in VARIANTS}
                     line = {"task": task, "world": world, "measure": label, "larger_is_better": larger, "values": values}
-                    line["gap"] = _gap(*(x[v][np.isfinite(x[v])] for v in ("naive", "truth")))
+                    both = np.isfinite(x["naive"]) & np.isfinite(x["truth"])
+                    line["gap"] = _gap(x["naive"][both], x["truth"][both])
                     for other in ("fitted", "wide"):
                         both = np.isfinite(x["naive"]) & np.isfinite(x["truth"]) & np.isfinite(x[other])
                         if both.any() and line["gap"]["sure"]:
@@ -317,13 +318,13 @@ class Loop:
 
 
 def _gap(naive: np.ndarray, truth: np.ndarray) -> dict:
-    """mean truth - mean naive with its 95 % interval (Student's t over seeds), and whether it is surely not 0: what cannot be told from
-    nothing has no share that could be recovered. One seed each: taken as it is."""
-    if not len(naive) or not len(truth):
+    """Mean over seeds of truth - naive (a seed's fine-tune begins at its naive policy, and both play the same episodes) with its 95 %
+    interval (Student's t), and whether it is surely not 0: what cannot be told from nothing has no share that could be recovered. One
+    seed: taken as it is."""
+    if not len(naive):
         return {"value": None, "low": None, "high": None, "sure": False}
-    value, free = float(truth.mean() - naive.mean()), len(naive) + len(truth) - 2
-    error = math.sqrt(sum(x.var(ddof=1) / len(x) for x in (naive, truth) if len(x) > 1))
-    half = float(student.ppf(0.975, free)) * error if free else 0.0
+    n, value = len(naive), float((truth - naive).mean())
+    half = float(student.ppf(0.975, n - 1)) * float((truth - naive).std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
     return {"value": value, "low": value - half, "high": value + half, "sure": abs(value) > half}
 
 
