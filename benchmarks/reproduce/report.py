@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
 from benchmarks.reproduce import jobs, rows
@@ -16,6 +17,8 @@ from benchmarks.reproduce.jobs import Job, Plan
 from benchmarks.reproduce.rows import Row
 
 RESAMPLES = 4000
+SMOOTH = 15
+"""Iterations of the learning curves' running median: after a resume all worlds begin their episodes at once, and dip together."""
 WORLD_NAMES = {"simulation": "simulation", "reality": "other world"}
 
 
@@ -144,6 +147,7 @@ def _rotation_figure(axes, order: list[Row], table: dict) -> None:
     x = np.arange(len(order))
     for quantity, seeds, ax, unit in (("average", "by_seed", axes[0], "consecutive successes; dots: each seed"),
                                       ("seconds_per_success", "seconds_by_seed", axes[1], "s a success; dots: each seed")):
+        dots: list[tuple[int, int, float]] = []
         series = [("paper, real hand", [r.paper.get(quantity, np.nan) for r in order], None)]
         for world in jobs.WORLDS:
             found = [table.get(r.key, {}).get(world) for r in order]
@@ -153,10 +157,17 @@ def _rotation_figure(axes, order: list[Row], table: dict) -> None:
                 error = np.array([[np.nan, np.nan] if f is None else [f["average"] - f["interval"][0], f["interval"][1] - f["average"]] for f in found]).T
             series.append((WORLD_NAMES[world], value, error))
             for i, f in enumerate(found):
-                dots = [v for v in (f or {}).get(seeds, ()) if v is not None]
-                ax.plot([i + 0.27 * (len(series) - 2)] * len(dots), dots, "k.", markersize=5, zorder=3)
+                here = [(i, len(series) - 2, v) for v in (f or {}).get(seeds, ()) if v is not None]
+                ax.plot([i + 0.27 * k for i, k, _ in here], [v for _, _, v in here], "k.", markersize=5, zorder=3)
+                dots += here
         for k, (label, value, error) in enumerate(series):
             ax.bar(x + 0.27 * (k - 1), value, width=0.25, yerr=error, label=label, capsize=2, ecolor="#777777")
+        if quantity == "seconds_per_success":  # a seed that hardly turns must not flatten the others
+            top = 1.3 * max((v for _, value, _ in series for v in value if np.isfinite(v)), default=1.0)
+            ax.set_ylim(0, top)
+            for i, k, v in dots:
+                if v > top:
+                    ax.annotate(f"{v:.0f} s", (i + 0.27 * k, top), xytext=(i + 0.27 * k, 0.86 * top), ha="center", fontsize=7, arrowprops={"arrowstyle": "->"})
         ax.set_ylabel(unit)
         ax.set_xticks(x, [r.key.replace("_", "\n") for r in order], fontsize=7)
     axes[0].legend(fontsize=7)
@@ -243,9 +254,10 @@ def learning(plan: Plan, all_jobs: list[Job]) -> dict[Row, list[tuple[np.ndarray
 def _learning_figure(ax, curves: dict[Row, list[tuple[np.ndarray, np.ndarray]]]) -> None:
     for k, (row, seeds) in enumerate(curves.items()):
         for i, (steps, successes) in enumerate(seeds):
-            ax.plot(steps, successes, "-" if i % 2 == 0 else "--", color=f"C{k}", linewidth=1.1, label=row.label if i == 0 else None)
+            ax.plot(steps, median_filter(successes, SMOOTH, mode="nearest"), "-" if i % 2 == 0 else "--", color=f"C{k}", linewidth=1.1,
+                    label=row.label if i == 0 else None)
     ax.set_xlabel("environment steps [million]; dashed: the second seed")
-    ax.set_ylabel("successes a minute, while training")
+    ax.set_ylabel(f"successes a minute, while training\n(running median of {SMOOTH} iterations)")
     ax.legend(fontsize=7)
     ax.grid(alpha=0.3)
 
