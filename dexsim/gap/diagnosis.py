@@ -445,7 +445,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
         v = out.joints[case.joint]
         if not mine or v["after"] < 0.98 * v["before"]:
             continue
-        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
+        reason = "" if case.told else _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
         if reason:
             for e in out.evidence:
                 if e.joint == case.joint and e.effect != "current_sensor":

@@ -225,6 +225,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
             case.scales.nominal[name] = value
             case.ranges[name] = (low, max(high, low + 1e-9))
         case.unknown = tuple(n for n in case.unknown if n not in open_)
+        case.told = True
         factor = x.value["inertia"] / max(case.scales.inertia, 1e-12)
         if abs(factor - 1) < BELIEF:
             half = max(0.5 * (x.high["inertia"] - x.low["inertia"]) / x.value["inertia"], 1e-3)

@@ -37,6 +37,7 @@ class Case:
     moved: bool = True
     loop_rate: float | None = None
     factors: dict[str, tuple[float, float]] = field(default_factory=dict)  # of what the model says, by nuisance, where more than BELIEF is known
+    told: bool = False  # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
 
 
 def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
