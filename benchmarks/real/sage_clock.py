@@ -4,7 +4,7 @@ A servo's current follows its position error and its speed (the law of its firmw
 |current| = |a error - b speed + c| + d, one a, b, c, d a joint. The error that explains the current best is the one with the command
 that was in force: the logged one, or that of a period later, where the log writes each command down after the servo has had it. What
 most motions have counts as right (a delay that all share is for the fit).
-The current has lost its sign and is used for nothing else; how a joint moves takes no part. One JSON line.
+The current has lost its sign and is used for nothing else; no model of the motion takes part. One JSON line.
 """
 
 from __future__ import annotations
