@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from dexsim.gap.inverse import identify
+from dexsim.actuator.columns import INDEX
+from dexsim.gap.inverse import believe, identify
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):
@@ -49,3 +52,20 @@ def test_further_effects_are_named_one_after_another():
 
 def test_nothing_further_is_named_where_nothing_is_missing():
     assert identify(*carriage(), test=carriage(seed=1)).named == []
+
+
+def test_unknown_friction_is_believed_as_the_torque_tells_it():
+    def case(*unknown: str) -> SimpleNamespace:
+        scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=94.0)
+        return SimpleNamespace(joint="carriage", unknown=unknown, scales=scales, plant=SimpleNamespace(nominal=np.zeros((2, len(INDEX)))), ranges={}, factors={}, told=False)
+
+    x = identify(*carriage())
+    open_, known = case("viscous_friction", "coulomb_friction", "kd"), case("kd")
+    assert len(believe([(open_, x, []), (known, x, [])])) == 1
+    assert open_.told and open_.unknown == ("kd",) and not known.told and not known.ranges
+    for name, true in (("viscous_friction", 200), ("coulomb_friction", 20), ("friction_asymmetry", -0.3)):
+        assert open_.plant.nominal[:, INDEX[name]] == pytest.approx([true, true], rel=0.02)
+        low, high = open_.ranges[name]
+        assert low < open_.scales.nominal[name] < high
+    low, high = open_.factors["inertia"]
+    assert low < 95 / 94 < high

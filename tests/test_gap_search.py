@@ -67,13 +67,14 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
 def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     """before, after: in windows of what was kept out; ratio: of a free run over it; gain: where it was fitted and on conditions left out."""
 
-    def reason(before: float, after: float, ratio: float, gain: float, loss: float) -> str:
+    def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
-        search = SimpleNamespace(polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
+        search = SimpleNamespace(case=SimpleNamespace(told=told), polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
         return diagnosis._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
     assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
+    assert reason(5.0, 1.1, 1.3, 0.8, 5.7, told=True) == ""  # the recorded torque knows better
     assert "does not show it" in reason(1.0, 1.0, 1.0, 0.6, 2.1)  # a limit that was not reached there
     assert reason(1.0, 1.1, 1.02, 0.6, 2.1) == "" and reason(1.0, 1.0, 1.0, 0.15, 2.1) == ""
     assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found

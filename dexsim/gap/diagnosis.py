@@ -445,7 +445,7 @@ def _assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, f
         v = out.joints[case.joint]
         if not mine or v["after"] < 0.98 * v["before"]:
             continue
-        reason = "" if case.told else _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
+        reason = _not_refuted(search, outcome, v["after"] / v["before"], test, span_test)
         if reason:
             for e in out.evidence:
                 if e.joint == case.joint and e.effect != "current_sensor":
@@ -513,7 +513,10 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
     """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are doubted, not dropped; empty
-    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there."""
+    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there. What the
+    recorded torque has told of a joint is known: nothing that is not shown goes beyond it."""
+    if search.case.told:
+        return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     needed = confidence.NEEDED**2
     if before > needed and after < (1 - 2 * LEAST) * before:
