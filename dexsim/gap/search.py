@@ -306,15 +306,15 @@ class JointSearch:
                 gain = (2 * c * dot - c * c * dd) / total
                 null = np.maximum(null, np.maximum(flips @ part, 0.0) ** 2 / dd / total)
                 member, start = owners[a + i]
-                rows.append((gain, member, start, len(rows)))
+                rows.append((gain, member, start))
                 raw_d = (r0 - res) * sw
                 dots.append(float(raw_d @ rw))
                 squares.append(float(raw_d @ raw_d))
                 cross.append(all_J.T @ raw_d)
-        self.saved = self._saved([(m, st) for _, m, st, _ in rows], np.array(dots), np.array(squares), np.array(cross), all_J, rw, params, x)
+        self.saved = self._saved([(m, st) for _, m, st in rows], np.array(dots), np.array(squares), np.array(cross), all_J, rw, params, x)
         best: dict[tuple, tuple] = {}
         self.other_start: dict[str, np.ndarray] = {}
-        for gain, member, start, _ in sorted(rows, key=lambda r: -r[0]):
+        for gain, member, start in sorted(rows, key=lambda r: -r[0]):
             key = (member.id, member.variant.label)
             if key not in best:
                 best[key] = (gain, member, start)
