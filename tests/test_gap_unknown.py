@@ -12,7 +12,7 @@ from dexsim.gap import demo, excluded
 from dexsim.gap.catalogue import EFFECTS
 from dexsim.gap.findings import servo_changes
 from dexsim.gap.fit import intervals
-from dexsim.gap.plant_columns import INDEX
+from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
 from dexsim.gap.prepare import build
 from dexsim.gap.runs import Run, conditions
 from dexsim.gap.search import JointSearch
@@ -85,6 +85,24 @@ def test_the_joint_that_drags_is_the_one_the_servo_names():
     assert slope == pytest.approx(0.3, abs=0.06)
     short = case({"j0": {"coupling": 0.3, "coupling_from": 2}}, order=(0, 1))  # the joint that drags was not recorded
     assert short.plant.base()[0][INDEX["coupling"]] == 0
+
+
+def test_what_other_joints_draw_follows_their_commands_between_samples():
+    """A target that jumps between two samples of a joint loads the supply from its own time on."""
+    bodies = "".join(f"""<body pos="0 {0.4 * k} 0"><joint name="j{k}" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"/>
+      <geom type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/></body>""" for k in range(2))  # fmt: skip
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody></mujoco>")
+    t_cmd = np.r_[0.0, 1.004]
+    cmd = np.array([[0.0, 0.0], [0.0, 0.2]])
+    t = np.arange(0.0, 2.0, 0.02)
+    q = np.stack([0.2 * np.sin(t), np.zeros(len(t))], 1)
+    run = Run("a", ("j0", "j1"), t_cmd, cmd, t, q, ServoTable.from_dict({"joints": {"*": SERVO}}), np.array([0, 0, -9.81]))
+    run.smooth()
+    run.fine = (t, run.qs, run.vs, run.as_)
+    plant = build(model, [run])[0].plant
+    drawn = plant.series[:, SERIES_INDEX["others_torque"]]
+    at = plant.dt * np.arange(len(drawn))
+    assert np.abs(drawn[at < 1.0]).max() < 1e-9 and np.allclose(drawn[at > 1.007], 2.0 * 0.2, rtol=1e-6)
 
 
 def test_a_plant_in_shorter_steps_is_the_same_joint():

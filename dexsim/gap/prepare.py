@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -98,6 +99,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
     for run, row in zip(runs, rows, strict=True):
         cmd = run.command_at(run.t)
         torques.append(np.stack([demand(row[j], voltage, cmd[:, j], run.q[:, j], run.vs[:, j]) for j in range(J)], 1))
+    given = [_given(run, row, *m[:2], voltage) for run, row, m in zip(runs, rows, mech, strict=True)] if J > 1 else []
     cases = []
     for j, joint in enumerate(joints):
         if only is not None and joint not in only:
@@ -118,7 +120,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
             if run.temperature is not None:
                 exact["warmth"] = run.temperature[:, j] - REFERENCE
             if J > 1:
-                exact["others_torque"] = np.abs(np.delete(torques[i], j, 1)).sum(1)
+                mech[i][1][j][:, SERIES_INDEX["others_torque"]] = np.delete(given[i], j, 1).sum(1)
             for k, o in enumerate(others[:4]):
                 exact[f"drag{k}"] = run.qs[:, o] - run.qs[0, o]
                 _linked(mech[i][0], mech[i][1][j], mech[i][1][o], k, constants[o].armature)
@@ -261,6 +263,14 @@ def _draggers(model, joints, j, runs) -> list[int]:
         return (len(own) - shared) + (len(other) - shared) - 0.1 * shared, o
 
     return sorted(moved, key=far)
+
+
+def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: Sequence[np.ndarray], voltage: bool) -> np.ndarray:
+    """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed: by commands of
+    those moments, which are finer than the samples. N.m"""
+    cmd = run.command_at(times)
+    q, v = SERIES_INDEX["q"], SERIES_INDEX["v"]
+    return np.abs(np.stack([demand(rows[j], voltage, cmd[:, j], x[:, q], x[:, v]) for j, x in enumerate(series)], 1))
 
 
 def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
