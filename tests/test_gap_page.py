@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from dexsim.gap import demo, touch_rig
-from dexsim.gap.diagnosis import Settings, diagnose, grouped, save
+from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.write import grouped
 
 CHROMIUM = next((p for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (p := shutil.which(name))), None)
 PROBE = """<script>

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from dexsim.gap import diagnosis, judge
+from dexsim.gap import assemble, judge
 from dexsim.gap.fit import Fitter, Param
 from dexsim.gap.prepare import REFERENCE, build
 from dexsim.gap.search import JointSearch, Member, subset
@@ -70,7 +70,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
         search = SimpleNamespace(case=SimpleNamespace(told=told), polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
-        return diagnosis._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
+        return assemble._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
     assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
@@ -82,7 +82,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
 
 def test_what_only_the_recording_kept_out_shows_is_said():
     def alone(before: float, fitted: float, *found: dict) -> list[str]:
-        return diagnosis._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
+        return assemble._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
 
     assert alone(16.0, 1.0) == ["a"]
     assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing

@@ -190,7 +190,7 @@ class Progress:
 def verdict(d) -> str:
     """The verdict in at most ten lines."""
     from dexsim.gap.charts import number
-    from dexsim.gap.diagnosis import place
+    from dexsim.gap.sentence import place
 
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]

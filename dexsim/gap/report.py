@@ -13,7 +13,7 @@ from dexsim.gap.picture import mechanism, pad, scale
 from dexsim.gap.touch_effects import entry
 
 if TYPE_CHECKING:
-    from dexsim.gap.diagnosis import Diagnosis
+    from dexsim.gap.result import Diagnosis
 
 VERDICTS = {
     "explained": ("Explained", "good"), "partly_explained": ("Partly explained", "warn"), "unknown": ("Unknown", "bad"),
@@ -223,7 +223,7 @@ def _findings(d: Diagnosis) -> str:
     findings = d.data["findings"]
     if not findings:
         return _nearest(d)
-    from dexsim.gap.diagnosis import WEAK, spoken, words_of
+    from dexsim.gap.sentence import WEAK, spoken, words_of
 
     cards = []
     ends = _ends(d)
@@ -258,7 +258,7 @@ def _metric(d: Diagnosis, f: dict) -> str:
 
 
 def _place(f: dict) -> str:
-    from dexsim.gap.diagnosis import place
+    from dexsim.gap.sentence import place
 
     return place(f)
 
