@@ -77,6 +77,35 @@ def test_resume_is_bitwise_the_unbroken_run(tmp_path):
     assert torch.equal(torch.rand(3), torch.rand(3)) is False  # generators are live, not frozen
 
 
+def test_episodes_that_begin_anew_on_resume_do_not_end_together(tmp_path, monkeypatch):
+    """An environment that keeps its episodes (the dummy) goes on with their ages; of one that begins them all anew they are spread
+    as at the first start, the same each time the checkpoint is resumed."""
+    made = runner(worlds=64, steps=1000)
+    made.learn(1)
+    saved = checkpoint.save(tmp_path / "last.pt", made.payload())
+
+    def ages_after_resume():
+        torch.manual_seed(99)
+        again = runner(seed=77, worlds=64, steps=1000)
+        again.restore(checkpoint.load(saved), "last.pt")
+        begun = again.env.episode_length_buf.clone()
+        again.learn(2, stop=lambda: True)  # nothing is learned: what is at its beginning
+        return begun, again.env.episode_length_buf
+
+    before, kept = ages_after_resume()
+    assert torch.equal(before, made.env.episode_length_buf) and torch.equal(kept, before)
+    keep = dummy_task.DummyEnv.load_state_dict
+
+    def anew(self, state):
+        keep(self, state)
+        self.reset_all()
+
+    monkeypatch.setattr(dummy_task.DummyEnv, "load_state_dict", anew)
+    before, spread = ages_after_resume()
+    assert not before.any() and len(spread.unique()) > 50 and 700 < spread.max() < 1000
+    assert torch.equal(ages_after_resume()[1], spread)
+
+
 def test_resume_restores_the_learning_rate_and_normalization(saved, trained):
     again = runner(seed=5)
     again.restore(checkpoint.load(saved), "last.pt")

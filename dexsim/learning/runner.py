@@ -181,7 +181,9 @@ class Runner(OnPolicyRunner):
             seed_all(seed)
             self.env.rng.manual_seed(seed)
             self.env.reset_all()
-        self._fresh = False
+        # An environment whose state does not hold its episodes began them all anew just now; their ages are then spread as at
+        # the first start, or all worlds would time out, and dip in the curves, together.
+        self._fresh = not bool(self.env.episode_length_buf.any())
 
     def policy(self) -> Any:
         """The actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""
