@@ -14,6 +14,7 @@ from dexsim.errors import UserError
 from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, judge, stage, standin, touch, touch_handed
 from dexsim.gap.assemble import add_behind, assemble
 from dexsim.gap.catalogue import EFFECTS
+from dexsim.gap.joint import Kept
 from dexsim.gap.next_experiment import rival_of
 from dexsim.gap.next_recording import plan_next
 from dexsim.gap.prepare import Case, build
@@ -80,11 +81,13 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     absent = [j for j in m.joints if runs and not any(j in r.joints for r in runs)]
     if absent:
         notes.append(f"in the model but in no recording: {', '.join(absent)}; nothing can be said of {'it' if len(absent) == 1 else 'them'}, taken to stand at rest")
-    wrong, out = channels.inspect(runs, m.spec.compile(), channels.spoiled(readable))
+    wrong, out, blind = channels.inspect(runs, m.spec.compile(), channels.spoiled(readable))
     channel = channels.secondary(channel + wrong)
     before = {id(r): k for k, r in enumerate(runs)}
     runs = channels.drop(runs, out, notes)
     held = [k for k, r in enumerate(runs) if before[id(r)] in held]
+    if blind:
+        runs, held = inputs.free_air(runs, held, inputs.merged_spans(blind), notes, "readings are old ones, sent again", "in which they are not", (0.0, 0.0), inputs.SHORTEST)
     notes += failures
     failures += [f"{name}: {joint}: {why}" for (name, joint), why in out.items()] if not runs else []
     if failures and runs and len(held) < len(runs):
@@ -191,7 +194,6 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         say(f"  {x}")
     clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
-    rng = np.random.default_rng(s.seed)
     answers = together(joints, search_of, s.device, progress)
     unsettled = [k for k, (_, found) in enumerate(answers) if found is not None and (found.best.members or found.best.fit.loss > UNSETTLED)]
     if linked and len(unsettled) > 1 and all(found is not None for _, found in answers):
@@ -208,7 +210,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         else:
             outcomes.append((case, search, found))
     clock.lap("search")
-    result = assemble(s, m, runs, cases, outcomes, train, test, span_train, span_test, floor, floor_how, how, channel, notes, rng, clock)
+    result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes)
     result.stages = [x.text for x in stages] + behind
     add_behind(result, inverse.findings(by_torque, nothing_believed, runs, train), by_torque)
     inverse.write(by_torque, result.servo, nothing_believed)
