@@ -51,6 +51,8 @@ class Scales:
     armature: float = 0.0
     own_torque: float = 0.0  # of one kg on the joint's own link; 0 where that is the last
     own_inertia: float = 0.0
+    leaf_mass: float = 0.0  # kg: of the last link, and of the joint's own
+    own_mass: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ CONFUSED: tuple[frozenset[str], ...] = tuple(
 
 
 RINGS = (0.1, 0.3)  # damping ratios of a transmission that are tried: whether a loop rattles with it hangs on them
+LIGHTEST = 0.95  # of a link's believed mass: what may be taken away at most
 MIN_WARMTH = 2.0  # degC: a smaller change of temperature tells nothing
 
 
@@ -274,8 +277,10 @@ def _payload(s: Scales) -> list[Variant]:
     unit = s.tau / max(s.load_torque, 1e-9) if s.load_torque * s.inertia > 0.05 * s.tau * s.load_inertia else np.inf
     unit = min(unit, 3 * s.inertia / max(s.load_inertia, 1e-12))
     if np.isfinite(unit) and s.load_torque > 0.02 * s.gravity:
-        mass = _p("mass", "payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
-        out.append(Variant((mass,), tuple((f * unit,) for f in (0.03, 0.08, 0.2, 0.5, 1.0, -0.06, -0.15)), "mass"))
+        # a link may be believed heavier by all but a little of what it is said to weigh
+        least = -max(0.3 * unit, LIGHTEST * s.leaf_mass)
+        mass = _p("mass", "payload", "set", least, 2.0 * unit, 0.0, "kg")
+        out.append(Variant((mass,), (*((f * unit,) for f in (0.03, 0.08, 0.2, 0.5, 1.0, -0.06, -0.15)), (0.4 * least,)), "mass"))
         reach = np.sqrt(s.load_inertia)  # of the last link's centre from the hinge
         if not s.slide and reach > 1e-3:
             params = (_p("mass", "payload", "set", 0.0, 2.0 * unit, 0.0, "kg"), _p("com_out", "com_out", "set", -1.2 * reach, 1.2 * reach, 0.0, "m"),
@@ -284,7 +289,7 @@ def _payload(s: Scales) -> list[Variant]:
             out.append(Variant(params, starts, "mass and its centre"))
     if s.own_torque > 0.02 * s.gravity and s.own_inertia > 0:
         unit = min(s.tau / s.own_torque, 3 * s.inertia / s.own_inertia)
-        mass = _p("mass", "own_payload", "set", -0.3 * unit, 2.0 * unit, 0.0, "kg")
+        mass = _p("mass", "own_payload", "set", -max(0.3 * unit, LIGHTEST * s.own_mass), 2.0 * unit, 0.0, "kg")
         out.append(Variant((mass,), tuple((f * unit,) for f in (0.05, 0.3, -0.1)), "mass on its own link", note={"own": True}))
     for letter, size in s.tilt.items():
         if size > 0.05 * s.tau * 0.1 and size > 0.2 * max(s.tilt.values()):

@@ -11,11 +11,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dexsim.gap import frozen
 from dexsim.gap.runs import Run
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
+BLIND = 0.15  # s: over a longer one the motion is not known, and a joint is judged before and after it
 EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
 TURN = 180 / np.pi
 
@@ -45,11 +47,15 @@ def secondary(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for f in findings if not (f["regime"].startswith(("sign_mismatch", "lost_sign")) and set(f["where"]["joints"]) & wrong)]
 
 
-def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]) -> tuple[list[dict[str, Any]], dict[tuple[str, str], str]]:
-    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why). `known`: what the audit
-    has named already. Repeated readings are taken out of the runs, which can then be used."""
+def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]
+            ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
+    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by run in s in which
+    nothing is known of a joint). `known`: what the audit has named already. Repeated readings are taken out of the runs, which can then be
+    used, but for those stretches."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     out = dict(known)
+    long = {joint: frozen.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
+    blind: dict[str, list[tuple[float, float]]] = {}
 
     def add(kind: str, text: str, run: Run, joint: str, topics: list[str], spans: list[tuple[float, float]], confidence: float = 0.9, drop: bool = True):
         entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
@@ -57,7 +63,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
         if drop:
             out[run.name, joint] = f"{kind}: {text}"
 
-    for run in runs:
+    for i, run in enumerate(runs):
         stale = np.zeros(len(run.t), bool)
         for j, joint in enumerate(run.joints):
             if (run.name, joint) in out:
@@ -82,15 +88,22 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                 add("stuck", f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a drive that is off", run, joint,
                     [STATES], [(stop, run.t[-1])], 0.7)  # fmt: skip
                 continue
-            held = _held(run.t, q)
+            held, single = _held(run.t, q), frozen.duplicates(run.t, q)
+            for a, b in long[joint][i]:
+                held[a + 1 : b + 1] = True
+                if run.t[b] - run.t[a] > BLIND:
+                    blind.setdefault(run.name, []).append((float(run.t[a]), float(run.t[b])))
             if held.any():
                 edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
                 add("stale", f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old readings, sent again", run, joint,
                     [STATES], [(run.t[a], run.t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)], drop=False)  # fmt: skip
-                stale |= held
+            elif single.any():
+                add("stale", f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: old readings, sent again", run, joint,
+                    [STATES], [(run.t[0], run.t[-1])], drop=False)  # fmt: skip
+            stale |= held | single
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
-    return list(found.values()), out
+    return list(found.values()), out, blind
 
 
 def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str]) -> list[Run]:

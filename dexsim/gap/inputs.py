@@ -136,8 +136,10 @@ def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool
 
 
 def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[float, float]]], notes: list[str],
-             why: str = "something is touched, or links touch each other") -> tuple[list[Run], list[int]]:
-    """The runs without the stretches in which something is touched (by recording: start, end in s; `why` in words), and which are held out.
+             why: str = "something is touched, or links touch each other", rest: str = "in free air", room: tuple[float, float] = (0.1, 0.3),
+             least: float = 2.0) -> tuple[list[Run], list[int]]:
+    """The runs without the stretches in which something is touched (by recording: start, end in s; `why`, and what is left, `rest`, in
+    words) and `room` s before and after, and which are held out. Pieces shorter than `least` s are left out.
 
     A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in between
     becomes several of the same name, on its own clock.
@@ -152,12 +154,12 @@ def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[flo
             continue
         edges = [float(run.t[0])]
         for a, b in spans:
-            edges += [a - 0.1, b + 0.3]
+            edges += [a - room[0], b + room[1]]
         edges.append(float(run.t[-1]))
-        pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2.0]
+        pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= least]
         pieces = [p for p in pieces if len(p.t) >= 20 and (np.ptp(p.q, axis=0) > 2e-3).any()]
         share = sum(p.duration for p in pieces) / max(run.duration, 1e-9)
-        notes.append(f"{run.name}: {why}; joints are judged by the {100 * share:.0f} % of its time in free air" if pieces
+        notes.append(f"{run.name}: {why}; joints are judged by the {100 * share:.0f} % of its time {rest}" if pieces
                      else f"{run.name}: {why}, nearly all the time; its joints are not judged")  # fmt: skip
         kept += range(len(out), len(out) + len(pieces)) if i in held else []
         out += pieces

@@ -26,6 +26,8 @@ class JointConstants:
     inertia: float  # median about the joint, kg.m2
     gravity: float  # largest gravity torque along the motion, N.m
     leaf: str = ""  # the last link after it
+    leaf_mass: float = 0.0  # of that link, kg
+    own_mass: float = 0.0  # of the joint's own link, kg
     centre: np.ndarray | None = None  # [3] m: that link's centre of mass in the link's frame
     places: np.ndarray | None = None  # [2, 3] in the link's frame: out from the hinge, and along the way it turns there
 
@@ -168,6 +170,8 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
                 inertia=float(np.median(diag[:, j])),
                 gravity=float(np.abs(out[j, :, SERIES_INDEX["gravity_cos"]]).max()),
                 leaf=model.body(int(leaves[j])).name,
+                leaf_mass=float(model.body_mass[leaves[j]]),
+                own_mass=float(model.body_mass[bodies[j]]),
                 centre=model.body_ipos[leaves[j]].copy(),
                 places=places[j],
             )
