@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from benchmarks.reproduce import __main__ as command
-from benchmarks.reproduce import jobs, pack, report, rows
+from benchmarks.reproduce import jobs, own, pack, report, rows
 from benchmarks.reproduce.schedule import Schedule
 from dexsim.cli import start
 from dexsim.errors import UserError
@@ -135,6 +135,75 @@ def test_seeds_that_differ_widen_the_interval(tmp_path):
     put(every[1], p, "simulation", [20] * 50)
     row = report.rotation(p, every)[1]["rows"]["full"]["simulation"]
     assert row["average"] == 15.0 and row["interval"] == [10.0, 20.0]
+
+
+def judged(p: jobs.Plan, key: str, seed: int, world: str, successes: list[int], iteration: int = 2, stage: str = "") -> jobs.Job:
+    """A row's seed, judged as it stood after 100 * iteration steps; stage: folder of a stage's judging."""
+    job = jobs.Job(next(r for r in (*rows.ROTATION, *rows.OURS) if r.key == key), seed)
+    put(job, p, world, successes, iteration=iteration)
+    if stage:
+        target = job.folder(p) / stage / world
+        target.mkdir(parents=True)
+        for name in ("metrics.json", "judged.json"):
+            (job.folder(p) / world / name).rename(target / name)
+    return job
+
+
+def test_rows_of_our_own_are_compared_at_the_same_steps(tmp_path):
+    """Ours after 200 steps: against the first row's judging of then, at a stage, not against what it became after 400."""
+    p, ours = plan(tmp_path), []
+    for seed in (1, 2):
+        for world, at_200, at_400 in (("simulation", 60, 100), ("reality", 30, 90)):
+            judged(p, "full", seed, world, [at_200 + seed] * 10, stage="at_0.0002M")
+            judged(p, "full", seed, world, [at_400] * 10, iteration=4)
+            ours += [judged(p, "fixed", seed, world, [(60 if world == "simulation" else 36) + seed] * 10),
+                     judged(p, "curriculum", seed, world, [200 if seed == 1 else 190] * 10)]
+    ours = list(dict.fromkeys(ours))
+    text, data, draw = own.table(p, ours)
+    said = data["against"]
+    assert said["fixed"]["simulation"]["difference"] == 0.0 and said["fixed"]["simulation"]["here"].startswith("undecided (+0.0")
+    assert said["curriculum"]["reality"]["here"].startswith("more (+163.5") and said["curriculum"]["reality"]["to_steps"] == 200
+    # by hand: variances of pairs 0.5, 0.5, 50 over 3 degrees of freedom, t = 3.1824; the difference of two rows of two seeds
+    half = 3.1824 * (51 / 3) ** 0.5
+    assert said["curriculum"]["reality"]["interval"] == pytest.approx([163.5 - half, 163.5 + half], rel=1e-3)
+    losses = data["lost_in_the_other_world"]
+    assert losses["fixed"]["lost"] == pytest.approx(1 - 37.5 / 61.5) and losses["fixed"]["by_seed"] == pytest.approx([1 - 37 / 61, 1 - 38 / 62])
+    assert losses["full"]["lost"] == pytest.approx(1 - 31.5 / 61.5) and losses["fixed"]["interval"][0] >= 1 - 38 / 62 - 1e-9
+    assert "Trained without randomization, 2 of 2 seeds lose at least a third" in text and "| everything, 6D orientation (the paper's first row), 0.0002 M steps | 61.5 (" in text
+    from matplotlib.figure import Figure
+    axes = Figure().subplots(1, 2)
+    draw(axes)
+    assert [t.get_text() for t in axes[0].get_xticklabels()] == ["full", "fixed", "curriculum"]
+    assert len(axes[0].patches) == 6 and len(axes[1].get_legend_handles_labels()[0]) == 2
+
+
+def test_rows_of_our_own_without_their_reference(tmp_path):
+    """The first row judged at other steps, or under another cap; seeds of ours at different steps; one seed: said, not compared."""
+    p = plan(tmp_path)
+    judged(p, "full", 1, "simulation", [50] * 10, iteration=4)
+    job = judged(p, "fixed", 1, "simulation", [60] * 10)
+    assert own.table(p, [job])[1]["against"]["fixed"]["simulation"]["here"] == "`full` was not judged at these steps"
+    judged(replace(p, cap=30.0), "full", 1, "simulation", [50] * 10)
+    assert own.table(p, [job])[1]["against"]["fixed"]["simulation"]["difference"] is None
+    judged(p, "full", 1, "simulation", [50] * 10)
+    text, data, _ = own.table(p, [job])
+    assert data["against"]["fixed"]["simulation"]["here"].startswith("undecided, one seed a row (+10.0")
+    assert data["lost_in_the_other_world"] == {"full": None, "fixed": None} and "randomization | not judged |" in text
+    pair = [job, judged(p, "fixed", 2, "simulation", [60] * 10, iteration=3)]
+    assert own.table(p, pair)[1]["against"]["fixed"]["simulation"]["here"] == "its seeds have different steps"
+
+
+def test_own_rows_have_a_table_of_their_own(tmp_path):
+    p = plan(tmp_path)
+    every = [judged(p, key, 1, "simulation", [5] * 10) for key in ("full", "fixed")]
+    names = [path.name for path in report.write("rotation", p, every, {"command": "x", "device": "y"})]
+    assert names == ["rotation.md", "rotation_own.md"]
+    assert "without randomization" not in (tmp_path / "rotation.md").read_text() and "| everything, trained without" in (tmp_path / "rotation_own.md").read_text()
+    assert set(json.loads((tmp_path / "rotation.json").read_text())["rows"]) == {"full"}
+    assert set(json.loads((tmp_path / "rotation_own.json").read_text())["rows"]) == {"fixed"} and (tmp_path / "rotation_own.png").stat().st_size > 1000
+    (tmp_path / "rotation.md").unlink()
+    assert [path.name for path in report.write("rotation", p, every[1:], {"command": "x", "device": "y"})] == ["rotation_own.md"]
+    assert not (tmp_path / "rotation.md").exists()
 
 
 def test_the_grasp_table(tmp_path):
@@ -389,7 +458,7 @@ def test_a_row_end_to_end(tmp_path):
     done = subprocess.run(argv, capture_output=True, text=True, cwd=CONFIGS.parent, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["missing"] == 0
-    table = json.loads((tmp_path / "rotation.json").read_text())["rows"]
+    table, ours = (json.loads((tmp_path / name).read_text())["rows"] for name in ("rotation.json", "rotation_own.json"))
     assert table["full"]["simulation"]["steps"] == [32]  # one iteration of 8 steps in 4 worlds
     pack.main([f"out={tmp_path}", f"into={tmp_path / 'state'}"])
     elsewhere = tmp_path / "elsewhere"
@@ -398,5 +467,5 @@ def test_a_row_end_to_end(tmp_path):
     done = subprocess.run(again, capture_output=True, text=True, cwd=CONFIGS.parent, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads((elsewhere / "rotation.json").read_text())["rows"]["full"]["simulation"]["steps"] == [64]
-    assert set(table) == {"full", "fixed"} and set(table["full"]) == {"simulation", "reality"}
+    assert set(table) == {"full"} and set(ours) == {"fixed"} and set(table["full"]) == set(ours["fixed"]) == {"simulation", "reality"}
     assert (tmp_path / "rotation.md").exists() and (tmp_path / "rotation.png").stat().st_size > 1000

@@ -190,8 +190,9 @@ def judge(job: Job, plan: Plan, policy: Path, world: str, gpu: str | None, say: 
     """Play the policy in one world, unless it has been judged there in the same way already."""
     target = job.metrics(plan, world)
     data = checkpoint.load(policy)
+    cap, reality = _judging(plan, world)
     wanted = {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "episodes": plan.episodes[world],
-              "cap_s": plan.cap if plan.task == "rotate" else None, "reality": plan.reality if world == "reality" else None}  # fmt: skip
+              "cap_s": cap, "reality": reality}
     mark = target.parent / "judged.json"
     if target.exists() and mark.exists() and json.loads(mark.read_text()) == wanted:
         return
@@ -383,9 +384,29 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
 
 def read(job: Job, plan: Plan, world: str) -> dict | None:
     """The metrics of a judged policy, with the iterations and steps it was trained for; None where it was not judged."""
-    path = job.metrics(plan, world)
+    return _judged(job.metrics(plan, world))
+
+
+def read_at(job: Job, plan: Plan, world: str, steps: float) -> dict | None:
+    """As `read`, of the judging after `steps` environment steps (within an iteration), whichever stage or end of an earlier run it
+    was, in trials of the plan's cap and other world; None where there is none."""
+    folder = job.folder(plan)
+    for path in (folder / world / "metrics.json", *sorted(folder.glob(f"at_*/{world}/metrics.json"))):
+        found = _judged(path)
+        if found is not None and abs(found["trained_steps"] - steps) < plan.per and found["judged_as"] == _judging(plan, world):
+            return found
+    return None
+
+
+def _judging(plan: Plan, world: str) -> tuple[float | None, str | None]:
+    """What makes two judgings in one world comparable: the trials' cap, and which other world it is."""
+    return plan.cap if plan.task == "rotate" else None, plan.reality if world == "reality" else None
+
+
+def _judged(path: Path) -> dict | None:
     mark = path.parent / "judged.json"
     if not path.exists() or not mark.exists():
         return None
     judged = json.loads(mark.read_text())
-    return json.loads(path.read_text()) | {"trained_steps": judged["steps"], "trained_iterations": judged["iteration"]}
+    return json.loads(path.read_text()) | {"trained_steps": judged["steps"], "trained_iterations": judged["iteration"],
+                                           "judged_as": (judged["cap_s"], judged["reality"])}

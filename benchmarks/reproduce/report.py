@@ -19,6 +19,7 @@ from benchmarks.reproduce.rows import Row
 RESAMPLES = 4000
 SMOOTH = 15
 """Iterations of the learning curves' running median: after a resume all worlds begin their episodes at once, and dip together."""
+COLUMNS = "row | average (95 %) | by seed | median | s a success (seeds) | s to fall (seeds) | to the cap"
 WORLD_NAMES = {"simulation": "simulation", "reality": "other world"}
 
 
@@ -30,11 +31,10 @@ def trials(found: list[dict]) -> tuple[list[np.ndarray], float, float]:
     return successes, fall, capped
 
 
-def resampled(successes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """[RESAMPLES] averages: seeds drawn anew with replacement, then trials within each."""
+def resampled(successes: list[np.ndarray], rng: np.random.Generator, picks: list[np.ndarray] | None = None) -> np.ndarray:
+    """[RESAMPLES] averages: seeds drawn anew with replacement (or as in `picks`, [RESAMPLES] for each seed), then trials within each."""
     out = np.zeros(RESAMPLES)
-    for _ in successes:
-        pick = rng.integers(len(successes), size=RESAMPLES)
+    for pick in picks or [rng.integers(len(successes), size=RESAMPLES) for _ in successes]:
         for k, own in enumerate(successes):
             chosen = pick == k
             out[chosen] += own[rng.integers(len(own), size=(int(chosen.sum()), len(own)))].mean(1)
@@ -58,10 +58,10 @@ def rotation_row(row: Row, found: list[dict], rng: np.random.Generator) -> dict[
 
 
 def rotation(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
-    """(Markdown, JSON, figure) of what has been judged so far."""
+    """(Markdown, JSON, figure) of what has been judged so far of the paper's rows."""
     rng = np.random.default_rng(0)
     table: dict[str, dict[str, dict]] = {}
-    order = list(dict.fromkeys(j.row for j in all_jobs))
+    order = list(dict.fromkeys(j.row for j in all_jobs if j.row.paper))
     for row in order:
         for world in jobs.WORLDS:
             found = [m for j in all_jobs if j.row == row and (m := jobs.read(j, plan, world)) is not None]
@@ -69,26 +69,29 @@ def rotation(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
                 table.setdefault(row.key, {})[world] = rotation_row(row, found, rng)
     lines = []
     for world in jobs.WORLDS:
-        lines += ["", f"**Judged in {WORLD_NAMES[world]}**", "",
-                  "| row | average (95 %) | by seed | median | s a success (seeds) | s to fall (seeds) | to the cap | paper: average, median, s, s to fall |",
-                  "|---|---|---|---|---|---|---|---|"]
+        lines += ["", f"**Judged in {WORLD_NAMES[world]}**", "", f"| {COLUMNS} | paper: average, median, s, s to fall |", "|---" * 8 + "|"]
         for row in order:
-            r = table.get(row.key, {}).get(world)
-            paper = ", ".join(f"{v:g}" for v in row.paper.values()) or "-"
-            if r is None:
-                lines.append(f"| {row.label} | not judged | | | | | | {paper} |")
-                continue
-            seconds = "-" if r["seconds_per_success"] is None else f"{r['seconds_per_success']:.2f} ({_each(r['seconds_by_seed'], 2)})"
-            lines.append(f"| {row.label} | {r['average']:.1f} ({r['interval'][0]:.1f}-{r['interval'][1]:.1f}) | "
-                         f"{', '.join(f'{x:.1f}' for x in r['by_seed'])} | {r['median']:.1f} | {seconds} | {r['seconds_to_fall']:.1f} ({_each(r['fall_by_seed'], 1)}) | "
-                         f"{100 * r['capped']:.0f} % | {paper} |")
+            paper = ", ".join(f"{v:g}" for v in row.paper.values())
+            lines.append(f"| {row.label} | {_cells(table.get(row.key, {}).get(world))} | {paper} |")
     claims = {world: orderings(table, world) for world in jobs.WORLDS}
     lines += ["", "**The paper's orderings** (difference with its 95 % interval: bootstrap over seeds and trials, and at least what seeds do to an average, pooled over the rows; undecided: it holds 0)", "",
               "| the paper says | simulation | other world |", "|---|---|---|"]
     lines += [f"| {a['says']} | {a['here']} | {b['here']} |" for a, b in zip(claims["simulation"], claims["reality"], strict=True)]
-    lines += ["", *_randomization(table)]
-    plain = {k: {w: {n: v for n, v in r.items() if n != "_draws"} for w, r in by.items()} for k, by in table.items()}
-    return "\n".join(lines) + "\n", {"rows": plain, "orderings": claims}, lambda axes: _rotation_figure(axes, order, table)
+    return "\n".join(lines) + "\n", {"rows": _plain(table), "orderings": claims}, lambda axes: _rotation_figure(axes, order, table)
+
+
+def _cells(r: dict[str, Any] | None) -> str:
+    """What stands under COLUMNS, but for the row's name."""
+    if r is None:
+        return "not judged | | | | | "
+    seconds = "-" if r["seconds_per_success"] is None else f"{r['seconds_per_success']:.2f} ({_each(r['seconds_by_seed'], 2)})"
+    return (f"{r['average']:.1f} ({r['interval'][0]:.1f}-{r['interval'][1]:.1f}) | {_each(r['by_seed'], 1)} | {r['median']:.1f} | {seconds} | "
+            f"{r['seconds_to_fall']:.1f} ({_each(r['fall_by_seed'], 1)}) | {100 * r['capped']:.0f} %")
+
+
+def _plain(table: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
+    """As it can be written."""
+    return {k: {w: {n: v for n, v in r.items() if not n.startswith("_")} for w, r in by.items()} for k, by in table.items()}
 
 
 def _between_seeds(by_seed: list[list[float]]) -> float:
@@ -101,13 +104,21 @@ def _between_seeds(by_seed: list[list[float]]) -> float:
     return float(student.ppf(0.975, free)) * math.sqrt(squares / free)
 
 
+def _difference(a: dict, b: dict, spread: float) -> tuple[float, float, float]:
+    """(a's average less b's, and the ends of its 95 % interval): the wider one of the bootstrap's and of what seeds do to an average
+    (`spread`, of `_between_seeds`)."""
+    difference, between = a["average"] - b["average"], spread * math.sqrt(1 / len(a["by_seed"]) + 1 / len(b["by_seed"]))
+    low, high = np.percentile(a["_draws"] - b["_draws"], [2.5, 97.5])
+    return difference, min(float(low), difference - between), max(float(high), difference + between)
+
+
 def _each(values: list[float | None], digits: int) -> str:
     return ", ".join("-" if v is None else f"{v:.{digits}f}" for v in values)
 
 
 def orderings(table: dict, world: str) -> list[dict[str, str]]:
-    """Each claim of the paper and whether it holds: averages by the interval of their difference, the wider one of the bootstrap's
-    and of what seeds do to an average (`_between_seeds`); times by every pair of seeds."""
+    """Each claim of the paper and whether it holds: averages by the interval of their difference (`_difference`); times by every pair
+    of seeds."""
     spread = _between_seeds([by[world]["by_seed"] for by in table.values() if world in by])
     labels = {r.key: r.label for r in rows.ROTATION}
     out = []
@@ -118,9 +129,7 @@ def orderings(table: dict, world: str) -> list[dict[str, str]]:
         if a is None or b is None or (quantity != "average" and None in (a[quantity], b[quantity])):
             here = "not judged"
         elif quantity == "average":
-            difference, between = a["average"] - b["average"], spread * math.sqrt(1 / len(a["by_seed"]) + 1 / len(b["by_seed"]))
-            low, high = np.percentile(a["_draws"] - b["_draws"], [2.5, 97.5])
-            low, high = min(low, difference - between), max(high, difference + between)
+            difference, low, high = _difference(a, b, spread)
             here = "holds" if low > 0 else "reversed" if high < 0 else "undecided"
             here += f" ({difference:+.1f}, {low:+.1f} to {high:+.1f})"
         else:
@@ -129,17 +138,6 @@ def orderings(table: dict, world: str) -> list[dict[str, str]]:
             here = "undecided, one seed" if min(len(mine), len(theirs)) == 1 else here
             here += f" ({a[quantity]:.2f} and {b[quantity]:.2f} s)"
         out.append({"says": says, "here": here, "first": first, "second": second, "quantity": quantity, "word": word})
-    return out
-
-
-def _randomization(table: dict) -> list[str]:
-    out = []
-    for key, text in (("full", "trained with randomization"), (rows.UNRANDOMIZED.key, "trained without")):
-        by = table.get(key, {})
-        if set(by) == set(jobs.WORLDS) and by["simulation"]["average"]:
-            kept = by["reality"]["average"] / by["simulation"]["average"]
-            out.append(f"Full observations, {text}: {by['simulation']['average']:.1f} successes in its own simulation, "
-                       f"{by['reality']['average']:.1f} in the other world ({100 * (kept - 1):+.0f} %).")
     return out
 
 
@@ -262,26 +260,36 @@ def _learning_figure(ax, curves: dict[Row, list[tuple[np.ndarray, np.ndarray]]])
     ax.grid(alpha=0.3)
 
 
-def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> Path:
-    """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage), and the learning curves of the rotation,
-    rotation_learning.png; returns the Markdown's path."""
+def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> list[Path]:
+    """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage), the same of rows of our own
+    (<table>_own..., `benchmarks.reproduce.own`), and the learning curves of the rotation, rotation_learning.png; returns the
+    Markdowns' paths."""
     from matplotlib.figure import Figure
 
-    text, data, draw = {"rotation": rotation, "grasp": grasp}[table](plan, all_jobs)
-    steps = sorted({s for j in all_jobs for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])})
-    trained = "nothing trained yet" if not steps else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
-    head = (f"# The paper's {table} table\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training, "
-            f"{len({j.seed for j in all_jobs})} seed(s) a row of the paper's, one for ours; "
-            + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
-            + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
-    path = plan.out / (table + ("" if plan.level is None else f"_at_{plan.level / 1e6:.4g}M") + ".md")
-    path.write_text(head + text)
-    path.with_suffix(".json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    draw(figure.subplots(1, 2))
-    figure.savefig(path.with_suffix(".png"), dpi=110)
+    from benchmarks.reproduce import own
+
+    stage = "" if plan.level is None else f"_at_{plan.level / 1e6:.4g}M"
+    written = []
+    for name, make, chosen in ((table, {"rotation": rotation, "grasp": grasp}[table], [j for j in all_jobs if j.row.paper]),
+                               (f"{table}_own", own.table, [j for j in all_jobs if not j.row.paper])):
+        if not chosen:
+            continue
+        text, data, draw = make(plan, chosen)
+        steps = sorted({s for j in chosen for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])})
+        trained = "nothing trained yet" if not steps else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
+        title = f"The paper's {table} table" if chosen[0].row.paper else f"Rows of our own beside the paper's {table} table"
+        head = (f"# {title}\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training, {len({j.seed for j in chosen})} seed(s) a row; "
+                 + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
+                 + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
+        path = plan.out / f"{name}{stage}.md"
+        path.write_text(head + text)
+        path.with_suffix(".json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")
+        figure = Figure(figsize=(11, 3.6), layout="constrained")
+        draw(figure.subplots(1, 2))
+        figure.savefig(path.with_suffix(".png"), dpi=110)
+        written.append(path)
     if table == "rotation" and plan.level is None and (curves := learning(plan, all_jobs)):
         figure = Figure(figsize=(8, 4), layout="constrained")
         _learning_figure(figure.subplots(), curves)
         figure.savefig(plan.out / f"{table}_learning.png", dpi=110)
-    return path
+    return written
