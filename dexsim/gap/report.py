@@ -161,10 +161,10 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> str:
                     f'<td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
     from dexsim.assets import xhand
 
-    for pad, v in (d.touch.pads if d.touch else {}).items():
-        f_ = xhand.FINGERS.index(pad)
+    for finger, v in (d.touch.pads if d.touch else {}).items():
+        f_ = xhand.FINGERS.index(finger)
         effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if any(t.startswith(f"{f_}:") for t in f["where"]["taxels"])) or "&#8211;"
-        rows.append(f'<tr><td>pad of the {_t(pad)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
+        rows.append(f'<tr><td>pad of the {_t(finger)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
                     f'<td class="n">{1e3 * v["noise"]:.2g} mN</td></tr>')  # fmt: skip
     more = f'<p class="soft small">and {len(order) - most} more joints with less, in the details</p>' if most is not None and len(order) > most else ""
     return f'<table><tr><th>where</th><th>found</th><th class="n">before</th><th class="n">after</th><th class="n">noise</th></tr>{"".join(rows)}</table>{more}'
