@@ -17,7 +17,7 @@ from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
 HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
-BLIND = 0.15  # s: over a longer one the motion is not known, and a joint is judged before and after it
+BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judged before and after it
 EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
 TURN = 180 / np.pi
 

@@ -1,0 +1,89 @@
+"""Readings that repeat old ones: told from those of a joint that rests, creeps, sticks and slips, or is hit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dexsim.gap import frozen
+from dexsim.gap.runs import Run
+
+T = np.arange(0, 7, 0.01)
+QUANTUM = 2 * np.pi / 4096
+
+
+def goal(kind: int) -> np.ndarray:
+    """Steps with rests, or a chirp."""
+    if kind:
+        return 0.3 * np.sin(2 * np.pi * (0.2 + 0.15 * T) * T)
+    knots = np.arange(0, 8, 0.7)
+    return np.interp(T, np.sort(np.r_[knots[1:], knots[1:] + 0.2]), np.repeat(np.random.default_rng(3).uniform(-0.8, 0.8, len(knots) - 1), 2))
+
+
+def follow(target: np.ndarray, stiction: float = 0.0) -> np.ndarray:
+    """A joint of second order behind its target; it stays where it is until the target is `stiction` away, then it goes all the way."""
+    q, v, out, stuck = target[0], 0.0, [], False
+    for c in np.repeat(target, 10):
+        stuck = abs(c - q) < stiction if stuck else stiction > 0 and abs(v) < 0.02 and abs(c - q) < stiction
+        v = 0.0 if stuck else v + 1e-3 * (900.0 * (c - q) - 42.0 * v)
+        q += 1e-3 * v
+        out.append(q)
+    return np.array(out[::10])
+
+
+def run(name: str, target: np.ndarray, q: np.ndarray, noise: float = 0.0, quantum: float = QUANTUM) -> Run:
+    read = q + noise * np.random.default_rng(len(name)).normal(size=len(q))
+    return Run(name, ("joint",), T, target[:, None], T, (np.round(read / quantum) * quantum)[:, None], None, np.array([0, 0, -9.81]))
+
+
+def clean(noise: float, quantum: float = QUANTUM, stiction: float = 0.0) -> list[Run]:
+    return [run(f"{k}", goal(k), follow(goal(k), stiction), noise, quantum) for k in (0, 1)]
+
+
+@pytest.mark.parametrize("noise", [0.0, 2e-4, 1e-3])
+@pytest.mark.parametrize(("first", "last"), [(100, 280), (205, 384), (333, 350), (430, 520)])
+def test_a_frozen_stretch_is_found_in_every_noise(noise, first, last):
+    runs = clean(noise)
+    q = runs[1].q
+    q[first : last + 1] = q[first]
+    none, found = frozen.stretches(runs, "joint")
+    assert none == [] and len(found) == 1
+    a, b = found[0]
+    assert first - 3 <= a <= first and last <= b <= last + 3
+
+
+@pytest.mark.parametrize("quantum", [QUANTUM, 2 * np.pi / 1024, 0.02])
+@pytest.mark.parametrize("stiction", [0.0, 0.02, 0.1, 0.3])
+def test_rests_of_a_coarse_encoder_and_of_a_joint_that_sticks_are_honest(quantum, stiction):
+    runs = clean(0.0, quantum, stiction)
+    longest = max(T[b] - T[a] for a, b in frozen.rests(runs[0].q[:, 0]))
+    assert longest > 0.3  # it does rest: readings repeat for as long as a frozen one's would
+    assert frozen.stretches(runs, "joint") == [[], []]
+    assert not any(frozen.duplicates(r.t, r.q[:, 0]).any() for r in runs)
+
+
+def test_a_spike_at_rest_and_a_joint_that_is_held_are_no_old_readings():
+    runs = clean(0.0)
+    a, b = max(frozen.rests(runs[0].q[:, 0]), key=lambda x: x[1] - x[0])
+    runs[0].q[b] += 0.3  # one sample, and back
+    assert frozen.stretches(runs, "joint") == [[], []]
+    target = goal(1)
+    held = follow(np.where((T > 2) & (T < 4), target[200], target))  # somebody holds it for two seconds, then lets go
+    assert frozen.stretches([clean(0.0)[0], run("1", target, held)], "joint") == [[], []]
+
+
+def test_single_readings_sent_twice():
+    once = clean(2e-4)[1]
+    assert not frozen.duplicates(once.t, once.q[:, 0]).any()
+    twice = once.q[:, 0].copy()
+    twice[1::4] = twice[0::4]
+    found = frozen.duplicates(once.t, twice)
+    assert found[1::4].sum() > 0.2 * len(twice) / 4 and not found[0::4].any()
+
+
+def test_a_run_without_the_joint_and_two_joints():
+    runs = clean(0.0)
+    two = Run("2", ("other", "joint"), T, np.stack([goal(0), goal(1)], 1), T, np.concatenate([runs[0].q, runs[1].q], 1), None, np.zeros(3))
+    two.q[200:330, 1] = two.q[200, 1]
+    assert frozen.stretches([*runs, two], "other") == [[], [], []]
+    assert [len(x) for x in frozen.stretches([*runs, two], "joint")] == [0, 0, 1]
