@@ -97,6 +97,24 @@ def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fit
     assert (now.value, now.low, now.high) == (fitted, *after) and (other.low, other.high) == (0.018, 0.022)
 
 
+def test_what_reproduces_what_was_kept_out_is_handed_on_as_fitted_whatever_its_name_is_worth():
+    """By hand: half of a tenth less error earns 0.5, a rival with 0.4 takes 0.4 of it; at a confidence of 0.5 the way to the belief (1.09) is then
+    1 - 0.3 of 0.84."""
+    from types import SimpleNamespace
+
+    from dexsim.gap.findings import earned, widen
+
+    found = lambda after, *others: {"held_out": {"before": 1.0, "after": after}, "alternatives": [{"effect": "lag", "confidence": c} for c in others]}  # noqa: E731
+    assert [earned(found(x)) for x in (1.2, 1.0, 0.95, 0.9, 0.2)] == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0]) and earned({"held_out": None}) == 0.0
+    assert earned(found(0.95, 0.3, 0.1)) == pytest.approx(0.3)
+    case = SimpleNamespace(joint=JOINT, scales=SimpleNamespace(nominal={"torque_limit": 1.09}))
+    member = SimpleNamespace(variant=SimpleNamespace(params=[SimpleNamespace(columns=("torque_limit",))]))
+    for worth, high in ((0.0, 1.09), (0.3, 0.25 + 0.7 * 0.84), (1.0, 0.3)):
+        table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1.09}}})
+        table.set(JOINT, "torque_limit", 0.25, 0.2, 0.3)
+        assert widen(table, case, member, 0.5, worth) == (high > 0.3) and table.value(JOINT, "torque_limit").high == pytest.approx(high)
+
+
 PLAY = {
     "backlash": {"value": 0.03, "low": 0.02, "high": 0.04}, "rebound": 0.1, "speed_lag": {"value": 0.01, "low": 0.005, "high": 0.02},
     "eccentric_sin": {"value": 0.05, "low": 0.04, "high": 0.06}, "sag": {"value": 0.05, "low": 0.02, "high": 0.08},

@@ -78,18 +78,20 @@ def test_no_share_of_a_gap_that_may_be_none():
 
 
 def test_report_reads_what_was_judged(tmp_path):
-    s = loop.SETTINGS | {"tasks": "grasp", "worlds": "soft", "seeds": "2", "out": str(tmp_path)}
+    s = loop.SETTINGS | {"tasks": "grasp", "worlds": "stiff", "seeds": "2", "out": str(tmp_path)}
     one = loop.Loop(s)
     for seed in (1, 2):
         for variant, held in zip(loop.VARIANTS, (0.5, 0.6, 0.7 + 0.1 * seed, 0.9), strict=True):
-            where = one.folder("grasp", seed, "soft") / f"judged_{variant}"
+            where = one.folder("grasp", seed, "stiff") / f"judged_{variant}"
             where.mkdir(parents=True)
             (where / "metrics.json").write_text(json.dumps({"hold_rate_all": held, "force_error_N": 1.0}))
     line = one.report()["lines"][0]
     assert line["values"]["naive"] == [50.0, 50.0] and line["recovered_fitted"]["value"] == pytest.approx((85 - 50) / 40)
     assert "85" in loop.markdown(one.report())
     jobs = {j.name: j for j in one.jobs()}
-    assert jobs["fitted grasp 1 soft"].after == ["diagnose soft", "naive grasp 1"] and jobs["naive grasp 1"].gpu and not jobs["judge naive grasp 1 soft"].gpu
+    assert jobs["fitted grasp 1 stiff"].after == ["diagnose stiff", "naive grasp 1"] and jobs["naive grasp 1"].gpu and not jobs["judge naive grasp 1 stiff"].gpu
+    assert jobs["diagnose stiff"].after == ["excite stiff", "own grasp 1 stiff", "own grasp 2 stiff"] and jobs["own grasp 2 stiff"].after == ["naive grasp 2"]
+    assert max(j.rank for j in jobs.values() if j.name.startswith(("fitted", "truth"))) < jobs["wide grasp 1"].rank
 
 
 def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
@@ -101,7 +103,7 @@ def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
         for joint, p in kept["servo"]["joints"].items():
             b = nominal["joints"]["*"] | nominal["joints"].get(joint, {})
             assert 0.95 < p["torque_limit"] / b["torque_limit"] < 1.05
-            assert p["delay"] - b["delay"] > 0.02 and (p["kp"] / b["kp"] < 0.55 if name == "soft" else p["lag"] > 0.01)
+            assert (p["kp"] / b["kp"] > 1.6 and p["kd"] / b["kd"] < 0.55) if name == "stiff" else (p["delay"] - b["delay"] > 0.02 and p["lag"] > 0.01)
 
 
 def test_forced_mass_follows_its_formula():

@@ -1,17 +1,19 @@
 """The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,soft] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
                               [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
 
-A reality is one hand: it is recorded under safe excitation and diagnosed once. For each task
-and seed: the included policy goes on for `naive` iterations in the believed simulator without randomization of the drives. Then three
-fine-tunes of the naive checkpoint of `tune` iterations each: with the servo table that `diagnose` fitted (its intervals
-are the randomization), with wide randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are commands of the product. One GPU a
-training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use the CPUs meanwhile. gpus=none
-(the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU, fine-tuning a policy that
-has converged changes next to nothing, so that is for trying the command. Resumable: a step that is done is not repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
-runs is ended. Writes loop.json, table.md, loop.png.
+For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
+drives. A reality is one hand: it is recorded under safe excitation, and the naive policies' own runs in it are recorded and what they
+commanded is played again on the empty hand; all that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
+iterations: with the servo table that `diagnose` fitted (its intervals are the randomization), with wide randomization of the believed
+drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
+commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
+the CPUs meanwhile. gpus=none (the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU,
+fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. Resumable: a step that is done is not
+repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still runs is ended. Writes
+loop.json, table.md, loop.png.
 """
 
 from __future__ import annotations
@@ -35,17 +37,17 @@ from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,soft", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
+SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
             "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8"}  # fmt: skip
-# what is judged: file key, larger is better
+# what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
 FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "efficiency": 1.0, "deadband": 0.0, "delay": 0.0, "coulomb_friction": 1.0,
          "torque_ripple": 0.0}  # fmt: skip
 WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
-TASK = 100  # between the ranks of two tasks
+OWN_S, AGAIN_S = 20, 20  # s of a policy's own run that are recorded and played again
 JUDGING = 75.0  # s that judging may be begun after the last training
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
@@ -228,7 +230,7 @@ class Loop:
             where = self.folder(task, seed, world) / f"judged_{variant}"
             cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
             status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}", f"episodes={self.episodes[task]}",
-                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap], where / "log.txt", limit=400)  # fmt: skip
+                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap], where / "log.txt", limit=900)  # fmt: skip
             return status == 0 and (where / "metrics.json").is_file()
 
         return run
@@ -236,46 +238,70 @@ class Loop:
     def excite(self, world: str):
         def run(slot: str) -> bool:
             where = self.out / f"excited_{world}"
-            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1", "count=3"], where / "log.txt") == 0
+            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1"], where / "log.txt") == 0
+
+        return run
+
+    def own(self, task: str, seed: int, world: str):
+        """The naive policy's own run in the reality, and the same commands on the empty hand."""
+        def run(slot: str) -> bool:
+            where = self.out / f"own_{world}"
+            mcap = where / f"{task}_{seed}.mcap"
+            cap = [f"task.evaluation.cap_s={OWN_S}"] if task == "rotate" else []
+            log = where / f"{task}_{seed}.log"
+            if self.call(["play.py", f"checkpoint={self.policy(task, seed, 'naive', world)}", f"reality={world}", "episodes=4", f"seed={100 + seed}",
+                          "video=false", f"record={mcap}", "record_worlds=1", "realistic=true", f"out={where / f'play_{task}_{seed}'}", "sim.threads=1", *cap],
+                         log, limit=300):  # fmt: skip
+                return False
+            return self.call(["-m", "benchmarks.loop.steps", "again", f"world={world}", f"run={mcap}", f"out={where / f'again_{task}_{seed}.mcap'}",
+                              f"seed={seed}", f"seconds={AGAIN_S}"], where / f"again_{task}_{seed}.log") == 0  # fmt: skip
 
         return run
 
     def diagnose(self, world: str):
-        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs are of no use to it: a joint is
-        judged while nothing is touched, and most of what they touch carries no taxels."""
+        """One reality is one hand: it is diagnosed once. From what was excited and what the policies commanded there, played again on the
+        empty hand, which meets the speeds and steps that they use. Their own runs themselves are left out: a joint is judged while nothing
+        is touched, and most of what they touch carries no taxels. Kept out: the last of the excitation and the second seed's commands."""
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            fit, held = excited[:-1], excited[-1:]
+            again = [[self.out / f"own_{world}" / f"again_{task}_{seed}.mcap" for task in self.tasks] for seed in self.recorded()]
+            fit, held = excited[:-1] + again[0], excited[-1:] + [p for part in again[1:] for p in part]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()
 
         return run
 
+    def recorded(self) -> list[int]:
+        """Seeds whose naive policies are recorded: one for the fit, one that is kept out of it."""
+        return self.seeds[:2]
+
     def jobs(self) -> list[Job]:
-        """All steps; those that others wait for come first."""
+        """All steps; those that others wait for come first, wide randomization last."""
         out = []
         for w in self.worlds:
             out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
+            owns = [(task, seed) for task in self.tasks for seed in self.recorded()]
+            for task, seed in owns:
+                out.append(Job(f"own {task} {seed} {w}", self.out / f"own_{w}" / f"{task}_{seed}.done", self.own(task, seed, w), False, [f"naive {task} {seed}"], 1))
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False,
-                           [f"excite {w}"], 0, self.uses["diagnose"]))
-        for k, task in enumerate(self.tasks):  # one task's trainings before the next one's
-            first = TASK * k
+                           [f"excite {w}", *(f"own {task} {seed} {w}" for task, seed in owns)], 2, self.uses["diagnose"]))
+        for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
-                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], first + 1, self.uses["train"]))
-                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], first + 5 + seed, self.uses["train"]))
+                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"]))
+                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5, self.uses["train"]))
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
                         Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"]))
-                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], first + 8)
-                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], first + 2)
-                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], first + 3 + seed)
-                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], first + 9)
+                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8)
+                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], 3)
+                    add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
+                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
                     for variant in ("fitted", "truth"):
-                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], first + 8)
+                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], 7)
         return out
 
     def report(self) -> dict:

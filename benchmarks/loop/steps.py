@@ -1,7 +1,8 @@
 """The steps of the loop that no entry script does: a start that may be trained on, and recordings of the hand in its reality.
 
     python -m benchmarks.loop.steps start checkpoint=FILE out=last.pt device=cuda [any setting of train.py]
-    python -m benchmarks.loop.steps record world=soft out=DIR seed=1 [count=3] [seconds=19]
+    python -m benchmarks.loop.steps record world=late out=DIR seed=1 [seconds=19]
+    python -m benchmarks.loop.steps again world=late run=own.mcap out=again.mcap [seed=1] [seconds=20]
 """
 
 from __future__ import annotations
@@ -13,6 +14,9 @@ import numpy as np
 import yaml
 
 ROOT = Path(__file__).parents[2]
+EXCITED = ("random", "chirp", "steps", "random")
+"""Motions of the excitation, all joints (or fingers) at once: most is seen in little time. Chirps tell a delay from damping, steps reach the
+speeds and torques that a policy asks for."""
 
 
 def start(given: dict[str, str]) -> None:
@@ -39,37 +43,61 @@ def start(given: dict[str, str]) -> None:
 
 
 def record(given: dict[str, str]) -> None:
-    """Recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late and lost as there."""
-    from dexsim.cli.build import quiet_warp
-    from dexsim.recording import write
+    """Recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late and lost as there. The last
+    one, random motion as the first, is for the proof."""
     from dexsim.recording.excitation import plan
+    from dexsim.recording.mechanism import mechanism
+
+    world, out, seed = _world(given["world"]), Path(given["out"]), int(given.get("seed", 0))
+    out.mkdir(parents=True, exist_ok=True)
+    believed = mechanism()
+    for k, kind in enumerate(EXCITED):
+        p = plan(believed, kinds=[kind], seed=seed + k, repeats=0)
+        if kind == "random":
+            p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
+        _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
+
+
+def again(given: dict[str, str]) -> None:
+    """What a policy commanded in its own run (run=FILE of `play.py record=`), played again on the hand in that reality with nothing in it."""
+    from dexsim.recording import read
+    from dexsim.recording.mechanism import for_recording
+
+    own, seed, out = read(given["run"]), int(given.get("seed", 0)), Path(given["out"])
+    believed = for_recording(own)
+    order = [own.joints.index(j) for j in believed.joints]
+    held = own.commands.t < float(given.get("seconds", 20.0))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _drive(_world(given["world"]), believed, own.commands.t[held], own.commands.value[held][:, order], own.states.position.value[0, order],
+           np.random.default_rng(seed), out)
+
+
+def _world(name: str) -> dict:
+    from dexsim.cli.build import quiet_warp
+
+    quiet_warp("cpu")
+    return yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
+
+
+def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.ndarray, rng: np.random.Generator, path: Path) -> None:
+    """Sends targets value [T, J] rad at t [T] s to the empty hand of a world, from home [J], and writes what its bus delivers."""
+    from dexsim.recording import write
     from dexsim.recording.mechanism import drive, mechanism, recorded
     from dexsim.recording.realistic import realistic
     from dexsim.recording.schema import COMMANDS, Series
 
-    quiet_warp("cpu")
-    world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
-    believed, true = mechanism(), mechanism(servo=world["servo"])
-    out, seed = Path(given["out"]), int(given.get("seed", 0))
-    out.mkdir(parents=True, exist_ok=True)
-    kinds = [["random"], ["chirp"]]  # all joints at once: most is seen in little time; chirps tell a delay from damping
-    for k in range(int(given.get("count", 3))):
-        rng = np.random.default_rng([seed, k])
-        p = plan(believed, kinds=kinds[k % len(kinds)], seed=seed + k, repeats=0)
-        if kinds[k % len(kinds)] == ["random"]:
-            p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
-        arrives = rng.random(len(p.t)) >= world["timing"]["lost"]
-        late = p.t + world["timing"]["late"] * rng.random(len(p.t))
-        order = np.argsort(late[arrives], kind="stable")
-        sent = Series(late[arrives][order], p.value[arrives][order], COMMANDS)
-        run = drive(true, sent, believed.joints, float(p.t[-1]), initial=p.home, timestep=0.001)
-        dense = recorded(run, believed, Series(p.t, p.value, COMMANDS), believed.joints, rate=500.0)
-        seen = realistic(dense, seed=int(rng.integers(1 << 30)))
-        seen.meta["source"] = "real"
-        write(out / f"excite_{k}.mcap", seen)
-        print(f"{out / f'excite_{k}.mcap'}: {p.t[-1]:.0f} s", flush=True)
+    true = mechanism(servo=world["servo"], gravity=believed.spec.option.gravity)
+    arrives = rng.random(len(t)) >= world["timing"]["lost"]
+    late = t + world["timing"]["late"] * rng.random(len(t))
+    order = np.argsort(late[arrives], kind="stable")
+    sent = Series(late[arrives][order], value[arrives][order], COMMANDS)
+    run = drive(true, sent, believed.joints, float(t[-1]), initial=home, timestep=0.001)
+    seen = realistic(recorded(run, believed, Series(t, value, COMMANDS), believed.joints, rate=500.0), seed=int(rng.integers(1 << 30)))
+    seen.meta["source"] = "real"
+    write(path, seen)
+    print(f"{path}: {t[-1]:.0f} s", flush=True)
 
 
 if __name__ == "__main__":
     what, *rest = sys.argv[1:]
-    {"start": start, "record": record}[what](dict(item.split("=", 1) for item in rest))
+    {"start": start, "record": record, "again": again}[what](dict(item.split("=", 1) for item in rest))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.gap import confidence, judge, locate
-from dexsim.gap.findings import model_changes, servo_changes, widen
+from dexsim.gap.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.joint import JointAnswer, Kept, nuisances
 from dexsim.gap.prepare import Case
 from dexsim.gap.result import Diagnosis, Settings, empty
@@ -100,7 +100,7 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
     members = {(a.case.joint, mm.id): (a.case, mm) for a in answers for mm in a.outcome.best.members}
     for f in findings:
         joint, effect = f["where"]["joints"][0], f["effect"]
-        if f["confidence"] < DOUBTED and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"]):
+        if f["confidence"] < DOUBTED and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"], earned(f)):
             d.notes.append(f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed")
     d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
 

@@ -168,11 +168,25 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
     return left
 
 
-def widen(table: ServoTable, case: Case, member, confidence: float) -> bool:
+def earned(finding: dict[str, Any]) -> float:
+    """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or more off the error
+    on what was kept out (against all others fitted again without it), less by what other names claim of it, which would go on in another
+    way where nothing was recorded."""
+    error, others = finding.get("held_out") or {}, sum(float(x["confidence"]) for x in finding.get("alternatives") or ())
+    if not error or error["before"] is None or error["after"] is None:
+        return 0.0
+    less = float(np.clip((error["before"] - error["after"]) / (0.1 * error["before"] + 1e-12), 0.0, 1.0))
+    return less * max(1.0 - others, 0.0)
+
+
+def widen(table: ServoTable, case: Case, member, confidence: float, earned: float = 0.0) -> bool:
     """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of a half and
-    less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the belief as the effect is sure.
-    The fitted values stay. Returns whether a range changed."""
-    changed, share = False, min(1.0, 2.0 * (1.0 - confidence))
+    less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the belief as the effect is sure;
+    and of that way only the share that is not `earned`: a policy meets the drive, not the name. The fitted values stay. Returns whether a
+    range changed."""
+    changed, share = False, min(1.0, 2.0 * (1.0 - confidence)) * (1.0 - earned)
+    if share <= 0.0:
+        return False
     for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
         column, now = COLUMNS[INDEX[name]], table.value(case.joint, name)
         believed = float(np.clip(case.scales.nominal[name], column.low, min(column.high, 1e9)))

@@ -136,6 +136,15 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
     return cases
 
 
+def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
+    """Median over recordings of each one's median over its pieces (a contact cuts one into several): noise is the sensor's, and a recording
+    that moves too fast to tell the two apart counts once."""
+    by: dict[str, list[float]] = {}
+    for run, value in zip(runs, values, strict=True):
+        by.setdefault(run.name, []).append(value)
+    return float(np.median([np.median(x) for x in by.values()]))
+
+
 def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia, voltage) -> Case:
     cat = lambda get: np.concatenate([get(i) for i in range(len(runs))])  # noqa: E731
     t = plant.t
@@ -148,8 +157,8 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     else:
         limit = rows[0][j][SERVO_INDEX["torque_limit"]]
     estimates = [noise(run.t, run.q[:, j]) for run in runs]
-    sigma = float(np.median([e[0] for e in estimates]))
-    quantum = float(np.median([e[1] for e in estimates]))
+    sigma = _of_recordings(runs, [e[0] for e in estimates])
+    quantum = _of_recordings(runs, [e[1] for e in estimates])
     series = lambda name: np.concatenate([np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]])  # noqa: E731
                                           for i in range(len(runs))])
     gravity, load_t, load_i = series("gravity_cos"), series("load_cos"), series("load_inertia")
