@@ -12,7 +12,7 @@ from worlds import grasp_cfg, grasp_env
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.sim.engine import FLAG_NAN
-from dexsim.tasks import make_env, terms
+from dexsim.tasks import grasp_eval, make_env, terms
 from dexsim.tasks.grasp import ACTOR_SIZE, OBSERVATION, PRIVILEGED
 
 N = 8
@@ -501,3 +501,19 @@ def test_impossible_settings_are_user_errors(change, word):
         return
     with pytest.raises(UserError, match=word):
         make_env(cfg, 1, "cpu", 0, "mujoco")
+
+
+def test_play_prints_the_papers_columns_of_the_grasp():
+    """Ranges and correlations of held episodes, of forces and torques that follow the command exactly or not at all."""
+    n = 200
+    command = np.linspace(0.1, 1.0, n)
+    r = {"command": command, "mass": np.full(n, 0.05), "friction": np.full(n, 1.0), "load": np.full(n, 0.5), "pushed": np.zeros(n), "held": np.ones(n),
+         "held90": np.ones(n), "held180": np.ones(n), "force": command[:, None] * [1.0, 2, 2, 2, 2], "alive": np.ones(n),
+         "torque": np.tile(np.where(np.arange(n) % 2, 0.2, 0.4)[:, None], 12), "moved": np.zeros(n), "untouched": np.zeros(n)}  # fmt: skip
+    title, header, rows = grasp_eval._papers_columns(grasp_eval._metrics(r, r, 2.0))
+    assert "paper's columns" in title and header[0] == "contact forces N" and len(rows) == 1
+    low, high = (float(x) for x in rows[0][0].split("-"))
+    assert low == pytest.approx(9 * np.quantile(command, 0.05), abs=0.01) and high == pytest.approx(9 * np.quantile(command, 0.95), abs=0.01)
+    assert rows[0][1:3] == ("0.2-0.4", "1.000") and abs(float(rows[0][3])) < 0.05
+    nothing = r | {"held": np.zeros(n)}
+    assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, 2.0))[2] == [("-", "-", "-", "-")]

@@ -216,7 +216,19 @@ def test_the_grasp_table(tmp_path):
                                     "force_command_correlation": corr, "torque_command_correlation": 0.7}))
     text, data, _ = report.grasp(p, every)
     assert [o["here"] for o in data["orderings"]["simulation"]] == ["so for one seed each (0.950, 0.800)", "not so for one seed each (0.800, 0.900)"]
+    assert [o["here"] for o in data["orderings"]["reality"]] == ["not judged"] * 2
     assert "| R_force + R_torque | 0.90 (0.90) | 3.00 (3.00) | 40.00 (40.00) |" in text
+
+
+def test_a_correlation_is_stronger_beyond_what_seeds_do():
+    """By hand: variances 0.0002, 0.0002, 0.0098 over 3 degrees of freedom, t = 3.1824, two seeds a row."""
+    spread = report._between_seeds([[0.95, 0.93], [0.92, 0.94], [0.18, 0.32]])
+    half = 3.1824 * (0.0102 / 3) ** 0.5
+    far = report._stronger([0.92, 0.94], [0.18, 0.32], spread)
+    assert far["here"].startswith("holds (+0.680") and far["here"].endswith("above in every pair of seeds)")
+    assert far["interval"] == pytest.approx([0.68 - half, 0.68 + half], rel=1e-3)
+    assert report._stronger([0.95, 0.93], [0.92, 0.94], spread)["here"].startswith("undecided (+0.010")
+    assert report._stronger([0.18, 0.32], [0.92, 0.94], spread)["here"].startswith("reversed")
 
 
 class Children:

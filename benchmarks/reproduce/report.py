@@ -199,23 +199,32 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
                 cells.append("-" if not values else f"{np.mean(values):.2f} ({', '.join(f'{v:.2f}' for v in values)})")
             table.setdefault(row.key, {})[world] = entry
             lines.append(f"| {row.label} | " + " | ".join(cells) + f" | {paper} |")
-    lines += ["", "**Strength of the correlation of force and command** (the paper: both > force only > torque only)", ""]
+    lines += ["", "**Strength of the correlation of force and command** (the paper: both > force only > torque only; differences with the 95 % interval of what"
+              " seeds do to a correlation, pooled over the rows)", ""]
     said: dict[str, list] = {}
     for world in jobs.WORLDS:
         said[world] = []
+        each = {k: by[world]["force_correlation"] for k, by in table.items()}
+        spread = _between_seeds([v for v in each.values() if v])
         for first, second in (("both", "force"), ("force", "torque")):
-            a, b = (table.get(k, {}).get(world, {}).get("force_correlation") or [] for k in (first, second))
-            if not a or not b:
-                here = "not judged"
-            elif len(a) == len(b) == 1:
-                here = f"{'so' if a > b else 'not so'} for one seed each ({a[0]:.3f}, {b[0]:.3f})"
-            elif min(a) > max(b) or max(a) < min(b):
-                here = "holds in every pair of seeds" if min(a) > max(b) else "reversed in every pair of seeds"
-            else:
-                here = "undecided: the seeds overlap"
-            said[world].append({"first": first, "second": second, "here": here})
-            lines.append(f"- {WORLD_NAMES[world]}, {first} > {second}: {here}.")
+            here = {"first": first, "second": second} | _stronger(each.get(first) or [], each.get(second) or [], spread)
+            said[world].append(here)
+            lines.append(f"- {WORLD_NAMES[world]}, {first} > {second}: {here['here']}.")
     return "\n".join(lines) + "\n", {"rows": table, "orderings": said}, lambda axes: _grasp_figure(axes, order, table)
+
+
+def _stronger(a: list[float], b: list[float], spread: float) -> dict[str, Any]:
+    """Whether the correlations `a`, one of each seed, are above `b`: by the interval of their difference and by every pair of seeds.
+    spread: `_between_seeds` of all rows."""
+    if not a or not b:
+        return {"here": "not judged"}
+    difference, between = float(np.mean(a) - np.mean(b)), spread * math.sqrt(1 / len(a) + 1 / len(b))
+    if not spread:
+        return {"here": f"{'so' if difference > 0 else 'not so'} for one seed each ({a[0]:.3f}, {b[0]:.3f})", "difference": difference}
+    here = "holds" if difference > between else "reversed" if difference < -between else "undecided"
+    pairs = "above in every pair of seeds" if min(a) > max(b) else "below in every pair of seeds" if max(a) < min(b) else "the seeds overlap"
+    return {"here": f"{here} ({difference:+.3f}, {difference - between:+.3f} to {difference + between:+.3f}; {pairs})", "difference": difference,
+            "interval": [difference - between, difference + between]}
 
 
 def _grasp_figure(axes, order: list[Row], table: dict) -> None:

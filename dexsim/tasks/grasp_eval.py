@@ -46,7 +46,7 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     plots = [force_command, hold_by_command]
     return {
         "metrics": metrics,
-        "tables": _tables(trained, held_out, env),
+        "tables": [_papers_columns(metrics), *_tables(trained, held_out, env)],
         "frames": trained["frames"],
         "plots": plots,
     }
@@ -232,6 +232,19 @@ def _by_command(r: dict, held: np.ndarray) -> dict:
             rows["force_range_N"].append([float(x) for x in np.percentile(total[m], [5, 95])])
             rows["torque_Nm"].append(float(torque[m].mean()))
     return rows
+
+
+def _papers_columns(metrics: dict) -> tuple[str, tuple, list]:
+    """The paper's table of rewards, of held episodes: what is printed of the ranges, and of how force and torque follow the command."""
+    def ends(name: str) -> str:
+        return f"{metrics[name][0]:.3g}-{metrics[name][1]:.3g}" if name in metrics else "-"
+
+    def follows(name: str) -> str:
+        return "-" if metrics.get(name) is None else f"{metrics[name]:.3f}"
+
+    return ("Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
+            ("contact forces N", "joint torque N m", "force and command", "torque and command"),
+            [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), follows("force_command_correlation"), follows("torque_command_correlation"))])
 
 
 def _tables(r: dict, k: dict, env) -> list:
