@@ -140,6 +140,15 @@ def degrees(r):
     return "unit", "/joint_states", "a", None, 800
 
 
+def degrees_of_a_weak_drive(r):
+    s = r.states.position
+    s.value = 0.8 * s.value * 180 / np.pi  # it goes four fifths of the way that it is asked
+    if np.abs(s.value[:, 0]).max() < 7:
+        s.value *= 7 / np.abs(s.value[:, 0]).max()
+    r.states.velocity = None
+    return "unit", "/joint_states", "a", None, 800
+
+
 def degrees_commanded(r):
     r.commands.value *= 180 / np.pi
     return "unit", "/joint_commands", "a", None, 800
@@ -251,6 +260,7 @@ FAULTS = (
     lost_sign,
     wrong_sign,
     degrees,
+    degrees_of_a_weak_drive,
     degrees_commanded,
     counts,
     degrees_a_second,

@@ -454,9 +454,13 @@ def units(r: Recording) -> Iterator[Finding]:
         if len(c) > 20 and len(s.position) > 20:
             drive, q = _drive(r, j, s.position.t), s.position.value[:, j]
             ratio = _ratio(drive + q, q)
+            # a drive may follow less than it is asked, but none goes twenty times as far and beyond a turn
+            far = ratio is not None and ratio > 20 and np.nanmax(np.abs(q)) > 2 * np.pi
+            nearest = min(RATIOS, key=lambda k: abs(np.log(ratio / k))) if far else None
             for known, unit in RATIOS.items():
                 for k, whose in ((known, "position"), (1 / known, "command")):
-                    if ratio is not None and abs(ratio / k - 1) < 0.1:
+                    loose = whose == "position" and known == nearest and 0.5 < ratio / k < 1.3
+                    if ratio is not None and (abs(ratio / k - 1) < 0.1 or loose):
                         yield finding(
                             s.position if whose == "position" else c,
                             f"{whose} of {joint} is {known:.4g} times the other: {unit}?",
