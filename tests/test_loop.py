@@ -90,8 +90,20 @@ def test_report_reads_what_was_judged(tmp_path):
     assert "85" in loop.markdown(one.report())
     jobs = {j.name: j for j in one.jobs()}
     assert jobs["fitted grasp 1 stiff"].after == ["diagnose stiff", "naive grasp 1"] and jobs["naive grasp 1"].gpu and not jobs["judge naive grasp 1 stiff"].gpu
-    assert jobs["diagnose stiff"].after == ["excite stiff", "own grasp 1 stiff", "own grasp 2 stiff"] and jobs["own grasp 2 stiff"].after == ["naive grasp 2"]
+    assert jobs["diagnose stiff"].after == ["excite stiff"] and jobs["excite stiff"].after == ["own grasp stiff"] and jobs["own grasp stiff"].after == ["naive grasp 1"]
     assert max(j.rank for j in jobs.values() if j.name.startswith(("fitted", "truth"))) < jobs["wide grasp 1"].rank
+
+
+def test_excitation_is_as_fast_as_the_policies_were():
+    """By hand: 0.02 rad in 10 ms is 2 rad/s, 0.8 of a no-load speed of 2.5; never under 0.6, never over 1."""
+    from types import SimpleNamespace
+
+    from benchmarks.loop.steps import used
+
+    believed = SimpleNamespace(joints=("a", "b"), speeds=np.array([2.5, 10.0]))
+    run = lambda step: SimpleNamespace(joints=("b", "a"), states=SimpleNamespace(position=SimpleNamespace(  # noqa: E731
+        t=np.arange(200) * 0.01, value=np.outer(np.arange(200), [0.03, step]))))
+    assert used([run(0.02)], believed) == pytest.approx(0.8) and used([run(0.01)], believed) == used([], believed) == 0.6 and used([run(0.01), run(0.09)], believed) == 1.0
 
 
 def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():

@@ -5,8 +5,8 @@
                               [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
-drives. A reality is one hand: it is recorded under safe excitation, and the naive policies' own runs in it are recorded and what they
-commanded is played again on the empty hand; all that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
+drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
+they were; that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
 iterations: with the servo table that `diagnose` fitted (its intervals are the randomization), with wide randomization of the believed
 drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
 commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
@@ -47,7 +47,7 @@ FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "effic
          "torque_ripple": 0.0}  # fmt: skip
 WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
-OWN_S, AGAIN_S = 20, 20  # s of a policy's own run that are recorded and played again
+OWN_S = 20  # s of a rotation policy's own run that are recorded
 JUDGING = 75.0  # s that judging may be begun after the last training
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
@@ -235,58 +235,48 @@ class Loop:
 
         return run
 
-    def excite(self, world: str):
+    def own(self, task: str, world: str):
+        """A naive policy's own run in the reality, recorded as its bus reads."""
         def run(slot: str) -> bool:
-            where = self.out / f"excited_{world}"
-            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"out={where}", "seed=1"], where / "log.txt") == 0
+            where = self.out / f"own_{world}"
+            cap = [f"task.evaluation.cap_s={OWN_S}"] if task == "rotate" else []
+            argv = ["play.py", f"checkpoint={self.policy(task, self.seeds[0], 'naive', world)}", f"reality={world}", "episodes=4", "seed=101", "video=false",
+                    f"record={where / f'{task}.mcap'}", "record_worlds=1", "realistic=true", f"out={where / task}", "sim.threads=1", *cap]  # fmt: skip
+            return self.call(argv, where / f"{task}.log", limit=300) == 0 and (where / f"{task}.mcap").is_file()
 
         return run
 
-    def own(self, task: str, seed: int, world: str):
-        """The naive policy's own run in the reality, and the same commands on the empty hand."""
+    def excite(self, world: str):
+        """As fast as the policies move there."""
         def run(slot: str) -> bool:
-            where = self.out / f"own_{world}"
-            mcap = where / f"{task}_{seed}.mcap"
-            cap = [f"task.evaluation.cap_s={OWN_S}"] if task == "rotate" else []
-            log = where / f"{task}_{seed}.log"
-            if self.call(["play.py", f"checkpoint={self.policy(task, seed, 'naive', world)}", f"reality={world}", "episodes=4", f"seed={100 + seed}",
-                          "video=false", f"record={mcap}", "record_worlds=1", "realistic=true", f"out={where / f'play_{task}_{seed}'}", "sim.threads=1", *cap],
-                         log, limit=300):  # fmt: skip
-                return False
-            return self.call(["-m", "benchmarks.loop.steps", "again", f"world={world}", f"run={mcap}", f"out={where / f'again_{task}_{seed}.mcap'}",
-                              f"seed={seed}", f"seconds={AGAIN_S}"], where / f"again_{task}_{seed}.log") == 0  # fmt: skip
+            where = self.out / f"excited_{world}"
+            own = ",".join(str(self.out / f"own_{world}" / f"{task}.mcap") for task in self.tasks)
+            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"own={own}", f"out={where}", "seed=1"], where / "log.txt") == 0
 
         return run
 
     def diagnose(self, world: str):
-        """One reality is one hand: it is diagnosed once. From what was excited and what the policies commanded there, played again on the
-        empty hand, which meets the speeds and steps that they use. Their own runs themselves are left out: a joint is judged while nothing
-        is touched, and most of what they touch carries no taxels. Kept out: the last of the excitation and the second seed's commands."""
+        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast that has to be, and are
+        not fitted: a joint is judged while nothing is touched, and most of what they touch carries no taxels. What they command, played again
+        on the empty hand, throws the joints against the ends of their motion (docs/loop.md)."""
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            again = [[self.out / f"own_{world}" / f"again_{task}_{seed}.mcap" for task in self.tasks] for seed in self.recorded()]
-            fit, held = excited[:-1] + again[0], excited[-1:] + [p for part in again[1:] for p in part]
+            fit, held = excited[:-1], excited[-1:]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()
 
         return run
 
-    def recorded(self) -> list[int]:
-        """Seeds whose naive policies are recorded: one for the fit, one that is kept out of it."""
-        return self.seeds[:2]
-
     def jobs(self) -> list[Job]:
         """All steps; those that others wait for come first, wide randomization last."""
         out = []
         for w in self.worlds:
-            out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [], 0))
-            owns = [(task, seed) for task in self.tasks for seed in self.recorded()]
-            for task, seed in owns:
-                out.append(Job(f"own {task} {seed} {w}", self.out / f"own_{w}" / f"{task}_{seed}.done", self.own(task, seed, w), False, [f"naive {task} {seed}"], 1))
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False,
-                           [f"excite {w}", *(f"own {task} {seed} {w}" for task, seed in owns)], 2, self.uses["diagnose"]))
+            for task in self.tasks:
+                out.append(Job(f"own {task} {w}", self.out / f"own_{w}" / f"{task}.done", self.own(task, w), False, [f"naive {task} {self.seeds[0]}"], 0))
+            out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [f"own {task} {w}" for task in self.tasks], 1))
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"

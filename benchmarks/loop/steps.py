@@ -1,8 +1,7 @@
 """The steps of the loop that no entry script does: a start that may be trained on, and recordings of the hand in its reality.
 
     python -m benchmarks.loop.steps start checkpoint=FILE out=last.pt device=cuda [any setting of train.py]
-    python -m benchmarks.loop.steps record world=late out=DIR seed=1 [seconds=19]
-    python -m benchmarks.loop.steps again world=late run=own.mcap out=again.mcap [seed=1] [seconds=20]
+    python -m benchmarks.loop.steps record world=late out=DIR seed=1 [own=a.mcap,b.mcap] [seconds=19]
 """
 
 from __future__ import annotations
@@ -14,9 +13,10 @@ import numpy as np
 import yaml
 
 ROOT = Path(__file__).parents[2]
-EXCITED = ("random", "chirp", "steps", "random")
-"""Motions of the excitation, all joints (or fingers) at once: most is seen in little time. Chirps tell a delay from damping, steps reach the
-speeds and torques that a policy asks for."""
+EXCITED = (("random", 0.6), ("ladder", 0.9), ("chirp", 1.0), ("random", 1.0))
+"""The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of `used` speeds that
+they may reach. The ladder's constant speeds show where a drive ends; chirps tell a delay from a lag. The last is for the proof."""
+CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
 
 
 def start(given: dict[str, str]) -> None:
@@ -43,33 +43,34 @@ def start(given: dict[str, str]) -> None:
 
 
 def record(given: dict[str, str]) -> None:
-    """Recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late and lost as there. The last
-    one, random motion as the first, is for the proof."""
-    from dexsim.recording.excitation import plan
+    """Recordings of the hand in a concealed reality under safe excitation: read as its bus reads, targets late and lost as there. As fast as
+    the policies' own runs there were (own=a.mcap,b.mcap), since a limit that no motion meets is not found."""
+    from dexsim.recording import read
+    from dexsim.recording.excitation import Limits, plan
     from dexsim.recording.mechanism import mechanism
 
     world, out, seed = _world(given["world"]), Path(given["out"]), int(given.get("seed", 0))
     out.mkdir(parents=True, exist_ok=True)
     believed = mechanism()
-    for k, kind in enumerate(EXCITED):
-        p = plan(believed, kinds=[kind], seed=seed + k, repeats=0)
+    top = used([read(p) for p in given.get("own", "").split(",") if p], believed)
+    print(f"own runs: up to {top:.2f} of the believed no-load speed", flush=True)
+    for k, (kind, share) in enumerate(EXCITED):
+        p = plan(believed, kinds=[kind], seed=seed + k, repeats=0, limits=Limits(speed=max(share * top, 0.3)))
         if kind == "random":
             p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
         _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
 
 
-def again(given: dict[str, str]) -> None:
-    """What a policy commanded in its own run (run=FILE of `play.py record=`), played again on the hand in that reality with nothing in it."""
-    from dexsim.recording import read
-    from dexsim.recording.mechanism import for_recording
-
-    own, seed, out = read(given["run"]), int(given.get("seed", 0)), Path(given["out"])
-    believed = for_recording(own)
-    order = [own.joints.index(j) for j in believed.joints]
-    held = own.commands.t < float(given.get("seconds", 20.0))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    _drive(_world(given["world"]), believed, own.commands.t[held], own.commands.value[held][:, order], own.states.position.value[0, order],
-           np.random.default_rng(seed), out)
+def used(own: list, believed) -> float:
+    """Largest speed that a joint reached in recordings (99 % of the time below it), as a share of its believed no-load speed, from
+    CAREFUL to 1."""
+    shares = [CAREFUL]
+    for r in own:
+        q = r.states.position
+        speed = np.abs(np.diff(q.value, axis=0)) / np.diff(q.t)[:, None]
+        believed_speed = believed.speeds[[believed.joints.index(j) for j in r.joints]]
+        shares.append(float((np.nanpercentile(speed, 99, axis=0) / believed_speed).max()))
+    return min(max(shares), 1.0)
 
 
 def _world(name: str) -> dict:
@@ -100,4 +101,4 @@ def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.nda
 
 if __name__ == "__main__":
     what, *rest = sys.argv[1:]
-    {"start": start, "record": record, "again": again}[what](dict(item.split("=", 1) for item in rest))
+    {"start": start, "record": record}[what](dict(item.split("=", 1) for item in rest))
