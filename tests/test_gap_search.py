@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from dexsim.gap import assemble, judge
-from dexsim.gap.fit import Fitter, Param
+from dexsim.gap import assemble, judge, together
+from dexsim.gap.command import Progress
+from dexsim.gap.fit import Fitted, Fitter, Param, prior_weight
+from dexsim.gap.joint import STRETCHED, stretched
 from dexsim.gap.prepare import REFERENCE, build
 from dexsim.gap.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
@@ -107,3 +109,57 @@ def test_temperature_counts_from_that_of_a_data_sheet():
     assert case.scales.warm == pytest.approx(55 - REFERENCE)
     runs[1].temperature[:] = 40.5  # hardly any spread: nothing can be said of temperature
     assert build(model(), runs)[0].scales.warm == 0.0
+
+
+def valley(n: int = 400) -> tuple[Fitter, list[Param]]:
+    """A fitter whose residual knows a belief and an effect by their sum alone."""
+    rng = np.random.default_rng(0)
+    a, c, noise = rng.standard_normal(n), rng.standard_normal(n), 0.02 * rng.standard_normal(n)
+    fitter = Fitter.__new__(Fitter)
+    fitter.r, fitter.eliminate, fitter.window, fitter.count = SimpleNamespace(knee=0.0, sigma_q0=0.0, sigma_v0=0.0), False, np.zeros(n, int), 1
+    fitter.residuals = lambda params, x, inits=None: a * 10 * (2.3 - x[:, :1] - x[:, 1:2]) + c * 5 * (x[:, 2:] - 1.0) + noise
+    params = [Param("effect", ("kp",), "set", 0.1, 5.0, 1.0), Param("belief", ("kd",), "factor", 0.5, 2.0, 1.0, nuisance=True, sd=0.1),
+              Param("other", ("lag",), "factor", 0.9, 1.1, 1.0, nuisance=True, sd=0.05)]  # fmt: skip
+    return fitter, params
+
+
+def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
+    fitter, params = valley()
+    astray = fitter.fit(params, x0=np.array([0.7, 1.6, 1.0]), iterations=0)
+    home = fitter.homeward(params, astray)
+    score = lambda f: f.loss + prior_weight(params) @ (f.x - np.array([p.start for p in params])) ** 2 / len(f.residual)  # noqa: E731
+    assert abs(home.x[1] - 1.0) < 0.02 and abs(home.x[0] - 1.3) < 0.03 and score(home) < 0.1 * score(astray)
+    assert fitter.homeward(params, home) is home  # there is nothing to gain
+
+
+def test_intervals_follow_how_well_what_was_kept_out_is_followed():
+    params = [Param("a", ("kp",), "set", 0.0, 3.0, 0.0), Param("b", ("kd",), "set", 0.0, 100.0, 0.0)]
+    f = Fitted(params, np.array([2.0, 50.0]), np.zeros(4), np.zeros((4, 2)), np.zeros(4, int), 1.0, np.zeros(1))
+    bounds = np.array([[1.0, 2.5], [40.0, 60.0]])
+    width = lambda left: np.diff(stretched(bounds, f, left))[:, 0]  # noqa: E731
+    assert np.allclose(width(1.0), STRETCHED[0] * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)
+    assert np.allclose(stretched(bounds, f, 50.0), [[0.0, 3.0], [10.0, 90.0]])  # no farther than is physical, and than was seen to be needed
+    assert stretched(bounds, f, 0.0) is bounds  # nothing was kept out
+
+
+def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeypatch):
+    clock = iter(np.arange(0.0, 1000.0, 4.0))
+    monkeypatch.setattr("dexsim.gap.command.time.perf_counter", lambda: float(next(clock)))
+
+    def work(k, tell):
+        for part in (0.05, 0.25, 0.5):
+            tell(part)
+        return k
+
+    assert together.together(["knuckle"], work, "cpu", Progress()) == [0]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.strip() for line in lines] == ["searching knuckle (1/1)", "searching knuckle (1/1)", "searching knuckle (1/1), about 36 s left",
+                                                "searching knuckle (1/1), about 16 s left", "searched 1 in 20 s"]  # fmt: skip
+
+
+def test_a_search_tells_how_far_it_is():
+    told = []
+    s = searched({})
+    s.tell = told.append
+    s.settle(s.run())
+    assert len(told) >= 3 and told == sorted(told) and 0 < told[0] and told[-1] < 1

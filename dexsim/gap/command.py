@@ -176,14 +176,21 @@ def available(device: str) -> str:
 class Progress:
     """Which joint is searched, and the time left."""
 
+    EVERY = 3.0  # s between lines while none is done, where they are not written over each other
+
     def __init__(self) -> None:
         self.start = time.perf_counter()
         self.live = sys.stdout.isatty()
+        self.said, self.searched = 0.0, -1
 
-    def __call__(self, done: int, total: int, name: str) -> None:
-        spent = time.perf_counter() - self.start
-        left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
-        text = f"  searching {name} ({done + 1}/{total}){left}" if done < total else f"  searched {total} in {spent:.0f} s"
+    def __call__(self, done: float, total: int, name: str) -> None:
+        """done of total are searched, the one under way in part."""
+        now = time.perf_counter()
+        if int(done) == self.searched < total and not self.live and now - self.said < self.EVERY:
+            return
+        self.said, self.searched, spent = now, int(done), now - self.start
+        left = f", about {spent * (total - done) / done:.0f} s left" if 0.1 <= done < total else ""
+        text = f"  searching {name} ({int(done) + 1}/{total}){left}" if done < total else f"  searched {total} in {spent:.0f} s"
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 

@@ -32,7 +32,7 @@ KEEP_OUT = 0.25  # of the time of each recording, where there are too few to kee
 UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
 
 
-def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[[int, int, str], None] | None = None) -> Diagnosis:
+def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable[[float, int, str], None] | None = None) -> Diagnosis:
     """Diagnoses recordings; UserError only for what the command line got wrong, a verdict for everything else."""
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
@@ -161,19 +161,19 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     floor, floor_how = judge.floor(runs, cases)
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
-    def begun(k: int) -> JointSearch:
-        return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed)
+    def begun(k: int, tell: Callable[[float], None]) -> JointSearch:
+        return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed, tell=tell)
 
-    def search_of(k: int) -> tuple[JointSearch, Outcome | None]:
-        search = begun(k)
+    def search_of(k: int, tell: Callable[[float], None]) -> tuple[JointSearch, Outcome | None]:
+        search = begun(k, tell)
         if len(search.long.window) == 0:
             return search, None
         found = search.run() if cases[k].moved else search.idle()
         search.settle(found)
         return search, found
 
-    def start_of(k: int) -> Trial | None:
-        search = begun(k)
+    def start_of(k: int, tell: Callable[[float], None]) -> Trial | None:
+        search = begun(k, tell)
         return search.start() if len(search.long.window) else None
 
     joints = [c.joint for c in cases]
@@ -199,7 +199,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if linked and len(unsettled) > 1 and all(found is not None for _, found in answers):
         # what was found in one joint moves the others otherwise than was thought
         cases = again(model, runs, cases, [found.best for _, found in answers], s.device, _step(runs))
-        for k, answer in zip(unsettled, together([joints[k] for k in unsettled], lambda i: search_of(unsettled[i]), s.device, progress), strict=True):
+        for k, answer in zip(unsettled, together([joints[k] for k in unsettled], lambda i, tell: search_of(unsettled[i], tell), s.device, progress), strict=True):
             answers[k] = answer
     for search, found in answers:
         case = search.case

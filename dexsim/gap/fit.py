@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
 
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
@@ -223,6 +225,43 @@ class Fitter:
             if not float(score(again.x, again.residual)) < here * (1 - 5e-3):
                 break
             f = again
+        return f
+
+    def homeward(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
+        """The fit again from where one belief, or all of them, are back at what is believed, all else following by its slopes, where that is
+        better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at kinks, steps end before they are there."""
+        P = len(params)
+        nuisance = np.array([p.nuisance for p in params], bool)
+        if not nuisance.any():
+            return f
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        span, centre, believed = high - low, np.array([p.start for p in params], float), prior_weight(params)
+        score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: E731
+        for _ in range(rounds):
+            k = self.r.knee
+            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+            J = f.jacobian * span
+            A = (J * w[:, None]).T @ J
+            A[np.diag_indices(P)] += believed * span**2 + 1e-3 * np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
+            b = -(J * w[:, None]).T @ f.residual - believed * (f.x - centre) * span
+            away = nuisance & (np.abs(f.x - centre) > AWAY * span)
+            guesses = []
+            for back in [np.arange(P) == i for i in np.flatnonzero(away)] + [nuisance]:
+                z, rest = (centre - f.x) / span * back, np.flatnonzero(~back)
+                if len(rest):
+                    root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
+                    right = np.linalg.solve(root.T, b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back])
+                    z[rest] = lsq_linear(root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)).x
+                guesses.append(np.clip(f.x + z * span, low, high))
+            if not away.any():
+                return f
+            guesses = np.array(guesses)
+            s = self.init_directions(params, f.x)[1] if self.eliminate else None
+            tried = score(guesses, self.eliminated(self.residuals(params, guesses), s))
+            here, best = float(score(f.x, f.residual)), int(np.argmin(tried))
+            if not tried[best] < here * (1 - 5e-3):
+                return f
+            f = self.fit(params, x0=guesses[best], iterations=4, tolerance=5e-3)
         return f
 
     def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:

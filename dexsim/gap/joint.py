@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.gap import confidence, jitter, judge, locate
 from dexsim.gap.catalogue import EFFECTS, confusable, separating
 from dexsim.gap.findings import finding_parameters
-from dexsim.gap.fit import intervals
+from dexsim.gap.fit import Fitted, intervals
 from dexsim.gap.prepare import Case
 from dexsim.gap.result import Curve
 from dexsim.gap.runs import Run
@@ -18,6 +18,7 @@ from dexsim.gap.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
 
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
+STRETCH, STRETCHED = 0.5, (0.5, 4.0)  # of the intervals: by the square of what is left of what was kept out, over the noise
 CLEAR = 1.5  # x the noise squared that windows keep after the fit, from which on what it depends on is said
 
 
@@ -36,8 +37,8 @@ class JointAnswer:
     """A searched joint on what was kept out.
 
     before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at times t (rows,) [s];
-    effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 % intervals of the fitted parameters;
-    raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs."""
+    effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 % intervals of the fitted parameters; widest: as
+    they are before it is known how well what was kept out is followed, by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs."""
 
     def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
@@ -55,7 +56,8 @@ class JointAnswer:
         self.sensed = np.isfinite(self.torque)
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
-        self.bounds = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
+        self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
+        self.bounds = stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0)
         self.nuisance = nuisances(case.joint, self.best)
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}
@@ -83,14 +85,14 @@ class JointAnswer:
 
     def _finding(self, mm, m: Mechanism) -> dict[str, Any]:
         case, best = self.case, self.best
-        raw, spread = self._fitted(mm)
+        raw, spread = self._fitted(mm, self.bounds)
         self.raw[mm.id] = raw
         rest = tuple(x for x in best.members if x is not mm)
         trial = without(self.search, best, mm) if rest else self.none
         q, effort = judge.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed])
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.id == "current_sensor"
-        evidence = self._weighed(mm, raw, spread, error_without, effort_only)
+        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
@@ -116,13 +118,13 @@ class JointAnswer:
             finding["parameters"]["jitter"] = late.entry()
         return finding
 
-    def _fitted(self, mm) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values and 90 % intervals of one effect's parameters."""
+    def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
         best = self.best
         index = [[p.key for p in best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
         raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
-        spread = {p.key: (float(self.bounds[i][0]), float(self.bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
-        for p, x, b in zip(best.fit.params, best.fit.x, self.bounds, strict=True):  # a level that was unknown and is fitted anyway
+        spread = {p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
+        for p, x, b in zip(best.fit.params, best.fit.x, bounds, strict=True):  # a level that was unknown and is fitted anyway
             if mm.id == "coulomb_friction" and p.key == "coulomb_friction" and "torque" not in raw:
                 raw["torque"], spread["torque"] = float(x), (float(b[0]), float(b[1]))
         return raw, spread
@@ -174,6 +176,16 @@ class JointAnswer:
         case, fit = self.case, self.none.fit
         windows = case.plant.windows(None, self.kept.train, span=self.kept.span_train)
         return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, fit.params, fit.x, windows)[0]) ** 2)))
+
+
+def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
+    """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the noise is known better than
+    by all that might be off in it, what does not is the likeness of something else. The law is from concealed cases (docs/diagnose.md)."""
+    if left <= 0 or not fit.params:
+        return bounds
+    low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
+    x = fit.x[:, None]
+    return np.clip(x + np.clip(STRETCH * left**2, *STRETCHED) * (bounds - x), low, high)
 
 
 def rms(squares: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dexsim.gap.catalogue import CATALOGUE, EFFECTS, Effect, Scales, Variant, confusable
-from dexsim.gap.fit import Fitted, Fitter, Param, Residuals, disbelief, prior_weight
+from dexsim.gap.fit import AWAY, Fitted, Fitter, Param, Residuals, disbelief, prior_weight
 from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX, NAMES
 from dexsim.gap.prepare import BELIEF, Case
@@ -35,6 +35,8 @@ SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
 FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
+MAYBE = {"brake": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
+PIN = 1e-6  # of room for what is held at a value
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
 
@@ -101,11 +103,11 @@ class JointSearch:
     """The search on one joint. train: run indices; span: part of each run to use; folds [R]: condition of each run."""
 
     def __init__(self, case: Case, train: list[int], span: dict[int, tuple[float, float]] | None, conditions: list[int],
-                 seed: int = 0, allowed: set[str] | None = None, long: float = LONG, say: Callable[[str], None] | None = None):
+                 seed: int = 0, allowed: set[str] | None = None, long: float = LONG, tell: Callable[[float], None] | None = None):
         self.case, self.train, self.span = case, train, span
         self.rng = np.random.default_rng(seed)
         self.allowed = allowed
-        self.say = say or (lambda _: None)
+        self.tell, self._part = tell or (lambda _: None), 0.0
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
         self.long = plant.windows(long, train, span=span)
@@ -130,6 +132,11 @@ class JointSearch:
         self.nuisances = self.all_nuisances
         believed = [p for p in self.all_nuisances if p.key not in case.unknown and not (p.mode == "factor" and p.span > 0.3)]
         self.wide = {c for p in self.all_nuisances if p not in believed for c in p.columns}
+
+    def _on(self, share: float) -> None:
+        """Tells that about this share of the work that was left is done: how many effects there are to look for is not known before."""
+        self._part += (1 - self._part) * share
+        self.tell(self._part)
 
     # -- pieces ------------------------------------------------------------------------------------------------------------
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
@@ -224,7 +231,7 @@ class JointSearch:
         # large residuals are effects still to be named: the knee follows them down
         self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8)
-        return Trial((), self._shaken(self.nuisances, fit))
+        return Trial((), self.fitter.homeward(self.nuisances, self._shaken(self.nuisances, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
         """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the next."""
@@ -396,6 +403,7 @@ class JointSearch:
                 a = b if b.loss < a.loss else a
             if not quick:
                 a = self._shaken(params, a)
+            a = self.fitter.homeward(params, a)
         return Trial(members, a)
 
     def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
@@ -486,6 +494,7 @@ class JointSearch:
         self.fitted: dict[frozenset, Trial] = {}
         none = self.start()
         self.none_loss = self._left(none)
+        self._on(0.1)
         current = none
         gains, price, scanned = {}, {}, []
         rivals: dict[str, list[tuple[str, float]]] = {}
@@ -499,6 +508,7 @@ class JointSearch:
             if enough and current.members:
                 break
             scan = self.scan(current)
+            self._on(0.06)
             if not scanned:
                 scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
             if not scan:
@@ -518,6 +528,7 @@ class JointSearch:
                 if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
                     tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
                 drafts.append(min(tries, key=lambda d: d[2].loss))
+                self._on(0.03)
             drafts.sort(key=lambda d: d[2].loss)
             good = [d for k, d in enumerate(drafts) if k < 3 or (k < 6 and d[2].loss < 2.0 * drafts[0][2].loss + 0.3)]
             for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
@@ -527,6 +538,7 @@ class JointSearch:
             for d in good:
                 trial = self.finish(*d, current)
                 trials.append(trial)
+                self._on(0.06)
                 known = self.fitted.get(frozenset(trial.ids))
                 if known is None or trial.fit.loss < known.fit.loss:
                     self.fitted[frozenset(trial.ids)] = trial
@@ -554,6 +566,7 @@ class JointSearch:
             if len(current.members) > 1:
                 current, level = self._swap(current, pool, level)
         current = self._refine(self._drop(current))
+        self._on(0.1)
         final = self.rivals(current, pool)
         if len(current.members) == 1:  # one that only seemed worse before it was fitted in full takes the place
             others, share, _ = final[current.members[0].id]
@@ -712,6 +725,7 @@ class JointSearch:
                 if known is None and len(others) >= 3 and not confusable(key, member.id):
                     continue
                 trial = known or self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                self._on(0.05)
                 self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
                 if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
@@ -751,8 +765,27 @@ class JointSearch:
         """What was found, and nothing, as they are judged: on whole recordings, in shorter steps where an effect was found (where a joint
         sticks, or rattles in a dead zone, a millisecond leaves errors beyond the noise)."""
         if found.best.members:
+            found.best = self._simpler(found.best)
             self.whole = self.case.plant.refined(FINER)
+        self._on(0.3)
         self.polish(found.best), self.polish(found.none)  # kept for the judgement
+
+    def _simpler(self, trial: Trial) -> Trial:
+        """The trial without what may be so or otherwise in a drive near its limits (`MAYBE`), where it follows as well without: slopes
+        stall at such kinks, and what was kept out may go beyond what told them."""
+        params = trial.fit.params
+        away = [p.key for p, x in zip(params, trial.fit.x, strict=True) if p.key in MAYBE and abs(x - MAYBE[p.key]) > AWAY * p.span]
+        best = trial
+        for back in [{k} for k in away] + [set(away)] * (len(away) > 1):
+            pinned = [replace(p, low=MAYBE[p.key] - PIN, high=MAYBE[p.key] + PIN, start=MAYBE[p.key]) if p.key in back else p for p in params]
+            with self._fix(trial.members):
+                f = self.fitter.fit(pinned, x0=trial.fit.x, iterations=6)
+            new = Trial(trial.members, f)
+            if self._here(new) < (1 + 2 * TIE) * self._here(trial):  # the more of them go back, the better
+                best = new
+        if best is not trial:
+            self.cross(best)
+        return best
 
     def polish(self, trial: Trial) -> Trial:
         """The trial refitted on whole training recordings run free from their first sample, where that follows them

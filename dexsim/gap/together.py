@@ -26,18 +26,22 @@ def lanes(device: str, jobs: int) -> int:
     return max(1, min(jobs, MOST_CPU, cores // THREADS))
 
 
-def together(names: Sequence[str], work: Callable[[int], T], device: str, progress: Callable[[int, int, str], None] | None = None) -> list[T]:
-    """work(k) for each name, in their order; progress(done, of, which begins)."""
-    state = {"done": 0}
+def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
+             progress: Callable[[float, int, str], None] | None = None) -> list[T]:
+    """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is worked on)."""
+    parts = [0.0] * len(names)
     lock = threading.Lock()
 
     def one(k: int) -> T:
-        if progress:
+        def tell(part: float) -> None:
             with lock:
-                progress(state["done"], len(names), names[k])
-        out = work(k)
-        with lock:
-            state["done"] += 1
+                parts[k] = part
+                if progress and part < 1.0:
+                    progress(sum(parts), len(names), names[k])
+
+        tell(0.0)
+        out = work(k, tell)
+        tell(1.0)
         return out
 
     at_once = lanes(device, len(names))
