@@ -510,10 +510,26 @@ def test_play_prints_the_papers_columns_of_the_grasp():
     r = {"command": command, "mass": np.full(n, 0.05), "friction": np.full(n, 1.0), "load": np.full(n, 0.5), "pushed": np.zeros(n), "held": np.ones(n),
          "held90": np.ones(n), "held180": np.ones(n), "force": command[:, None] * [1.0, 2, 2, 2, 2], "alive": np.ones(n),
          "torque": np.tile(np.where(np.arange(n) % 2, 0.2, 0.4)[:, None], 12), "moved": np.zeros(n), "untouched": np.zeros(n)}  # fmt: skip
-    title, header, rows = grasp_eval._papers_columns(grasp_eval._metrics(r, r, 2.0))
+    metrics = grasp_eval._metrics(r, r, 2.0)
+    (title, header, rows), (_, _, intervals) = grasp_eval._papers_columns(metrics)
     assert "paper's columns" in title and header[0] == "contact forces N" and len(rows) == 1
-    low, high = (float(x) for x in rows[0][0].split("-"))
+    low, high = (float(x) for x in rows[0][0].split(" .. "))
     assert low == pytest.approx(9 * np.quantile(command, 0.05), abs=0.01) and high == pytest.approx(9 * np.quantile(command, 0.95), abs=0.01)
-    assert rows[0][1:3] == ("0.2-0.4", "1.000") and abs(float(rows[0][3])) < 0.05
+    assert rows[0][1:3] == ("0.2 .. 0.4", "1.000") and abs(float(rows[0][3])) < 0.05
+    assert [i[0] for i in intervals] == ["hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation", "torque_command_correlation"]
     nothing = r | {"held": np.zeros(n)}
-    assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, 2.0))[2] == [("-", "-", "-", "-")]
+    assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, 2.0))[0][2] == [("-", "-", "-", "-")]
+
+
+def test_the_grasps_intervals_are_those_of_theory():
+    """A share of 300 in 400 by its standard error; a correlation of 0.6 in 400 samples by Fisher's z."""
+    rng = np.random.default_rng(3)
+    low, high = grasp_eval._rate_interval(np.arange(500) % 4 != 0, np.arange(500) < 400, rng)
+    half = 1.96 * (0.75 * 0.25 / 400) ** 0.5
+    assert low == pytest.approx(0.75 - half, abs=0.01) and high == pytest.approx(0.75 + half, abs=0.01)
+    a, noise = rng.normal(size=(2, 400))
+    b = 0.6 * a + 0.8 * noise
+    r = np.corrcoef(a, b)[0, 1]
+    theory = np.tanh(np.arctanh(r) + np.array([-1.96, 1.96]) / 397**0.5)
+    assert grasp_eval._corr_interval(a, b, rng) == pytest.approx(theory, abs=0.015)
+    assert grasp_eval._rate_interval(a > 0, a > 9, rng) is None and grasp_eval._corr_interval(a, 0 * a, rng) is None

@@ -18,6 +18,7 @@ SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
 TURN_S, STAY_S = 0.75, 1.0
 BINS = 10
+RESAMPLES = 1000  # of the bootstrap
 FINGERS = ("index", "mid", "ring", "pinky")
 _END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
 
@@ -46,7 +47,7 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     plots = [force_command, hold_by_command]
     return {
         "metrics": metrics,
-        "tables": [_papers_columns(metrics), *_tables(trained, held_out, env)],
+        "tables": [*_papers_columns(metrics), *_tables(trained, held_out, env)],
         "frames": trained["frames"],
         "plots": plots,
     }
@@ -208,7 +209,31 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         out["joint_torque_range_Nm"] = [float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])]
         out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
         out["by_command"] = _by_command(r, held)
+        rng = np.random.default_rng(0)
+        out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held], rng)
+        out["torque_command_correlation_interval"] = _corr_interval(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1), rng)
+    rng = np.random.default_rng(1)
+    for name, part, among in (("hold_rate", r, ~pushed & firm), ("hold_rate_pushed", r, pushed & able),
+                              ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k)):
+        out[f"{name}_interval"] = _rate_interval(part["held"], among, rng)
     return out
+
+
+def _rate_interval(ok: np.ndarray, among: np.ndarray, rng: np.random.Generator) -> list[float] | None:
+    """95 % bootstrap over episodes of `_rate`: resampling yes and no is drawing from a binomial."""
+    rate, count = _rate(ok, among), int(among.sum())
+    return None if rate is None else [float(x) for x in np.percentile(rng.binomial(count, rate, RESAMPLES) / count, [2.5, 97.5])]
+
+
+def _corr_interval(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> list[float] | None:
+    """95 % bootstrap over episodes of `_corr`."""
+    if _corr(a, b) is None:
+        return None
+    weight = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES) / len(a)  # how often each episode is drawn
+    ma, mb = (weight @ a)[:, None], (weight @ b)[:, None]
+    both = (weight * (a - ma) * (b - mb)).sum(1)
+    spread = np.sqrt((weight * (a - ma) ** 2).sum(1) * (weight * (b - mb) ** 2).sum(1))
+    return [float(x) for x in np.percentile(both / np.maximum(spread, 1e-12), [2.5, 97.5])]
 
 
 def _by_object(r: dict, env) -> dict[str, float | None]:
@@ -234,17 +259,22 @@ def _by_command(r: dict, held: np.ndarray) -> dict:
     return rows
 
 
-def _papers_columns(metrics: dict) -> tuple[str, tuple, list]:
-    """The paper's table of rewards, of held episodes: what is printed of the ranges, and of how force and torque follow the command."""
-    def ends(name: str) -> str:
-        return f"{metrics[name][0]:.3g}-{metrics[name][1]:.3g}" if name in metrics else "-"
+def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
+    """What the paper's table of rewards says, of held episodes, and the intervals of what is judged."""
+    def ends(name: str, digits: int = 3) -> str:
+        pair = metrics.get(name)
+        return "-" if pair is None else f"{pair[0]:.{digits}g} .. {pair[1]:.{digits}g}"
 
-    def follows(name: str) -> str:
+    def value(name: str) -> str:
         return "-" if metrics.get(name) is None else f"{metrics[name]:.3f}"
 
-    return ("Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
-            ("contact forces N", "joint torque N m", "force and command", "torque and command"),
-            [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), follows("force_command_correlation"), follows("torque_command_correlation"))])
+    said = ("hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation", "torque_command_correlation")
+    return [
+        ("Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
+         ("contact forces N", "joint torque N m", "force and command", "torque and command"),
+         [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))]),
+        ("95 % intervals (bootstrap over episodes)", ("quantity", "value", "interval"), [(n, value(n), ends(f"{n}_interval", 4)) for n in said]),
+    ]
 
 
 def _tables(r: dict, k: dict, env) -> list:

@@ -191,6 +191,7 @@ def main(argv: list[str]) -> int:
     import yaml
 
     from dexsim.cli import start
+    from dexsim.cli.build import quiet_warp
 
     if any(a in ("-h", "--help", "help") for a in argv):
         print(f"{__doc__}\nSettings: {main.__doc__}")
@@ -214,6 +215,7 @@ def main(argv: list[str]) -> int:
     if begun is None:
         return 0
     torch.set_num_threads(1)
+    quiet_warp("cpu")
     grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))
     grasps.save(Path(str(own["out"])).expanduser())
     print(f"{len(grasps)} held poses, cubes of {1000 * grasps.edge.min():.0f}-{1000 * grasps.edge.max():.0f} mm: {own['out']}")
