@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from dexsim.gap import confidence, inputs, touch, touch_data, touch_plant, touch_rig
+from dexsim.gap import confidence, inputs, touch, touch_data, touch_plant, touch_rig, touch_search
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.runs import Run
 from dexsim.gap.touch_effects import TOUCH, confusable
@@ -213,3 +213,18 @@ def test_a_little_crosstalk_may_be_the_law_of_the_contact():
         return f["confidence"]
 
     assert said(0.08) == confidence.DOUBTED and said(0.2) == 0.99
+
+
+@pytest.mark.parametrize("spread", [0.8, 1.25])
+def test_a_force_that_spreads_otherwise_than_the_law_is_no_crosstalk(plain, spread, monkeypatch):
+    """Readings of a contact whose pressure reaches further (or less far): the reach is refitted, and nothing is named."""
+    data, _, _ = collected(*plain)
+    for run in data.runs:
+        x = touch_plant.readings(run, touch_plant.neutral() | {"spread": spread})
+        run.z = np.round(x / run.lsb) * run.lsb
+    best = touch_search.PadSearch(data.runs, set(), data.scale_known, False).run().best
+    assert best.ids == () and abs(best.values["spread"] / spread - 1) < 0.06
+    if spread > 1:  # as it was: the reach believed, the neighbours taken for guilty
+        believed = touch_search.PadSearch._keys
+        monkeypatch.setattr(touch_search.PadSearch, "_keys", lambda *a: tuple(k for k in believed(*a) if k != "spread"))
+        assert "tactile_crosstalk" in touch_search.PadSearch(data.runs, set(), data.scale_known, False).run().best.ids

@@ -165,7 +165,7 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
     common = (best.values["gain"], *bounds["gain"]) if "gain" in best.keys else None
     out.facts[name] = PadFacts(dict(search.silent), common, _rest(search, best), _chord(search, best, bounds), max(float(r.warm.max()) for r in search.runs), run.stiffness, run.friction,
                                search.shear)  # fmt: skip
-    for k in ("scale", "zero", "along", "across", "clock"):
+    for k in ("scale", "zero", "along", "across", "spread", "clock"):
         if k in best.keys:
             out.nuisance[f"touch_{k}@{name}"] = round(best.values[k], 7)
     out.recordings = sorted(set(out.recordings) | (kept or {r.recording for r in search.runs}))

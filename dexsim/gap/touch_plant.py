@@ -56,6 +56,7 @@ PARAMS: dict[str, TouchParam] = {
         TouchParam("zero", 0.0, -1.5e-4, 1.5e-4, "m", 5e-5, True),
         TouchParam("along", 0.0, -6e-4, 6e-4, "m", 2e-4, True),
         TouchParam("across", 0.0, -6e-4, 6e-4, "m", 2e-4, True),
+        TouchParam("spread", 1.0, 0.6, 1.6, "1", 0.1, True),  # factor on REACH: how a force spreads over the taxels is a model's guess
         TouchParam("clock", 0.0, -0.006, 0.006, "s", 0.004, True),
         TouchParam("skin", 1.0, 0.01, 100.0, "1", 0.5, True),  # factor on SHEAR_STIFFNESS
     )
@@ -79,7 +80,7 @@ def _beside() -> np.ndarray:
 BESIDE = _beside()
 
 
-CONTACT_KEYS = ("zero", "along", "across", "stiffness", "c10", "c01")
+CONTACT_KEYS = ("zero", "along", "across", "stiffness", "c10", "c01", "spread")
 REMEMBERED = 16  # contacts a recording: most numbers of a fit do not change it
 
 
@@ -107,7 +108,7 @@ def _contact(run: PadRun, v: dict[str, float], near: np.ndarray) -> tuple[np.nda
     else:
         force = run.stiffness * v["stiffness"] * np.maximum(run.depth[near] + v["zero"], 0.0)
     if not rubber or run.load is not None:
-        level = np.maximum(d.min(1) + REACH, 0.0)
+        level = np.maximum(d.min(1) + v["spread"] * REACH, 0.0)
         soft = run.area * np.maximum(level[:, None] - d, 0.0) ** 2
         if rubber:  # where the cell says there is force but the foundation is not reached yet
             w = np.where(total[:, None] > 0, w, soft)

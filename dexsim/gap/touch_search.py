@@ -176,7 +176,7 @@ class PadSearch:
     def _keys(self, ids: tuple[str, ...], mapped: bool = False) -> tuple[str, ...]:
         keys = [k for e in ids for k in BY_ID[e].fits if not (e == "tactile_gain" and mapped)]
         # single taxels' gains leave nothing to a common one
-        keys += ([] if mapped and self.scale_known else ["scale"]) + ["zero", "along", "across"] + (["skin"] if self.shear else [])
+        keys += ([] if mapped and self.scale_known else ["scale"]) + ["zero", "along", "across", "spread"] + (["skin"] if self.shear else [])
         if "tactile_delay" not in ids:
             keys.append("clock")
         return tuple(dict.fromkeys(keys))
