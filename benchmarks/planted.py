@@ -4,12 +4,14 @@
 
 One round is every entry of PLANTS once, its size drawn round robin from three tiers, and a few cases with nothing planted;
 `cases` counts along the rounds (0: one round). This is the sanity check of `diagnose`: the data come from the simulator that
-trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity) 0.1 ms, with gains, masses and
-friction a few percent off, an encoder's quantum, noise and a jittered clock. Of a case's four recordings the one that asks for the
-second most is kept out. limit: seconds after which no further case is waited
-for (0: all are). Size of an effect: its held-out change in the search's own plant, with what a refit of the believed figures hides
-of it taken away, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out
-recording differs by when it is made again from one encoder count away. Resumable; prints a table and one JSON line.
+trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity) 0.1 ms, with an encoder's quantum, noise and a
+jittered clock. Every believed figure is off by a draw from the very tolerance that the tool states for it (`_off`): gains, limits,
+friction, inertia and gravity by a normal deviate of 2.5 % cut at 5 %, delay and filters by fractions of a period or of 3 ms.
+Of a case's four recordings the one that asks for the second most is kept out. limit: seconds after which no further case is waited
+for (0: all are). Size of an effect: its held-out change in the search's own plant, with what a refit of all that the tool refits
+with every hypothesis hides of it taken away, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in
+squares, what the held-out recording differs by when it is made again from one encoder count away. Resumable; prints a table and one
+JSON line.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ SECONDS = 7.0
 QUANTUM = 2 * np.pi / 4096
 SETTINGS = {"cases": 0, "first": 0, "seed": 1, "workers": 1, "out": "out/planted", "effects": "", "limit": 0}
 REFIT = ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction", "viscous_friction", "inertia_scale", "gravity_scale")
-OFF = 0.03  # what every believed figure is off by, at most
+RATE = 1000  # Hz: of the loop
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,9 @@ PLANTS: dict[str, Plant] = {
                            lambda r, s: {"fraction": s, "fraction_backdriven": 1.4 * s}),
     "backlash": Plant("backlash", (0.003, 0.3), lambda r, s: {"backlash": s}, lambda r, s: {"gap": s}),
     "compliance": Plant("compliance", (0.03, 2.0), lambda r, s: {"softness": s / r["kp"]}, lambda r, s: {"stiffness": r["kp"] / s}),
-    "command_delay": Plant("command_delay", (0.002, 0.1), lambda r, s: {"+delay": s}, lambda r, s: {"delay": s}),
-    "lag": Plant("lag", (0.002, 0.1), lambda r, s: {"lag": s}, lambda r, s: {"time_constant": s}),
-    "lag of the speed": Plant("lag", (0.004, 0.1), lambda r, s: {"speed_lag": s}, lambda r, s: {"time_constant": s}, "damped"),
+    "command_delay": Plant("command_delay", (0.002, 0.1), lambda r, s: {"+delay": s}, lambda r, s: {"delay": s + r["off"]["+delay"]}),
+    "lag": Plant("lag", (0.002, 0.1), lambda r, s: {"+lag": s}, lambda r, s: {"time_constant": s + r["off"]["+lag"]}),
+    "lag of the speed": Plant("lag", (0.004, 0.1), lambda r, s: {"+speed_lag": s}, lambda r, s: {"time_constant": s + r["off"]["+speed_lag"]}, "damped"),
     "torque_limit": Plant("torque_limit", (0.05, 0.9), *_less("torque_limit", "torque")),
     "torque_speed_limit": Plant("torque_speed_limit", (0.06, 0.93), *_less("no_load_speed", "no_load_speed")),
     "supply_sag": Plant("supply_sag", (0.02, 0.9), lambda r, s: {"sag": s / (2 * r["weight"])}, lambda r, s: {"sag": s / (2 * r["weight"])}, "pair voltage"),
@@ -146,7 +148,7 @@ def model_xml(b: dict, true: dict | None = None) -> str:
 
 def servo(b: dict) -> dict:
     """The believed servo table."""
-    return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO}}, "loop_rate": 1000,
+    return {"drive": "voltage" if b["voltage"] else "torque", "joints": {"*": {k: float(b[k]) for k in SERVO}}, "loop_rate": RATE,
             "loop_encoder": "motor" if b["motor_loop"] else "joint", "position_encoder": "joint"}  # fmt: skip
 
 
@@ -282,11 +284,46 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
     return out
 
 
-def _hidden(change: np.ndarray, slopes: np.ndarray, keep: slice) -> float:
-    """RMS of a change [n] over the held-out rows, what a refit of the believed figures by 5 % takes away taken away."""
-    q, r = np.linalg.qr(slopes)
+def _off(rng: np.random.Generator, b: dict) -> dict:
+    """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for each."""
+    from dexsim.gap.prepare import BELIEF
+    from dexsim.gap.search import FILTER
+
+    def draw(centre: float, sd: float, low: float, high: float) -> float:
+        while not low <= (x := rng.normal(centre, sd)) <= high:
+            pass
+        return float(x)
+
+    off = {f"*{k}": draw(1.0, 0.5 * BELIEF, 1 - BELIEF, 1 + BELIEF) for k in REFIT}
+    off |= {"+delay": draw(0.0, 0.75 / RATE, 0.0, 1.5 / RATE), "+lag": draw(0.25 / RATE, 0.5 / RATE, 0.0, 1.0 / RATE)}
+    return off | ({"+speed_lag": draw(1.0 / RATE, 0.3 * FILTER, 0.0, FILTER)} if b["kd"] > 0 else {})
+
+
+def _refitted(b: dict) -> list[tuple[dict, float, float, float]]:
+    """What the tool refits with every hypothesis, seen from the true plant: (a small change of it, its size, how far down, how far up)."""
+    from dexsim.gap.prepare import BELIEF
+    from dexsim.gap.search import FILTER, GIVE
+
+    off = b["off"]
+    out = [({f"*{k}": 1.02}, 0.02, (1 - BELIEF) / off[f"*{k}"] - 1, (1 + BELIEF) / off[f"*{k}"] - 1) for k in REFIT if k != "kd" or b["kd"] > 0]
+    late = {"delay": (off["+delay"], 1.5 / RATE), "lag": (off["+lag"], 1.0 / RATE), "feedback_delay": (0.0, 1.5 / RATE), "presliding": (0.0, GIVE)}
+    if b["kd"] > 0:
+        late["speed_lag"] = (off["+speed_lag"], FILTER)
+    out += [({f"+{k}": 0.1 * most}, 0.1 * most, -now, most - now) for k, (now, most) in late.items()]
+    if not b["voltage"]:
+        out.append(({"brake": 0.8}, -0.2, -2.0, 0.0))
+        if b["kd"] > 0:
+            out.append(({"limit_speed": 0.2}, 0.2, 0.0, 1.0))
+    return out
+
+
+def _hidden(change: np.ndarray, slopes: np.ndarray, low: np.ndarray, high: np.ndarray, keep: slice) -> float:
+    """RMS of a change [n] over the held-out rows, without what refitted figures take away of it: slopes [n, P] per unit, which may move
+    from low to high [P]."""
+    span = high - low
+    q, r = np.linalg.qr(slopes * span)
     scale = max(float(np.abs(r).max()), 1e-30)
-    x = lsq_linear(r / scale, q.T @ change / scale, (-0.05, 0.05)).x
+    x = lsq_linear(r / scale, q.T @ change / scale, (low / span - 1e-9, high / span + 1e-9)).x * span
     return float(np.sqrt(np.mean((change - slopes @ x)[keep] ** 2)))
 
 
@@ -298,7 +335,7 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
     kind = PLANTS.get(entry["kind"])
     needs = kind.needs if kind else ""
     b = rig(rng, needs)
-    b["off"] = {f"*{k}": 1 + rng.uniform(-OFF, OFF) for k in REFIT}
+    b["off"] = _off(rng, b)
     extra = rng.uniform(2e-4, 5e-4)
     noise = float(np.hypot(QUANTUM / np.sqrt(12), extra))
     runs = _not_the_hardest_last(b, _runs(b, rng, needs))
@@ -306,14 +343,15 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
     if kind:
         sizes = np.geomspace(*kind.span, 20)
         tries = [b["off"], *(_joined(b["off"], kind.change(b, s)) for s in sizes)]
-        slopes = [_joined(b["off"], {f"*{k}": 1.02}) for k in REFIT]
-        cases, q, tau = _simulate(b, runs, tries + slopes, 1e-3, 2)
+        refitted = _refitted(b)
+        cases, q, tau = _simulate(b, runs, tries + [_joined(b["off"], x[0]) for x in refitted], 1e-3, 2)
         keep = cases[0].plant.rows(3)
         if kind.effect == "current_sensor":  # shows in the effort alone: sized by the noise of that
             reached = 1 + np.array([np.abs(s) for s in sizes]) * 20
         else:
-            move = (q[len(tries) :] - q[0]).T / 0.02
-            reached = np.array([np.hypot(_hidden(q[1 + i] - q[0], move, keep), noise) / noise for i in range(len(sizes))])
+            step, low, high = np.array([x[1:] for x in refitted]).T
+            move = (q[len(tries) :] - q[0]).T / step
+            reached = np.array([np.hypot(_hidden(q[1 + i] - q[0], move, low, high, keep), noise) / noise for i in range(len(sizes))])
         pick = int(np.argmin(np.abs(np.log(reached / TIERS[entry["tier"]]))))
         size, ratio, change = float(sizes[pick]), float(reached[pick]), tries[1 + pick]
     floor = float(np.hypot(noise, _by_mujoco(b, runs, change)))
@@ -347,10 +385,10 @@ def _believed_now(b: dict) -> dict:
 
 
 def _joined(off: dict, change: dict) -> dict:
-    """Both changes, factors on the same column multiplied."""
+    """Both changes, factors on the same column multiplied, additions to it added."""
     out = dict(off)
     for k, v in change.items():
-        out[k] = out[k] * v if k[0] == "*" and k in out else v
+        out[k] = v if k not in out else out[k] * v if k[0] == "*" else out[k] + v if k[0] == "+" else v
     return out
 
 
@@ -374,7 +412,7 @@ def score(truth: dict, d: dict) -> dict:
     out["right"] = bool(first and (first["effect"] == truth["effect"] or justified) and first["where"]["joints"] == [truth["joint"]])
     out["joint"] = bool(first and first["where"]["joints"] == [truth["joint"]])
     mine = next((f for f in found if f["effect"] == truth["effect"]), None)
-    out["errors"], out["covered"], out["missing"] = {}, {}, []
+    out["errors"], out["covered"], out["of_half"], out["missing"] = {}, {}, {}, []
     for key, value in truth["truth"].items():
         p = (mine or {}).get("parameters", {}).get(key)
         if mine is None:
@@ -389,6 +427,8 @@ def score(truth: dict, d: dict) -> dict:
         out["errors"][key] = float(np.linalg.norm(got - true) / max(np.linalg.norm(true), 1e-12))
         k = int(np.argmax(np.abs(true)))  # of a vector the component that was planted
         out["covered"][key] = bool(low[k] <= true[k] <= high[k])
+        half = high[k] - got[k] if true[k] > got[k] else got[k] - low[k]
+        out["of_half"][key] = float(abs(true[k] - got[k]) / max(half, 1e-12))
     return out
 
 
@@ -431,10 +471,11 @@ def table(results: list[dict]) -> dict:
     rate = lambda x: round(float(np.mean(x)), 3) if len(x) else None  # noqa: E731
     covered = [c for r in planted for c in r["covered"].values()]
     errors = [e for r in planted for e in r["errors"].values()]
+    of_half = [e for r in planted for e in r["of_half"].values()]
     out = {"right": rate([r["right"] for r in planted])}
     out |= {f"right_{t}": rate([r["right"] for r in planted if r["tier"] == t]) for t in TIERS}
     out |= {"joint": rate([r["joint"] for r in planted]), "coverage": rate(covered), "parameter_error_median": round(float(np.median(errors)), 4) if errors else None,
-            "parameters": len(covered), "within_1.3_floor": rate([r["after"] <= 1.3 for r in planted if "after" in r]),
+            "error_of_half_width_median": round(float(np.median(of_half)), 3) if of_half else None, "parameters": len(covered), "within_1.3_floor": rate([r["after"] <= 1.3 for r in planted if "after" in r]),
             "false_alarms": rate([r["false_alarm"] for r in results if r["effect"] == "none"]), "nothing_planted": sum(r["effect"] == "none" for r in results),
             "confident_and_wrong": rate([r["wrong_sure"] for r in results]), "failed": sum(r["verdict"].startswith("failed") for r in results),
             "keys_missing": sorted({f"{r['effect']}.{k}" for r in planted for k in r["missing"]}),

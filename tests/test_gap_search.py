@@ -163,3 +163,21 @@ def test_a_search_tells_how_far_it_is():
     s.tell = told.append
     s.settle(s.run())
     assert len(told) >= 3 and told == sorted(told) and 0 < told[0] and told[-1] < 1
+
+
+def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
+    """Half a second is cut off in the middle of a fast motion: one side of samples tells a speed badly."""
+    run = plant_run("a", 2, 4.0, {}, 1, noisy=False)
+    cut = int(np.argmax(np.abs(np.gradient(np.gradient(run.q[50:150, 0]))))) + 50
+    for r in (run,):
+        r.t, r.q = r.t[cut:], r.q[cut:]
+        r.torque = None if r.torque is None else r.torque[cut:]
+        r.smooth()
+    case = build(model(), [run])[0]
+    windows = case.plant.windows(None)
+    error = lambda underway: np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, [], np.zeros(0), windows, underway=underway)[0]) ** 2))  # noqa: E731
+    case.regimes["_speed"] = case.regimes["_speed"].copy()
+    case.regimes["_speed"][0] = case.scales.speed
+    assert error(True) < 0.7 * error(False)
+    case.regimes["_speed"][0] = 0.0  # at rest nothing is fitted
+    assert error(True) == error(False)

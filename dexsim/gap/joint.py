@@ -46,9 +46,9 @@ class JointAnswer:
         self.whole = replace(case, plant=search.whole)
         self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
         rows = self.rows = self.windows.sample_row
-        self.q_before, effort_before = judge.free_run(self.whole, self.none.fit.params, self.none.fit.x, self.windows)
+        self.q_before, effort_before = judge.free_run(self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True)
         fixed = [f for mm in self.best.members for f in mm.variant.fixed]
-        with_it = judge.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed) if self.best.members else (self.q_before, effort_before)
+        with_it = judge.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True) if self.best.members else (self.q_before, effort_before)
         self.q_after, effort_after = with_it
         self.measured, self.t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
         self.before, self.after = (self.measured - self.q_before) ** 2, (self.measured - self.q_after) ** 2
@@ -89,7 +89,7 @@ class JointAnswer:
         self.raw[mm.id] = raw
         rest = tuple(x for x in best.members if x is not mm)
         trial = without(self.search, best, mm) if rest else self.none
-        q, effort = judge.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed])
+        q, effort = judge.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True)
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.id == "current_sensor"
         evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
@@ -175,7 +175,7 @@ class JointAnswer:
         """Error (rms) of a free run over what was fitted, without any effect."""
         case, fit = self.case, self.none.fit
         windows = case.plant.windows(None, self.kept.train, span=self.kept.span_train)
-        return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, fit.params, fit.x, windows)[0]) ** 2)))
+        return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, fit.params, fit.x, windows, underway=True)[0]) ** 2)))
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
