@@ -12,7 +12,9 @@ from dexsim.gap.runs import Run, same_commands
 
 
 FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
-UNDERWAY, FIRST, START_SPEED = 0.1, 0.1, 0.1  # of a joint's speed, s, of a joint's speed: a recording that begins in motion; what tells how, and how far off
+UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
+FIRST = 0.1  # s tell where and how fast: within
+START_NOISE, START_SPEED = 10.0, 0.2  # x the noise, and of a joint's speed, of what the samples about its first say
 SURE_ENOUGH = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
 
 
@@ -55,7 +57,7 @@ def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray
     moving = np.abs(case.regimes["_speed"][windows.sample_row[first]]) > UNDERWAY * case.scales.speed
     if not moving.any():
         return case.plant.simulate(plants, windows)
-    size = np.array([sigma, START_SPEED * case.scales.speed])
+    size = np.array([START_NOISE * sigma, START_SPEED * case.scales.speed])
     q, tau = case.plant.simulate(np.repeat(plants, 3, 0), windows, np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]]]))
     slope, measured, which = q[1:] - q[0], case.plant.q[windows.sample_row], np.flatnonzero(moving)
     starts = []
