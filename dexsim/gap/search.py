@@ -568,13 +568,13 @@ class JointSearch:
         current = self._refine(self._drop(current))
         self._on(0.1)
         final = self.rivals(current, pool)
-        if len(current.members) == 1:  # one that only seemed worse before it was fitted in full takes the place
-            others, share, _ = final[current.members[0].id]
-            better = self.fitted.get(frozenset((others[0][0],))) if others and others[0][1] > share + 0.1 else None
-            if better is not None and not self._shrunk(better):
-                self.fitted[frozenset(current.ids)] = current
-                current = better
-                final = self.rivals(current, pool)
+        for _ in range(len(current.members)):  # one that only seemed worse before it was fitted in full takes the place
+            better = self._overtaken(current, final)
+            if better is None:
+                break
+            self.fitted[frozenset(current.ids)] = current
+            current = self._drop(better) if len(better.members) > 1 else better  # what went with the other may not be needed with it
+            final = self.rivals(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
@@ -703,6 +703,15 @@ class JointSearch:
                     current = more
                     break
         return current
+
+    def _overtaken(self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]) -> Trial | None:
+        """The hypothesis in which a rival stands in the place of the member that it beats in most bootstraps; None where each holds its own."""
+        ahead = [(others[0][1] - share, k, others[0][0]) for k, m in enumerate(current.members) for others, share, _ in [final[m.id]] if others]
+        for lead, k, rival in sorted(ahead, reverse=True):
+            better = self.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
+            if lead > 0.1 and better is not None and not self._shrunk(better):
+                return better
+        return None
 
     def rivals(self, current: Trial, pool) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
         """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
