@@ -33,6 +33,7 @@ import numpy as np
 import yaml
 from scipy.stats import t as student
 
+from benchmarks.loop.steps import KEPT
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
@@ -262,7 +263,7 @@ class Loop:
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            fit, held = excited[:-1], excited[-1:]
+            fit, held = excited[:-KEPT], excited[-KEPT:]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()
