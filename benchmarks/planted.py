@@ -57,7 +57,7 @@ def _less(column: str, key: str):
 PLANTS: dict[str, Plant] = {
     "coulomb_friction": Plant("coulomb_friction", (0.01, 1.0), lambda r, s: {"+coulomb_friction": s * r["weight"]},
                               lambda r, s: {"torque": r["coulomb_friction"] + s * r["weight"]}),
-    "coulomb_friction one way": Plant("coulomb_friction", (0.01, 1.0), lambda r, s: {"+coulomb_friction": s * r["weight"], "friction_asymmetry": 0.8},
+    "coulomb_friction one way": Plant("coulomb_friction", (0.002, 1.0), lambda r, s: {"+coulomb_friction": s * r["weight"], "friction_asymmetry": 0.8},
                                       lambda r, s: {"torque": r["coulomb_friction"] + s * r["weight"], "asymmetry": 0.8}),
     "stribeck_friction": Plant("stribeck_friction", (0.01, 1.2), lambda r, s: {"stribeck_peak": s * r["weight"], "stribeck_speed": 0.25},
                                lambda r, s: {"peak": s * r["weight"], "v_s": 0.25}),
@@ -68,7 +68,7 @@ PLANTS: dict[str, Plant] = {
     "backlash": Plant("backlash", (0.003, 0.3), lambda r, s: {"backlash": s}, lambda r, s: {"gap": s}),
     "compliance": Plant("compliance", (0.03, 2.0), lambda r, s: {"softness": s / r["kp"]}, lambda r, s: {"stiffness": r["kp"] / s}),
     "command_delay": Plant("command_delay", (0.002, 0.1), lambda r, s: {"+delay": s}, lambda r, s: {"delay": s + r["off"]["+delay"]}),
-    "lag": Plant("lag", (0.002, 0.1), lambda r, s: {"+lag": s}, lambda r, s: {"time_constant": s + r["off"]["+lag"]}),
+    "lag": Plant("lag", (0.0007, 0.1), lambda r, s: {"+lag": s}, lambda r, s: {"time_constant": s + r["off"]["+lag"]}),
     "lag of the speed": Plant("lag", (0.004, 0.1), lambda r, s: {"+speed_lag": s}, lambda r, s: {"time_constant": s + r["off"]["+speed_lag"]}, "damped"),
     "torque_limit": Plant("torque_limit", (0.05, 0.9), *_less("torque_limit", "torque")),
     "torque_speed_limit": Plant("torque_speed_limit", (0.06, 0.93), *_less("no_load_speed", "no_load_speed")),
@@ -341,7 +341,7 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
     runs = _not_the_hardest_last(b, _runs(b, rng, needs))
     size, ratio, change = 0.0, 1.0, dict(b["off"])
     if kind:
-        sizes = np.geomspace(*kind.span, 20)
+        sizes = np.geomspace(*kind.span, 24)
         tries = [b["off"], *(_joined(b["off"], kind.change(b, s)) for s in sizes)]
         refitted = _refitted(b)
         cases, q, tau = _simulate(b, runs, tries + [_joined(b["off"], x[0]) for x in refitted], 1e-3, 2)
