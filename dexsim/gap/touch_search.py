@@ -349,10 +349,12 @@ class PadSearch:
         ids = (*current.ids, e)
         tries = []
         if e == "tactile_gain":
-            order = self._swaps(current)
+            # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against the believed geometry
+            believed = {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
+            order = self._swaps(current.values | believed)
+            order = self._swaps(current.values) if order is None else order
             base = current if order is None else self.fit(current.ids, current.values, None, None, order, 24)
-            # single taxels must not be taken for a shifted object: gains first, against the believed geometry
-            base.values = base.values | {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
+            base.values = base.values | believed
             for _ in range(2):
                 gains = self.gain_map(base, self.train)
                 base = self.fit(current.ids, base.values, None, gains, base.order, 24)
@@ -381,11 +383,11 @@ class PadSearch:
         ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
         return self.fit((*current.ids, "tactile_gain"), current.values | {"gain": ratio}, None, current.gains, current.order, evaluations)
 
-    def _swaps(self, current: TouchTrial) -> np.ndarray | None:
-        """Order of the taxels [K] in which exchanged pairs are put right; None where there are none."""
+    def _swaps(self, values: dict[str, float]) -> np.ndarray | None:
+        """Order of the taxels [K] in which exchanged pairs are put right, by what `values` predict; None where there are none."""
         K = self.runs[0].z.shape[1]
         z = np.concatenate([r.z for r in self.runs])
-        p = np.concatenate([readings(r, current.values, None, None) for r in self.runs])
+        p = np.concatenate([readings(r, values, None, None) for r in self.runs])
         live = [k for k in range(K) if p[:, k].max() > 5 * self.noise and z[:, k].max() > 3 * self.noise]
         if len(live) < 3:
             return None
