@@ -1,0 +1,37 @@
+"""A hypothesis of several effects in which another one stands for a member that it beats."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace as Plain
+
+import pytest
+
+from dexsim.gap.search import JointSearch
+
+
+def hypothesis(*ids):
+    return Plain(members=[Plain(id=x) for x in ids], ids=ids)
+
+
+def search(*known):
+    out = Plain(fitted={frozenset(t.ids): t for t in known}, _shrunk=lambda t: "backlash" in t.ids)
+    return lambda current, final: JointSearch._overtaken(out, current, final)
+
+
+def test_a_rival_takes_the_place_of_the_member_that_it_beats():
+    now, better = hypothesis("payload", "torque_ripple"), hypothesis("position_scale", "torque_ripple")
+    final = {"payload": ([("position_scale", 0.93)], 0.06, 0.1), "torque_ripple": ([("position_scale", 0.01)], 0.98, 0.3)}
+    assert search(now, better)(now, final) is better
+    assert search(now)(now, final) is None  # never fitted beside the rest
+
+
+@pytest.mark.parametrize(("share", "rival"), [(0.5, "position_scale"), (0.06, "backlash")])
+def test_it_stays_where_it_holds_its_own_or_the_rival_is_fitted_away(share, rival):
+    now, other = hypothesis("payload", "torque_ripple"), hypothesis(rival, "torque_ripple")
+    final = {"payload": ([(rival, 0.55)], share, 0.1), "torque_ripple": ([], 0.98, 0.3)}
+    assert search(now, other)(now, final) is None
+
+
+def test_one_alone_is_overtaken_as_well():
+    now, better = hypothesis("payload"), hypothesis("position_scale")
+    assert search(now, better)(now, {"payload": ([("position_scale", 0.7)], 0.3, 0.1)}) is better
