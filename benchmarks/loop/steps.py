@@ -13,11 +13,12 @@ import numpy as np
 import yaml
 
 ROOT = Path(__file__).parents[2]
-EXCITED = (("random", 0.8), ("ladder", 0.7), ("ladder", 0.85), ("random", 1.0), ("ladder", 0.8))
+EXCITED = (("random", 0.6), ("chirp", 0.6), ("ladder", 0.8), ("ladder", 1.0), ("random", 0.8))
 """The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of the `used` speeds
-that they may reach. The ladder's constant speeds show where a drive ends, their corners its delay and lag."""
-KEPT = 2  # of them, the last, are for the proof
-MARGIN = 0.2  # of each joint's range kept free at both ends: a drive that is late swings past its target
+that they may reach. Chirps tell a delay from a lag; the ladders' constant speeds, two of them so that each may be foretold by the other,
+show where a drive ends."""
+KEPT = 1  # of them, the last, is for the proof
+MARGIN = 0.12  # of each joint's range kept free at both ends: a drive that is late swings past its target
 PAST = 0.005  # rad beyond its range at which a joint is taken to have met an end
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
 
@@ -57,15 +58,15 @@ def record(given: dict[str, str]) -> None:
     believed = mechanism()
     top = used([read(p) for p in given.get("own", "").split(",") if p], believed)
     print(f"own runs: up to {top:.2f} of the believed no-load speed", flush=True)
-    slower: list[str] = []  # joints that swung past an end of their range: they keep to random motion
+    slower: list[str] = []  # joints that swung past an end of their range on a ladder: they keep off it
     for k, (kind, share) in enumerate(EXCITED):
         for _ in range(3):
-            moving = [j for j in believed.joints if kind == "random" or j not in slower]
+            moving = [j for j in believed.joints if kind != "ladder" or j not in slower]
             p = plan(believed, joints=moving, kinds=[kind], seed=seed + k, repeats=0, limits=Limits(speed=share * top, margin=MARGIN))
             if kind == "random":
                 p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
             past = _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
-            if kind == "random" or not past:
+            if kind != "ladder" or not past:
                 break
             print(f"  past an end of its range: {', '.join(past)}; again without", flush=True)
             slower += past
