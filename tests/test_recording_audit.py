@@ -141,10 +141,8 @@ def degrees(r):
 
 
 def degrees_of_a_weak_drive(r):
-    s = r.states.position
-    s.value = 0.8 * s.value * 180 / np.pi  # it goes four fifths of the way that it is asked
-    if np.abs(s.value[:, 0]).max() < 7:
-        s.value *= 7 / np.abs(s.value[:, 0]).max()
+    r.commands.value *= 4.0
+    r.states.position.value *= 4.0 * 0.8 * 180 / np.pi  # it goes four fifths of the way that it is asked
     r.states.velocity = None
     return "unit", "/joint_states", "a", None, 800
 
