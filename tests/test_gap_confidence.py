@@ -46,6 +46,12 @@ def test_a_size_at_its_bound_is_told_from_one_at_nothing():
     assert confidence.at_bound([turns], {"per_turn": 4.08}, case) == "per_turn"
     coulomb = Param("torque", ("coulomb_friction",), "set", 0.0, 1.0, 0.0)
     assert confidence.at_bound([coulomb], {"torque": 0.0}, CASE) == ""
+    scale = Param("scale", ("position_scale",), "set", 0.7, 1.4, 1.0)
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0}))
+    assert [confidence.at_bound([scale], {"scale": x}, case) for x in (1.3986, 1.37, 1.0, 0.701)] == ["scale", "", "", "scale"]
+    gap = Param("gap", ("backlash",), "set", 0.0015, 0.4, 0.0015)  # begins near nothing: a small one is not at a bound
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"backlash": 0.0}))
+    assert confidence.at_bound([gap], {"gap": 0.004}, case) == ""
 
 
 def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():

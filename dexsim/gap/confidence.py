@@ -78,10 +78,12 @@ def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
     for p in params:
         if p.key in ("phase", "rebound", "rotor"):
             continue
-        room = 1e-3 * p.span
         zero = neutral_of(p, case)
-        for bound, inside in ((p.low, values[p.key] <= p.low + room), (p.high, values[p.key] >= p.high - room)):
-            if inside and abs(bound - zero) > room:
+        for bound in (p.low, p.high):
+            away = abs(bound - zero)
+            # a fit comes to rest a little before a bound; where an effect begins near one, it may be as small
+            room = (0.01 if away > 0.25 * p.span else 1e-3) * p.span
+            if away > room and abs(values[p.key] - bound) <= room:
                 return p.key
     return ""
 
