@@ -106,6 +106,18 @@ def test_excitation_is_as_fast_as_the_policies_were():
     assert used([run(0.02)], believed) == pytest.approx(0.8) and used([run(0.01)], believed) == used([], believed) == 0.6 and used([run(0.01), run(0.09)], believed) == 1.0
 
 
+def test_training_draws_near_what_was_found(tmp_path):
+    """By hand: a lag of 20 ms (believed 0) by 5 ms at most; gains of 4.1 (believed 4) by a twentieth; what is narrower stays."""
+    from dexsim.actuator.table import ServoTable
+
+    (tmp_path / "diagnosis_late").mkdir()
+    text = "drive: torque\njoints:\n  '*': {kp: 4.0, kd: 0.1}\n  mid_joint1: {lag: {value: 0.02, low: 0.0, high: 0.16}, kp: {value: 4.1, low: 3.0, high: 4.2}}\n"
+    (tmp_path / "diagnosis_late" / "servo.yaml").write_text(text)
+    table = ServoTable.load(loop.Loop(loop.SETTINGS | {"out": str(tmp_path)}).fitted(tmp_path / "x", "late"))
+    lag, kp = (table.value("mid_joint1", k) for k in ("lag", "kp"))
+    assert (lag.value, lag.low, lag.high) == pytest.approx((0.02, 0.015, 0.025)) and (kp.low, kp.high) == pytest.approx((4.1 - 0.205, 4.2))
+
+
 def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
     nominal = yaml.safe_load((ROOT / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     for name in worlds.SEEDS:

@@ -49,6 +49,7 @@ FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "effic
 WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
 OWN_S = 20  # s of a rotation policy's own run that are recorded
+DRAWN = 0.25  # share of what was found by which training draws about it, at most
 JUDGING = 75.0  # s that judging may be begun after the last training
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
@@ -210,7 +211,7 @@ class Loop:
             if variant == "wide":
                 argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
             elif variant == "fitted":
-                argv.append(f"servo_file={self.out / f'diagnosis_{world}' / 'servo.yaml'}")
+                argv.append(f"servo_file={self.fitted(base, world)}")
             else:
                 true = yaml.safe_load((ROOT / "configs" / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
                 (base / world).mkdir(parents=True, exist_ok=True)
@@ -221,6 +222,22 @@ class Loop:
             return (where / "policy.pt").is_file()
 
         return run
+
+    def fitted(self, base: Path, world: str) -> Path:
+        """The servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is that of one figure with all
+        others free (a longer delay goes with a shorter lag), and drawn at once their corners are drives that no recording allows. A range that
+        `diagnose` let reach the belief, being unsure, is cut like the others."""
+        from dexsim.actuator.table import ServoTable
+
+        belief, table = ServoTable.load(ROOT / "configs" / "servo" / "xhand.yaml"), ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml")
+        for joint, columns in table.entries.items():
+            for name, v in columns.items():
+                if not v.unknown and v.low < v.high:
+                    half = DRAWN * max(abs(v.value - belief.value(joint, name).value), 0.2 * abs(v.value))
+                    table.set(joint, name, v.value, max(v.low, v.value - half), min(v.high, v.value + half))
+        (base / world).mkdir(parents=True, exist_ok=True)
+        table.save(base / world / "fitted.yaml")
+        return base / world / "fitted.yaml"
 
     def policy(self, task: str, seed: int, variant: str, world: str) -> Path:
         base = self.folder(task, seed)

@@ -13,13 +13,10 @@ import numpy as np
 import yaml
 
 ROOT = Path(__file__).parents[2]
-EXCITED = (("random", 0.6), ("chirp", 0.6), ("ladder", 0.8), ("ladder", 1.0), ("random", 0.8))
+EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 """The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of the `used` speeds
-that they may reach. Chirps tell a delay from a lag; the ladders' constant speeds, two of them so that each may be foretold by the other,
-show where a drive ends."""
+that they may reach; chirps tell a delay from a lag. Faster, a drive that is late swings into the ends of its range (docs/loop.md)."""
 KEPT = 1  # of them, the last, is for the proof
-MARGIN = 0.12  # of each joint's range kept free at both ends: a drive that is late swings past its target
-PAST = 0.005  # rad beyond its range at which a joint is taken to have met an end
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
 
 
@@ -58,18 +55,11 @@ def record(given: dict[str, str]) -> None:
     believed = mechanism()
     top = used([read(p) for p in given.get("own", "").split(",") if p], believed)
     print(f"own runs: up to {top:.2f} of the believed no-load speed", flush=True)
-    slower: list[str] = []  # joints that swung past an end of their range on a ladder: they keep off it
     for k, (kind, share) in enumerate(EXCITED):
-        for _ in range(3):
-            moving = [j for j in believed.joints if kind != "ladder" or j not in slower]
-            p = plan(believed, joints=moving, kinds=[kind], seed=seed + k, repeats=0, limits=Limits(speed=share * top, margin=MARGIN))
-            if kind == "random":
-                p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
-            past = _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
-            if kind != "ladder" or not past:
-                break
-            print(f"  past an end of its range: {', '.join(past)}; again without", flush=True)
-            slower += past
+        p = plan(believed, kinds=[kind], seed=seed + k, repeats=0, limits=Limits(speed=share * top))
+        if kind == "random":
+            p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
+        _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
 
 
 def used(own: list, believed) -> float:
@@ -91,9 +81,8 @@ def _world(name: str) -> dict:
     return yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
-def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.ndarray, rng: np.random.Generator, path: Path) -> list[str]:
-    """Sends targets value [T, J] rad at t [T] s to the empty hand of a world, from home [J], and writes what its bus delivers. Returns the
-    joints that were seen past an end of their range."""
+def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.ndarray, rng: np.random.Generator, path: Path) -> None:
+    """Sends targets value [T, J] rad at t [T] s to the empty hand of a world, from home [J], and writes what its bus delivers."""
     from dexsim.recording import write
     from dexsim.recording.mechanism import drive, mechanism, recorded
     from dexsim.recording.realistic import realistic
@@ -109,9 +98,6 @@ def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.nda
     seen.meta["source"] = "real"
     write(path, seen)
     print(f"{path}: {t[-1]:.0f} s", flush=True)
-    q, ends = seen.states.position.value, believed.limits
-    beyond = np.maximum(ends[:, 0] - np.nanmin(q, 0), np.nanmax(q, 0) - ends[:, 1])
-    return [j for j, x in zip(believed.joints, beyond, strict=True) if x > PAST]
 
 
 if __name__ == "__main__":
