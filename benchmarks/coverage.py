@@ -203,7 +203,7 @@ def draw(ours: list, theirs: list, label: str, found: dict, path: Path) -> None:
         top.set_xlabel("mm", fontsize=8)
         bottom.set_xlabel("F [N]", fontsize=8)
         bottom.set_yscale("log")
-    axes[0, 0].legend(fontsize=7)
+    axes[1, 0].legend(fontsize=7)  # its patches are seen at any size; points of a scatter are not
     figure.savefig(path, dpi=110)
 
 

@@ -60,6 +60,26 @@ def test_rows_are_settings_of_train():
     assert all(np.median(r.listed) == pytest.approx(r.paper["median"]) for r in rows.ROTATION)
 
 
+def test_the_rotation_rows_keep_the_reward_they_were_trained_with():
+    """All but `paper_reward` with the term `spin` that the default leaves out; a user's own setting comes after a row's; what was
+    begun goes on with its own config."""
+    kept = {r.key: start.for_train(["task=rotate", "device=cpu", *r.settings], CONFIGS).cfg["task"] for r in (*rows.ROTATION, *rows.OURS)}
+    assert {k: t["rewards"]["spin"] for k, t in kept.items()} == {k: 0.0 if k == "paper_reward" else 0.01 for k in kept}
+    assert kept["paper_reward"] == start.for_train(["task=rotate", "device=cpu"], CONFIGS).cfg["task"]
+    changed = [k for k in kept["full"] if kept["full"][k] != kept["paper_reward"][k]]
+    assert changed == ["rewards"]  # it differs from the row with everything in that alone
+
+
+def test_a_row_begins_with_its_settings_and_goes_on_with_its_own(tmp_path, monkeypatch):
+    p, job, children = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1), Children(monkeypatch)
+    p = replace(p, extra=("task.rewards.spin=0",))
+    jobs.train(job, p, None, silent)
+    begun = children.commands[0]
+    assert begun.index("task.rewards.spin=0.01") < begun.index("task.rewards.spin=0")  # the last one counts
+    jobs.train(job, replace(p, extra=(), steps=2 * p.steps), None, silent)
+    assert any(a.startswith("resume=") for a in children.commands[1]) and not any("spin" in a for a in children.commands[1])
+
+
 def test_the_torque_row_is_paid_for_no_contact_force():
     """Every reward of the default task that looks at the commanded force is off in it; R_torque is off in the force row."""
     weights = {r.key: start.for_train(["task=grasp", "device=cpu", *r.settings], CONFIGS).cfg["task"]["rewards"] for r in rows.GRASP}

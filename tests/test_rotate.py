@@ -258,8 +258,8 @@ def test_drift_withholds_success(env):
 
 
 def test_reward_by_hand():
-    """The table's formula with plain numbers, the terms beyond it left out."""
-    env = make("task.rewards.spin=0")
+    """The table's formula with plain numbers; nothing beyond the table's three terms is paid, nor listed."""
+    env = make()
     r, w = env.task["reward"], env.task["rewards"]
     env.action[:] = 0.5
     env.last_action[:] = 0.25
@@ -270,11 +270,23 @@ def test_reward_by_hand():
     put(env, pose)
     env.terminated()
     out = env.rewards()
-    assert set(out) == {"goal", "action", "bonus"}
+    assert set(out) == {"goal", "action", "bonus"} == {row[0] for row in env.describe()["rewards"]}
     for i, (d_rot, d_goal) in enumerate(zip((0.5, 1.0, 1.5, 0.4), drift.tolist(), strict=True)):
         close = 1.0 / (abs(d_rot) + r["epsilon"]) * 1.0 / (1.0 + math.exp(r["alpha"] * (d_goal - r["delta_dist"])))
         assert out["goal"][i].item() == pytest.approx(w["goal"] * close, rel=1e-3)
     assert torch.allclose(out["action"], torch.full((4,), w["action"] * 12 * 0.25**2))
+
+
+def test_the_term_spin_is_beyond_the_table_and_off():
+    """Turned on, it pays for turning the way the goal lies, up to `spin_max`, and is listed."""
+    assert config()["task"]["rewards"]["spin"] == 0
+    for angle in (90.0, -90.0):
+        env = make("task.rewards.spin=0.01", f"task.goal.angle={angle}")
+        assert [row[1] for row in env.describe()["rewards"] if row[0] == "spin"] == [0.01]
+        env._spin = lambda: torch.tensor([[0.0, 0.0, w] for w in (0.5, -0.5, 3.0, 0.0)])
+        env.terminated()
+        paid = torch.tensor([0.005, -0.005, 0.01, 0.0]) * math.copysign(1.0, angle)
+        assert torch.allclose(env.rewards()["spin"], paid, atol=1e-7)
 
 
 def test_endings(env):

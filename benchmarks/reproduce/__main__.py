@@ -82,7 +82,7 @@ def main(argv: list[str]) -> int:
         gpus = [v.strip() for v in own["gpus"].split(",")]
     task = rows.TASK[table]
     for row in chosen:  # refuse a slip before hours of training
-        cfg = tools.config([f"task={task}", *extra, *row.settings])
+        cfg = tools.config([f"task={task}", *row.settings, *extra])
     per = cfg["worlds"] * cfg["agent"]["num_steps_per_env"]
     cores = len(os.sched_getaffinity(0))
     judge = own["judge"] if own["judge"] != "auto" else ("cpu" if cores >= 32 or not count else "cuda")

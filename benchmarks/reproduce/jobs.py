@@ -144,7 +144,7 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
         return so_far.last
     numbers = [int(n) for p in folder.glob("train_*") if (n := p.name.removeprefix("train_")).isdigit()]
     out = folder / f"train_{max(numbers, default=-1) + 1}"
-    start = [f"task={plan.task}", f"seed={job.seed}", *plan.extra, *job.row.settings] if so_far.last is None else [f"resume={so_far.last}", *plan.extra]
+    start = [f"task={plan.task}", f"seed={job.seed}", *job.row.settings, *plan.extra] if so_far.last is None else [f"resume={so_far.last}", *plan.extra]
     iterations = so_far.iteration + math.ceil((to - so_far.steps) / plan.per)
     command = [sys.executable, "train.py", *start, f"iterations={iterations}", "final_episodes=0", f"out={out}"]
     env = os.environ | {"OMP_NUM_THREADS": "1"} | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
