@@ -230,7 +230,8 @@ def main(argv: list[str]) -> int:
     if own["recording"] != "null":
         theirs, label = recorded(own["recording"], meta), "recording"
     else:
-        theirs, label = played([*settings, f"reality={own['reality']}"], other_worlds, other_seconds, seed + 1), f"reality={own['reality']}"
+        elsewhere = [*settings, "device=cpu", f"reality={own['reality']}"]  # C MuJoCo steps it, whatever trained
+        theirs, label = played(elsewhere, other_worlds, other_seconds, seed + 1), f"reality={own['reality']}"
     found = {finger: envelope(a, b) for finger, a, b in zip(xhand.FINGERS, ours, theirs, strict=True)}
     out = Path(own["out"]).expanduser()
     out.mkdir(parents=True, exist_ok=True)

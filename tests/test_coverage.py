@@ -68,6 +68,22 @@ def test_the_command_line_is_checked():
             coverage.main(argv)
 
 
+def test_trainings_side_may_play_on_a_gpu(tmp_path, monkeypatch):
+    """The other world is played on the CPU whatever `device` says, which is for training's side."""
+    asked = []
+
+    def played(argv, worlds, seconds, seed):
+        asked.append(argv)
+        return [samples(300, (0.1, 8.0), (-0.005, 0.005), seed)] * 5
+
+    monkeypatch.setattr(coverage, "played", played)
+    assert coverage.main(["checkpoint=checkpoints/rotate.pt", "device=cuda", "reality=bench", f"out={tmp_path}"]) == 0
+    ours, theirs = asked
+    assert [a for a in ours if a.startswith("device=")] == ["device=cuda"]
+    begun = coverage.start.for_play([*theirs, "worlds=2"], coverage.tools.ROOT / "configs")
+    assert begun.cfg["device"] == "cpu" and begun.cfg["reality"]["name"] == "bench"
+
+
 @pytest.mark.slow
 def test_against_the_other_world_and_a_recording(tmp_path):
     """The included checkpoint for a second, against the other world and against its own recording."""
