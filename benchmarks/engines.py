@@ -89,4 +89,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    tools.command(main)
+    tools.command(main, __doc__)

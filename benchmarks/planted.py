@@ -28,6 +28,9 @@ import numpy as np
 import yaml
 from scipy.optimize import lsq_linear
 
+from dexsim.cli.ending import guard
+from dexsim.errors import UserError
+
 TIERS = {"large": 8.0, "medium": 4.0, "small": 2.0}
 NONE_EACH = 6  # cases with nothing planted in a round
 SECONDS = 7.0
@@ -509,13 +512,13 @@ def main(argv: list[str]) -> dict:
     for argument in argv:
         key, equals, text = argument.partition("=")
         if not equals or key not in s or (key not in ("out", "effects") and not text.isdigit()):
-            raise SystemExit(f"'{argument}' is not a setting; valid: {', '.join(s)} (key=value)")
+            raise UserError(f"'{argument}' is not a setting; valid: {', '.join(s)} (key=value)")
         s[key] = text if key in ("out", "effects") else int(text)
     s["out"] = str(Path(s["out"]).expanduser().resolve())
     effects = {e for e in s["effects"].split(",") if e}
     unknown = effects - set(PLANTS) - {p.effect for p in PLANTS.values()}
     if unknown:
-        raise SystemExit(f"effects={s['effects']}: {', '.join(sorted(unknown))} is not planted; valid: {', '.join(PLANTS)}")
+        raise UserError(f"effects={s['effects']}: {', '.join(sorted(unknown))} is not planted; valid: {', '.join(PLANTS)}")
     entries = plan(s["seed"], effects)
     count = s["cases"] or sum(not effects or p.effect in effects or n in effects for n, p in PLANTS.items()) + (0 if effects else NONE_EACH)
     jobs = [(n, entries[n], s) for n in range(s["first"], s["first"] + count)]
@@ -565,4 +568,4 @@ def _watch(stream, total: int, start: float, limit: float) -> list[dict]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(guard(lambda argv: 0 if main(argv) else 1, sys.argv[1:], __doc__))

@@ -77,4 +77,4 @@ def run(env, steps: int, device: str, seed: int) -> float:
 
 
 if __name__ == "__main__":
-    tools.command(main)
+    tools.command(main, __doc__)

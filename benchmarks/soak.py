@@ -167,4 +167,4 @@ def report(rows: np.ndarray, out: Path, about: dict) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))

@@ -72,4 +72,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    tools.command(main)
+    tools.command(main, __doc__)

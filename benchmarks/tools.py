@@ -23,14 +23,14 @@ from dexsim.sim.scene import OBJECT_FIELDS
 ROOT = Path(__file__).parents[1]
 
 
-def command(main: Callable[[list[str]], object]) -> None:
-    """Run `main` on the command line's arguments and end the process as every command of dexsim ends (`dexsim.cli.ending`)."""
+def command(main: Callable[[list[str]], object], about: str | None = None) -> None:
+    """Run `main` on the command line's arguments (or print `about` for --help) and end the process as every command of dexsim ends (`dexsim.cli.ending`)."""
 
     def run(argv: list[str]) -> int:
         main(argv)
         return 0
 
-    sys.exit(guard(run, sys.argv[1:]))
+    sys.exit(guard(run, sys.argv[1:], about))
 
 
 def split(argv: Sequence[str], own: dict[str, str]) -> tuple[dict[str, str], list[str]]:

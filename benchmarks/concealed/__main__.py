@@ -22,6 +22,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks.concealed import baselines, generate, score
+from dexsim.cli.ending import guard
+from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False}
@@ -29,27 +31,27 @@ CI = {"effect": 6, "none": 2, "pair": 1, "outside": 1, "decoy": 2}
 
 
 def parse(argv: list[str]) -> dict:
-    """key=value settings; exits with status 2 for one that does not exist or is no number."""
+    """key=value settings; UserError for one that does not exist or is no number."""
     given = dict(SETTINGS)
     for argument in argv:
         key, equals, text = argument.partition("=")
         if not equals or key not in SETTINGS:
-            raise SystemExit(f"'{argument}' is not a setting; valid: {', '.join(SETTINGS)} (key=value)")
+            raise UserError(f"'{argument}' is not a setting; valid: {', '.join(SETTINGS)} (key=value)")
         if key == "mix":
             pairs = [part.partition(":")[::2] for part in text.split(",")]
             if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
-                raise SystemExit(f"mix={text}: must read like effect:14,none:4 with groups of {', '.join(generate.MIX)}")
+                raise UserError(f"mix={text}: must read like effect:14,none:4 with groups of {', '.join(generate.MIX)}")
             given[key] = {group: int(number) for group, number in pairs}
         elif key == "out":
             given[key] = text
         elif isinstance(SETTINGS[key], bool):
             if text not in ("true", "false"):
-                raise SystemExit(f"{key}={text}: must be true or false")
+                raise UserError(f"{key}={text}: must be true or false")
             given[key] = text == "true"
         elif text.isdigit():
             given[key] = int(text)
         else:
-            raise SystemExit(f"{key}={text}: must be a whole number")
+            raise UserError(f"{key}={text}: must be a whole number")
     if given["ci"]:
         given["mix"] = dict(CI)
     return given
@@ -164,4 +166,4 @@ def main(argv: list[str]) -> dict:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(guard(lambda argv: 0 if main(argv) else 1, sys.argv[1:], __doc__))

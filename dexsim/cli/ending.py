@@ -12,8 +12,13 @@ from dexsim.errors import UserError
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-def guard(main: Callable[[list[str]], int], argv: list[str]) -> int:
-    """Run ``main(argv)`` and turn its errors into a line on stderr and an exit status."""
+def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None = None) -> int:
+    """Run ``main(argv)`` and turn its errors into a line on stderr and an exit status.
+
+    about: what ``-h`` or ``--help`` print instead of running, for a command that has no help of its own."""
+    if about and {"-h", "--help"} & set(argv):
+        print(about.strip())
+        return 0
     try:
         return main(argv)
     except UserError as error:

@@ -1,0 +1,36 @@
+"""Every benchmark says what it does and which settings it has, without running."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = sorted(
+    {p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")}
+    | {p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")}
+)
+
+
+def test_commands_are_found():
+    assert {"step", "engines", "planted", "concealed", "loop", "reproduce"} <= set(COMMANDS)
+
+
+@pytest.mark.slow  # a new interpreter each
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_the_command_and_ends_well(name):
+    done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert f"benchmarks.{name}" in done.stdout
+    assert "train.py [key=value" not in done.stdout  # its own, not that of the command behind it
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["planted", "concealed"])
+def test_a_wrong_setting_is_one_line_and_status_2(name):
+    done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", "case=3"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.strip().startswith("error: 'case=3' is not a setting") and len(done.stderr.strip().splitlines()) == 1
