@@ -29,6 +29,13 @@ def test_help_names_the_command_and_ends_well(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("module", ["benchmarks.loop.worlds", "benchmarks.reproduce.pack", "dexsim.tasks.reality", "dexsim.tasks.nan_dump"])
+def test_help_of_what_writes_files(module):
+    done = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and module in done.stdout, done.stderr
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planted", "concealed"])
 def test_a_wrong_setting_is_one_line_and_status_2(name):
     done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", "case=3"], cwd=ROOT, capture_output=True, text=True, timeout=120)

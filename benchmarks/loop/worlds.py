@@ -45,9 +45,13 @@ def draw(name: str) -> dict:
     return world
 
 
-def main() -> int:
+def main(argv: list[str]) -> int:
     """Writes the files."""
+    from dexsim.errors import UserError
     from dexsim.tasks.reality import text
+
+    if argv:
+        raise UserError(f"'{argv[0]}': there are no settings; the numbers are drawn from SEEDS in benchmarks/loop/worlds.py")
 
     for name in SEEDS:
         path = ROOT / "configs" / "reality" / f"{name}.yaml"
@@ -61,4 +65,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from dexsim.cli.ending import guard
+
+    sys.exit(guard(main, sys.argv[1:], __doc__))

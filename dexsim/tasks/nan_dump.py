@@ -146,4 +146,4 @@ def _largest(x: np.ndarray) -> str:
 if __name__ == "__main__":
     from dexsim.cli.ending import guard
 
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))

@@ -222,4 +222,4 @@ def main(argv: list[str]) -> int:
 if __name__ == "__main__":
     from dexsim.cli.ending import guard
 
-    sys.exit(guard(main, sys.argv[1:]))
+    sys.exit(guard(main, sys.argv[1:], __doc__))
