@@ -78,15 +78,18 @@ def test_joints_side_by_side_come_back_in_order(monkeypatch):
 
     seen, meet = [], threading.Barrier(3, timeout=20)
 
-    def work(k: int) -> int:
+    def work(k: int, tell) -> int:
         meet.wait()  # passes only where three run at once
+        tell(0.5)
         return k * k
 
     names = ["a", "b", "c"]
     assert side_by_side(names, work, "cuda", lambda *x: seen.append(x)) == [0, 1, 4]
-    assert seen[-1] == (3, 3, "") and sorted(x[2] for x in seen[:-1]) == names
+    assert seen[-1] == (3, 3, "") and sorted({x[2] for x in seen[:-1]}) == names
+    done = [x[0] for x in seen]
+    assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])  # each begins, and is half done
     with pytest.raises(ZeroDivisionError):
-        side_by_side(names, lambda k: 1 // 0, "cuda")
+        side_by_side(names, lambda k, tell: 1 // 0, "cuda")
     for given, cores in (("1", 1), ("4", 2), ("64", together.MOST_CPU), ("12", 6)):
         monkeypatch.setenv("OMP_NUM_THREADS", given)
         assert lanes("cpu", 20) == max(1, min(cores, int(given) // plants.THREADS))
