@@ -195,8 +195,15 @@ def _rest(search: PadSearch, t: TouchTrial) -> Fit | None:
     sure[list(search.silent)] = False
     if sure.sum() < AGREE:
         return None
-    low, value, high = (float(x) for x in np.quantile(t.gains[sure], [0.05, 0.5, 0.95]))
+    low, value, high = _quantiles(t.gains[sure], _gain_width(search, t)[sure] ** -2.0, (0.05, 0.5, 0.95))  # one barely known counts little
     return (value, low, high) if abs(value - 1) > GAIN_OFF and high - low < abs(value - 1) else None
+
+
+def _quantiles(x: np.ndarray, weight: np.ndarray, at: tuple[float, ...]) -> list[float]:
+    """Quantiles of x [n], each counting by its weight: the least value below or at which that share of the weights lies."""
+    order = np.argsort(x)
+    share = np.cumsum(weight[order]) / weight.sum()
+    return [float(x[order][min(int(np.searchsorted(share, q)), len(x) - 1)]) for q in at]
 
 
 def _chord(search: PadSearch, t: TouchTrial, bounds: dict[str, tuple[float, float]]) -> Fit | None:

@@ -191,9 +191,10 @@ class PadSearch:
             return -0.7 / self.warm, 0.7 / self.warm
         return p.low, p.high
 
-    def fit(self, ids: tuple[str, ...], start: dict[str, float], where: np.ndarray | None = None, gains=None, order=None, evaluations: int = 60) -> TouchTrial:
-        """Least squares of the effects' numbers and the nuisances on residuals `where` (default: training), from `start`."""
-        keys = self._keys(ids, gains is not None)
+    def fit(self, ids: tuple[str, ...], start: dict[str, float], where: np.ndarray | None = None, gains=None, order=None, evaluations: int = 60,
+            still: tuple[str, ...] = ()) -> TouchTrial:
+        """Least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default: training), from `start`."""
+        keys = tuple(k for k in self._keys(ids, gains is not None) if k not in still)
         where = self.train if where is None else where
         low, high = np.array([self._bounds(k) for k in keys]).T
         scale = np.array([PLACE[k] * self.doubt / 3 if k in PLACE else PARAMS[k].scale for k in keys])
@@ -352,7 +353,9 @@ class PadSearch:
             # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against the believed geometry
             believed = {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
             order = self._swaps(current.values | believed)
-            order = self._swaps(current.values) if order is None else order
+            if order is None:  # where the object lies may be off, but a wider contact looks like what exchanged taxels do
+                place = {k: v for k, v in current.values.items() if k != "spread"}
+                order = self._swaps(self.fit(current.ids, place, None, None, None, 40, ("spread",)).values)
             base = current if order is None else self.fit(current.ids, current.values, None, None, order, 24)
             base.values = base.values | believed
             for _ in range(2):
