@@ -23,7 +23,7 @@ from dexsim.gap.prepare import build, noise
 from dexsim.gap.runs import Run, conditions, local_polynomial
 from dexsim.gap.search import JointSearch
 from dexsim.recording import read, write
-from dexsim.recording.mechanism import drive, mechanism
+from dexsim.recording.mechanism import drive
 
 SERVO = {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}
 
