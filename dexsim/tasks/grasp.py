@@ -112,7 +112,7 @@ class GraspEnv(HandEnv):
 
     # -- episodes ------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:
-        s, t, n = self.sampler, self.task, self.num_envs
+        s, t = self.sampler, self.task
         pick = torch.searchsorted(self._cumulative, s.uniform()).clamp(max=len(self._cumulative) - 1)
         scale = s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
         self.objects.write(

@@ -54,7 +54,7 @@ class ServoRandomizer:
 
     def draw(self, mask: torch.Tensor) -> None:
         """New parameters in the worlds that mask [N] selects; others keep theirs."""
-        s, n, J = self.servo, *self.servo.params.shape[:2]
+        s, J = self.servo, self.servo.params.shape[1]
         new = s.nominal.expand_as(s.params).clone()
         for name in self.columns:
             c = INDEX[name]
