@@ -23,6 +23,8 @@ TIMING = 3e-3  # s by which a reading's time is uncertain: between two positions
 PRIOR = 0.3  # standard deviation of a taxel's gain, before anything is seen
 PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
 GAIN_OFF = 0.08  # a taxel whose gain is less than this off is not listed
+ALIKE = frozenset(("tactile_gain", "tactile_crosstalk"))  # with a wider contact beside it one follows much of the other: where one is tried, both are
+CLOSE = 0.03  # of the loss on presses left out: nearer than this the one that follows the presses themselves better is taken
 
 
 @dataclass
@@ -276,20 +278,22 @@ class PadSearch:
             if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < 1.2**2:
                 break
             listed = self.scan(current)
+            listed += [e for e in TOUCH if e.id in ALIKE and e not in listed and ALIKE & {x.id for x in listed} and self._possible(current, e)]
             options = [t for e in listed if (t := self._try(current, e)) is not None]
             if self.scale_known and any(e.id == "tactile_gain" for e in listed):  # one number for the pad, beside one for each taxel
                 options.append(self._common(current, 120))
             for t in options:
                 trials[frozenset(t.ids)] = t
             options.sort(key=lambda t: float(np.minimum(np.abs(t.res[self.train]), 30).sum()))
-            for t in options[:3]:
+            for t in options[:4]:
                 self.cross(t)
-            good = [t for t in options[:3] if self._earns(t, current)]
+            good = [t for t in options[:4] if self._earns(t, current)]
             if not good:
                 break
             # a gain for every taxel must do clearly better than one number
             priced = lambda t, had=current.gains is not None: self.cross(t).sum() * (1.0 if t.gains is None or had else MAP_PRICE)  # noqa: E731
-            current = min(good, key=priced)
+            least = min(map(priced, good))
+            current = min((t for t in good if priced(t) <= (1 + CLOSE) * least), key=lambda t: self._size(t.res) * priced(t))
         current = self._drop(current, trials)
         if current.ids and current.gains is None:  # the numbers, to their end
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
@@ -451,7 +455,7 @@ class PadSearch:
         others = []
         tried = self.scan(base, 3)
         for x in TOUCH:
-            if x.id in current.ids or not (x in tried or confusable(x.id, e)):
+            if x.id in current.ids or not (x in tried or confusable(x.id, e) or {x.id, e} == ALIKE):
                 continue
             t = trials.get(frozenset((*base.ids, x.id))) or self._try(base, x)
             if confusable(x.id, e) and t is not None:  # what is said to be no rival must have been fitted to its end
