@@ -6,9 +6,9 @@
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
 drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
-they were; that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
-iterations: with the servo table that `diagnose` fitted (its intervals are the randomization), with wide randomization of the believed
-drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
+they were, then presses on its five fingertips; all that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
+iterations: with the servo table and the touch that `diagnose` fitted (the intervals are the randomization), with wide randomization of the
+believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
 commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
 the CPUs meanwhile. gpus=none (the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU,
 fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. Resumable: a step that is done is not
@@ -33,6 +33,7 @@ import numpy as np
 import yaml
 from scipy.stats import t as student
 
+from benchmarks.loop import presses
 from benchmarks.loop.steps import KEPT
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
@@ -51,6 +52,7 @@ WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no
 OWN_S = 20  # s of a rotation policy's own run that are recorded
 DRAWN = 0.25  # share of what was found by which training draws about it, at most
 JUDGING = 75.0  # s that judging may be begun after the last training
+FINGERS = ("thumb", "index", "mid", "ring", "pinky")
 VARIANTS = ("naive", "wide", "fitted", "truth")
 
 
@@ -211,7 +213,9 @@ class Loop:
             if variant == "wide":
                 argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
             elif variant == "fitted":
-                argv.append(f"servo_file={self.fitted(base, world)}")
+                argv += [f"servo_file={self.fitted(base, world)}", f"tactile_file={self.out / f'touch_{world}' / 'tactile.yaml'}"]
+                if presses.feels_others(self.out / f"touch_{world}" / "pinch.mcap"):
+                    argv.append("tactile.feel_others=true")
             else:
                 true = yaml.safe_load((ROOT / "configs" / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
                 (base / world).mkdir(parents=True, exist_ok=True)
@@ -280,10 +284,31 @@ class Loop:
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            fit, held = excited[:-KEPT], excited[-KEPT:]
+            fit, held = [*excited[:-KEPT], self.out / f"excited_{world}" / "fast.mcap"], excited[-KEPT:]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()
+
+        return run
+
+    def press(self, finger: str, world: str):
+        """A fingertip pressed in the reality, and its diagnosis."""
+        def run(slot: str) -> bool:
+            where = self.out / f"touch_{world}" / finger
+            if self.call(["-m", "benchmarks.loop.presses", "record", f"world={world}", f"finger={finger}", f"out={where}"], where / "record.log", limit=300):
+                return False
+            argv = ["diagnose.py", f"recordings=[{','.join(map(str, sorted(where.glob('press_*.mcap'))))}]", f"model={where / 'rig.xml'}", f"servo={where / 'rig.yaml'}"]
+            return self.call([*argv, "next=false", f"out={where / 'found'}"], where / "found.log", limit=float(self.s["diagnose_s"])) == 0
+
+        return run
+
+    def touch(self, world: str):
+        """What was found on the five fingertips, as training takes it."""
+        def run(slot: str) -> bool:
+            where = self.out / f"touch_{world}"
+            pinched = self.call(["-m", "benchmarks.loop.presses", "pinch", f"world={world}", f"out={where / 'pinch.mcap'}"], where / "pinch.log", limit=300)
+            found = ",".join(str(where / f) for f in FINGERS)
+            return not pinched and self.call(["-m", "benchmarks.loop.presses", "sum", f"found={found}", f"out={where / 'tactile.yaml'}"], where / "sum.log") == 0
 
         return run
 
@@ -294,6 +319,9 @@ class Loop:
             for task in self.tasks:
                 out.append(Job(f"own {task} {w}", self.out / f"own_{w}" / f"{task}.done", self.own(task, w), False, [f"naive {task} {self.seeds[0]}"], 0))
             out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [f"own {task} {w}" for task in self.tasks], 1))
+            for finger in FINGERS:
+                out.append(Job(f"press {finger} {w}", self.out / f"touch_{w}" / f"{finger}.done", self.press(finger, w), False, [], 1))
+            out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
         for task in self.tasks:
             for seed in self.seeds:
@@ -305,7 +333,7 @@ class Loop:
                     add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
                         Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"]))
                     add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8)
-                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"naive {name}"], 3)
+                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"touch {w}", f"naive {name}"], 3)
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
                     add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
                     for variant in ("fitted", "truth"):

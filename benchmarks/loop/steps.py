@@ -18,6 +18,12 @@ EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 that they may reach; chirps tell a delay from a lag. Faster, a drive that is late swings into the ends of its range (docs/loop.md)."""
 KEPT = 1  # of them, the last, is for the proof
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
+DASH = ((0.7, 0.5), (-0.7, 0.75), (1.0, 1.0), (-1.0, 0.6), (0.8, 0.9), (-0.8, 1.1), (0.5, 0.7), (0.0, 0.5))
+"""Straight moves about the middle of a joint's range: to which share of the largest offset, at which share of the believed no-load speed."""
+DASH_S = 0.5  # s from one to the next
+LATE = {"delay": 0.05, "lag": 0.025}  # s more: drives as late as this must stay clear of the ends as well
+SMALLEST = 0.05  # of a joint's range: not made smaller than that
+CLEAR = 0.05  # share of a joint's range that a dash leaves free at both ends
 
 
 def start(given: dict[str, str]) -> None:
@@ -60,6 +66,60 @@ def record(given: dict[str, str]) -> None:
         if kind == "random":
             p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
         _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
+    _drive(world, believed, *dashes(believed), np.random.default_rng([seed, 100]), out / "fast.mcap")
+
+
+def dashes(believed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [T] s, targets [T, J] rad and home [J]: one joint of each finger at a time is led about the middle of its range, for a tenth of
+    a second faster than its drive may be able to follow: a speed limit shows, which smooth motion does not reach. A step of the target
+    would too, but a drive with a lag swings far past it. Simulated with the drives as believed and with drives as late as LATE; a joint's
+    motion is made smaller and slower until it keeps CLEAR of the ends in both, that of a group where anything touches."""
+    from dexsim.recording import excitation, safety
+    from dexsim.recording.mechanism import drive, mechanism
+    from dexsim.recording.schema import Series
+    from dexsim.recording.waveforms import minimum_jerk
+
+    dt = 0.01
+    low, high, home = excitation._range(believed, excitation.Limits())
+    table = believed.table.to_dict()
+    for columns in table["joints"].values():
+        columns |= {k: columns[k] + v if k in columns else v for k, v in LATE.items() if k in columns or k == "lag"}
+    hands = [believed, mechanism(servo=table, gravity=believed.spec.option.gravity)]
+    check = safety.ContactCheck(believed, home, excitation.Limits().clearance)
+    parts = [np.tile(home, (30, 1))]
+    for group in excitation.groups(believed, believed.joints):
+        free = {j: excitation._free(check, home, believed.joints.index(j), low, high) for j in group}
+        size = {j: 0.45 for j in group}  # of the free range, either way
+        while True:
+            centre, body = home.copy(), np.zeros((round(DASH_S / dt) * len(DASH), len(home)))
+            for j in group:
+                i, wide = believed.joints.index(j), free[j][1] - free[j][0]
+                centre[i], at = 0.5 * sum(free[j]), 0.0
+                for k, (level, share) in enumerate(DASH):
+                    first, to = round(DASH_S / dt) * k, level * size[j] * wide
+                    move = np.arange(round(DASH_S / dt)) * dt * share * believed.speeds[i] * size[j] / 0.45
+                    body[first : first + len(move), i] = at + np.sign(to - at) * np.minimum(move, abs(to - at))
+                    at = to
+            value = np.concatenate([minimum_jerk(home, centre, 0.8, dt), centre + body, minimum_jerk(centre, home, 0.8, dt), np.tile(home, (30, 1))])
+            t = np.arange(len(value)) * dt
+            over, touched = set(), False
+            for hand in hands:
+                run = drive(hand, Series(t, value), hand.joints, float(t[-1]), home, excitation.CHECK_STEP, frame_s=excitation.FRAME)
+                for j in group:
+                    x, wide = run.position[(run.t > 0.8) & (run.t < t[-1] - 1.1), believed.joints.index(j)], free[j][1] - free[j][0]
+                    if size[j] > SMALLEST and (x.min() < free[j][0] + CLEAR * wide or x.max() > free[j][1] - CLEAR * wide):
+                        over.add(j)
+                touched = touched or bool(check.along(run))
+            if touched and max(size.values()) > SMALLEST:
+                over = set(group)
+            if not over:
+                break
+            size |= {j: 0.85 * size[j] for j in over}
+        print("fast: " + ", ".join(f"{j} +-{size[j] * (free[j][1] - free[j][0]):.2f}" for j in group) + (" rad, left out: touches" if touched else " rad"), flush=True)
+        if not touched:
+            parts.append(value)
+    value = np.concatenate(parts)
+    return np.arange(len(value)) * dt, value, home
 
 
 def used(own: list, believed) -> float:
