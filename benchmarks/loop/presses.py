@@ -239,8 +239,8 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
     """What training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip; felt: taxels of each that
     felt anything; lsb N a count.
 
-    delay, hysteresis: the median of what was found on the fingertips, from the lowest to the highest. A fingertip that was judged and on
-    which an effect was not found counts as one without. Gains: the normal spread that makes those listed, and that the others are
+    delay, hysteresis: the median of what was found, from the lowest to the highest, where most fingertips show it; where fewer do, from
+    nothing to the highest. Gains: the normal spread that makes those listed, and that the others are
     within LISTED, most likely (1 + spread * normal, as the sensor has it); dead: their share, with a Jeffreys prior.
     """
     from scipy.stats import beta
@@ -248,25 +248,26 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
     values: dict[str, list[float]] = {"delay": [], "hysteresis": [], "hysteresis_time": []}
     listed, dead, total = [], 0, 0
     for folder, n in zip(folders, felt, strict=True):
-        found = {f["effect"]: f["parameters"] for f in json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))["findings"]}
-        values["delay"].append(found["tactile_delay"]["delay"]["value"] if "tactile_delay" in found else 0.0)
-        if "tactile_hysteresis" in found:
-            values["hysteresis"].append(found["tactile_hysteresis"]["fraction"]["value"])
-            values["hysteresis_time"].append(found["tactile_hysteresis"]["time_constant"]["value"])
+        effects = {f["effect"]: f["parameters"] for f in json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))["findings"]}
+        values["delay"].append(effects["tactile_delay"]["delay"]["value"] if "tactile_delay" in effects else 0.0)
+        if "tactile_hysteresis" in effects:
+            values["hysteresis"].append(effects["tactile_hysteresis"]["fraction"]["value"])
+            values["hysteresis_time"].append(effects["tactile_hysteresis"]["time_constant"]["value"])
         else:
             values["hysteresis"].append(0.0)
         gains = []
-        if "tactile_gain" in found:
-            gains = np.broadcast_to(found["tactile_gain"]["gain"]["value"], (len(str(found["tactile_gain"]["taxels"]["value"]).split(",")),)).tolist()
+        if "tactile_gain" in effects and ":" in str(effects["tactile_gain"]["taxels"]["value"]):  # not one gain for all of the pad
+            gains = np.broadcast_to(effects["tactile_gain"]["gain"]["value"], (len(str(effects["tactile_gain"]["taxels"]["value"]).split(",")),)).tolist()
         dead += sum(g == 0.0 for g in gains)
         listed += [g for g in gains if g > 0.0]
         total += n
     out: dict = {"lsb": lsb}
     for key, x in values.items():
-        if x and np.median(x) > 0:
-            value = float(np.median(x))
-            kept = [v for v in x if v > 0]
-            out[key] = _near(value, min(kept), max(kept))
+        found = [v for v in x if v > 0]
+        if len(found) > 0.5 * len(x):
+            out[key] = _near(float(np.median(found)), min(found), max(found))
+        elif found:  # not sure: what was believed is in the range
+            out[key] = {"value": float(f"{np.mean(x):.5g}"), "low": 0.0, "high": float(f"{max(found):.5g}")}
     out["gain_spread"] = _near(*spread(np.array(listed), max(total - len(listed), 0)))
     if dead:
         everyone = total + dead  # dead ones did not feel anything
