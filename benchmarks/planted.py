@@ -293,7 +293,7 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
 def _off(rng: np.random.Generator, b: dict) -> dict:
     """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for each."""
     from dexsim.gap.prepare import BELIEF
-    from dexsim.gap.search import FILTER
+    from dexsim.gap.search import FILTER, LATE
 
     def draw(centre: float, sd: float, low: float, high: float) -> float:
         while not low <= (x := rng.normal(centre, sd)) <= high:
@@ -301,18 +301,18 @@ def _off(rng: np.random.Generator, b: dict) -> dict:
         return float(x)
 
     off = {f"*{k}": draw(1.0, 0.5 * BELIEF, 1 - BELIEF, 1 + BELIEF) for k in REFIT}
-    off |= {"+delay": draw(0.0, 0.75 / RATE, 0.0, 1.5 / RATE), "+lag": draw(0.25 / RATE, 0.5 / RATE, 0.0, 1.0 / RATE)}
+    off |= {"+delay": draw(0.0, LATE / 3 / RATE, 0.0, LATE / RATE), "+lag": draw(0.25 / RATE, 0.25 / RATE, 0.0, 1.0 / RATE)}
     return off | ({"+speed_lag": draw(1.0 / RATE, 0.3 * FILTER, 0.0, FILTER)} if b["kd"] > 0 else {})
 
 
 def _refitted(b: dict) -> list[tuple[dict, float, float, float]]:
     """What the tool refits with every hypothesis, seen from the true plant: (a small change of it, its size, how far down, how far up)."""
     from dexsim.gap.prepare import BELIEF
-    from dexsim.gap.search import FILTER, GIVE
+    from dexsim.gap.search import FILTER, GIVE, LATE
 
     off = b["off"]
     out = [({f"*{k}": 1.02}, 0.02, (1 - BELIEF) / off[f"*{k}"] - 1, (1 + BELIEF) / off[f"*{k}"] - 1) for k in REFIT if k != "kd" or b["kd"] > 0]
-    late = {"delay": (off["+delay"], 1.5 / RATE), "lag": (off["+lag"], 1.0 / RATE), "feedback_delay": (0.0, 1.5 / RATE), "presliding": (0.0, GIVE)}
+    late = {"delay": (off["+delay"], LATE / RATE), "lag": (off["+lag"], 1.0 / RATE), "feedback_delay": (0.0, 1.5 / RATE), "presliding": (0.0, GIVE)}
     if b["kd"] > 0:
         late["speed_lag"] = (off["+speed_lag"], FILTER)
     out += [({f"+{k}": 0.1 * most}, 0.1 * most, -now, most - now) for k, (now, most) in late.items()]

@@ -34,7 +34,7 @@ def test_refold_fits_each_condition_left_out_better_than_one_step_does():
         fitter = Fitter(s.case.plant, subset(s.long, s.fold_of != number), s.r)
         loss = [fitter.loss(fitter.evaluate(step.fit.params, g)[None])[0] for g in (x, y)]
         assert loss[1] <= 1.02 * loss[0]
-    assert own.left_out.sum() <= 1.15 * step.left_out.sum()  # what is free to fit noise does, a little
+    assert own.left_out.sum() <= 1.25 * step.left_out.sum()  # what is free to fit noise does, a little
 
 
 def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():

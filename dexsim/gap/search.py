@@ -37,6 +37,7 @@ FINER = 4  # steps of whole recordings, where an effect was found, in one of the
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 MAYBE = {"brake": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 PIN = 1e-6  # of room for what is held at a value
+LATE = 0.75  # periods of its loop by which any drive may act on its commands late
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
 
@@ -169,12 +170,13 @@ class JointSearch:
                 out.append(Param(name, (name,), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
         rate = c.loop_rate or 1000.0
         taken = {p.columns[0] for p in out}
-        # a sampled loop acts half a period late and a clock is read when it is read
+        # a command waits for the loop's next period, half of one on average, and a clock is read when it is read; more is an effect, which
+        # training is given
         if "delay" not in taken:
-            d, most = s.nominal["delay"], 1.5 / rate
-            out.append(Param("delay", ("delay",), "add", -min(d, most), most, 0.0, "s", nuisance=True, sd=0.5 * most))
+            d, most = s.nominal["delay"], (LATE if c.loop_rate else 2 * LATE) / rate  # of a loop that nothing is known of, twice as much
+            out.append(Param("delay", ("delay",), "add", -min(d, most), most, 0.0, "s", nuisance=True, sd=most / (3 if c.loop_rate else 2)))
         if "lag" not in taken:
-            out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=0.5 / rate))
+            out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=(0.25 if c.loop_rate else 0.5) / rate))
         # a drive tells its speed from its encoder through some filter
         if s.nominal["kd"] > 0 and "speed_lag" not in taken:
             f, most = s.nominal["speed_lag"], max(FILTER, 2.0 / rate)
