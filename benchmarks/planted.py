@@ -8,8 +8,8 @@ trains policies, C MuJoCo with the servo kernel, at 0.2 ms or (play, elasticity)
 jittered clock. Every believed figure is off by a draw from the very tolerance that the tool states for it (`_off`): gains, limits,
 friction, inertia and gravity by a normal deviate of 2.5 % cut at 5 %, delay and filters by fractions of a period or of 3 ms.
 Of a case's four recordings one is kept out that leads the others neither in error nor in speed nor in torque.
-Size of an effect: its held-out change in the search's own plant, with what a refit of all that the tool refits with every hypothesis
-hides of it taken away, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out
+Size of an effect: what a refit of all that the tool refits with every hypothesis leaves of it, in the recordings fitted and in the one
+kept out, in the search's own plant without noise, is 8, 4 or 2 times the measurement noise. The floor of a case is that noise and, in squares, what the held-out
 recording differs by when it is made again from one encoder count away. limit: seconds after which no further case is waited for (0:
 all are). Resumable; prints a table and one JSON line.
 """
@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.optimize import lsq_linear
 
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
@@ -300,37 +299,49 @@ def _off(rng: np.random.Generator, b: dict) -> dict:
             pass
         return float(x)
 
-    off = {f"*{k}": draw(1.0, 0.5 * BELIEF, 1 - BELIEF, 1 + BELIEF) for k in REFIT}
+    off = {f"*{k}": draw(1.0, 0.5 * BELIEF, 1 - BELIEF, 1 + BELIEF) for k in REFIT} | {"limit_speed": 0.0}  # the simulator's limit goes by the motor's own speed
     off |= {"+delay": draw(0.0, LATE / 3 / RATE, 0.0, LATE / RATE), "+lag": draw(0.25 / RATE, 0.25 / RATE, 0.0, 1.0 / RATE)}
     return off | ({"+speed_lag": draw(1.0 / RATE, 0.3 * FILTER, 0.0, FILTER)} if b["kd"] > 0 else {})
 
 
-def _refitted(b: dict) -> list[tuple[dict, float, float, float]]:
-    """What the tool refits with every hypothesis, seen from the true plant: (a small change of it, its size, how far down, how far up)."""
-    from dexsim.gap.prepare import BELIEF
-    from dexsim.gap.search import FILTER, GIVE, LATE
+def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:
+    """What is left of recordings q [n], simulated in the search's own plant, in times the noise, when all that the
+    tool refits with every hypothesis is fitted to the first three: of those or of the last, whichever is less (what only the last shows could
+    be known by nobody, what it does not show not be judged). Begun at the values under the effect; none [C]: without it."""
+    from dexsim.gap.fit import Fitter, Residuals, expand
+    from dexsim.gap.plant_columns import INDEX
+    from dexsim.gap.search import JointSearch
 
-    off = b["off"]
-    out = [({f"*{k}": 1.02}, 0.02, (1 - BELIEF) / off[f"*{k}"] - 1, (1 + BELIEF) / off[f"*{k}"] - 1) for k in REFIT if k != "kd" or b["kd"] > 0]
-    late = {"delay": (off["+delay"], LATE / RATE), "lag": (off["+lag"], 1.0 / RATE), "feedback_delay": (0.0, 1.5 / RATE), "presliding": (0.0, GIVE)}
-    if b["kd"] > 0:
-        late["speed_lag"] = (off["+speed_lag"], FILTER)
-    out += [({f"+{k}": 0.1 * most}, 0.1 * most, -now, most - now) for k, (now, most) in late.items()]
-    if not b["voltage"]:
-        out.append(({"brake": 0.8}, -0.2, -2.0, 0.0))
-        if b["kd"] > 0:
-            out.append(({"limit_speed": 0.2}, 0.2, 0.0, 1.0))
-    return out
+    plant = case.plant
+    params = [p for p in JointSearch(case, [0, 1, 2], None, [0, 1, 2, 3]).all_nuisances if p.columns[0] != "effort_gain"]
+    base = plant.base()[0]
+    x = [none[c] / base[c] if p.mode == "factor" else none[c] - base[c] if p.mode == "add" else none[c] for p in params for c in [INDEX[p.columns[0]]]]
+    r = Residuals(noise, knee=5.0)
+    fitter, all_four = Fitter(plant, plant.windows(None, [0, 1, 2]), r), plant.windows(None)
+    fitter.q = q[fitter.w.sample_row]
+    best = min((fitter.fit(params, x0=x0, iterations=6, tolerance=1e-2) for x0 in (np.array(x), None)), key=lambda f: f.loss)
+    miss = plant.simulate(expand(plant, params, best.x[None]), all_four)[0][0] - q
+    each = [float(np.sqrt(np.mean(miss[rows] ** 2))) for rows in (plant.run_of < 3, plant.run_of == 3)]
+    return float(np.hypot(min(each), noise) / noise)
 
 
-def _hidden(change: np.ndarray, slopes: np.ndarray, low: np.ndarray, high: np.ndarray, keep: slice) -> float:
-    """RMS of a change [n] over the held-out rows, without what refitted figures take away of it: slopes [n, P] per unit, which may move
-    from low to high [P]."""
-    span = high - low
-    q, r = np.linalg.qr(slopes * span)
-    scale = max(float(np.abs(r).max()), 1e-30)
-    x = lsq_linear(r / scale, q.T @ change / scale, (low / span - 1e-9, high / span + 1e-9)).x * span
-    return float(np.sqrt(np.mean((change - slopes @ x)[keep] ** 2)))
+def _sized(case, tries: list[dict], q: np.ndarray, noise: float, wanted: float) -> tuple[int, float]:
+    """(number, x noise) of the change of tries[1:], growing, that is nearest to what is wanted, by halving: what is left grows with the size."""
+    base = case.plant.base()[0]
+    none = _apply(base, tries[0])
+    known: dict[int, float] = {}
+
+    def of(i: int) -> float:
+        if i not in known:
+            known[i] = _left(case, q[i], none, noise)
+        return known[i]
+
+    low, high = 0, len(tries) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if of(middle) < wanted else (low, middle)
+    pick = min((i for i in (low, high) if i > 0), key=lambda i: abs(np.log(of(i) / wanted)))
+    return pick, of(pick)
 
 
 def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
@@ -349,17 +360,14 @@ def make(entry: dict, number: int, seed: int, folder: Path) -> dict:
     if kind:
         sizes = np.geomspace(*kind.span, 24)
         tries = [b["off"], *(_joined(b["off"], kind.change(b, s)) for s in sizes)]
-        refitted = _refitted(b)
-        cases, q, tau = _simulate(b, runs, tries + [_joined(b["off"], x[0]) for x in refitted], 1e-3, 2)
-        keep = cases[0].plant.rows(3)
+        cases, q, _ = _simulate(b, runs, tries, 1e-3, 2)
         if kind.effect == "current_sensor":  # shows in the effort alone: sized by the noise of that
-            reached = 1 + np.array([np.abs(s) for s in sizes]) * 20
+            reached = [1 + abs(x) * 20 for x in sizes]
+            pick = 1 + int(np.argmin(np.abs(np.log(np.array(reached) / TIERS[entry["tier"]]))))
+            ratio = reached[pick - 1]
         else:
-            step, low, high = np.array([x[1:] for x in refitted]).T
-            move = (q[len(tries) :] - q[0]).T / step
-            reached = np.array([np.hypot(_hidden(q[1 + i] - q[0], move, low, high, keep), noise) / noise for i in range(len(sizes))])
-        pick = int(np.argmin(np.abs(np.log(reached / TIERS[entry["tier"]]))))
-        size, ratio, change = float(sizes[pick]), float(reached[pick]), tries[1 + pick]
+            pick, ratio = _sized(cases[0], tries, q, noise, TIERS[entry["tier"]])
+        size, change = float(sizes[pick - 1]), tries[pick]
     floor = float(np.hypot(noise, _by_mujoco(b, runs, change)))
     effort = "effort" in needs or bool(rng.uniform() < 0.4)
     folder.mkdir(parents=True, exist_ok=True)

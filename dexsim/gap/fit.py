@@ -11,6 +11,7 @@ from dexsim.gap.plant import JointPlant, Windows
 from dexsim.gap.plant_columns import INDEX
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
+STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
@@ -246,15 +247,17 @@ class Fitter:
             b = -(J * w[:, None]).T @ f.residual - believed * (f.x - centre) * span
             away = nuisance & (np.abs(f.x - centre) > AWAY * span)
             guesses = []
-            for back in [np.arange(P) == i for i in np.flatnonzero(away)] + [nuisance]:
-                z, rest = (centre - f.x) / span * back, np.flatnonzero(~back)
-                if len(rest):
-                    root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
-                    right = np.linalg.solve(root.T, b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back])
-                    z[rest] = lsq_linear(root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)).x
-                guesses.append(np.clip(f.x + z * span, low, high))
             if not away.any():
                 return f
+            for back in [np.arange(P) == i for i in np.flatnonzero(away)] + [nuisance]:
+                # all else follows, or an effect alone: an inertia's takes over exactly, slopes of rough losses say so only nearly
+                for rest, pull in ((np.flatnonzero(~back), 1.0), (np.flatnonzero(~back & ~nuisance), 0.0)):
+                    z = (centre - f.x) / span * back
+                    if len(rest):
+                        root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
+                        right = np.linalg.solve(root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back])
+                        z[rest] = lsq_linear(root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)).x
+                    guesses.append(np.clip(f.x + z * span, low, high))
             guesses = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
             tried = score(guesses, self.eliminated(self.residuals(params, guesses), s))
@@ -283,6 +286,7 @@ class Fitter:
         x = np.array([p.start for p in params], float) if x0 is None else np.array(x0, float)
         x = np.clip(x, low, high)
         span = high - low
+        belief = np.array([p.nuisance for p in params], bool)
         damping = 1e-2
         P = len(params)
         believed, centre = prior_weight(params), np.array([p.start for p in params], float)
@@ -294,6 +298,7 @@ class Fitter:
                 # one batch: here, each parameter moved, the initial state moved
                 # small beside the value too: a range may be wide, and many effects are kinked where they begin
                 size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
+                size = np.where(belief, STEP_OF_BELIEF * span, size)
                 delta = np.where(x + size <= high, size, -size)
                 guesses = np.concatenate([x[None], x[None] + np.diag(delta), np.repeat(x[None], 2, 0)])
                 inits = np.zeros((P + 3, 2))

@@ -10,7 +10,7 @@ import numpy as np
 from dexsim.gap import confidence, jitter, judge, locate
 from dexsim.gap.catalogue import EFFECTS, confusable, separating
 from dexsim.gap.findings import finding_parameters
-from dexsim.gap.fit import Fitted, intervals
+from dexsim.gap.fit import PRIOR, Fitted, intervals, prior_weight
 from dexsim.gap.prepare import Case
 from dexsim.gap.result import Curve
 from dexsim.gap.runs import Run
@@ -184,8 +184,24 @@ def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
     if left <= 0 or not fit.params:
         return bounds
     low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
-    x = fit.x[:, None]
-    return np.clip(x + np.clip(STRETCH * left**2, *STRETCHED) * (bounds - x), low, high)
+    x, least = fit.x[:, None], traded(fit)[:, None] * np.array([-1.0, 1.0])
+    by = np.clip(STRETCH * left**2, *STRETCHED) * (bounds - x)
+    return np.clip(x + np.where(np.abs(by) < np.abs(least), least, by), low, high)
+
+
+def traded(fit: Fitted) -> np.ndarray:
+    """[P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the link's), however well all is followed:
+    the variance that the beliefs' own, as far as the residuals leave it, adds to that of the sizes alone. 0 for beliefs."""
+    low, high = (np.array([getattr(p, k) for p in fit.params]) for k in ("low", "high"))
+    span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
+    J = fit.jacobian * span
+    A = J.T @ J
+    A[np.diag_indices(len(A))] += prior_weight(fit.params) * span**2 + np.where(mine, 1e-9 * max(np.trace(A), 1e-30), 12.0 * PRIOR)
+    i = np.flatnonzero(mine)
+    out = np.zeros(len(span))
+    if len(i):
+        out[i] = np.maximum(np.diag(np.linalg.inv(A))[i] - np.diag(np.linalg.inv(A[np.ix_(i, i)])), 0.0)
+    return 1.645 * np.sqrt(PRIOR * out) * span
 
 
 def rms(squares: np.ndarray) -> float:

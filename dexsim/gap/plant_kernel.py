@@ -130,6 +130,9 @@ def plant_kernel():
                     slope = zero
                     if pd * v_lim > zero and limit > zero:
                         line = tau0 / (nls * supply)
+                    elif pd * v_lim < zero and limit > zero:
+                        # it grows as the speed falls, exponentially: taken at the step's start it would come late
+                        line = -wp.min(brake * tau0 / (nls * supply), half / wp.max(gain, f64(1.0e-12)))
                 else:
                     slope = slope * limit / wp.abs(pd)
         return wp.vec4d(motor_now, motor, slope, line)
@@ -381,6 +384,8 @@ def plant_kernel():
                 motor = torque[1]
                 damping = torque[2]
                 slope_m = torque[3]
+                if two:  # its steps are short, and a light rotor's would not stand it
+                    slope_m = wp.max(slope_m, zero)
                 if consts[C_OPEN] > zero:  # the stage after the drive, with its recorded input
                     now = series[g, XDRIVE]
                     motor = now
@@ -396,7 +401,9 @@ def plant_kernel():
                     motor = zero
                     damping = zero
                     slope_m = zero
-                blend = dts / (params[h, P_LAG] + dts)
+                # the lag whose mean delay, of what is stored at the steps' starts beside what acts in their middle, is the one that is meant
+                short = params[h, P_LAG] - f64(1.5) * dts
+                blend = dts / (half * (short + wp.sqrt(short * short + f64(4.0) * params[h, P_LAG] * dts)) + dts)
                 if fresh == 1:
                     last = now
                     fresh = 0

@@ -29,6 +29,7 @@ SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.08  # x the noise: an error within it needs no effect
 HINT = 0.03  # of the squared error with what the beliefs give for it: an effect that the scan sees to save as much is tried, whatever its price
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
+AGAIN = 3  # hypotheses from which the fit without any effect is begun again before one is claimed
 TIE = 0.02  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
 CLEAR = 0.15  # of the squared error: what an effect must remove where the error is within the noise without it
 SWEEPS = 60  # over the beliefs, by which the scan moves them
@@ -557,6 +558,14 @@ class JointSearch:
                 if close.fit.loss < (1 - LEAST) * current.fit.loss:
                     best = self.refold(close)
                     self.fitted[frozenset(best.ids)] = best
+            if not current.members:
+                less = self._begun_again(current, trials)
+                if less is not current:
+                    none = current = less
+                    self.none_loss = self._left(none)
+                    if not self._earns(best, none):  # the fit without it had stopped short: what is missing is looked for anew
+                        self.fitted.clear()
+                        continue
             if enough and self.gain(best, current) < CLEAR:
                 break
             if not self._earns(best, current):
@@ -580,6 +589,21 @@ class JointSearch:
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
+
+    def _begun_again(self, none: Trial, trials: list[Trial]) -> Trial:
+        """No effect, fitted again from where hypotheses ended that follow better: what they refitted, and of their effects what is inside the
+        bounds of a belief. The fit without any effect may have stopped in a hollow beside; `none` where it had not."""
+        best, params = none, none.fit.params
+        columns = [INDEX[p.columns[0]] for p in params]
+        believed = self.case.plant.base()[0][columns]
+        ahead = [t for t in trials if t.fit.loss < (1 - TIE) * none.fit.loss]
+        for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
+            at = expand_one(self.case, trial.fit.params, trial.fit.x)[0][columns]
+            x0 = [a / b if p.mode == "factor" else a - b if p.mode == "add" else a for p, a, b in zip(params, at, believed, strict=True)]
+            new = Trial((), self.fitter.homeward(params, self.fitter.fit(params, x0=np.array(x0), iterations=8)))
+            if self._here(new) < (1 - 0.5 * TIE) * self._here(best):
+                best = new
+        return best
 
     def _shortlist(self, scan, size, loss, members):
         """The best variants of the best effects, and what the first is confused with."""
@@ -726,7 +750,7 @@ class JointSearch:
             rest = tuple(m for k, m in enumerate(current.members) if k != i)
             kept = [v for k, v in enumerate(values) if k != i]
             without = self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
-            lost = self._left(without) if without else self._left(self._none(current))
+            lost = self._left(without) if without else self.none_loss
             self.costs[member.id] = self._by_condition(lost, mine)
             others: list[Trial] = []
             for key, (other, start) in pool.items():
@@ -870,11 +894,6 @@ class JointSearch:
         square += (1.645 * itself * np.abs(x)) ** 2
         half = np.sqrt(square)
         return np.stack([np.maximum(x - half, low), np.minimum(x + half, high)], 1)
-
-    def _none(self, current: Trial) -> Trial:
-        if not hasattr(self, "_none_trial"):
-            self._none_trial = self.fit((), np.zeros(0))
-        return self._none_trial
 
 
 class _Fixed:
