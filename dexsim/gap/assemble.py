@@ -13,7 +13,7 @@ from dexsim.gap.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.joint import JointAnswer, Kept, nuisances
 from dexsim.gap.prepare import Case
 from dexsim.gap.result import Diagnosis, Settings, empty
-from dexsim.gap.search import LEAST, JointSearch, Outcome
+from dexsim.gap.search import ENOUGH, LEAST, JointSearch, Outcome
 from dexsim.gap.sentence import sentence
 from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
@@ -142,7 +142,7 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     needed = confidence.NEEDED**2
-    if before > needed and after < (1 - 2 * LEAST) * before:
+    if before > ENOUGH**2 and after < (1 - 2 * LEAST) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
     plain = outcome.none.fit.loss > needed and search.gain(outcome.best, outcome.none) >= 2 * LEAST
