@@ -34,7 +34,7 @@ import yaml
 from scipy.stats import t as student
 
 from benchmarks.loop import presses
-from benchmarks.loop.steps import KEPT
+from benchmarks.loop.steps import FAST, KEPT
 from dexsim.cli.ending import guard
 from dexsim.errors import UserError
 
@@ -283,8 +283,8 @@ class Loop:
         on the empty hand, throws the joints against the ends of their motion (docs/loop.md)."""
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
-            excited = sorted((self.out / f"excited_{world}").glob("excite_*.mcap"))
-            fit, held = [*excited[:-KEPT], self.out / f"excited_{world}" / "fast.mcap"], excited[-KEPT:]
+            excited, fast = sorted((self.out / f"excited_{world}").glob("excite_*.mcap")), [self.out / f"excited_{world}" / name for name in FAST]
+            fit, held = [*excited[:-KEPT], fast[0]], [*excited[-KEPT:], fast[1]]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
             status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
             return status == 0 and (where / "servo.yaml").is_file()

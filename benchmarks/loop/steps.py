@@ -18,6 +18,7 @@ EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 that they may reach; chirps tell a delay from a lag. Faster, a drive that is late swings into the ends of its range (docs/loop.md)."""
 KEPT = 1  # of them, the last, is for the proof
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
+FAST = ("fast.mcap", "fast_kept.mcap")  # the recordings of fast moves: one is fitted, one is for the proof
 DASH = ((0.7, 0.5), (-0.7, 0.75), (1.0, 1.0), (-1.0, 0.6), (0.8, 0.9), (-0.8, 1.1), (0.5, 0.7), (0.0, 0.5))
 """Straight moves about the middle of a joint's range: to which share of the largest offset, at which share of the believed no-load speed."""
 DASH_S = 0.5  # s from one to the next
@@ -66,14 +67,16 @@ def record(given: dict[str, str]) -> None:
         if kind == "random":
             p.t, p.value = (x[p.t < float(given.get("seconds", 19.0))] for x in (p.t, p.value))
         _drive(world, believed, p.t, p.value, p.home, np.random.default_rng([seed, k]), out / f"excite_{k}.mcap")
-    _drive(world, believed, *dashes(believed), np.random.default_rng([seed, 100]), out / "fast.mcap")
+    for k, name in enumerate(FAST):
+        _drive(world, believed, *dashes(believed, (1.0, -1.0)[k]), np.random.default_rng([seed, 100 + k]), out / name)
 
 
-def dashes(believed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dashes(believed, way: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [T] s, targets [T, J] rad and home [J]: one joint of each finger at a time is led about the middle of its range, for a tenth of
     a second faster than its drive may be able to follow: a speed limit shows, which smooth motion does not reach. A step of the target
     would too, but a drive with a lag swings far past it. Simulated with the drives as believed and with drives as late as LATE; a joint's
-    motion is made smaller and slower until it keeps CLEAR of the ends in both, that of a group where anything touches."""
+    motion is made smaller and slower until it keeps CLEAR of the ends in both, that of a group where anything touches. way: 1, or -1 for
+    the same the other way round."""
     from dexsim.recording import excitation, safety
     from dexsim.recording.mechanism import drive, mechanism
     from dexsim.recording.schema import Series
@@ -96,7 +99,7 @@ def dashes(believed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 i, wide = believed.joints.index(j), free[j][1] - free[j][0]
                 centre[i], at = 0.5 * sum(free[j]), 0.0
                 for k, (level, share) in enumerate(DASH):
-                    first, to = round(DASH_S / dt) * k, level * size[j] * wide
+                    first, to = round(DASH_S / dt) * k, way * level * size[j] * wide
                     move = np.arange(round(DASH_S / dt)) * dt * share * believed.speeds[i] * size[j] / 0.45
                     body[first : first + len(move), i] = at + np.sign(to - at) * np.minimum(move, abs(to - at))
                     at = to
