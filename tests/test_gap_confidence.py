@@ -133,3 +133,12 @@ def test_temperature_that_follows_something_else(starts, gains, what):
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
     assert judge.verdict([], 1.0, before, low, before, structured, judge.FAR) == word
+
+
+def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():
+    both = [evidence(effect="lag", confidence=0.99), evidence(effect="inertia", confidence=0.9)]
+    confidence.together(both)
+    assert both[0].confidence == 0.99 and both[1].confidence == DOUBTED and "what is fast" in both[1].reasons[0]
+    apart = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
+    confidence.together(apart)
+    assert [e.confidence for e in apart] == [0.99, 0.9]

@@ -83,3 +83,22 @@ def test_the_catalogue_offers_both_ends_of_a_linkage():
     variants = EFFECTS["joint_coupling"].variants(build(mujoco.MjModel.from_xml_string(MODEL), [run])[0].scales)
     assert [v.params[0].columns[0] for v in variants] == ["coupling", "linkage", "reaction"]
     assert {v.note["from_joint"] for v in variants} == {"b"}
+
+
+def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
+    from types import SimpleNamespace
+
+    from dexsim.gap import assemble
+
+    def end(joint: str, other: str, sure: float) -> dict:
+        return {"effect": "joint_coupling", "confidence": sure, "where": {"joints": [joint], "taxels": [], "topics": []}, "parameters": {"from_joint": {"value": other}}}
+
+    def answer(joint: str, column: str):
+        member = SimpleNamespace(id="joint_coupling", variant=SimpleNamespace(params=[SimpleNamespace(columns=(column,))]))
+        return SimpleNamespace(case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member])))
+
+    lag = {"effect": "lag", "confidence": 0.9, "where": {"joints": ["b"], "taxels": [], "topics": []}, "parameters": {}}
+    found = assemble._linkages([end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")])
+    assert [(f["effect"], f["where"]["joints"], f["confidence"]) for f in found] == [("joint_coupling", ["b", "a"], 0.99), ("lag", ["b"], 0.9)]
+    chain = [end("a", "b", 0.9), end("b", "c", 0.9)]
+    assert assemble._linkages(chain, []) == chain

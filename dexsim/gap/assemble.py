@@ -60,6 +60,7 @@ def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSear
     findings.sort(key=lambda f: -_weight(f))
     _doubts(out, findings, channel)
     _hand_on(out, m, [a for a in answers if a.case.joint not in refuted], findings)
+    findings = _linkages(findings, answers)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed)
     out.sentence = sentence(data, out, floor[0])
@@ -161,6 +162,24 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
         f["confidence"] = round(e.confidence, 3)
         d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]
     d.evidence = mine
+
+
+def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:
+    """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is the end that is
+    dragged, where one of them feels only the pull; the name is as sure as its surer end."""
+    pulled = {a.case.joint for a in answers for mm in a.outcome.best.members if mm.id == "joint_coupling" and mm.variant.params[0].columns == ("reaction",)}
+    ends = {(f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f for f in findings if f["effect"] == "joint_coupling"}
+    out = list(findings)
+    for (joint, other), f in ends.items():
+        second = ends.get((other, joint))
+        if second is None or f not in out or second not in out:
+            continue
+        first, second = (second, f) if joint in pulled and other not in pulled else (f, second)
+        place = min(out.index(first), out.index(second))
+        out = [x for x in out if x is not first and x is not second]
+        joints = [*first["where"]["joints"], *second["where"]["joints"]]
+        out.insert(place, first | {"where": first["where"] | {"joints": joints}, "confidence": max(first["confidence"], second["confidence"])})
+    return out
 
 
 def _weight(f: dict) -> float:

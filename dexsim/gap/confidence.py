@@ -22,6 +22,7 @@ NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
 SPREAD = 0.15  # share that neighbours may take over because pressure spreads by another law (foundation or half-space) than the plant's
 FROM_POSES = ("payload", "inertia", "joint_coupling")  # effects told from the pose and the motion of other joints
+FAST = ("command_delay", "lag", "inertia")  # effects that hold back what is fast: what one's size is off by another makes up for
 ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
 
 
@@ -145,9 +146,9 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
 
 
 def of_pose(effect: str, values: dict[str, float], case: Case) -> bool:
-    """Whether an effect is a torque that follows the pose and changes slowly along it: a load, an offset of the pose, a ripple of
+    """Whether an effect is a torque that follows the pose and changes slowly along it: a load, an encoder's zero or scale, a ripple of
     which the motion shows less than two periods. Two of them together are any such torque: a cable, a spring."""
-    return effect in ("payload", "position_offset") or (effect == "torque_ripple" and 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span)
+    return effect in ("payload", "position_offset", "position_scale") or (effect == "torque_ripple" and 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span)
 
 
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
@@ -168,6 +169,9 @@ def together(mine: list[Evidence]) -> None:
         doubtful = next((x for x in mine[:k] if x.confidence < DOUBTED), None)
         if doubtful is not None:
             _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
+        alike = next((x for x in mine[:k] if e.effect in FAST and x.effect in FAST), None)
+        if alike is not None:
+            _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
         if len(mine) >= CROWD and k > 0:
             _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
 
