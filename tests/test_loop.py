@@ -61,6 +61,22 @@ def test_queue_without_a_gpu_shares_the_cores_out(tmp_path):
     assert set(queue.state.values()) == {"done"} and most[0] == 3 and order[:2] == ["record", "diagnose"]
 
 
+def test_queue_lets_others_go_before(tmp_path):
+    """A job that is behind another waits until that one has begun, however many cores are free; not for ever for one that failed."""
+    begun = []
+
+    def job(name, after=(), behind=(), good=True):
+        def run(slot):
+            begun.append(name)
+            time.sleep(0.02)
+            return good
+
+        return loop.Job(name, tmp_path / name, run, False, list(after), 0, 1, list(behind))
+
+    loop.Queue([job("judge", behind=["diagnose", "lost"]), job("record"), job("diagnose", ["record"]), job("bad", good=False), job("lost", ["bad"])], [], 8, 0.0, 0.0, lambda: None).go()
+    assert begun.index("judge") > begun.index("diagnose") and "lost" not in begun
+
+
 def test_share_recovered_by_hand():
     r = loop._ratio(np.array([1.0, 2.0]), np.array([2.0, 3.5]), np.array([3.0, 4.0]))
     assert r["value"] == pytest.approx(1.25 / 2.0) and r["low"] <= r["value"] <= r["high"] and r["seeds"] == 2

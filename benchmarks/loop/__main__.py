@@ -68,6 +68,7 @@ class Job:
     after: list[str] = field(default_factory=list)
     rank: int = 0
     cores: int = 1
+    behind: list[str] = field(default_factory=list)
 
 
 class Queue:
@@ -102,7 +103,7 @@ class Queue:
                         self.state[job.name] = "failed"
                         print(f"  {job.name}: left out, what it needs failed", flush=True)
                         continue
-                    if any(s != "done" for s in before):
+                    if any(s != "done" for s in before) or any(self.state[b] == "waits" for b in job.behind):
                         continue
                     on_gpu = job.gpu and self.with_gpus
                     if on_gpu and not self.gpus or not on_gpu and (full or self.free < self._takes(job)):
@@ -313,7 +314,8 @@ class Loop:
         return run
 
     def jobs(self) -> list[Job]:
-        """All steps; those that others wait for come first, wide randomization last."""
+        """All steps; those that others wait for come first, wide randomization last. Nothing is judged that would keep the diagnoses, or
+        the judging of what was fitted, waiting for cores."""
         out = []
         for w in self.worlds:
             for task in self.tasks:
@@ -323,6 +325,8 @@ class Loop:
                 out.append(Job(f"press {finger} {w}", self.out / f"touch_{w}" / f"{finger}.done", self.press(finger, w), False, [], 1))
             out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
+        diagnoses = [f"diagnose {w}" for w in self.worlds]
+        fitted = [f"judge fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds]
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
@@ -330,14 +334,14 @@ class Loop:
                 out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5, self.uses["train"]))
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
-                    add = lambda what, run, gpu, after, rank, here=here, name=name, w=w: out.append(  # noqa: E731
-                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"]))
-                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8)
+                    add = lambda what, run, gpu, after, rank, behind=(), here=here, name=name, w=w: out.append(  # noqa: E731
+                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"], list(behind)))
+                    add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8, diagnoses)
                     add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"touch {w}", f"naive {name}"], 3)
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
-                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9)
-                    for variant in ("fitted", "truth"):
-                        add(f"judge {variant}", self.judge(task, seed, variant, w), False, [f"{variant} {name} {w}"], 7)
+                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9, fitted)
+                    add("judge fitted", self.judge(task, seed, "fitted", w), False, [f"fitted {name} {w}"], 6)
+                    add("judge truth", self.judge(task, seed, "truth", w), False, [f"truth {name} {w}"], 7, diagnoses)
         return out
 
     def report(self) -> dict:
