@@ -196,7 +196,8 @@ def traded(fit: Fitted) -> np.ndarray:
     span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
     J = fit.jacobian * span
     A = J.T @ J
-    A[np.diag_indices(len(A))] += prior_weight(fit.params) * span**2 + np.where(mine, 1e-9 * max(np.trace(A), 1e-30), 12.0 * PRIOR)
+    believed = prior_weight(fit.params) * span**2
+    A[np.diag_indices(len(A))] += np.where(mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * PRIOR))
     i = np.flatnonzero(mine)
     out = np.zeros(len(span))
     if len(i):

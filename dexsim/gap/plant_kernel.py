@@ -401,18 +401,20 @@ def plant_kernel():
                     motor = zero
                     damping = zero
                     slope_m = zero
-                # the lag whose mean delay, of what is stored at the steps' starts beside what acts in their middle, is the one that is meant
-                short = params[h, P_LAG] - f64(1.5) * dts
-                blend = dts / (half * (short + wp.sqrt(short * short + f64(4.0) * params[h, P_LAG] * dts)) + dts)
+                blend = dts / (params[h, P_LAG] + dts)
                 if fresh == 1:
                     last = now
                     fresh = 0
                 now = last + blend * (now - last)
                 motor = last + blend * (motor - last)
-                damping = eff * blend * damping
-                slope_m = eff * blend * slope_m
+                line_l = blend * damping
+                line_m = blend * slope_m
+                damping = eff * line_l
+                slope_m = eff * line_m
                 before = last
                 last = now
+                begun = v
+                begun_m = vm
                 applied = eff * motor
                 if ripple != zero:
                     applied += ripple * wp.sin(turn * q + params[h, P_PHASE])
@@ -450,8 +452,10 @@ def plant_kernel():
                         if preslide > zero:
                             z = (z + v_fric * dts / preslide) / (one + wp.abs(v_fric) * dts / preslide)
                     else:
+                        went = carried  # speed in the middle of the step, or at its end
                         if preslide > zero:
                             free = giving(free, a, level, z, preslide / dts)
+                            went = free + carried
                             z = (z + free * dts / preslide) / (one + wp.abs(free) * dts / preslide)
                             q += dts * (free + carried)
                             v = v + (free + carried - v) / theta
@@ -462,11 +466,13 @@ def plant_kernel():
                             v = carried
                         else:
                             free -= wp.sign(free) * level / a
-                            q += dts * (free + carried)
+                            went = free + carried
+                            q += dts * went
                             ahead = v + (free + carried - v) / theta
                             if (ahead - carried) * free < zero:  # friction stops the joint within the step
                                 ahead = carried
                             v = ahead
+                        last = motor - (line_l + line_m) * (went - begun)  # what it gave: the lag goes on from there
                     qm = q
                     vm = v
                 else:
@@ -528,6 +534,10 @@ def plant_kernel():
                     if i >= warm:
                         v = x2
                         q += dts * v
+                        turned = v - begun
+                        if consts[C_LOOP_MOTOR] > half:
+                            turned = vm - begun_m
+                        last = motor - line_l * turned - line_m * (vm - begun_m)
                     if i < warm:  # a held link must not let the rotor run past the play
                         qm = wp.clamp(qm, q - gap2 - wp.abs(last) / stiff * f64(2.0), q + gap2 + wp.abs(last) / stiff * f64(2.0))
 
