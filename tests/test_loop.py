@@ -108,6 +108,8 @@ def test_report_reads_what_was_judged(tmp_path):
     assert jobs["fitted grasp 1 stiff"].after == ["diagnose stiff", "touch stiff", "naive grasp 1"] and jobs["naive grasp 1"].gpu and not jobs["judge naive grasp 1 stiff"].gpu
     assert jobs["diagnose stiff"].after == ["excite stiff"] and jobs["excite stiff"].after == ["own grasp stiff"] and jobs["own grasp stiff"].after == ["naive grasp 1"]
     assert max(j.rank for j in jobs.values() if j.name.startswith(("fitted", "truth"))) < jobs["wide grasp 1"].rank
+    fewer = {j.name for j in loop.Loop(s | {"variants": "fitted,truth"}).jobs()}
+    assert set(jobs) - fewer == {"wide grasp 1", "wide grasp 2", "judge wide grasp 1 stiff", "judge wide grasp 2 stiff"}
 
 
 def test_excitation_is_as_fast_as_the_policies_were():
@@ -232,5 +234,5 @@ def test_fast_moves_reach_a_speed_limit_and_stay_clear_of_the_ends():
     world = yaml.safe_load((ROOT / "configs" / "reality" / "late.yaml").read_text(encoding="utf-8"))
     run = drive(mechanism(servo=world["servo"], gravity=believed.spec.option.gravity), Series(t, value), believed.joints, float(t[-1]), home, 0.002)
     limit = np.array([world["servo"]["joints"][j]["no_load_speed"] for j in believed.joints])
-    assert ((np.abs(run.velocity) > 0.95 * limit).sum(0) * 0.002 > 0.2).sum() >= 10
+    assert ((np.abs(run.velocity) > 0.9 * limit).sum(0) * 0.002 > 0.3).sum() >= 10
     assert (run.position.max(0) - value.max(0)).max() < 0.1 and (run.position <= believed.limits[:, 1]).all()

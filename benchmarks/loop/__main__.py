@@ -2,7 +2,7 @@
 
     python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
-                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [train="worlds=64 ..."]
+                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [variants=wide,fitted,truth] [train="worlds=64 ..."]
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
 drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
@@ -41,7 +41,7 @@ from dexsim.errors import UserError
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
-            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8"}  # fmt: skip
+            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth"}  # fmt: skip
 # what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
@@ -145,6 +145,7 @@ class Loop:
     def __init__(self, s: dict[str, str]):
         self.s, self.out = s, Path(s["out"]).expanduser().resolve()
         self.tasks, self.worlds = s["tasks"].split(","), s["worlds"].split(",")
+        self.variants = set(s["variants"].split(","))
         self.seeds = list(range(1, int(s["seeds"]) + 1))
         self.gpus = [g for g in s["gpus"].split(",") if g not in ("", "none")]
         self.episodes = {k: int(v) for k, v in (part.split(":") for part in s["episodes"].split(","))}
@@ -326,7 +327,7 @@ class Loop:
             out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
         diagnoses = [f"diagnose {w}" for w in self.worlds]
-        fitted = [f"judge fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds]
+        fitted = [f"judge fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
@@ -342,7 +343,8 @@ class Loop:
                     add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9, fitted)
                     add("judge fitted", self.judge(task, seed, "fitted", w), False, [f"fitted {name} {w}"], 6)
                     add("judge truth", self.judge(task, seed, "truth", w), False, [f"truth {name} {w}"], 7, diagnoses)
-        return out
+        left_out = {v for v in VARIANTS if v != "naive"} - self.variants
+        return [j for j in out if not left_out & set(j.name.split()[:2])]
 
     def report(self) -> dict:
         """The table: by task, world and measure, the mean of each variant over seeds, and the share of the loss recovered."""

@@ -19,12 +19,11 @@ that they may reach; chirps tell a delay from a lag. Faster, a drive that is lat
 KEPT = 1  # of them, the last, is for the proof
 CAREFUL = 0.6  # of the believed no-load speed, as `dexsim.excite` has it
 FAST = ("fast.mcap", "fast_kept.mcap")  # the recordings of fast moves: one is fitted, one is for the proof
-DASH = ((0.7, 0.5), (-0.7, 0.75), (1.0, 1.0), (-1.0, 0.6), (0.8, 0.9), (-0.8, 1.1), (0.5, 0.7), (0.0, 0.5))
-"""Straight moves about the middle of a joint's range: to which share of the largest offset, at which share of the believed no-load speed."""
-DASH_S = 0.5  # s from one to the next
-LATE = {"delay": 0.05, "lag": 0.025}  # s more: drives as late as this must stay clear of the ends as well
-SMALLEST = 0.05  # of a joint's range: not made smaller than that
-CLEAR = 0.05  # share of a joint's range that a dash leaves free at both ends
+DASH = ((1, 0.35), (-1, 0.5), (1, 0.6), (-1, 0.7), (1, 0.45), (-1, 0.55), (1, 0.65), (0, 0.35))
+"""Straight moves about the middle of a joint's range: to which end of them, at which share of the believed no-load speed."""
+DASH_S, REACH, SHORT = 0.6, 0.4, 0.25  # s from one to the next; of the free range, either way; rad: joints that cannot go so far are left out
+LATE, SLOW = {"delay": 0.05, "lag": 0.025}, 0.5  # s more, and of the no-load speed: drives as late or as slow as this must keep to it too
+SETTLED, MARGIN, LEAST = 0.05, 0.02, 0.6  # rad from its target before the next move, at most; rad from its ends, at least; of DASH, or left out
 
 
 def start(given: dict[str, str]) -> None:
@@ -72,55 +71,59 @@ def record(given: dict[str, str]) -> None:
 
 
 def dashes(believed, way: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [T] s, targets [T, J] rad and home [J]: one joint of each finger at a time is led about the middle of its range, for a tenth of
-    a second faster than its drive may be able to follow: a speed limit shows, which smooth motion does not reach. A step of the target
-    would too, but a drive with a lag swings far past it. Simulated with the drives as believed and with drives as late as LATE; a joint's
-    motion is made smaller and slower until it keeps CLEAR of the ends in both, that of a group where anything touches. way: 1, or -1 for
-    the same the other way round."""
+    """Times [T] s, targets [T, J] rad and home [J]: one joint of each finger at a time is led to and fro about the middle of its range, far
+    and faster than its drive may be able to follow: a speed limit shows, which smooth motion of all joints does not reach. Long straight
+    moves, since after a step or a short fast move a drive with a lag swings for long. Simulated with the drives as believed, with drives as
+    late as LATE, and with those as slow as SLOW too; a joint is led less far and more slowly until in all of them it has come to rest before
+    each next move and met no end. way: 1, or -1 for the same the
+    other way round."""
     from dexsim.recording import excitation, safety
     from dexsim.recording.mechanism import drive, mechanism
     from dexsim.recording.schema import Series
     from dexsim.recording.waveforms import minimum_jerk
 
-    dt = 0.01
+    dt, hold = 0.01, round(DASH_S / 0.01)
     low, high, home = excitation._range(believed, excitation.Limits())
-    table = believed.table.to_dict()
-    for columns in table["joints"].values():
-        columns |= {k: columns[k] + v if k in columns else v for k, v in LATE.items() if k in columns or k == "lag"}
-    hands = [believed, mechanism(servo=table, gravity=believed.spec.option.gravity)]
+    hands = [believed]
+    for speed in (1.0, SLOW):
+        table = believed.table.to_dict()
+        for columns in table["joints"].values():
+            columns |= {k: columns[k] + v if k in columns else v for k, v in LATE.items() if k in columns or k == "lag"}
+            columns |= {"no_load_speed": speed * columns["no_load_speed"]} if "no_load_speed" in columns else {}
+        hands.append(mechanism(servo=table, gravity=believed.spec.option.gravity))
     check = safety.ContactCheck(believed, home, excitation.Limits().clearance)
     parts = [np.tile(home, (30, 1))]
     for group in excitation.groups(believed, believed.joints):
         free = {j: excitation._free(check, home, believed.joints.index(j), low, high) for j in group}
-        size = {j: 0.45 for j in group}  # of the free range, either way
-        while True:
-            centre, body = home.copy(), np.zeros((round(DASH_S / dt) * len(DASH), len(home)))
-            for j in group:
-                i, wide = believed.joints.index(j), free[j][1] - free[j][0]
-                centre[i], at = 0.5 * sum(free[j]), 0.0
-                for k, (level, share) in enumerate(DASH):
-                    first, to = round(DASH_S / dt) * k, way * level * size[j] * wide
-                    move = np.arange(round(DASH_S / dt)) * dt * share * believed.speeds[i] * size[j] / 0.45
-                    body[first : first + len(move), i] = at + np.sign(to - at) * np.minimum(move, abs(to - at))
+        pace = {j: 1.0 for j in group if REACH * (free[j][1] - free[j][0]) > SHORT}  # how far and how fast, of DASH
+        while pace:
+            centre, body = home.copy(), np.zeros((hold * len(DASH), len(home)))
+            for j, slower in pace.items():
+                i, at = believed.joints.index(j), 0.0
+                centre[i] = 0.5 * sum(free[j])
+                for k, (end, share) in enumerate(DASH):
+                    to = way * end * slower * REACH * (free[j][1] - free[j][0])
+                    body[hold * k : hold * (k + 1), i] = at + np.sign(to - at) * np.minimum(np.arange(1, hold + 1) * dt * slower * share * believed.speeds[i], abs(to - at))
                     at = to
             value = np.concatenate([minimum_jerk(home, centre, 0.8, dt), centre + body, minimum_jerk(centre, home, 0.8, dt), np.tile(home, (30, 1))])
             t = np.arange(len(value)) * dt
-            over, touched = set(), False
+            swings, touched = set(), False
             for hand in hands:
                 run = drive(hand, Series(t, value), hand.joints, float(t[-1]), home, excitation.CHECK_STEP, frame_s=excitation.FRAME)
-                for j in group:
-                    x, wide = run.position[(run.t > 0.8) & (run.t < t[-1] - 1.1), believed.joints.index(j)], free[j][1] - free[j][0]
-                    if size[j] > SMALLEST and (x.min() < free[j][0] + CLEAR * wide or x.max() > free[j][1] - CLEAR * wide):
-                        over.add(j)
+                ends = len(value) - len(body) - 110 + hold * np.arange(1, len(DASH) + 1) - 1
+                for j in pace:
+                    i = believed.joints.index(j)
+                    low_end, high_end = believed.limits[i]
+                    settled = np.abs(np.interp(t[ends], run.t, run.position[:, i]) - value[ends, i]).max() < SETTLED
+                    if not settled or run.position[:, i].min() < low_end + MARGIN or run.position[:, i].max() > high_end - MARGIN:
+                        swings.add(j)
                 touched = touched or bool(check.along(run))
-            if touched and max(size.values()) > SMALLEST:
-                over = set(group)
-            if not over:
+            if not swings and not touched:
                 break
-            size |= {j: 0.85 * size[j] for j in over}
-        print("fast: " + ", ".join(f"{j} +-{size[j] * (free[j][1] - free[j][0]):.2f}" for j in group) + (" rad, left out: touches" if touched else " rad"), flush=True)
-        if not touched:
-            parts.append(value)
+            pace = {j: 0.85 * x if j in swings or touched else x for j, x in pace.items()}
+            pace = {j: x for j, x in pace.items() if x > LEAST}
+        print("fast: " + ", ".join(f"{j} +-{x * REACH * (free[j][1] - free[j][0]):.2f} rad at {x:.2f} of the speeds" for j, x in pace.items()), flush=True)
+        parts += [value] if pace else []
     value = np.concatenate(parts)
     return np.arange(len(value)) * dt, value, home
 
