@@ -13,13 +13,14 @@ from dexsim.gap.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.joint import JointAnswer, Kept, nuisances
 from dexsim.gap.prepare import Case
 from dexsim.gap.result import Diagnosis, Settings, empty
-from dexsim.gap.search import ENOUGH, LEAST, JointSearch, Outcome
+from dexsim.gap.search import ENOUGH, JointSearch, Outcome
 from dexsim.gap.sentence import sentence
 from dexsim.gap.touch_effects import entry
 from dexsim.recording.mechanism import Mechanism
 
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
 NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
+SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 
 
@@ -142,11 +143,10 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
-    needed = confidence.NEEDED**2
-    if before > ENOUGH**2 and after < (1 - 2 * LEAST) * before:
+    if before > ENOUGH**2 and after < (1 - SIDES) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
-    plain = outcome.none.fit.loss > needed and search.gain(outcome.best, outcome.none) >= 2 * LEAST
+    plain = outcome.none.fit.loss > ENOUGH**2 and search.gain(outcome.best, outcome.none) >= SIDES
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 

@@ -268,7 +268,7 @@ def _scale(s: Scales) -> list[Variant]:
         out.append(Variant(params, ((0.2 * e, 0.0), (-0.2 * e, 0.0), (0.0, 0.2 * e), (0.0, -0.2 * e)), "eccentricity"))
         # its zero may have been set anywhere along the turn, and not where the model has it
         params = (params[0], _p("ecc_cos", ("eccentric_cos", "position_offset"), "add", -e, e, 0.0, "rad"))
-        out.append(Variant(params, ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)), "eccentricity, its zero elsewhere", dear=0.2))
+        out.append(Variant(params, ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)), "eccentricity, its zero elsewhere", dear=0.08))
     return out
 
 

@@ -62,6 +62,7 @@ P_OWN = INDEX["own_payload"]
 XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
 P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
+P_FRESH = INDEX["effort_fresh"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKE, P_DEADKIND = INDEX["presliding"], INDEX["brake"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
@@ -383,6 +384,11 @@ def plant_kernel():
                 now = torque[0]
                 motor = torque[1]
                 damping = torque[2]
+                older = zero  # what the age of its position makes of the torque that the loop asks for
+                if damping != zero:
+                    older = kp * age * shows * v_l
+                    if voltage > zero:
+                        older = tau0 * supply * older
                 slope_m = torque[3]
                 if two:  # its steps are short, and a light rotor's would not stand it
                     slope_m = wp.max(slope_m, zero)
@@ -556,7 +562,7 @@ def plant_kernel():
             while s < s_end and sample_step[s] == i:
                 p = sample_part[s]
                 out_q[h, s] = shown + p * (nxt - shown)
-                out_torque[h, s] = last
+                out_torque[h, s] = last - params[h, P_FRESH] * older
                 s += 1
             prev_tau = last
             t += dt

@@ -18,7 +18,7 @@ USUAL = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_fri
          "position_offset", "position_scale", "speed_lag", "backlash", "softness")  # fmt: skip
 WITH_OTHERS = ("torque_ripple", "ripple_per_turn", "ripple_phase", "deadband_kind", "coupling", "coupling_from", "warmth")
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
-LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
+LEAST = 0.09  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 CHANCE = 0.03  # of the bootstraps in which an effect may be of no use to what was left out
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
@@ -31,7 +31,7 @@ HINT = 0.03  # of the squared error with what the beliefs give for it: an effect
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
 AGAIN = 3  # hypotheses from which the fit without any effect is begun again before one is claimed
 TIE = 0.02  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
-CLEAR = 0.15  # of the squared error: what an effect must remove where the error is within the noise without it
+CLEAR = 0.11  # of the squared error: what an effect must remove where the error is within the noise without it
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
 FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
@@ -200,6 +200,8 @@ class JointSearch:
             out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
         if c.sigma_torque > 0:
             out.append(Param("effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
+            # a drive may show what it last asked for, or what acts meanwhile
+            out.append(Param("effort_fresh", ("effort_fresh",), "set", 0.0, 1.0, 0.5, nuisance=True))
         return out
 
     def _params(self, members: tuple[Member, ...]) -> list[Param]:
@@ -518,7 +520,7 @@ class JointSearch:
                 break
             listed = self._shortlist(scan, shortlist, loss, current.members)
             if loss < ROUGH:
-                listed = self._hinted([] if enough else listed, current.members, 0.5 * CLEAR if enough else HINT)
+                listed = self._hinted([] if enough else listed, current.members, HINT)
             if not listed:
                 break
             drafts = []
@@ -653,7 +655,8 @@ class JointSearch:
         at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
         for m in trial.members:
             first = m.variant.params[0]
-            if first.mode == "set" and first.start == first.low and at[f"{m.id}.{first.key}"] <= first.low + 1e-3 * first.span:
+            sizes = [p for p in m.variant.params if p.key.startswith(first.key)]  # of a friction with load one direction may have none
+            if first.mode == "set" and first.start == first.low and all(at[f"{m.id}.{p.key}"] <= p.low + 1e-3 * p.span for p in sizes):
                 return True
         return False
 
