@@ -315,8 +315,8 @@ class Loop:
         return run
 
     def jobs(self) -> list[Job]:
-        """All steps; those that others wait for come first, wide randomization last. Nothing is judged that would keep the diagnoses, or
-        the judging of what was fitted, waiting for cores."""
+        """All steps; those that others wait for come first, wide randomization last. Nothing is trained or judged that would keep the
+        diagnoses, or what is fitted, waiting for a GPU or for cores."""
         out = []
         for w in self.worlds:
             for task in self.tasks:
@@ -327,12 +327,12 @@ class Loop:
             out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
         diagnoses = [f"diagnose {w}" for w in self.worlds]
-        fitted = [f"judge fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
+        tuned = [f"fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
                 out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"]))
-                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5, self.uses["train"]))
+                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5, self.uses["train"], tuned))
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, behind=(), here=here, name=name, w=w: out.append(  # noqa: E731
@@ -340,7 +340,7 @@ class Loop:
                     add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8, diagnoses)
                     add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"touch {w}", f"naive {name}"], 3)
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
-                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9, fitted)
+                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9, [f"judge {x}" for x in tuned])
                     add("judge fitted", self.judge(task, seed, "fitted", w), False, [f"fitted {name} {w}"], 6)
                     add("judge truth", self.judge(task, seed, "truth", w), False, [f"truth {name} {w}"], 7, diagnoses)
         left_out = {v for v in VARIANTS if v != "naive"} - self.variants
