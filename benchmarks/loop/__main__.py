@@ -2,7 +2,8 @@
 
     python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
-                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [variants=wide,fitted,truth] [train="worlds=64 ..."]
+                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [variants=wide,fitted,truth]
+                              [diagnose_gpu=3 diagnose_slots=3] [train="worlds=64 ..."]
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
 drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
@@ -11,7 +12,8 @@ iterations: with the servo table and the touch that `diagnose` fitted (the inter
 believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
 commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
 the CPUs meanwhile. gpus=none (the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU,
-fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. Resumable: a step that is done is not
+fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. diagnose_gpu: a GPU beside those of
+gpus= on which the diagnoses are computed too, and then so many trainings at a time. Resumable: a step that is done is not
 repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still runs is ended. Writes
 loop.json, table.md, loop.png.
 """
@@ -41,7 +43,8 @@ from dexsim.errors import UserError
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
-            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth"}  # fmt: skip
+            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth", "diagnose_gpu": "",
+            "diagnose_slots": "3"}  # fmt: skip
 # what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
@@ -69,6 +72,7 @@ class Job:
     rank: int = 0
     cores: int = 1
     behind: list[str] = field(default_factory=list)
+    frees: list[str] = field(default_factory=list)
 
 
 class Queue:
@@ -79,6 +83,7 @@ class Queue:
         self.gpus, self.with_gpus, self.cores, self.free = list(gpus), bool(gpus), cores, cores
         self.stop_s, self.kill_s, self.kill = stop_s, kill_s, kill
         self.state = {j.name: "done" if j.mark.is_file() else "waits" for j in jobs}
+        self.gpus += [g for j in jobs if self.state[j.name] == "done" for g in j.frees]
         self.lock, self.begun = threading.Condition(), time.perf_counter()
 
     def _takes(self, job: Job) -> int:
@@ -130,8 +135,7 @@ class Queue:
             job.mark.write_text(f"{time.perf_counter() - start:.1f}\n", encoding="utf-8")
         with self.lock:
             self.state[job.name] = "done" if good else "failed"
-            if slot != "cpu":
-                self.gpus.append(slot)
+            self.gpus += job.frees + ([slot] if slot != "cpu" else [])
             self.free += self._takes(job)
             done = sum(s in ("done", "failed") for s in self.state.values())
             spent = time.perf_counter() - self.begun
@@ -156,19 +160,34 @@ class Loop:
 
     def call(self, argv: list[str], log: Path, gpu: str = "", limit: float = 3600.0, threads: int = 1) -> int:
         """A command of the product, its output in a file. gpu: the one that it sees; threads: OMP_NUM_THREADS."""
-        log.parent.mkdir(parents=True, exist_ok=True)
-        env = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-        env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
-        with open(log, "w", encoding="utf-8") as file:
-            process = subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
-            self.running.add(process)
-            try:
-                return process.wait(limit)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                return 124
-            finally:
-                self.running.discard(process)
+        return 0 if self.first([(argv, log, gpu, threads)], limit) == 0 else 1
+
+    def first(self, commands: list[tuple[list[str], Path, str, int]], limit: float) -> int | None:
+        """Runs commands (argv, log, gpu, threads) side by side until one has ended well, and ends the others: its number, or None."""
+        processes = []
+        for argv, log, gpu, threads in commands:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            env = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+            env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
+            with open(log, "w", encoding="utf-8") as file:
+                processes.append(subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT))
+        self.running |= set(processes)
+        end = time.perf_counter() + limit
+        try:
+            while time.perf_counter() < end:
+                status = [p.poll() for p in processes]
+                if 0 in status:
+                    return status.index(0)
+                if None not in status:
+                    return None
+                time.sleep(0.1)
+            return None
+        finally:
+            for p in processes:
+                if p.poll() is None:
+                    p.kill()
+                    p.wait()
+            self.running -= set(processes)
 
     def kill(self) -> None:
         """Ends what this program began."""
@@ -288,8 +307,15 @@ class Loop:
             excited, fast = sorted((self.out / f"excited_{world}").glob("excite_*.mcap")), [self.out / f"excited_{world}" / name for name in FAST]
             fit, held = [*excited[:-KEPT], fast[0]], [*excited[-KEPT:], fast[1]]
             argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
-            status = self.call([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", limit=float(self.s["diagnose_s"]), threads=self.uses["diagnose"])
-            return status == 0 and (where / "servo.yaml").is_file()
+            tries = [([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", "", self.uses["diagnose"])]
+            if self.s["diagnose_gpu"]:  # beside the cores: whichever is done first
+                other = self.out / f"diagnosis_{world}_gpu"
+                tries.append(([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", self.s["diagnose_gpu"], 2))
+            won = self.first(tries, float(self.s["diagnose_s"]))
+            if won == 1:
+                shutil.rmtree(where, ignore_errors=True)
+                other.rename(where)
+            return won is not None and (where / "servo.yaml").is_file()
 
         return run
 
@@ -325,7 +351,9 @@ class Loop:
             for finger in FINGERS:
                 out.append(Job(f"press {finger} {w}", self.out / f"touch_{w}" / f"{finger}.done", self.press(finger, w), False, [], 1))
             out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"]))
+            free = ([self.s["diagnose_gpu"]] if self.s["diagnose_gpu"] else []) * int(self.s["diagnose_slots"])
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"],
+                           frees=free[self.worlds.index(w) :: len(self.worlds)]))  # fmt: skip
         diagnoses = [f"diagnose {w}" for w in self.worlds]
         tuned = [f"fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
         for task in self.tasks:
