@@ -35,3 +35,10 @@ def test_it_stays_where_it_holds_its_own_or_the_rival_is_fitted_away(share, riva
 def test_one_alone_is_overtaken_as_well():
     now, better = hypothesis("payload"), hypothesis("position_scale")
     assert search(now, better)(now, {"payload": ([("position_scale", 0.7)], 0.3, 0.1)}) is better
+
+
+def test_draws_that_an_effects_like_wins_are_not_lost_to_a_rival():
+    now, better = hypothesis("payload"), hypothesis("coulomb_friction")
+    shares = lambda like: {"payload": ([("coulomb_friction", 0.48), (like, 0.26)], 0.26, 0.5)}  # noqa: E731
+    assert search(now, better)(now, shares("position_offset")) is None  # a tilt of gravity and an encoder's zero: half of the draws together
+    assert search(now, better)(now, shares("torque_ripple")) is better

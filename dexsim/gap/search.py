@@ -560,14 +560,17 @@ class JointSearch:
                 if close.fit.loss < (1 - LEAST) * current.fit.loss:
                     best = self.refold(close)
                     self.fitted[frozenset(best.ids)] = best
-            if not current.members:
-                less = self._begun_again(current, trials)
-                if less is not current:
-                    none = current = less
-                    self.none_loss = self._left(none)
-                    if not self._earns(best, none):  # the fit without it had stopped short: what is missing is looked for anew
-                        self.fitted.clear()
-                        continue
+            less = self._begun_again(current, trials)
+            if less is not current:
+                if not current.members:
+                    none, self.none_loss = less, self._left(less)
+                    self.fitted.clear()
+                else:
+                    self.fitted[frozenset(less.ids)] = less
+                current = less
+                if not self._earns(best, current):  # the fit without it had stopped short: what is missing is looked for anew
+                    continue
+                self.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
             if enough and self.gain(best, current) < CLEAR:
                 break
             if not self._earns(best, current):
@@ -592,18 +595,21 @@ class JointSearch:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
 
-    def _begun_again(self, none: Trial, trials: list[Trial]) -> Trial:
-        """No effect, fitted again from where hypotheses ended that follow better: what they refitted, and of their effects what is inside the
-        bounds of a belief. The fit without any effect may have stopped in a hollow beside; `none` where it had not."""
-        best, params = none, none.fit.params
+    def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
+        """The hypothesis fitted again from where those with one effect more ended that follow better: what they refitted, and of that effect what
+        is inside the bounds of a belief. The fit without it may have stopped in a hollow beside; `current` where it had not."""
+        best, params = current, current.fit.params
         columns = [INDEX[p.columns[0]] for p in params]
         believed = self.case.plant.base()[0][columns]
-        ahead = [t for t in trials if t.fit.loss < (1 - TIE) * none.fit.loss]
+        ahead = [t for t in trials if t.fit.loss < (1 - TIE) * current.fit.loss]
         for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
+            own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
             at = expand_one(self.case, trial.fit.params, trial.fit.x)[0][columns]
-            x0 = [a / b if p.mode == "factor" else a - b if p.mode == "add" else a for p, a, b in zip(params, at, believed, strict=True)]
-            new = Trial((), self.fitter.homeward(params, self.fitter.fit(params, x0=np.array(x0), iterations=8)))
-            if self._here(new) < (1 - 0.5 * TIE) * self._here(best):
+            x0 = [own.get(p.key, p.start) if not p.nuisance else a / b if p.mode == "factor" else a - b if p.mode == "add" else a
+                  for p, a, b in zip(params, at, believed, strict=True)]  # fmt: skip
+            with self._fix(current.members):
+                new = Trial(current.members, self.fitter.homeward(params, self.fitter.fit(params, x0=np.array(x0), iterations=8)))
+            if self._here(new) < (1 - 0.5 * TIE) * self._here(best) and not self._shrunk(new):
                 best = new
         return best
 
@@ -735,7 +741,13 @@ class JointSearch:
 
     def _overtaken(self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]) -> Trial | None:
         """The hypothesis in which a rival stands in the place of the member that it beats in most bootstraps; None where each holds its own."""
-        ahead = [(others[0][1] - share, k, others[0][0]) for k, m in enumerate(current.members) for others, share, _ in [final[m.id]] if others]
+        ahead = []
+        for k, m in enumerate(current.members):
+            others, share, _ = final[m.id]
+            if others:
+                rival = others[0][0]  # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
+                like = sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival)) if not confusable(rival, m.id) else 0.0
+                ahead.append((others[0][1] - share - like, k, rival))
         for lead, k, rival in sorted(ahead, reverse=True):
             better = self.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
             if lead > 0.1 and better is not None and not self._shrunk(better):
