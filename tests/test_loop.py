@@ -78,13 +78,14 @@ def test_queue_lets_others_go_before(tmp_path):
 
 
 def test_the_first_that_ends_well_counts_and_a_gpu_joins_after_its_diagnosis(tmp_path):
-    one = loop.Loop(loop.SETTINGS | {"out": str(tmp_path), "gpus": "0", "diagnose_gpu": "3", "diagnose_slots": "3", "worlds": "late,stiff"})
+    one = loop.Loop(loop.SETTINGS | {"out": str(tmp_path), "gpus": "0", "diagnose_gpus": "3", "diagnose_slots": "3", "worlds": "late,stiff"})
     wait = lambda s, status=0: (["-c", f"import time; time.sleep({s}); raise SystemExit({status})"], tmp_path / f"{s}.log", "", 1)  # noqa: E731
     start = time.perf_counter()
     assert one.first([wait(30), wait(0.1, 1), wait(0.3)], 20.0) == 2 and time.perf_counter() - start < 10 and not one.running
     assert one.first([wait(0.1, 1)], 20.0) is None and one.first([wait(30)], 0.3) is None and one.call(wait(0.1, 3)[0], tmp_path / "x.log") != 0
     frees = {j.name: j.frees for j in one.jobs() if j.frees}
     assert frees == {"diagnose late": ["3", "3"], "diagnose stiff": ["3"]}
+    assert [loop.Loop(one.s | {"diagnose_gpus": g}).helper("stiff") for g in ("", "2", "2,3")] == ["", "2", "3"]
     used = []
     job = lambda name, gpu, after=(), frees=(): loop.Job(name, tmp_path / name, lambda slot: not used.append((name, slot)), gpu, list(after), frees=list(frees))  # noqa: E731
     loop.Queue([job("diagnose", False, frees=["3"]), *(job(f"train {k}", True, ["diagnose"]) for k in range(4))], ["0"], 2, 0.0, 0.0, lambda: None).go()

@@ -3,7 +3,7 @@
     python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
                               [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
                               [train_cores=1] [judge_cores=2] [diagnose_cores=8] [variants=wide,fitted,truth]
-                              [diagnose_gpu=3 diagnose_slots=3] [train="worlds=64 ..."]
+                              [diagnose_gpus=2,3 diagnose_slots=3] [train="worlds=64 ..."]
 
 For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
 drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
@@ -12,8 +12,8 @@ iterations: with the servo table and the touch that `diagnose` fitted (the inter
 believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
 commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
 the CPUs meanwhile. gpus=none (the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU,
-fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. diagnose_gpu: a GPU beside those of
-gpus= on which the diagnoses are computed too, and then so many trainings at a time. Resumable: a step that is done is not
+fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. diagnose_gpus: GPUs beside those of
+gpus= on which the diagnoses are computed too (a reality each), and then so many trainings at a time. Resumable: a step that is done is not
 repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still runs is ended. Writes
 loop.json, table.md, loop.png.
 """
@@ -43,7 +43,7 @@ from dexsim.errors import UserError
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
             "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
-            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth", "diagnose_gpu": "",
+            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth", "diagnose_gpus": "",
             "diagnose_slots": "3"}  # fmt: skip
 # what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
@@ -171,6 +171,8 @@ class Loop:
             env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
             with open(log, "w", encoding="utf-8") as file:
                 processes.append(subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT))
+            if len(commands) > 1 and not gpu:  # what has a GPU beside it leaves that one its cores
+                os.setpriority(os.PRIO_PROCESS, processes[-1].pid, 10)
         self.running |= set(processes)
         end = time.perf_counter() + limit
         try:
@@ -298,6 +300,11 @@ class Loop:
 
         return run
 
+    def helper(self, world: str) -> str:
+        """The GPU on which a reality's diagnosis is computed too; "" for none."""
+        gpus = [g for g in self.s["diagnose_gpus"].split(",") if g]
+        return gpus[self.worlds.index(world) % len(gpus)] if gpus else ""
+
     def diagnose(self, world: str):
         """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast that has to be, and are
         not fitted: a joint is judged while nothing is touched, and most of what they touch carries no taxels. What they command, played again
@@ -306,11 +313,11 @@ class Loop:
             where = self.out / f"diagnosis_{world}"
             excited, fast = sorted((self.out / f"excited_{world}").glob("excite_*.mcap")), [self.out / f"excited_{world}" / name for name in FAST]
             fit, held = [*excited[:-KEPT], fast[0]], [*excited[-KEPT:], fast[1]]
-            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false"]
+            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false", "replay=none"]
             tries = [([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", "", self.uses["diagnose"])]
-            if self.s["diagnose_gpu"]:  # beside the cores: whichever is done first
+            if helper := self.helper(world):  # beside the cores: whichever is done first
                 other = self.out / f"diagnosis_{world}_gpu"
-                tries.append(([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", self.s["diagnose_gpu"], 2))
+                tries.append(([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", helper, 2))
             won = self.first(tries, float(self.s["diagnose_s"]))
             if won == 1:
                 shutil.rmtree(where, ignore_errors=True)
@@ -351,9 +358,10 @@ class Loop:
             for finger in FINGERS:
                 out.append(Job(f"press {finger} {w}", self.out / f"touch_{w}" / f"{finger}.done", self.press(finger, w), False, [], 1))
             out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
-            free = ([self.s["diagnose_gpu"]] if self.s["diagnose_gpu"] else []) * int(self.s["diagnose_slots"])
+            sharing = [x for x in self.worlds if self.helper(x) == self.helper(w)]
+            free = ([self.helper(w)] if self.helper(w) else []) * int(self.s["diagnose_slots"])
             out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"],
-                           frees=free[self.worlds.index(w) :: len(self.worlds)]))  # fmt: skip
+                           frees=free[sharing.index(w) :: len(sharing)]))  # fmt: skip
         diagnoses = [f"diagnose {w}" for w in self.worlds]
         tuned = [f"fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
         for task in self.tasks:
