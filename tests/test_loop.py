@@ -97,6 +97,7 @@ def test_share_recovered_by_hand():
     assert r["value"] == pytest.approx(1.25 / 2.0) and r["low"] <= r["value"] <= r["high"] and r["seeds"] == 2
     smaller_is_better = loop._ratio(np.array([4.0]), np.array([3.0]), np.array([2.0]))
     assert smaller_is_better["value"] == pytest.approx(0.5)
+    assert loop._share(smaller_is_better) == "0.50 (one seed)" and loop._share(r).startswith("0.62 (")
 
 
 def test_no_share_of_a_gap_that_may_be_none():

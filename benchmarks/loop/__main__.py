@@ -447,6 +447,11 @@ def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
     return {"value": value, "low": low, "high": high, "seeds": len(naive)}
 
 
+def _share(r: dict) -> str:
+    """With its interval; of one seed there is none."""
+    return f"{r['value']:.2f} " + (f"({r['low']:.2f} to {r['high']:.2f})" if r["seeds"] > 1 else "(one seed)")
+
+
 def markdown(data: dict) -> str:
     """The table as Markdown."""
     text = ["| task, reality | measure | naive | wide | fitted | true physics | recovered by fitted | by wide |", "|---|---|---|---|---|---|---|---|"]
@@ -456,7 +461,7 @@ def markdown(data: dict) -> str:
             x = np.array([a for a in line["values"][v] if a == a])
             cells.append("-" if not len(x) else f"{x.mean():.3g}" + (f" ± {x.std(ddof=1) / math.sqrt(len(x)):.2g}" if len(x) > 1 else ""))
         none = "-" if line["gap"]["sure"] or line["gap"]["value"] is None else "no sure gap"
-        shares = [f"{r['value']:.2f} ({r['low']:.2f} to {r['high']:.2f})" if (r := line.get(f"recovered_{o}")) else none for o in ("fitted", "wide")]
+        shares = [_share(r) if (r := line.get(f"recovered_{o}")) else none for o in ("fitted", "wide")]
         text.append(f"| {line['task']}, {line['world']} | {line['measure']} | " + " | ".join(cells + shares) + " |")
     return "\n".join(text) + "\n"
 
