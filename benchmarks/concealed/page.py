@@ -17,7 +17,7 @@ from benchmarks.concealed.score import wilson
 AIMS = {  # line: (to publish, aim), from the project's judging table
     "right effect first, easy": ("85 %", "95 %"), "right effect first, medium": ("70 %", "88 %"), "right effect first, hard": ("45 %", "65 %"),
     "right joint (F1), rigs of several": ("0.85", "0.95"), "regime: overlap >= 0.5, where named right": ("70 %", "85 %"), "several effects at once (F1)": ("0.60", "0.80"),
-    "parameter error, median": ("15 %", "8 %"), "90 % interval covers the truth": ("90 %", "85-95 %"), "held-out error removed, mean": ("0.70", "0.90"),
+    "parameter error, median": ("15 %", "8 %"), "90 % interval covers the truth": ("", "85-95 %"), "held-out error removed, mean": ("0.70", "0.90"),
     "false alarm, nothing missing": ("8 %", "3 %"), "outside the catalogue: not claimed": ("60 %", "80 %"), "confident and wrong, all cases": ("10 %", "3 %"),
 }  # fmt: skip
 PLAIN = ("(F1)", "mean", "error removed")
