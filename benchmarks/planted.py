@@ -173,7 +173,7 @@ def motion(rng: np.random.Generator, kind: int) -> np.ndarray:
 def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
     """Four runs with commands, times and temperature, the measured motion still to be simulated."""
     from dexsim.actuator.table import ServoTable
-    from dexsim.gap.runs import Run
+    from dexsim.gap.read.runs import Run
 
     out, J = [], len(b["joints"])
     t_cmd = np.arange(0.0, SECONDS, 0.01)
@@ -196,7 +196,7 @@ def _runs(b: dict, rng: np.random.Generator, needs: str) -> list:
 
 def _apply(params: np.ndarray, change: dict) -> np.ndarray:
     """Plant parameters [..., C] with the changes made."""
-    from dexsim.gap.plant_columns import INDEX
+    from dexsim.gap.plant.columns import INDEX
 
     out = params.copy()
     for key, value in change.items():
@@ -210,7 +210,7 @@ def _simulate(b: dict, runs: list, changes: list[dict], dt: float, passes: int) 
     of the first joint makes them."""
     import mujoco
 
-    from dexsim.gap.prepare import build
+    from dexsim.gap.plant.case import build
 
     model = mujoco.MjModel.from_xml_string(model_xml(b))
     for _ in range(passes):
@@ -239,8 +239,8 @@ def _by_mujoco(b: dict, runs: list, change: dict) -> float:
 
     from dexsim.actuator.columns import INDEX as SERVO_INDEX
     from dexsim.actuator.table import ServoTable
-    from dexsim.gap.confirm import World, free_runs
-    from dexsim.gap.prepare import REFERENCE
+    from dexsim.gap.judge.full_model import World, free_runs
+    from dexsim.gap.plant.case import REFERENCE
 
     table = servo(b)
     true = {}
@@ -293,8 +293,8 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
 
 def _off(rng: np.random.Generator, b: dict) -> dict:
     """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for each."""
-    from dexsim.gap.prepare import BELIEF
-    from dexsim.gap.search import FILTER, LATE
+    from dexsim.gap.plant.case import BELIEF
+    from dexsim.gap.search.search import FILTER, LATE
 
     def draw(centre: float, sd: float, low: float, high: float) -> float:
         while not low <= (x := rng.normal(centre, sd)) <= high:
@@ -310,9 +310,9 @@ def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:
     """What is left of recordings q [n], simulated in the search's own plant, in times the noise, when all that the
     tool refits with every hypothesis is fitted to the first three: of those or of the last, whichever is less (what only the last shows could
     be known by nobody, what it does not show not be judged). Begun at the values under the effect; none [C]: without it."""
-    from dexsim.gap.fit import Fitter, Residuals, expand
-    from dexsim.gap.plant_columns import INDEX
-    from dexsim.gap.search import JointSearch
+    from dexsim.gap.search.fit import Fitter, Residuals, expand
+    from dexsim.gap.plant.columns import INDEX
+    from dexsim.gap.search.search import JointSearch
 
     plant = case.plant
     params = [p for p in JointSearch(case, [0, 1, 2], None, [0, 1, 2, 3]).all_nuisances if p.columns[0] != "effort_gain"]
@@ -413,7 +413,7 @@ def _joined(off: dict, change: dict) -> dict:
 
 def score(truth: dict, d: dict) -> dict:
     """What the table needs of one diagnosis (as diagnosis.json holds it)."""
-    from dexsim.gap.catalogue import confusable
+    from dexsim.gap.effects.catalogue import confusable
 
     found = d.get("findings", [])
     first = found[0] if found else None
@@ -462,7 +462,7 @@ def _one(job: tuple) -> dict:
     from dexsim.cli.build import quiet_warp
 
     quiet_warp("cpu")
-    from dexsim.gap import plant
+    from dexsim.gap.plant import batch as plant
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
     if s["workers"] > 1:
@@ -538,7 +538,7 @@ def main(argv: list[str]) -> dict:
     start = time.perf_counter()
     results = []
     if s["workers"] > 1:
-        from dexsim.gap.plant_kernel import plant_kernel  # compiled once, before the workers ask for it all at once
+        from dexsim.gap.plant.kernel import plant_kernel  # compiled once, before the workers ask for it all at once
 
         _warm(plant_kernel)
         with mp.get_context("spawn").Pool(min(s["workers"], len(jobs)), maxtasksperchild=8) as pool:

@@ -1,6 +1,6 @@
 """Planted touch and contact effects, several sizes and seeds: python -m benchmarks.planted_touch [seeds=2] [load_cell=true] [only=EFFECT].
 
-Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch_rig`: MuJoCo's contact geometry, the taxel kernels
+Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch.press_rig`: MuJoCo's contact geometry, the taxel kernels
 that train policies, counts of 0.1 N, a load cell with 20 mN of noise). Right: named first, or in a set of its class. One JSON line
 at the end. Then the same motion is felt by the sensor that trains, first as believed, then with what tactile.yaml hands on: the rms
 difference where a taxel reads anything (of a rubber, at the force that the cell measured). The sanity check of the method on our
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
     from dexsim.cli.build import quiet_warp
-    from dexsim.gap import touch, touch_handed, touch_rig
+    from dexsim.gap.touch import handed_on as touch_handed, press_rig, touch
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
 
@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
             if s["only"] and s["only"] != effect:
                 continue
             with tempfile.TemporaryDirectory() as folder:
-                paths, model, servo = touch_rig.record(Path(folder), 3, 8.0, seed=10 + seed, load_cell=s["load_cell"] == "true", **planted)
+                paths, model, servo = press_rig.record(Path(folder), 3, 8.0, seed=10 + seed, load_cell=s["load_cell"] == "true", **planted)
                 m = mechanism(model, servo)
                 start = time.perf_counter()
                 out = touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set(), seed)
@@ -95,7 +95,7 @@ def main(argv: list[str]) -> int:
 
 def _felt_again(folder: Path, paths: list[Path], h, planted: dict, seed: int, again: list) -> str:
     """The recorded motion felt by the sensor that trains, as believed and with what is handed on; in words."""
-    from dexsim.gap import touch_rig
+    from dexsim.gap.touch import press_rig
     from dexsim.recording import read
 
     recorded = [read(p, audit=False) for p in paths]
@@ -105,10 +105,10 @@ def _felt_again(folder: Path, paths: list[Path], h, planted: dict, seed: int, ag
     # training's contact is a straight line: of a rubber it has the spread over the taxels, at the force that the cell measured
     given = {"pressed": [np.maximum(r.external_force.value[:, 0], 0.0) for r in recorded]} if "rubber" in planted and recorded[0].external_force else {}
     rms = []
-    for k, settings in enumerate(({}, touch_rig.as_trained(said))):
-        other, _, _ = touch_rig.record(folder / f"again{k}", len(paths), 8.0, seed=seed, **shape, **settings, **given)
+    for k, settings in enumerate(({}, press_rig.as_trained(said))):
+        other, _, _ = press_rig.record(folder / f"again{k}", len(paths), 8.0, seed=seed, **shape, **settings, **given)
         pairs = [(a, read(p, audit=False).tactile.value) for a, p in zip(true, other, strict=True)]
-        rms.append([(a - b) * touch_rig.LSB for a, b in pairs])
+        rms.append([(a - b) * press_rig.LSB for a, b in pairs])
     on = [np.abs(a) > 0 for a in true]
     before, after = (float(np.sqrt(np.mean(np.concatenate([d[o] for d, o in zip(e, on, strict=True)]) ** 2))) for e in rms)
     again.append((before, after))

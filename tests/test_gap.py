@@ -14,14 +14,18 @@ from dexsim.actuator import reference
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import command, demo, inputs, judge, locate, stage, touch
-from dexsim.gap.catalogue import CATALOGUE, EFFECTS, confusable
+from dexsim.gap import command, demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.plant import JointPlant, nominal_row
-from dexsim.gap.plant_columns import INDEX, NEUTRAL
-from dexsim.gap.prepare import build, noise
-from dexsim.gap.runs import Run, conditions, local_polynomial
-from dexsim.gap.search import JointSearch
+from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
+from dexsim.gap.judge import errors
+from dexsim.gap.locate import bins
+from dexsim.gap.plant.batch import JointPlant, nominal_row
+from dexsim.gap.plant.case import build, noise
+from dexsim.gap.plant.columns import INDEX, NEUTRAL
+from dexsim.gap.read import inputs, stage_tests
+from dexsim.gap.read.runs import Run, conditions, local_polynomial
+from dexsim.gap.search.search import JointSearch
+from dexsim.gap.touch import touch
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import drive
 
@@ -182,10 +186,10 @@ def test_floor_from_repeats_of_the_same_commands():
         r.smooth()
         runs.append(r)
     assert conditions(runs) == [0, 0]
-    value, how = judge.floor(runs, build(model(), runs))
+    value, how = errors.floor(runs, build(model(), runs))
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
     runs[1].name = "a"  # two pieces of one recording
-    assert judge.floor(runs, build(model(), runs))[1] != "repeats"
+    assert errors.floor(runs, build(model(), runs))[1] != "repeats"
 
 
 def test_map_finds_the_regime_and_controls_false_discoveries():
@@ -194,11 +198,11 @@ def test_map_finds_the_regime_and_controls_false_discoveries():
     speed, other = rng.uniform(0, 1, n), rng.uniform(0, 1, n)
     block = np.arange(n) // 50
     plain = rng.standard_normal(n)
-    found = locate.control(locate.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
+    found = bins.control(bins.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
     assert found and found[0].regime == "speed" and found[0].low > 0.7 and found[0].text == found[0].where
-    both = locate.control(locate.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found)
+    both = bins.control(bins.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found)
     assert both[0].of == "position" and both[-1].of == "effort" and both[-1].text.startswith("effort, speed")
-    assert not locate.control(locate.spots("j", plain, block, {"speed": speed, "load": other}, rng))
+    assert not bins.control(bins.spots("j", plain, block, {"speed": speed, "load": other}, rng))
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.7])
@@ -207,7 +211,7 @@ def test_stage_test_reads_the_drives_gain(factor):
     r.smooth()
     cases = build(model(), [r])
     r.torque = (2.0 * (r.command_at(r.t) - r.q) - 0.04 * r.vs) * factor
-    (found,) = stage.tests(cases, [r], [0])
+    (found,) = stage_tests.tests(cases, [r], [0])
     assert found.slope == pytest.approx(factor, rel=0.02) and found.delay == 0.0 and found.sound == (factor == 1.0)
 
 
@@ -230,7 +234,7 @@ def test_rms_interval_covers():
     rng = np.random.default_rng(4)
     t = np.arange(0, 60, 0.01)
     e = np.convolve(rng.standard_normal(len(t)), np.ones(20) / np.sqrt(20), "same")
-    value, low, high = judge.rms_interval([e**2], [t])
+    value, low, high = errors.rms_interval([e**2], [t])
     assert low < 1.0 < high and low < value < high and high - low < 0.3
 
 

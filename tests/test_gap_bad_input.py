@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dexsim.errors import UserError
-from dexsim.gap import channels, command, demo
+from dexsim.gap import command, demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.gap.read import channels
 from dexsim.recording import read, write
 
 
@@ -211,8 +212,8 @@ def test_links_that_touch_each_other_are_cut_out():
     import mujoco
 
     from dexsim.assets import xhand
-    from dexsim.gap import inputs
-    from dexsim.gap.runs import Run
+    from dexsim.gap.read import inputs
+    from dexsim.gap.read.runs import Run
 
     model = xhand.hand_spec().compile()
     data = mujoco.MjData(model)

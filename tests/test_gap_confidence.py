@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap import confidence, judge
-from dexsim.gap.confidence import DOUBTED, Evidence
-from dexsim.gap.fit import Param
-from dexsim.gap.plant_columns import INDEX
+from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge.confidence import DOUBTED, Evidence
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.search.fit import Param
 
 CASE = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0}))
 
@@ -132,7 +132,7 @@ def test_temperature_that_follows_something_else(starts, gains, what):
                                                                   (4.0, 3.0, True, "unknown"), (12.0, 1.1, True, "unknown"), (12.0, 9.0, False, "unknown")])  # fmt: skip
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
-    assert judge.verdict([], 1.0, before, low, before, structured, judge.FAR) == word
+    assert errors.verdict([], 1.0, before, low, before, structured, errors.FAR) == word
 
 
 def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():

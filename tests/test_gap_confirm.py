@@ -13,13 +13,13 @@ import yaml
 from test_gap import SERVO, demo, mechanism_of, motion, plant_run
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap import confirm
-from dexsim.gap.catalogue import EFFECTS
-from dexsim.gap.confirm import Hypothesis, World, free_runs
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import conditions
-from dexsim.gap.search import JointSearch, Member
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.judge import full_model
+from dexsim.gap.judge.full_model import Hypothesis, World, free_runs
+from dexsim.gap.plant.case import build
+from dexsim.gap.read.runs import conditions
+from dexsim.gap.search.search import JointSearch, Member
 from dexsim.recording import read
 from dexsim.recording.mechanism import drive, mechanism, replay
 from dexsim.recording.schema import COMMANDS, Series
@@ -110,7 +110,7 @@ def replayed(effect: str, label: str, hidden: dict[str, float], x: list[float], 
     none = search.start()
     variant = next(v for v in EFFECTS[effect].variants(case.scales) if v.label == label)
     found = search.fit((Member(EFFECTS[effect], variant),), np.array(x), none)
-    return confirm.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
+    return full_model.confirm(m, runs, [case], [Hypothesis("believed", {"joint": none}), Hypothesis("found", {"joint": found})], [1], None, 4e-4)
 
 
 @pytest.mark.parametrize(("effect", "label", "hidden", "x", "servo", "temperature"), [
@@ -134,22 +134,22 @@ def test_what_training_cannot_be_given_is_not_confirmed():
     """The motor's servo has no linkage: the search's plant follows what it names, the engine does not, and both are said."""
     member = Member(EFFECTS["joint_coupling"], EFFECTS["joint_coupling"].variants(SimpleNamespace(others=("other",)))[1])
     trial = SimpleNamespace(members=(member,), fit=SimpleNamespace(params=member.variant.params, x=np.array([0.3])))
-    assert confirm.missing_of(Hypothesis("found", {"joint": trial})) == ["joint_coupling (linkage with other)@joint"]
-    c = confirm.Confirmation("C MuJoCo", 5e-4, {"believed": (6e-3, 6e-3), "found": (5e-3, 1e-3)}, {}, confirm.missing_of(Hypothesis("found", {"joint": trial})),
-                             [], confirm.agree(5e-3, 1e-3, 1e-3, 6e-3), 1e-3)  # fmt: skip
+    assert full_model.missing_of(Hypothesis("found", {"joint": trial})) == ["joint_coupling (linkage with other)@joint"]
+    c = full_model.Confirmation("C MuJoCo", 5e-4, {"believed": (6e-3, 6e-3), "found": (5e-3, 1e-3)}, {}, full_model.missing_of(Hypothesis("found", {"joint": trial})),
+                             [], full_model.agree(5e-3, 1e-3, 1e-3, 6e-3), 1e-3)  # fmt: skip
     assert not c.agrees and "Not confirmed" in c.text() and "joint_coupling (linkage with other)@joint" in c.text()
 
 
 @pytest.mark.parametrize(("engine", "word"), [(1.2e-3, True), (1.5e-3, True), (2.6e-3, False)])
 def test_confirmed_is_what_leaves_little_of_the_error_before(engine, word):
     """Floor 1 mrad, the plant leaves as much, 20 mrad before: within 1.3 x of it, or a tenth of the error before in squares."""
-    assert confirm.agree(engine, 1e-3, 1e-3, 20e-3) is word
-    assert confirm.agree(engine, 1e-3, 1e-3, 1.5e-3) is (engine < 1.3e-3)
+    assert full_model.agree(engine, 1e-3, 1e-3, 20e-3) is word
+    assert full_model.agree(engine, 1e-3, 1e-3, 1.5e-3) is (engine < 1.3e-3)
 
 
 def test_what_the_engine_follows_in_the_main_is_said_so():
     one = {"joint": (1e-3, 5e-4)}
-    c = confirm.Confirmation("C MuJoCo", 5e-4, {"believed": (6e-3, 6e-3), "found": (1e-3, 5e-4)}, one, [], ["a.mcap"], False, 4e-4)
+    c = full_model.Confirmation("C MuJoCo", 5e-4, {"believed": (6e-3, 6e-3), "found": (1e-3, 5e-4)}, one, [], ["a.mcap"], False, 4e-4)
     assert c.text() == "Replayed in the engine that trains, 1 mrad of 6 are left, more than in the search's own plant."
     c.errors["found"] = (5e-3, 5e-4)
     assert c.text().startswith("Not confirmed by the engine that trains: it leaves 5 mrad")
@@ -157,4 +157,4 @@ def test_what_the_engine_follows_in_the_main_is_said_so():
 
 def test_the_tasks_step_is_that_of_the_configuration():
     configured = yaml.safe_load((Path(__file__).parents[1] / "configs" / "config.yaml").read_text())
-    assert confirm.TASKS == configured["sim"]["timestep"]
+    assert full_model.TASKS == configured["sim"]["timestep"]

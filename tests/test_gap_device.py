@@ -8,12 +8,13 @@ import warp as wp
 from test_gap import demo, plant_run
 
 from dexsim.errors import UserError
-from dexsim.gap import command, together
-from dexsim.gap import plant as plants
-from dexsim.gap.plant_columns import INDEX
-from dexsim.gap.prepare import build
-from dexsim.gap.together import lanes
-from dexsim.gap.together import together as side_by_side
+from dexsim.gap import command
+from dexsim.gap.plant import batch as plants
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.search import parallel
+from dexsim.gap.search.parallel import lanes
+from dexsim.gap.search.parallel import together as side_by_side
 
 GPU = wp.get_cuda_device_count() > 0
 
@@ -90,10 +91,10 @@ def test_joints_side_by_side_come_back_in_order(monkeypatch):
     assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])  # each begins, and is half done
     with pytest.raises(ZeroDivisionError):
         side_by_side(names, lambda k, tell: 1 // 0, "cuda")
-    for given, cores in (("1", 1), ("4", 2), ("64", together.MOST_CPU), ("12", 6)):
+    for given, cores in (("1", 1), ("4", 2), ("64", parallel.MOST_CPU), ("12", 6)):
         monkeypatch.setenv("OMP_NUM_THREADS", given)
         assert lanes("cpu", 20) == max(1, min(cores, int(given) // plants.THREADS))
-    assert lanes("cpu", 1) == 1 and lanes("cuda", 20) == together.MOST_GPU
+    assert lanes("cpu", 1) == 1 and lanes("cuda", 20) == parallel.MOST_GPU
 
 
 def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dexsim.gap.fit import Fitted, Param
-from dexsim.gap.joint import stretched, traded
-from dexsim.gap.plant_columns import INDEX
-from dexsim.gap.prepare import build
-from dexsim.gap.search import JointSearch, Member, Trial
+from dexsim.gap.judge.joint import stretched, traded
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.search.fit import Fitted, Param
+from dexsim.gap.search.search import JointSearch, Member, Trial
 from tests.test_gap import model, plant_run
 
 

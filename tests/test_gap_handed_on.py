@@ -15,11 +15,11 @@ from dexsim.actuator.columns import INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.gap import standin
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import conditions
-from dexsim.gap.search import JointSearch
+from dexsim.gap.judge import residual_fit
+from dexsim.gap.plant.case import build
+from dexsim.gap.read.runs import conditions
+from dexsim.gap.search.search import JointSearch
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import realistic
@@ -85,7 +85,7 @@ def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fit
     """An effect that is not sure: its range is widened to the belief (1.09), half of the way at 0.75; its fitted value stays, other columns do not move."""
     from types import SimpleNamespace
 
-    from dexsim.gap.findings import widen
+    from dexsim.gap.judge.findings import widen
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1.09}}})
     table.set(JOINT, "torque_limit", fitted, low, high)
@@ -102,7 +102,7 @@ def test_what_reproduces_what_was_kept_out_is_handed_on_as_fitted_whatever_its_n
     1 - 0.3 of 0.84."""
     from types import SimpleNamespace
 
-    from dexsim.gap.findings import earned, widen
+    from dexsim.gap.judge.findings import earned, widen
 
     found = lambda after, *others: {"held_out": {"before": 1.0, "after": after}, "alternatives": [{"effect": "lag", "confidence": c} for c in others]}  # noqa: E731
     assert [earned(found(x)) for x in (1.2, 1.0, 0.95, 0.9, 0.2)] == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0]) and earned({"held_out": None}) == 0.0
@@ -181,7 +181,7 @@ def test_a_hand_with_play_in_every_joint_holds_what_it_catches(tmp_path):
 def test_model_file_is_the_hand_that_trains(tmp_path):
     from types import SimpleNamespace
 
-    from dexsim.gap.findings import model_changes, save_model
+    from dexsim.gap.judge.findings import model_changes, save_model
 
     spec = xhand.hand_spec()
     case = SimpleNamespace(joint=JOINT)
@@ -208,8 +208,8 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
     """kp (q - age v): a loop that acts on where the joint was 1 ms ago has kp * age less damping; where kd is unknown there is none to take it from."""
     from types import SimpleNamespace
 
-    from dexsim.gap.findings import servo_changes
-    from dexsim.gap.fit import Param
+    from dexsim.gap.judge.findings import servo_changes
+    from dexsim.gap.search.fit import Param
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
     age = Param("feedback_delay", ("feedback_delay",), "set", 0.0, 0.003, 0.0, "s", nuisance=True)
@@ -235,7 +235,7 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
     true = copy.deepcopy(table)
     true.set("joint", "standin_drag", drag)
     spec = mujoco.MjSpec.from_string(demo.MODEL)
-    from dexsim.gap.runs import Run
+    from dexsim.gap.read.runs import Run
     from dexsim.recording.mechanism import Mechanism
 
     runs = []
@@ -247,12 +247,12 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
         runs[-1].smooth()
     case = build(spec.compile(), runs)[0]
     none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
-    found = standin.fit(case, runs, none, [0, 2], [1])
+    found = residual_fit.fit(case, runs, none, [0, 2], [1])
     assert found is not None and found.after < 0.5 * found.before
     assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
     hand = ServoTable.from_dict(grasp_cfg()["servo"])
     found.joint = JOINT
-    standin.write(hand, [found], tmp_path / "servo_standin.yaml")
+    residual_fit.write(hand, [found], tmp_path / "servo_standin.yaml")
     env = grasp_env(f"servo_file={tmp_path / 'servo_standin.yaml'}", worlds=32)
     drawn = env.servo.params[:, xhand.JOINTS.index(JOINT), INDEX["standin_drag"]]
     assert float(drawn.min()) >= found.low[3] - 1e-6 and float(drawn.max()) <= found.high[3] + 1e-6 and float(drawn.std()) > 0
@@ -264,4 +264,4 @@ def test_no_stand_in_where_nothing_is_left():
         r.smooth()
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
     none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
-    assert standin.fit(case, runs, none, [0, 2], [1]) is None
+    assert residual_fit.fit(case, runs, none, [0, 2], [1]) is None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.inverse import believe, identify
+from dexsim.gap.search.inverse_dynamics import believe, identify
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.catalogue import EFFECTS
-from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import Run
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
+from dexsim.gap.read.runs import Run
 
 ROTOR, BOB = 5e-4, 0.2 * 0.1**2
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody>
@@ -88,7 +88,7 @@ def test_the_catalogue_offers_both_ends_of_a_linkage():
 def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
     from types import SimpleNamespace
 
-    from dexsim.gap import assemble
+    from dexsim.gap.judge import conclude
 
     def end(joint: str, other: str, sure: float) -> dict:
         return {"effect": "joint_coupling", "confidence": sure, "where": {"joints": [joint], "taxels": [], "topics": []}, "parameters": {"from_joint": {"value": other}}}
@@ -98,7 +98,7 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
         return SimpleNamespace(case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member])))
 
     lag = {"effect": "lag", "confidence": 0.9, "where": {"joints": ["b"], "taxels": [], "topics": []}, "parameters": {}}
-    found = assemble._linkages([end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")])
+    found = conclude._linkages([end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")])
     assert [(f["effect"], f["where"]["joints"], f["confidence"]) for f in found] == [("joint_coupling", ["b", "a"], 0.99), ("lag", ["b"], 0.9)]
     chain = [end("a", "b", 0.9), end("b", "c", 0.9)]
-    assert assemble._linkages(chain, []) == chain
+    assert conclude._linkages(chain, []) == chain

@@ -9,15 +9,15 @@ from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
-from dexsim.gap import jitter
-from dexsim.gap.catalogue import EFFECTS
-from dexsim.gap.findings import add_mass, finding_parameters
-from dexsim.gap.fit import intervals
-from dexsim.gap.mechanics import leaf_of
-from dexsim.gap.plant_columns import INDEX, SERIES_INDEX
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import Run, conditions
-from dexsim.gap.search import JointSearch
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.judge.findings import add_mass, finding_parameters
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
+from dexsim.gap.plant.mechanics import leaf_of
+from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.search import jitter
+from dexsim.gap.search.fit import intervals
+from dexsim.gap.search.search import JointSearch
 
 OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 

@@ -7,12 +7,13 @@ import pytest
 from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap import next_experiment, touch_rig
-from dexsim.gap.catalogue import CONFUSED, EFFECTS, SEPARATED, separating
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import conditions
-from dexsim.gap.search import JointSearch, Member
+from dexsim.gap.effects.catalogue import CONFUSED, EFFECTS, SEPARATED, separating
+from dexsim.gap.plant.case import build
+from dexsim.gap.read.runs import conditions
+from dexsim.gap.report import next_experiment
+from dexsim.gap.search.search import JointSearch, Member
+from dexsim.gap.touch import press_rig
 from dexsim.recording import read
 from dexsim.recording.mechanism import Mechanism
 
@@ -69,7 +70,7 @@ def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
 
 
 def test_touch_asks_for_the_same_presses_with_a_load_cell(tmp_path):
-    paths, rig, servo = touch_rig.record(tmp_path / "rig", 2, 6.0, seed=6, load_cell=False, stiffness=4500.0)
+    paths, rig, servo = press_rig.record(tmp_path / "rig", 2, 6.0, seed=6, load_cell=False, stiffness=4500.0)
     d = diagnose(Settings(paths, tmp_path / "out", None, str(rig), str(servo)), say=lambda _: None)
     written = save(d, tmp_path / "out")
     n = d.data["next_recording"]

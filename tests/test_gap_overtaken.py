@@ -6,7 +6,7 @@ from types import SimpleNamespace as Plain
 
 import pytest
 
-from dexsim.gap.search import JointSearch
+from dexsim.gap.search.search import JointSearch
 
 
 def hypothesis(*ids):

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dexsim.gap import demo, touch_rig
+from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.write import grouped
+from dexsim.gap.report.files import grouped
+from dexsim.gap.touch import press_rig
 
 CHROMIUM = next((p for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (p := shutil.which(name))), None)
 PROBE = """<script>
@@ -51,7 +52,7 @@ def pages(tmp_path_factory):
     out = {}
     paths, model, servo, _ = demo.make(folder / "joint", "command_delay", seconds=4.0, joint="knuckle")
     out["joint"] = Settings(paths, folder / "joint_out", None, str(model), str(servo), next_recording=False)
-    paths, model, servo = touch_rig.record(folder / "touch", 2, 5.0, gains={54: 0.4, 66: 0.0})
+    paths, model, servo = press_rig.record(folder / "touch", 2, 5.0, gains={54: 0.4, 66: 0.0})
     out["touch"] = Settings(paths, folder / "touch_out", None, str(model), str(servo), next_recording=False)
     from dexsim.recording import read, write
 

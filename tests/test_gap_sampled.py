@@ -8,11 +8,11 @@ import pytest
 from test_gap import SERVO, model, motion
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.plant_columns import INDEX
-from dexsim.gap.prepare import build
-from dexsim.gap.runs import Run
-from dexsim.gap.search import JointSearch
-from dexsim.gap.sharpen import _true
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.coupled_motion import _true
+from dexsim.gap.read.runs import Run
+from dexsim.gap.search.search import JointSearch
 
 FREE = SERVO | {"coulomb_friction": 0.0, "torque_limit": 1e3, "no_load_speed": 1e6}
 

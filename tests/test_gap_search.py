@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from dexsim.gap import assemble, judge, together
 from dexsim.gap.command import Progress
-from dexsim.gap.fit import Fitted, Fitter, Param, prior_weight
-from dexsim.gap.joint import STRETCHED, stretched
-from dexsim.gap.prepare import REFERENCE, build
-from dexsim.gap.search import JointSearch, Member, subset
+from dexsim.gap.judge import conclude, errors
+from dexsim.gap.judge.joint import STRETCHED, stretched
+from dexsim.gap.plant.case import REFERENCE, build
+from dexsim.gap.search import parallel
+from dexsim.gap.search.fit import Fitted, Fitter, Param, prior_weight
+from dexsim.gap.search.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
 
 
@@ -72,7 +73,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
         search = SimpleNamespace(case=SimpleNamespace(told=told), polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
-        return assemble._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
+        return conclude._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
     assert reason(5.0, 4.5, 1.3, 0.8, 5.7) == ""  # refuted
@@ -85,7 +86,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
 
 def test_what_only_the_recording_kept_out_shows_is_said():
     def alone(before: float, fitted: float, *found: dict) -> list[str]:
-        return assemble._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
+        return conclude._shown_there_alone({"a": {"before": before, "fitted": fitted, "sigma": 1.0}}, list(found))
 
     assert alone(16.0, 1.0) == ["a"]
     assert not alone(16.0, 9.0) and not alone(3.0, 1.0)  # the others show it too; next to nothing
@@ -95,7 +96,7 @@ def test_what_only_the_recording_kept_out_shows_is_said():
 @pytest.mark.parametrize(("confidence", "group", "word"), [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")])
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
     finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
-    assert judge.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
+    assert errors.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 
 def test_temperature_counts_from_that_of_a_data_sheet():
@@ -103,7 +104,7 @@ def test_temperature_counts_from_that_of_a_data_sheet():
     for run, heat in zip(runs, (40.0, 55.0), strict=True):
         run.temperature = np.full((len(run.t), 1), heat)
     case = build(model(), runs)[0]
-    from dexsim.gap.plant_columns import SERIES_INDEX
+    from dexsim.gap.plant.columns import SERIES_INDEX
 
     warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
     assert warmth.min() == pytest.approx(40 - REFERENCE) and warmth.max() == pytest.approx(55 - REFERENCE)
@@ -152,7 +153,7 @@ def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeyp
             tell(part)
         return k
 
-    assert together.together(["knuckle"], work, "cpu", Progress()) == [0]
+    assert parallel.together(["knuckle"], work, "cpu", Progress()) == [0]
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == ["searching knuckle (1/1)", "searching knuckle (1/1)", "searching knuckle (1/1), about 36 s left",
                                                 "searching knuckle (1/1), about 16 s left", "searched 1 in 20 s"]  # fmt: skip
@@ -176,7 +177,7 @@ def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
         r.smooth()
     case = build(model(), [run])[0]
     windows = case.plant.windows(None)
-    error = lambda underway: np.sqrt(np.mean((case.plant.q[windows.sample_row] - judge.free_run(case, [], np.zeros(0), windows, underway=underway)[0]) ** 2))  # noqa: E731
+    error = lambda underway: np.sqrt(np.mean((case.plant.q[windows.sample_row] - errors.free_run(case, [], np.zeros(0), windows, underway=underway)[0]) ** 2))  # noqa: E731
     case.regimes["_speed"] = case.regimes["_speed"].copy()
     case.regimes["_speed"][0] = case.scales.speed
     assert error(True) < 0.7 * error(False)

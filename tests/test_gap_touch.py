@@ -7,10 +7,15 @@ import json
 import numpy as np
 import pytest
 
-from dexsim.gap import confidence, inputs, touch, touch_data, touch_plant, touch_rig, touch_search
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.runs import Run
-from dexsim.gap.touch_effects import TOUCH, confusable
+from dexsim.gap.effects.touch import TOUCH, confusable
+from dexsim.gap.judge import confidence
+from dexsim.gap.read import inputs
+from dexsim.gap.read.runs import Run
+from dexsim.gap.touch import plant as touch_plant
+from dexsim.gap.touch import press_rig, touch
+from dexsim.gap.touch import read as touch_read
+from dexsim.gap.touch import search as touch_search
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import mechanism
 from dexsim.tactile import reference as ref
@@ -18,18 +23,18 @@ from dexsim.tactile import reference as ref
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    return touch_rig.record(tmp_path_factory.mktemp("plain"), 3, 6.0, seed=1)
+    return press_rig.record(tmp_path_factory.mktemp("plain"), 3, 6.0, seed=1)
 
 
 def collected(paths, model, servo):
     m = mechanism(model, servo)
     recordings = [read(p, joints=m.joints, audit=False) for p in paths]
-    return touch_data.collect(recordings, m), recordings, m
+    return touch_read.collect(recordings, m), recordings, m
 
 
 def found(folder, seconds=7.0, **planted):
     """The touch of three rig recordings with what was planted."""
-    paths, model, servo = touch_rig.record(folder, 3, seconds, seed=4, **planted)
+    paths, model, servo = press_rig.record(folder, 3, seconds, seed=4, **planted)
     m = mechanism(model, servo)
     return touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set())
 
@@ -81,7 +86,7 @@ def test_a_slipping_bristle_stops_at_friction_times_force(plain):
     run.z[:, [60, 61]] = 1.0, 2.0
     run.pressed = run.z > 0
     out = touch_plant.shear(run, touch_plant.neutral() | {"mu": 0.5})
-    assert out[-1, 0] == pytest.approx(0.5 * touch_data.FRICTION * 3.0) and out[-1, 1] == 0
+    assert out[-1, 0] == pytest.approx(0.5 * touch_read.FRICTION * 3.0) and out[-1, 1] == 0
     early = 5  # before anything slips: stiffness times area times path
     k = touch_plant.SHEAR_STIFFNESS * run.area[[60, 61]].sum()
     assert out[early, 0] == pytest.approx(k * (np.interp(run.t[early], run.grid, run.slide[:, 0]) - np.interp(run.t[0], run.grid, run.slide[:, 0])), rel=1e-6)
@@ -157,7 +162,7 @@ def test_without_a_load_cell_gain_and_stiffness_are_a_set(tmp_path):
 
 
 def test_the_rig_is_diagnosed_from_end_to_end(tmp_path):
-    paths, model, servo = touch_rig.record(tmp_path / "rig", 3, 7.0, seed=5, sensor={"delay": 0.06})
+    paths, model, servo = press_rig.record(tmp_path / "rig", 3, 7.0, seed=5, sensor={"delay": 0.06})
     d = diagnose(Settings(paths, tmp_path / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None)
     save(d, tmp_path / "out")
     data = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
@@ -177,7 +182,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
     bare = tmp_path / "bare.xml"
     bare.write_text(model.read_text().replace('<geom name="ball"', '<geom name="ball" group="1"').replace('type="sphere" ', 'type="ellipsoid" ').replace('"0.012"', '"0.012 0.012 0.012"'))
     m = mechanism(model, servo)
-    from dexsim.gap import touch_data as td
+    from dexsim.gap.touch import read as td
 
     kinds, td.KINDS = td.KINDS, {}
     try:
@@ -189,7 +194,7 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 
 
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
-    paths, model, servo = touch_rig.record(tmp_path, 3, 6.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
+    paths, model, servo = press_rig.record(tmp_path, 3, 6.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
     m = mechanism(model, servo)
     out = touch.diagnose([read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set())
     assert not out.findings and any("tactile_lsb is unknown" in n for n in out.notes)

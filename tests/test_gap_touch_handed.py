@@ -15,11 +15,11 @@ from dexsim.assets import xhand
 from dexsim.cli import help as help_page
 from dexsim.cli import start
 from dexsim.errors import UserError
-from dexsim.gap import touch_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.touch_effects import TOUCH
-from dexsim.gap.touch_handed import HEAD, PadFacts, chord, handed
-from dexsim.gap.touch_handed import save as write
+from dexsim.gap.effects.touch import TOUCH
+from dexsim.gap.touch import press_rig
+from dexsim.gap.touch.handed_on import HEAD, PadFacts, chord, handed
+from dexsim.gap.touch.handed_on import save as write
 from dexsim.recording import read
 from dexsim.tactile.file import load
 
@@ -27,7 +27,7 @@ INDEX, MID = 1, 2
 
 
 def diagnosed(folder, **planted):
-    paths, model, servo = touch_rig.record(folder / "rig", 3, 7.0, seed=5, **planted)
+    paths, model, servo = press_rig.record(folder / "rig", 3, 7.0, seed=5, **planted)
     d = diagnose(Settings(paths, folder / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None)
     save(d, folder / "out")
     return d, folder / "out" / "tactile.yaml"
@@ -66,8 +66,8 @@ def test_from_a_recording_to_the_worlds_that_train(late):
 
 def test_the_sensor_that_trains_reads_what_was_recorded(late, tmp_path):
     """The same motion felt by training's own kernels: with the file's best guess the readings are those of the recording."""
-    recorded, plain, same = (read(touch_rig.record(tmp_path / str(k), 1, 7.0, seed=5, **settings)[0][0], audit=False).tactile.value * touch_rig.LSB
-                             for k, settings in enumerate(({"sensor": {"delay": 0.06}}, {}, touch_rig.as_trained(yaml.safe_load(late[1].read_text())))))  # fmt: skip
+    recorded, plain, same = (read(press_rig.record(tmp_path / str(k), 1, 7.0, seed=5, **settings)[0][0], audit=False).tactile.value * press_rig.LSB
+                             for k, settings in enumerate(({"sensor": {"delay": 0.06}}, {}, press_rig.as_trained(yaml.safe_load(late[1].read_text())))))  # fmt: skip
     rms = [float(np.sqrt(np.mean((x - recorded)[recorded > 0] ** 2))) for x in (plain, same)]
     assert rms[0] > 0.15 and rms[1] < 0.02, rms
 

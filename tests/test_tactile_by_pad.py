@@ -12,7 +12,7 @@ from worlds import grasp_cfg, grasp_env
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.gap import touch_plant
+from dexsim.gap.touch import plant as touch_plant
 from dexsim.tactile import ShapeSet, Tactile, xhand_layout
 from dexsim.tactile import reference as ref
 from dexsim.tactile.config import tactile_config
@@ -174,10 +174,10 @@ def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the counts."""
     from test_gap_touch import collected
 
-    from dexsim.gap import touch_rig
+    from dexsim.gap.touch import press_rig
 
     pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 2 / 90}}
-    paths = touch_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})
+    paths = press_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})
     run = collected(*paths)[0].runs[0]
     v = touch_plant.neutral() | {"gain": 0.8, "neighbours": 0.25, "fraction": 0.3, "time_constant": 0.4, "delay": 2 / 90}
     on = run.z.max(1) > 0

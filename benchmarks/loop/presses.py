@@ -36,9 +36,9 @@ DRAWN = 0.25  # share of what was found by which training draws about it, at mos
 
 def rig(finger: str):
     """The press rig of `touch_rig` with a third slide, so that the ball reaches all of the pad: spec."""
-    from dexsim.gap import touch_rig
+    from dexsim.gap.touch import press_rig
 
-    s, _, direction, along = touch_rig.spec(finger)
+    s, _, direction, along = press_rig.spec(finger)
     side = s.body("slider")
     side.add_joint(name="across", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.cross(-direction, along).tolist(), range=[-0.025, 0.02])
     s.joint("slide").range = [-0.02, 0.02]
@@ -67,7 +67,7 @@ def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> 
 def record(given: dict[str, str]) -> None:
     """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are led by hand)."""
     from dexsim.cli.build import quiet_warp
-    from dexsim.gap.touch_rig import SERVO
+    from dexsim.gap.touch.press_rig import SERVO
 
     quiet_warp("cpu")
     world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
@@ -95,7 +95,7 @@ class Sensor:
 
         from dexsim.assets import xhand
         from dexsim.assets.objects import library
-        from dexsim.gap.touch_rig import RADIUS
+        from dexsim.gap.touch.press_rig import RADIUS
         from dexsim.tactile.layout import xhand_layout
         from dexsim.tactile.posed import PosedEngine
         from dexsim.tactile.shapes import ShapeSet

@@ -72,7 +72,7 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
     result["found"] = found
     result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
     # the tool's own stage for a logged motor torque, as its report has it
-    from dexsim.gap.inverse import LAG, SQUARE, identify
+    from dexsim.gap.search.inverse_dynamics import LAG, SQUARE, identify
 
     given = {n: force.load(data, n) for n in force.FILES}
     tool = identify(*given["estimation"], test=given["pulses"])

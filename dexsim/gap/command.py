@@ -109,13 +109,13 @@ def main(argv: list[str]) -> int:
 
         print(describe())
         return 0
-    from dexsim.cli.build import quiet_warp
-    from dexsim.gap import inputs
     from dexsim.actuator.columns import did_you_mean
-    from dexsim.gap.catalogue import EFFECTS
-    from dexsim.gap.confirm import REPLAY
+    from dexsim.cli.build import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.gap.touch_effects import BY_ID
+    from dexsim.gap.effects.catalogue import EFFECTS
+    from dexsim.gap.effects.touch import BY_ID
+    from dexsim.gap.judge.full_model import REPLAY
+    from dexsim.gap.read import inputs
 
     start = time.perf_counter()
     device = given.get("device", "cpu")
@@ -196,8 +196,8 @@ class Progress:
 
 def verdict(d) -> str:
     """The verdict in at most ten lines."""
-    from dexsim.gap.charts import number
-    from dexsim.gap.sentence import place
+    from dexsim.gap.report.charts import number
+    from dexsim.gap.report.sentence import place
 
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]

@@ -11,21 +11,26 @@ from typing import Any
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.gap import channels, confidence, confirm, ends, excluded, inputs, inverse, judge, stage, standin, touch, touch_handed
-from dexsim.gap.assemble import add_behind, assemble
-from dexsim.gap.catalogue import EFFECTS
-from dexsim.gap.joint import Kept
-from dexsim.gap.next_experiment import rival_of
-from dexsim.gap.next_recording import plan_next
-from dexsim.gap.prepare import Case, build
+from dexsim.gap.effects import not_considered
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.effects.touch import entry
+from dexsim.gap.judge import confidence, errors, full_model, residual_fit
+from dexsim.gap.judge.conclude import add_behind, assemble
+from dexsim.gap.judge.joint import Kept
+from dexsim.gap.plant.case import Case, build
+from dexsim.gap.plant.coupled_motion import again, coupled, sharpen
+from dexsim.gap.read import channels, end_stops, inputs, stage_tests
+from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.report.files import plain, save
+from dexsim.gap.report.next_experiment import rival_of
+from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Clock, Diagnosis, Settings, empty
-from dexsim.gap.runs import Run, conditions
-from dexsim.gap.search import JointSearch, Outcome, Trial
-from dexsim.gap.sharpen import again, coupled, sharpen
-from dexsim.gap.together import together
-from dexsim.gap.touch_effects import entry
-from dexsim.gap.with_touch import add_touch, touch_alone
-from dexsim.gap.write import plain, save
+from dexsim.gap.search import inverse_dynamics
+from dexsim.gap.search.parallel import together
+from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.touch import handed_on as touch_handed
+from dexsim.gap.touch import touch
+from dexsim.gap.touch.merge import add_touch, touch_alone
 from dexsim.recording.mechanism import Mechanism
 
 KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
@@ -105,7 +110,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         if felt.before is None and not felt.findings:
             return _unusable(reason, channel, notes, m)
         notes.append(f"no joint is judged: {reason}")
-        left_out = excluded.reasons((), felt, s.allowed)
+        left_out = not_considered.reasons((), felt, s.allowed)
         notes.extend(_cannot(s, left_out))
         out = touch_alone(channel, felt, notes, m)
         out.data["unexplained"]["not_considered"] = left_out
@@ -130,8 +135,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if s.held_out and not held:
         notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
     model = m.spec.compile()
-    notes += _limits(model, runs) + ends.used(model, [r for i, r in enumerate(runs) if i not in held])
-    pressed = ends.unforeseen(model, [runs[i] for i in held])
+    notes += _limits(model, runs) + end_stops.used(model, [r for i, r in enumerate(runs) if i not in held])
+    pressed = end_stops.unforeseen(model, [runs[i] for i in held])
     if pressed:
         runs, held = inputs.free_air(runs, held, inputs.merged_spans(pressed), notes, "presses against an end of its motion that no recording for the fit has shown")
         if s.held_out and not held:
@@ -146,8 +151,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     say(f"{len(runs)} recordings, {sum(r.duration for r in runs):.0f} s, {len(runs[0].joints)} joint{'s' * (len(runs[0].joints) > 1)}")
     cases = build(model, runs, device=s.device, dt=_step(runs))
     cases = sharpen(model, runs, cases, s.device, _step(runs), only=s.joints)
-    left_out = excluded.reasons(cases, felt, s.allowed)
-    notes += _cannot(s, left_out) + excluded.not_fitted(cases)
+    left_out = not_considered.reasons(cases, felt, s.allowed)
+    notes += _cannot(s, left_out) + not_considered.not_fitted(cases)
     if s.joints is not None:
         cases = [c for c in cases if c.joint in s.joints]
         if not cases:
@@ -158,7 +163,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
     train, test, span_train, span_test, how = _split(runs, held, group)
     say(f"kept out of the fit: {how}")
-    floor, floor_how = judge.floor(runs, cases)
+    floor, floor_how = errors.floor(runs, cases)
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
     def begun(k: int, tell: Callable[[float], None]) -> JointSearch:
@@ -183,13 +188,13 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         if all(t is not None for t in first):
             cases = again(model, runs, cases, first, s.device, _step(runs))
         clock.lap("model along the motion")
-    stages = stage.tests(cases, runs, train, s.seed)
+    stages = stage_tests.tests(cases, runs, train, s.seed)
     for x in stages[:4]:
         say(f"  {x.text}")
-    by_torque = inverse.found(cases, runs, train, test, s.seed)
-    behind = inverse.texts(by_torque)
+    by_torque = inverse_dynamics.found(cases, runs, train, test, s.seed)
+    behind = inverse_dynamics.texts(by_torque)
     nothing_believed = [c.joint for c, _, _ in by_torque if "coulomb_friction" in c.unknown]
-    notes += inverse.believe(by_torque)
+    notes += inverse_dynamics.believe(by_torque)
     for x in behind[:4]:
         say(f"  {x}")
     clock.lap("stage tests")
@@ -212,8 +217,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("search")
     result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes)
     result.stages = [x.text for x in stages] + behind
-    add_behind(result, inverse.findings(by_torque, nothing_believed, runs, train), by_torque)
-    inverse.write(by_torque, result.servo, nothing_believed)
+    add_behind(result, inverse_dynamics.findings(by_torque, nothing_believed, runs, train), by_torque)
+    inverse_dynamics.write(by_torque, result.servo, nothing_believed)
     result.data["unexplained"]["not_considered"] = left_out
     add_touch(result, felt)
     result.lengths = lengths
@@ -237,7 +242,7 @@ def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, 
             continue
         claimed = any(case.joint in f["where"]["joints"] and entry(f) is not None for f in d.data["findings"])
         trial = search.polish(outcome.best if claimed else outcome.none)
-        found = standin.fit(case, runs, trial, train, test, span_train, span_test, seed)
+        found = residual_fit.fit(case, runs, trial, train, test, span_train, span_test, seed)
         if found is not None:
             d.standins.append(found)
             d.notes.append(found.text)
@@ -252,17 +257,17 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
     searches = {case.joint: (search, outcome) for case, search, outcome in outcomes}
     none = {case.joint: search.polish(outcome.none) for case, search, outcome in outcomes}
     final = none | {j: searches[j][0].polish(searches[j][1].best) for j in claimed}
-    hypotheses = [confirm.Hypothesis("believed", none)] + ([confirm.Hypothesis("found", final)] if claimed else [])
+    hypotheses = [full_model.Hypothesis("believed", none)] + ([full_model.Hypothesis("found", final)] if claimed else [])
     for f in named:
         rivals = [a["effect"] for a in f["alternatives"]]
         joint = f["where"]["joints"][0]
         other = rival_of(*searches[joint], f["effect"], rivals[0]) if rivals else None
         if other is not None:
-            hypotheses.append(confirm.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}))
+            hypotheses.append(full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}))
             break
     try:
         finer = [replace(case, plant=search.whole) for case, search, _ in outcomes]
-        found = confirm.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device, s.replay, finer=finer)
+        found = full_model.confirm(m, runs, [case for case, _, _ in outcomes], hypotheses, test, span_test, floor, s.device, s.replay, finer=finer)
     except UserError as error:
         d.notes.append(f"not replayed in the engine that trains: {error}")
         return
@@ -339,7 +344,7 @@ def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
 
 def _cannot(s: Settings, left_out: dict[str, str]) -> list[str]:
     """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
-    from dexsim.gap.touch_effects import BY_ID
+    from dexsim.gap.effects.touch import BY_ID
 
     asked = [e for e in sorted(s.allowed or ()) if e in left_out]
     return [f"{e} cannot be seen here: {left_out[e]}; to see it: {(EFFECTS.get(e) or BY_ID[e]).experiment}" for e in asked]

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap import confidence, confirm, locate, standin, touch
-from dexsim.gap.search import Outcome
+from dexsim.gap.judge import confidence, full_model, residual_fit
+from dexsim.gap.locate import bins
+from dexsim.gap.search.search import Outcome
+from dexsim.gap.touch.touch import TouchResult
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -56,7 +58,7 @@ class Diagnosis:
     sentence: str
     notes: list[str]
     curves: list[Curve] = field(default_factory=list)
-    spots: list[locate.Spot] = field(default_factory=list)
+    spots: list[bins.Spot] = field(default_factory=list)
     joints: dict[str, dict[str, float]] = field(default_factory=dict)  # by joint: before, after, sigma; as_fitted: after, where it was taken back
     outcomes: list[Outcome] = field(default_factory=list)
     servo: ServoTable | None = None
@@ -65,12 +67,12 @@ class Diagnosis:
     stages: list[str] = field(default_factory=list)
     shares: dict[str, float] = field(default_factory=dict)
     spans: dict[str, float] = field(default_factory=dict)
-    touch: touch.TouchResult | None = None
+    touch: TouchResult | None = None
     lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
-    standins: list[standin.StandIn] = field(default_factory=list)
+    standins: list[residual_fit.StandIn] = field(default_factory=list)
     mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
     untrained: list[str] = field(default_factory=list)
-    confirmation: confirm.Confirmation | None = None
+    confirmation: full_model.Confirmation | None = None
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
 
 

@@ -1,6 +1,6 @@
 """What is known of single pads (`tactile.pads`), between what a skin feels and what its sensor reports.
 
-Order, that of `dexsim.gap.touch_plant`: spread by rubber -> hysteresis -> neighbours -> exchanged wires -> gain -> (noise,
+Order, that of `dexsim.gap.touch.plant`: spread by rubber -> hysteresis -> neighbours -> exchanged wires -> gain -> (noise,
 threshold, counts: `dexsim.tactile.measure`) -> stuck -> delay by pad. Nothing here is compiled or launched without
 `tactile.pads`. Plain kernels, a thread for each pad or taxel, the same on every device; launches only, on memory that never
 moves, so that they can be recorded.

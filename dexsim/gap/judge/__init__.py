@@ -1,0 +1,1 @@
+"""Step 5: held-out errors, confidence, findings and the verdict."""

@@ -1,0 +1,208 @@
+"""From the search's answers to the diagnosis: findings with their doubts, the verdict, the fitted servo and model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dexsim.gap.effects.touch import entry
+from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
+from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances
+from dexsim.gap.locate import bins
+from dexsim.gap.plant.case import Case
+from dexsim.gap.report.sentence import sentence
+from dexsim.gap.result import Diagnosis, Settings, empty
+from dexsim.gap.search.search import ENOUGH, JointSearch, Outcome
+from dexsim.recording.mechanism import Mechanism
+
+DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
+NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
+SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
+ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
+
+
+def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]], kept: Kept, floor: tuple[float, str], how: str,
+             channel: list[dict[str, Any]], notes: list[str]) -> Diagnosis:
+    """The diagnosis of the joints.
+
+    outcomes: what the search answered of each; floor: of the noise [rad or m], and where it comes from; how: what was kept out, in words;
+    channel: findings about signals, of all joints; notes: what the page says beside the findings, added to."""
+    data = empty("none")
+    data["noise_floor"] = {"position_rad": float(floor[0]), "how": floor[1]}
+    out = Diagnosis(data, "", notes, mechanism=m)
+    rng = np.random.default_rng(s.seed)
+    answers = [JointAnswer(case, search, outcome, kept) for case, search, outcome in outcomes]
+    findings: list[dict[str, Any]] = []
+    spots = []
+    for a in answers:
+        joint = a.case.joint
+        findings += a.findings(m)
+        out.evidence += a.evidence
+        out.spans |= a.spans
+        out.joints[joint] = a.numbers
+        out.mae |= {(joint, name): v for name, v in a.mae().items()}
+        out.outcomes.append(a.outcome)
+        data["nuisance"] |= a.nuisance
+        mine, depends = a.spots(rng, s.seed)
+        spots += mine
+        data["unexplained"]["depends_on"] += depends
+        if (curve := a.curve()) is not None:
+            out.curves.append(curve)
+    out.spots = bins.control(spots)
+    refuted = _take_back(out, answers, findings)
+    findings = [f for f in findings if f["effect"] == "current_sensor" or not set(f["where"]["joints"]) & refuted]
+    for joint in _shown_there_alone(out.joints, findings) if s.held_out else ():
+        v = out.joints[joint]
+        notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
+                     "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
+    findings.sort(key=lambda f: -_weight(f))
+    _doubts(out, findings, channel)
+    _hand_on(out, m, [a for a in answers if a.case.joint not in refuted], findings)
+    findings = _linkages(findings, answers)
+    data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
+    _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed)
+    out.sentence = sentence(data, out, floor[0])
+    return out
+
+
+def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:
+    """Joints whose findings did not help on what was kept out: they keep none of them, and are left as they were believed."""
+    refuted = set()
+    for a in answers:
+        joint = a.case.joint
+        mine = [f for f in findings if joint in f["where"]["joints"] and f["effect"] != "current_sensor"]
+        v = d.joints[joint]
+        if not mine or v["after"] < 0.98 * v["before"]:
+            continue
+        reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
+        if reason:
+            for e in d.evidence:
+                if e.joint == joint and e.effect != "current_sensor":
+                    e.reasons.append(reason)
+                    e.confidence = min(e.confidence, confidence.DOUBTED)
+            continue
+        refuted.add(joint)
+        d.notes += [f"{f['effect']} on {joint} earned its place on the training conditions but not on what was kept out; not claimed" for f in mine]
+        d.data["nuisance"] = {key: x for key, x in d.data["nuisance"].items() if not key.endswith(f"@{joint}")} | nuisances(joint, a.none)
+        v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
+    return refuted
+
+
+def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> None:
+    """The fitted servo and model; what is not sure reaches towards what was believed."""
+    servo, spec, changed, untrained = copy.deepcopy(m.table), m.spec.copy(), False, set()
+    for a in answers:
+        untrained |= set(servo_changes(servo, a.case, a.best, a.bounds, m.joints))
+        texts = list(model_changes(spec, a.case, a.best, a.raw))
+        changed |= bool(texts)
+        d.notes += texts
+    members = {(a.case.joint, mm.id): (a.case, mm) for a in answers for mm in a.outcome.best.members}
+    for f in findings:
+        joint, effect = f["where"]["joints"][0], f["effect"]
+        if f["confidence"] < DOUBTED and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"], earned(f)):
+            d.notes.append(f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed")
+    d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
+
+
+def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings: list[dict[str, Any]], refuted: set[str], floor: float, how: str,
+             seed: int) -> None:
+    """Errors over all joints on what was kept out, and the word for it."""
+    data, times = d.data, [a.t for a in answers]
+    b, bl, bh = errors.rms_interval([a.before for a in answers], times, seed)
+    a, al, ah = errors.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
+    slide = all(x.case.constants.slide for x in answers)
+    data["held_out"] = {"recordings": [kept.runs[i].name for i in kept.test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
+                        "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}  # fmt: skip
+    structured = any(x.outcome.none.fit.loss > 1.3**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
+    data["verdict"] = errors.verdict(data["findings"], floor, b, bl, a, structured, errors.FAR)
+    if findings and all(f["effect"] == "current_sensor" for f in findings):
+        data["verdict"] = "explained"
+        squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
+        eb, ea = (float(np.sqrt(np.concatenate([x for x in xs if x is not None]).mean())) for xs in squares)
+        data["held_out"] |= {"error": "effort_rmse_Nm", "before": eb, "after": ea, "before_low": eb, "before_high": eb, "after_low": ea, "after_high": ea}
+    gap = b**2 - floor**2
+    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * floor else 0.0
+    if data["verdict"] in ("none", "explained"):
+        data["unexplained"]["depends_on"] = []
+
+
+def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
+    """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing (a limit, a sag) shows
+    there alone, and what is kept out must not be fitted."""
+    found = {j for f in findings for j in f["where"]["joints"]}
+    return [j for j, v in joints.items() if j not in found and v["before"] > max(errors.FAR * v["sigma"], ALONE * v["fitted"])]
+
+
+def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
+    """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are doubted, not dropped; empty
+    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there. What the
+    recorded torque has told of a joint is known: nothing that is not shown goes beyond it."""
+    if search.case.told:
+        return ""
+    before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
+    if before > ENOUGH**2 and after < (1 - SIDES) * before:
+        return "what was kept out is followed better from moment to moment, but not by a free run"
+    sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
+    plain = outcome.none.fit.loss > ENOUGH**2 and search.gain(outcome.best, outcome.none) >= SIDES
+    return "what was kept out does not show it" if sides_with_neither and plain else ""
+
+
+def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str, Any]]) -> None:
+    """Confidences of the joints' findings (the weightiest first), after what they and the signals say of each other."""
+    by = {(e.joint, e.effect): e for e in d.evidence}
+    mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
+    for joint in {e.joint for e in mine}:
+        confidence.together([e for e in mine if e.joint == joint])
+    coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if f["effect"] == "joint_coupling"}
+    confidence.of_the_whole(mine, coupled, {j for f in channel for j in f["where"]["joints"]})
+    for f, e in zip(findings, mine, strict=True):
+        f["confidence"] = round(e.confidence, 3)
+        d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]
+    d.evidence = mine
+
+
+def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:
+    """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is the end that is
+    dragged, where one of them feels only the pull; the name is as sure as its surer end."""
+    pulled = {a.case.joint for a in answers for mm in a.outcome.best.members if mm.id == "joint_coupling" and mm.variant.params[0].columns == ("reaction",)}
+    ends = {(f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f for f in findings if f["effect"] == "joint_coupling"}
+    out = list(findings)
+    for (joint, other), f in ends.items():
+        second = ends.get((other, joint))
+        if second is None or f not in out or second not in out:
+            continue
+        first, second = (second, f) if joint in pulled and other not in pulled else (f, second)
+        place = min(out.index(first), out.index(second))
+        out = [x for x in out if x is not first and x is not second]
+        joints = [*first["where"]["joints"], *second["where"]["joints"]]
+        out.insert(place, first | {"where": first["where"] | {"joints": joints}, "confidence": max(first["confidence"], second["confidence"])})
+    return out
+
+
+def _weight(f: dict) -> float:
+    h = f["held_out"]
+    return (h["before"] - h["after"]) if h else 0.0
+
+
+def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
+    """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque that is left
+    on the recording kept out, where the loop's own error shows nothing."""
+    if not findings:
+        return
+    data = d.data
+    shown = [f for f in data["findings"] if entry(f) is not None]
+    taken = {(f["effect"], *f["where"]["joints"]) for f in shown}
+    data["findings"] += [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
+    if not shown:
+        judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in findings)]
+        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]  # not what the catalogue has no name for
+        b, a = (float(np.sqrt(sum(y**2 for y in ys))) for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last]))
+        data["held_out"] = {"recordings": judged[0][1], "error": findings[0]["held_out"]["error"], "before": b, "after": a, "before_low": None, "before_high": None,
+                            "after_low": None, "after_high": None, "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere"}  # fmt: skip
+        data["verdict"] = "partly_explained" if a < 0.7 * b else "unknown"
+        data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
+    d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])

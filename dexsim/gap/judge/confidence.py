@@ -1,0 +1,211 @@
+"""How sure a name is: the share of the bootstraps that it wins, and every reason to doubt it.
+
+A confidence is used as a probability, so whatever else could have made the same trace has to lower it: an effect whose interval
+holds "nothing missing", a size that stopped at a physical bound, a second effect that explains little of what the first one left,
+three effects where a machine has one, a temperature that follows the clock. Each reason is a line that the page shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.columns import INDEX, NEUTRAL
+
+DOUBTED = 0.7  # what a name keeps at most where one reason speaks against it: below what counts as confident
+SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say what an effect is like, not how large it is
+CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
+NEEDED = 1.3  # x the noise: an error within it asks for no effect
+SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
+SPREAD = 0.15  # share that neighbours may take over because pressure spreads by another law (foundation or half-space) than the plant's
+FROM_POSES = ("payload", "inertia", "joint_coupling")  # effects told from the pose and the motion of other joints
+FAST = ("command_delay", "lag", "inertia")  # effects that hold back what is fast: what one's size is off by another makes up for
+ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
+
+
+@dataclass
+class Evidence:
+    """What speaks for and against one finding. share: of the bootstraps; earned: 1 where dropping it costs a tenth of the error
+    kept out; left, left_of_rest: squared error kept out that stays, over that before anything was named, and over that without
+    this effect alone; folds: relative cost of dropping it on each condition left out; reasons: why it is doubted."""
+
+    effect: str
+    joint: str
+    share: float
+    earned: float
+    left: float
+    left_of_rest: float
+    folds: list[float]
+    members: int
+    place: int
+    reasons: list[str] = field(default_factory=list)
+    confidence: float = 0.0
+    of_pose: bool = False  # whether it is a torque that changes slowly with the pose alone
+
+    def plain(self) -> dict:
+        """As it is written."""
+        return asdict(self)
+
+
+def neutral_of(param, case: Case) -> float:
+    """Value of a parameter at which its effect is not there."""
+    if param.mode == "add":
+        return 0.0
+    if param.mode == "factor":
+        return 1.0
+    name = param.columns[0]
+    return float(case.scales.nominal.get(name, NEUTRAL[INDEX[name]]))
+
+
+def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> bool:
+    """Whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far as it is believed."""
+    sizes = [p for p in params if p.key not in SHAPES]
+    for p in sizes:
+        low, high = spread[p.key]
+        zero = neutral_of(p, case)
+        give = BELIEF * abs(zero) if p.mode in ("factor", "set") and abs(zero) < 1e8 else 0.0
+        # where an effect begins at a bound, the bound is nothing
+        begins = p.mode == "set" and ((zero <= p.low and low <= p.low * (1 + 1e-6) + 1e-12) or (zero >= p.high and high >= p.high * (1 - 1e-6)))
+        if not begins and not low - give <= zero <= high + give:
+            return False
+    return bool(sizes)
+
+
+def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
+    """Key of a parameter that stopped at a bound of what is physical; empty where none did."""
+    for p in params:
+        if p.key in ("phase", "rebound", "rotor"):
+            continue
+        zero = neutral_of(p, case)
+        for bound in (p.low, p.high):
+            away = abs(bound - zero)
+            # a fit comes to rest a little before a bound; where an effect begins near one, it may be as small
+            room = (0.01 if away > 0.25 * p.span else 1e-3) * p.span
+            if away > room and abs(values[p.key] - bound) <= room:
+                return p.key
+    return ""
+
+
+def left_over(after: float, before: float, noise: float) -> float:
+    """Share of a squared error `before` that stays, above 1.3 x the noise."""
+    base = (1.3 * noise) ** 2
+    return max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
+
+
+def trusted(before: float, after: float, noise: float) -> float:
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a twentieth,
+    half from a third on. What follows only half of a gap may be another effect's likeness."""
+    return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - 0.05) / 0.28, 0.0, 1.0))
+
+
+def temperature_follows(case: Case, runs: Sequence[int]) -> str:
+    """What the temperature follows, in words: the clock since the first recording (then whatever drifts looks like heat), or the
+    gain that the drive was set to; empty where it follows neither."""
+    if "temperature" not in case.regimes or not len(runs):
+        return ""
+    warm, clock = [], []
+    for k, r in enumerate(runs):
+        rows = case.plant.rows(r)
+        t = case.plant.t[rows]
+        warm.append(case.regimes["temperature"][rows])
+        clock.append(k + (t - t[0]) / max(float(t[-1] - t[0]), 1e-9))
+    if abs(_rank_correlation(np.concatenate(clock), np.concatenate(warm))) > ORDERED:
+        return "the clock"
+    if len(warm) < 3:
+        return ""
+    means = np.array([x.mean() for x in warm])
+    if abs(_rank_correlation(np.arange(float(len(means))), means)) > ORDERED:
+        return "the order of the recordings"
+    gain = np.array([case.plant.nominal[r][INDEX["kp"]] for r in runs])
+    return "the gain" if abs(_rank_correlation(gain, means)) > ORDERED else ""
+
+
+def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Spearman's, with ties at their middle rank; 0 where one does not change."""
+    if np.ptp(a) <= 0 or np.ptp(b) <= 0:
+        return 0.0
+
+    def ranks(x: np.ndarray) -> np.ndarray:
+        _, inverse, count = np.unique(x, return_inverse=True, return_counts=True)
+        return (np.cumsum(count) - 0.5 * (count - 1))[inverse]
+
+    return float(np.corrcoef(ranks(a), ranks(b))[0, 1])
+
+
+def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
+    """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing is asked for,
+    or is a trifle beside what others removed of the error before; empty where it is not."""
+    if without <= NEEDED * noise:
+        return "without it the error kept out is hardly above the noise"
+    if not alone and without**2 - after**2 < SMALL * max(before, without) ** 2:
+        return "it is a trifle beside what another effect explains, whose law need not be exact"
+    return ""
+
+
+def of_pose(effect: str, values: dict[str, float], case: Case) -> bool:
+    """Whether an effect is a torque that follows the pose and changes slowly along it: a load, an encoder's zero or scale, a ripple of
+    which the motion shows less than two periods. Two of them together are any such torque: a cable, a spring."""
+    return effect in ("payload", "position_offset", "position_scale") or (effect == "torque_ripple" and 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span)
+
+
+def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
+    """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
+    c = e.share * (0.3 + 0.7 * e.earned) * trusted(before, after, noise)
+    if e.members > 1:  # of what the others leave it has to explain most
+        c *= trusted(without, after, noise)
+    return float(min(c, 0.99, DOUBTED if e.reasons else 1.0))
+
+
+def together(mine: list[Evidence]) -> None:
+    """What the findings of one joint (the largest first) say of each other."""
+    slow = [e for e in mine if e.of_pose]
+    for k, e in enumerate(mine):
+        e.place = k
+        if e.of_pose and len(slow) > 1:
+            _doubt(e, f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on the pose")
+        doubtful = next((x for x in mine[:k] if x.confidence < DOUBTED), None)
+        if doubtful is not None:
+            _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
+        alike = next((x for x in mine[:k] if e.effect in FAST and x.effect in FAST), None)
+        if alike is not None:
+            _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
+        if len(mine) >= CROWD and k > 0:
+            _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
+
+
+def _doubt(e: Evidence, reason: str) -> None:
+    e.reasons.append(reason)
+    e.confidence = min(e.confidence, DOUBTED)
+
+
+def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
+    """Lowers the confidence of touch's findings that are too small, or that the law of a contact's pressure may stand for; returns
+    why, a line each."""
+    said = []
+    for f in findings:
+        h = f["held_out"]
+        reason = too_small(before, h["before"], h["after"], noise, len(findings) == 1) if h else ""
+        if not reason and f["effect"] == "tactile_crosstalk" and f.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < SPREAD:
+            reason = "a contact's force may spread over the taxels as much wider than its law says"
+        if reason:
+            f["confidence"] = min(f["confidence"], DOUBTED)
+            said.append(f"{f['effect']} is not sure: {reason}")
+    return said
+
+
+def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str]) -> None:
+    """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that is not
+    what it says."""
+    misread = [e.joint for e in all_ if e.effect in ("position_scale", "position_offset")]
+    for e in all_:
+        elsewhere = [j for j in misread if j != e.joint]
+        if elsewhere and e.effect in FROM_POSES:
+            _doubt(e, f"the position of {elsewhere[0]} is not what it says, and with it what the other joints load")
+        pulls = [j for j, k in coupled.items() if k == e.joint]
+        if pulls and e.effect != "joint_coupling":
+            _doubt(e, f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
+        if e.joint in bad:
+            _doubt(e, f"a signal of {e.joint} is not what it says")

@@ -1,0 +1,340 @@
+"""The few final hypotheses once more, in the engine and the servo that train policies.
+
+The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out of
+the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's columns
+and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one batch.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from dexsim.actuator.columns import COLUMNS
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.actuator.servo import FIELDS, Servo
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.gap.judge.errors import free_run
+from dexsim.gap.judge.findings import MODEL_COLUMNS, columns_beside, handed, model_changes, undamped
+from dexsim.gap.plant.case import REFERENCE, Case
+from dexsim.gap.plant.columns import SERIES_INDEX
+from dexsim.gap.read.runs import Run
+from dexsim.gap.search.fit import expand
+from dexsim.gap.search.search import Trial
+from dexsim.recording.mechanism import Mechanism
+from dexsim.sim import make_engine
+
+STEP = 5e-4  # s: of the engine; its error is of first order in it
+REPLAY = ("mujoco", "warp", "none")
+TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
+WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
+BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
+APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
+LITTLE = 0.1  # of the error before: what the engine may leave beside what the plant leaves, added in squares
+MOSTLY = 0.3  # of the error before: what the engine may leave for the answer to hold there in the main
+MOST = 120.0  # s of recordings that are replayed, at most
+
+
+@dataclass
+class Hypothesis:
+    """A name and the fitted trial of each joint that has one; joints without one are driven as believed."""
+
+    name: str
+    trials: dict[str, Trial]
+
+
+@dataclass
+class World:
+    """One free run: what drives it and where it begins. All in the units the encoders report, J joints of the mechanism.
+
+    rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first position
+    and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K, J] (NaN
+    keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]: from where a joint
+    that drags another is counted (None: q)."""
+
+    rows: np.ndarray
+    table: ServoTable
+    gravity: np.ndarray
+    duration: float
+    q: np.ndarray
+    v: np.ndarray
+    target: np.ndarray
+    stamps: np.ndarray
+    targets: np.ndarray
+    enabled: tuple[np.ndarray, np.ndarray] | None = None
+    warmth: tuple[np.ndarray, np.ndarray] | None = None
+    home: np.ndarray | None = None
+
+
+@dataclass
+class Confirmation:
+    """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the gap's own
+    plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot be given;
+    recordings: replayed; agrees: see `agree`."""
+
+    engine: str
+    step_s: float
+    errors: dict[str, tuple[float, float]]
+    joints: dict[str, tuple[float, float]]
+    missing: list[str]
+    recordings: list[str]
+    agrees: bool
+    floor: float
+    at_tasks_step: float = math.nan
+    simulated: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def text(self, unit: str = "mrad") -> str:
+        """The result in a sentence; unit: what a thousandth of the position's is called."""
+        engine, plant = list(self.errors.values())[min(1, len(self.errors) - 1)]
+        if self.agrees:
+            together = ", all joints at once," if len(self.joints) > 1 else ""
+            return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
+        believed = next(iter(self.errors.values()))[0]
+        if not self.missing and len(self.errors) > 1 and engine <= MOSTLY * believed:
+            return f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, more than in the search's own plant."
+        because = f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
+        return f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own plant leaves {1e3 * plant:.3g} ({because})."
+
+    def entry(self) -> dict[str, Any]:
+        """As diagnosis.json has it."""
+        out = {"engine": self.engine, "step_s": self.step_s, "recordings": self.recordings, "agrees": self.agrees, "not_handed_on": self.missing}
+        out["engine_at_tasks_step"] = {"step_s": TASKS, "after": self.at_tasks_step}
+        out |= {name: {"engine": a, "plant": b} for name, (a, b) in self.errors.items()}
+        return out | {"joints": {j: {"engine": a, "plant": b} for j, (a, b) in self.joints.items()}}
+
+
+def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hypothesis) -> np.ndarray:
+    """[J, C] servo columns of the mechanism's joints in one run, with what the hypothesis hands on."""
+    rows = run.servo.nominal(m.joints).copy()
+    for case in cases:
+        trial = h.trials.get(case.joint)
+        if trial is None:
+            continue
+        plant = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, index]
+        j = m.joints.index(case.joint)
+        for p in trial.fit.params:
+            for name in p.columns if handed(p, case) else ():
+                if name in SERVO_INDEX:
+                    c = COLUMNS[SERVO_INDEX[name]]
+                    rows[j, SERVO_INDEX[name]] = np.clip(plant[SERVO_INDEX[name]], c.low, c.high)
+        kd = SERVO_INDEX["kd"]
+        rows[j, kd] = max(rows[j, kd] - undamped(trial, rows[j, SERVO_INDEX["kp"]]), 0.0)
+        for name, value in columns_beside(case, trial, m.joints).items():
+            rows[j, SERVO_INDEX[name]] = value
+    if run.supply is not None and run.servo.supply_voltage:
+        rows[:, SERVO_INDEX["supply"]] *= float(np.mean(run.supply)) / run.servo.supply_voltage
+    return rows
+
+
+def model_of(m: Mechanism, cases: Sequence[Case], h: Hypothesis) -> tuple[mujoco.MjSpec, bool]:
+    """(model with the fields that the hypothesis hands on, whether anything differs)."""
+    spec, changed = m.spec.copy(), False
+    for case in cases:
+        trial = h.trials.get(case.joint)
+        if trial is not None:
+            changed |= bool(model_changes(spec, case, trial, values_of(trial)))
+    return spec, changed
+
+
+def values_of(trial: Trial) -> dict[str, dict[str, float]]:
+    """Fitted values of each member by parameter."""
+    known = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
+    return {x.id: {p.key: float(known[f"{x.id}.{p.key}"]) for p in x.variant.params} for x in trial.members}
+
+
+def missing_of(h: Hypothesis) -> list[str]:
+    """Fitted parameters of effects that neither the servo's table nor the model has, as effect@joint."""
+    out = []
+    for joint, trial in h.trials.items():
+        for x in trial.members:
+            columns = {c for p in x.variant.params for c in p.columns}
+            fixed = {name for name, value in x.variant.fixed if value}
+            if (columns | fixed) - set(SERVO_INDEX) - set(MODEL_COLUMNS):
+                out.append(f"{x.id} ({x.variant.label})@{joint}" if x.variant.label else f"{x.id}@{joint}")
+    return sorted(out)
+
+
+def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows) -> list[World]:
+    """One world a window (a whole run, or the part of it that was kept out)."""
+    out = []
+    at_rest = m.spec.compile()
+    rest = np.array([at_rest.qpos0[at_rest.joint(j).qposadr[0]] for j in m.joints])
+    for w in range(len(windows.window)):
+        r = int(windows.run[w])
+        run, start = runs[r], float(windows.window_t[w])
+        rows = servo_rows(m, run, r, cases, h)
+        scale, offset = rows[:, SERVO_INDEX["position_scale"]], rows[:, SERVO_INDEX["position_offset"]]
+        q, v, home = scale * rest + offset, np.zeros(len(m.joints)), scale * rest + offset
+        for case in cases:
+            series = case.plant.series[windows.window[w, 0]]
+            j = m.joints.index(case.joint)
+            q[j], v[j] = series[SERIES_INDEX["q"]], series[SERIES_INDEX["v"]]
+        place = [m.joints.index(j) for j in run.joints]
+        first = int(np.clip(np.searchsorted(run.cmd_t, start - BEFORE) - 1, 0, len(run.cmd_t) - 1))
+        targets = np.full((len(run.cmd_t) - first, len(m.joints)), np.nan)
+        targets[:, place] = run.cmd[first:]
+        target = q.copy()
+        target[place] = run.cmd[first]
+        enabled = None
+        if run.enabled is not None:
+            on = np.ones((len(run.t), len(m.joints)))
+            on[:, place] = run.enabled
+            enabled = (run.t - start, on)
+        warmth = None
+        if run.temperature is not None:
+            heat = np.zeros((len(run.t), len(m.joints)))
+            heat[:, place] = np.nan_to_num(run.temperature - REFERENCE)
+            warmth = (run.t - start, heat)
+        home[place] = run.qs[0] if run.qs is not None else run.q[0]
+        samples = windows.sample_row[windows.sample_window == w]
+        end = float(cases[0].plant.t[samples[-1]])
+        out.append(World(rows, run.servo, np.asarray(run.gravity, float), end - start, q, v, target, run.cmd_t[first:] - start, targets, enabled, warmth, home))
+    return out
+
+
+def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP,
+              engine: str = "auto", torque: bool = False) -> list:
+    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity;
+    torque: (positions, motor torques [T, J] as their current shows them) instead."""
+    groups: dict[tuple, list[int]] = {}
+    for i, w in enumerate(worlds):
+        groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
+    out: list = [np.zeros((0, len(joints)))] * len(worlds)
+    for members in groups.values():
+        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True):
+            out[i] = q
+    return out
+
+
+def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float, engine: str, torque: bool) -> list:
+    spec = spec.copy()
+    spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    N = len(worlds)
+    engine = make_engine(spec, N, device, engine, fields=FIELDS)
+    rows = np.stack([w.rows for w in worlds])
+    table = copy.deepcopy(worlds[0].table)
+    table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
+    spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
+    spacing = spacing[spacing > 1e-6]
+    varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]
+    servo = Servo(engine, joints, table, control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None, varied=varied)
+    real = engine.t.qpos.dtype
+    up = lambda x, dtype=real: torch.as_tensor(np.asarray(x), dtype=dtype, device=engine.t.qpos.device)  # noqa: E731
+    servo.params.copy_(up(rows))
+    scale = rows[:, :, SERVO_INDEX["position_scale"]]
+    address, dofs = engine.qpos_index(joints), engine.dof_index(joints)
+    qpos, qvel = np.tile(engine.mjm.qpos0, (N, 1)), np.zeros((N, engine.mjm.nv))
+    qpos[:, address] = servo.unmeasured(up(np.stack([w.q for w in worlds]))).cpu().numpy()
+    qvel[:, dofs] = np.stack([w.v for w in worlds]) / scale
+    servo.home.copy_(servo.unmeasured(up(np.stack([w.q if w.home is None else w.home for w in worlds]))))
+    engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
+    now = np.stack([w.target for w in worlds])
+    servo.reset(None, up(now))
+    steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
+    seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
+    given = torch.zeros_like(seen) if torque else None
+    warm = [i for i, w in enumerate(worlds) if w.warmth is not None] if "warmth" in varied or "rare" in servo.features else []
+    sent = [0] * N
+    freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
+    for k in range(steps):
+        t = k * timestep
+        while True:  # the next command of each world that has one within this step, in turns
+            mask, stamp = np.zeros(N, bool), np.zeros(N)
+            for i, w in enumerate(worlds):
+                while sent[i] < len(w.stamps) and w.stamps[sent[i]] < t + timestep:
+                    row = w.targets[sent[i]]
+                    new = np.where(np.isfinite(row), row, now[i])
+                    sent[i] += 1
+                    if (new != now[i]).any():
+                        now[i], mask[i], stamp[i] = new, True, w.stamps[sent[i] - 1]
+                        break
+            if not mask.any():
+                break
+            servo.send(up(now), up(mask, torch.bool), up(stamp))
+        for i, w in enumerate(worlds):
+            if freed[i] is not None:
+                on = w.enabled[1][max(int(np.searchsorted(w.enabled[0], t, side="right")) - 1, 0)] > 0.5
+                if (on != freed[i]).any():
+                    freed[i] = on
+                    servo.state[i, :, servo.slots["enabled"]] = up(on)
+        if warm and k % max(1, round(WARM_EVERY / timestep)) == 0:
+            for i in warm:
+                at, heat = worlds[i].warmth
+                servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(t, at, x) for x in heat.T])
+        seen[k].copy_(servo.position())
+        engine.step(1, servo.before_each)
+        if given is not None:
+            given[k].copy_(servo.torque)
+    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
+    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+
+def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
+            floor: float, device: str = "cpu", replay: str = "mujoco", timestep: float = STEP, finer: Sequence[Case] = ()) -> Confirmation | None:
+    """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
+    kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+    device = "cpu" if replay == "mujoco" else device
+    windows = [c.plant.windows(None, test, span=span_test) for c in cases]
+    if not cases or not len(windows[0].window):
+        return None
+    seconds = np.cumsum(windows[0].window[:, 1]) * cases[0].plant.dt
+    use = np.flatnonzero(seconds <= max(MOST, seconds[0]))
+    errors, joints, simulated = {}, {}, {}
+    final = min(1, len(hypotheses) - 1)
+    parts = [model_of(m, cases, h) for h in hypotheses]
+    worlds = [[w for i, w in enumerate(worlds_of(m, runs, cases, h, windows[0])) if i in use] for h in hypotheses]
+    plain = [i for i, (_, changed) in enumerate(parts) if not changed]
+    found: dict[int, list[np.ndarray]] = {}
+    for group in ([plain] if plain else []) + [[i] for i in range(len(parts)) if i not in plain]:
+        q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, replay)
+        for k, i in enumerate(group):
+            found[i] = q[k * len(use) : (k + 1) * len(use)]
+    def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
+        """(simulated position, squared error) [n] of one joint at its samples."""
+        on = np.isin(ws.sample_window, use)
+        t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
+        out = np.empty(len(t))
+        for k, w in enumerate(use):
+            here = ws.sample_window[on] == w
+            x = q[k][:, m.joints.index(case.joint)]
+            out[here] = np.interp(t[here], step * np.arange(len(x)), x)
+        return out, (case.plant.q[ws.sample_row[on]] - out) ** 2
+
+    rms = lambda x: float(np.sqrt(np.mean(np.concatenate(x))))  # noqa: E731
+    for i, h in enumerate(hypotheses):
+        square, own = [], []
+        for case, ws, fine in zip(cases, windows, finer or cases, strict=True):
+            trial, on = h.trials[case.joint], np.isin(ws.sample_window, use)
+            same = ws if fine is case else fine.plant.windows(None, test, span=span_test)
+            fast = free_run(fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed])[0][on]
+            there, miss = error(found[i], timestep, case, ws)
+            square.append(miss)
+            own.append((case.plant.q[ws.sample_row[on]] - fast) ** 2)
+            if i == final:
+                joints[case.joint] = (rms(square[-1:]), rms(own[-1:]))
+                simulated[case.joint] = there
+        errors[h.name] = (rms(square), rms(own))
+    coarse = free_runs(parts[final][0], m.joints, worlds[final], device, TASKS, replay)
+    at_tasks_step = rms([error(coarse, TASKS, case, ws)[1] for case, ws in zip(cases, windows, strict=True)])
+    engine, plant = errors[hypotheses[final].name]
+    before = errors[hypotheses[0].name][1] if final else 0.0
+    if not np.isfinite(engine):
+        raise UserError("the engine's state did not stay finite")
+    names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
+    return Confirmation("MuJoCo-Warp" if replay == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
+                        agree(engine, plant, floor, before), floor, at_tasks_step, simulated)
+
+
+def agree(engine: float, plant: float, floor: float, before: float) -> bool:
+    """Whether the engine's replay confirms the plant's: it leaves no more than APART times as much, or what it leaves beyond that is
+    LITTLE beside the error before (the figures by which the plant absorbs its own inaccuracy are not handed on)."""
+    return engine <= max(APART * max(plant, floor), math.hypot(plant, LITTLE * before))

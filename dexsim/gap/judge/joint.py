@@ -1,0 +1,235 @@
+"""One joint's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, where its residual lives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dexsim.gap.effects.catalogue import EFFECTS, confusable, separating
+from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge.findings import finding_parameters
+from dexsim.gap.locate import bins
+from dexsim.gap.plant.case import Case
+from dexsim.gap.read.runs import Run
+from dexsim.gap.result import Curve
+from dexsim.gap.search import jitter
+from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
+from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.recording.mechanism import Mechanism
+
+SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
+STRETCH, STRETCHED = 0.5, (0.5, 4.0)  # of the intervals: by the square of what is left of what was kept out, over the noise
+CLEAR = 1.5  # x the noise squared that windows keep after the fit, from which on what it depends on is said
+
+
+@dataclass
+class Kept:
+    """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept out."""
+
+    runs: list[Run]
+    train: list[int]
+    test: list[int]
+    span_train: dict[int, tuple[float, float]] | None
+    span_test: dict[int, tuple[float, float]] | None
+
+
+class JointAnswer:
+    """A searched joint on what was kept out.
+
+    before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at times t (rows,) [s];
+    effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 % intervals of the fitted parameters; widest: as
+    they are before it is known how well what was kept out is followed, by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs."""
+
+    def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
+        self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
+        self.best, self.none = search.polish(outcome.best), search.polish(outcome.none)
+        self.whole = replace(case, plant=search.whole)
+        self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
+        rows = self.rows = self.windows.sample_row
+        self.q_before, effort_before = errors.free_run(self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True)
+        fixed = [f for mm in self.best.members for f in mm.variant.fixed]
+        with_it = errors.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True) if self.best.members else (self.q_before, effort_before)
+        self.q_after, effort_after = with_it
+        self.measured, self.t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
+        self.before, self.after = (self.measured - self.q_before) ** 2, (self.measured - self.q_after) ** 2
+        self.torque = case.plant.torque[rows]
+        self.sensed = np.isfinite(self.torque)
+        self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
+        self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
+        self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
+        self.bounds = stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0)
+        self.nuisance = nuisances(case.joint, self.best)
+        self.raw: dict[str, dict[str, float]] = {}
+        self.spans: dict[str, float] = {}
+        self.evidence: list[confidence.Evidence] = []
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Errors for the page."""
+        out = {"before": rms(self.before), "after": rms(self.after), "mae_before": float(np.abs(self.measured - self.q_before).mean()),
+               "mae_after": float(np.abs(self.measured - self.q_after).mean()), "sigma": self.case.sigma, "fitted": self._followed(), "left": 0.0}  # fmt: skip
+        return out | ({"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)} if self.effort_before is not None else {})
+
+    def mae(self) -> dict[str, tuple[float, float]]:
+        """Mean |error| before and after by recording; one that was cut is several runs."""
+        out, runs, run_of = {}, self.kept.runs, self.case.plant.run_of[self.rows]
+        for i in self.kept.test:
+            pick = np.isin(run_of, [k for k in self.kept.test if runs[k].name == runs[i].name])
+            if pick.any():
+                out[runs[i].name] = tuple(float(np.abs(self.measured - q)[pick].mean()) for q in (self.q_before, self.q_after))
+        return out
+
+    def findings(self, m: Mechanism) -> list[dict[str, Any]]:
+        """What was found, as `diagnosis.json` says it; the evidence behind each is kept beside it."""
+        return [self._finding(mm, m) for mm in self.best.members]
+
+    def _finding(self, mm, m: Mechanism) -> dict[str, Any]:
+        case, best = self.case, self.best
+        raw, spread = self._fitted(mm, self.bounds)
+        self.raw[mm.id] = raw
+        rest = tuple(x for x in best.members if x is not mm)
+        trial = without(self.search, best, mm) if rest else self.none
+        q, effort = errors.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True)
+        error_without = rms((self.measured - q) ** 2)
+        effort_only = mm.id == "current_sensor"
+        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
+        self.evidence.append(evidence)
+        rivals = self.outcome.rivals.get(mm.id, [])
+        same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
+        signal = errors.own_signal(mm.id, case, raw, mm.variant.note)
+        active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
+        self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
+        of_effort = effort_only and self.effort_after is not None
+        finding = {
+            "effect": mm.id,
+            "confidence": evidence.confidence,  # what the other findings say of it comes last
+            "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
+            "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
+            "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
+            "where": {"joints": [case.joint], "taxels": [], "topics": []},
+            "regime": EFFECTS[mm.id].shows,
+            "when": errors.intervals_of(active, case, self.kept.runs, self.kept.train),
+            "parameters": finding_parameters(mm, raw, spread, case, m.table),
+            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)} if of_effort else
+                        {"before": error_without, "after": rms(self.after)},
+        }  # fmt: skip
+        late = jitter.estimate(self.search, best) if mm.id == "command_delay" and best.fit.loss > jitter.LEFT else None
+        if late is not None:
+            finding["parameters"]["jitter"] = late.entry()
+        return finding
+
+    def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
+        best = self.best
+        index = [[p.key for p in best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
+        raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
+        spread = {p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
+        for p, x, b in zip(best.fit.params, best.fit.x, bounds, strict=True):  # a level that was unknown and is fitted anyway
+            if mm.id == "coulomb_friction" and p.key == "coulomb_friction" and "torque" not in raw:
+                raw["torque"], spread["torque"] = float(x), (float(b[0]), float(b[1]))
+        return raw, spread
+
+    def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, effort_only: bool) -> confidence.Evidence:
+        """How sure the name is, and every reason to doubt it."""
+        case, outcome, before, after = self.case, self.outcome, rms(self.before), rms(self.after)
+        earned = 1.0 if effort_only else float(np.clip((error_without - after) / (0.1 * error_without + 1e-12), 0.0, 1.0))
+        evidence = confidence.Evidence(
+            mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, case.sigma),
+            confidence.left_over(after, error_without, case.sigma), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
+        if confidence.holds_nothing(mm.variant.params, spread, case):
+            evidence.reasons.append("its interval holds the size at which nothing is missing")
+        small = "" if effort_only else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
+        if small:
+            evidence.reasons.append(small)
+        stopped = confidence.at_bound(mm.variant.params, raw, case)
+        if stopped:
+            evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
+        follows = confidence.temperature_follows(case, sorted({*self.kept.train, *self.kept.test})) if mm.id == "thermal" else ""
+        if follows:
+            evidence.reasons.append(f"temperature follows {follows}, so it may stand for anything that changes with it")
+        evidence.of_pose = confidence.of_pose(mm.id, raw, case)
+        evidence.confidence = confidence.weigh(evidence, before, after, error_without, case.sigma)
+        return evidence
+
+    def spots(self, rng: np.random.Generator, seed: int) -> tuple[list[bins.Spot], list[str]]:
+        """(where the believed simulator's residual lives, what the residual that is left depends on)."""
+        case, search = self.case, self.search
+        n, blocks = search.long.n, search.blocks[: search.long.n]
+        regimes = {k: v[search.long.sample_row] for k, v in case.regimes.items()}
+        everything = search.fitter.evaluate(self.none.fit.params, self.none.fit.x)
+        found = bins.spots(case.joint, everything[:n] * case.sigma, blocks, regimes, rng)
+        if search.fitter.use_torque:
+            on = search.fitter.tau_on
+            effort = everything[n:][on] * search.r.sigma_torque
+            found += bins.spots(case.joint, effort, blocks[on], {k: v[on] for k, v in regimes.items()}, np.random.default_rng(seed + 1), "effort")
+        with search._fix(self.best.members):
+            left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
+        spots = bins.control(bins.spots(case.joint, left * case.sigma, blocks, regimes, rng))
+        return found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > CLEAR else []
+
+    def curve(self) -> Curve | None:
+        """The stretch where the believed simulator is worst."""
+        return _curve(self.case, self.kept.runs, self.rows, self.q_before, self.q_after, int(np.argmax(self.before))) if len(self.rows) else None
+
+    def _followed(self) -> float:
+        """Error (rms) of a free run over what was fitted, without any effect."""
+        case, fit = self.case, self.none.fit
+        windows = case.plant.windows(None, self.kept.train, span=self.kept.span_train)
+        return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - errors.free_run(case, fit.params, fit.x, windows, underway=True)[0]) ** 2)))
+
+
+def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
+    """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the noise is known better than
+    by all that might be off in it, what does not is the likeness of something else. The law is from concealed cases (docs/diagnose.md)."""
+    if left <= 0 or not fit.params:
+        return bounds
+    low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
+    x, least = fit.x[:, None], traded(fit)[:, None] * np.array([-1.0, 1.0])
+    by = np.clip(STRETCH * left**2, *STRETCHED) * (bounds - x)
+    return np.clip(x + np.where(np.abs(by) < np.abs(least), least, by), low, high)
+
+
+def traded(fit: Fitted) -> np.ndarray:
+    """[P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the link's), however well all is followed:
+    the variance that the beliefs' own, as far as the residuals leave it, adds to that of the sizes alone. 0 for beliefs."""
+    low, high = (np.array([getattr(p, k) for p in fit.params]) for k in ("low", "high"))
+    span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
+    J = fit.jacobian * span
+    A = J.T @ J
+    believed = prior_weight(fit.params) * span**2
+    A[np.diag_indices(len(A))] += np.where(mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * PRIOR))
+    i = np.flatnonzero(mine)
+    out = np.zeros(len(span))
+    if len(i):
+        out[i] = np.maximum(np.diag(np.linalg.inv(A))[i] - np.diag(np.linalg.inv(A[np.ix_(i, i)])), 0.0)
+    return 1.645 * np.sqrt(PRIOR * out) * span
+
+
+def rms(squares: np.ndarray) -> float:
+    """Root of the mean of squares; 0 for none."""
+    return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
+
+
+def nuisances(joint: str, trial: Trial) -> dict[str, float]:
+    """The refitted beliefs of one joint by the keys of `diagnosis.json`."""
+    return {f"{p.key}_factor@{joint}" if p.mode == "factor" else f"{p.key}@{joint}": round(float(x), 6)
+            for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
+
+
+def without(search: JointSearch, best, member):
+    """The best hypothesis without one member, refitted."""
+    rest = tuple(x for x in best.members if x is not member)
+    sizes = np.cumsum([len(x.variant.params) for x in best.members])[:-1]
+    values = np.split(search._values(best), sizes)
+    kept = [v for x, v in zip(best.members, values, strict=True) if x is not member]
+    return search.fit(rest, np.concatenate(kept) if kept else np.zeros(0), best, quick=True)
+
+
+def _curve(case, runs, rows, q0, q1, worst) -> Curve:
+    t, r = case.plant.t[rows], case.plant.run_of[rows]
+    run = r[worst]
+    pick = np.flatnonzero((r == run) & (np.abs(t - t[worst]) < 4.0))
+    command = runs[run].command_at(t[pick])[:, case.index]
+    return Curve(case.joint, runs[run].name, t[pick], case.plant.q[rows][pick], q0[pick], q1[pick], command)

@@ -1,0 +1,1 @@
+"""Step 2: where and in which regime simulation and recording part."""

@@ -1,0 +1,333 @@
+"""Batched simulation of one joint's recorded windows under many parameter guesses (see `plant_kernel.py`)."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from dexsim.gap.plant import kernel as pk
+from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
+from dexsim.gap.plant.mechanics import JointConstants
+
+THREADS = 2  # CPU launches release the interpreter: two run side by side
+BLOCK = 32  # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there are
+FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
+_GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
+_LANE = threading.local()
+
+
+class Lane:
+    """One thread's way to a GPU: a stream of its own, so that the launches of several joints overlap, and memory that is
+    allocated once (an allocation or a release in between would wait for every stream)."""
+
+    pinned = True  # memory of the CPU that the GPU copies by itself
+
+    def __init__(self, device: str):
+        self.device = device
+        self.stream = wp.Stream(device)
+        wp.get_device(device).context_guard.__enter__()  # for the thread's life: it also waits for its stream outside of the lock
+        self._room: dict[str, wp.array] = {}
+        self._host: dict[str, wp.array] = {}
+
+    def room(self, name: str, size: int) -> wp.array:
+        """Memory of the device for `size` numbers, the same for the same name."""
+        if name not in self._room or self._room[name].shape[0] < size:
+            self._room[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device=self.device)
+        return self._room[name]
+
+    def host(self, name: str, size: int) -> wp.array:
+        """Page-locked memory of the CPU for `size` numbers."""
+        if name not in self._host or self._host[name].shape[0] < size:
+            self._host[name] = wp.empty(int(1.3 * size) + 1024, dtype=wp.float64, device="cpu", pinned=self.pinned)
+        return self._host[name]
+
+    def part(self, of: wp.array, at: int, shape: tuple[int, ...]) -> wp.array:
+        """`shape` numbers of an array, from number `at` on."""
+        return wp.array(ptr=of.ptr + 8 * at, shape=shape, dtype=wp.float64, device=self.device)
+
+    def up(self, given: Sequence[np.ndarray]) -> list[wp.array]:
+        """The arrays on the device, by one copy; valid until this is called again, which must not be before the stream was waited for."""
+        ends = np.cumsum([0, *(x.size for x in given)])
+        here, there = self.host("in", int(ends[-1])), self.room("in", int(ends[-1]))
+        np.concatenate([np.ravel(x) for x in given], out=here.numpy()[: ends[-1]])
+        wp.copy(there, here, count=int(ends[-1]))
+        return [self.part(there, int(at), x.shape) for at, x in zip(ends, given, strict=False)]
+
+
+def lane(device: str) -> Lane:
+    """This thread's lane; call it with the lock held."""
+    known = getattr(_LANE, "by_device", None)
+    if known is None:
+        known = _LANE.by_device = {}
+    if device not in known:
+        known[device] = Lane(device)
+    return known[device]
+
+
+@dataclass
+class Windows:
+    """W stretches of recordings, to be simulated apart. Everything a launch needs, samples of all windows in a row.
+
+    window [W, 8], window_t [W]: see the kernel; sample_step, sample_part [n]; of each sample: its window [n], its row
+    in the joint's measurements [n]. run [W]: which run a window is of.
+    """
+
+    window: np.ndarray
+    window_t: np.ndarray
+    sample_step: np.ndarray
+    sample_part: np.ndarray
+    sample_window: np.ndarray
+    sample_row: np.ndarray
+    run: np.ndarray
+    device: dict | None = None
+
+    @property
+    def n(self) -> int:
+        return len(self.sample_row)
+
+
+class JointPlant:
+    """One joint over all runs: measurements in a row, series on the integration grid, and the simulation.
+
+    t, q, run_of [n]: time in its run [s], measured position [rad], which run. torque [n] or None: measured motor
+    torque [N.m]. nominal [R, C]: plant parameters believed in each run.
+    """
+
+    def __init__(self, joint: str, constants: JointConstants, dt: float, voltage: bool, loop: str, position: str,
+                 device: str = "cpu"):
+        self.joint, self.constants, self.dt = joint, constants, dt
+        self.voltage, self.loop, self.position, self.device = voltage, loop, position, device
+        self.nominal: list[np.ndarray] = []
+        self._series, self._cmd_t, self._cmd = [], [], []
+        self._t, self._q, self._torque, self._start, self._grid, self._cmds = [], [], [], [], [0], [0]
+        self._rows = [0]
+        self.open_stage = 0  # 0 whole loop; 1 recorded motor torque; 2 recorded duty drives the joint
+        self._ready = False
+
+    def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
+            cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None, exact: dict[str, np.ndarray]):
+        """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]."""
+        t0 = float(t[0])
+        steps = max(int(np.ceil((float(t[-1]) - t0) / self.dt)) + 2, 2)
+        grid = t0 + self.dt * np.arange(steps)
+        fine = np.stack([np.interp(grid, times, series[:, e]) for e in range(len(SERIES))], 1)
+        for name, values in exact.items():
+            fine[:, SERIES_INDEX[name]] = np.interp(grid, t, values)
+        if "enabled" in exact:
+            k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
+            fine[:, SERIES_INDEX["enabled"]] = exact["enabled"][k]
+        self._series.append(fine)
+        self._grid.append(self._grid[-1] + steps)
+        self._cmd_t.append(cmd_t)
+        self._cmd.append(cmd)
+        self._cmds.append(self._cmds[-1] + len(cmd_t))
+        self._t.append(t)
+        self._q.append(q)
+        self._torque.append(np.full(len(t), np.nan) if torque is None else torque)
+        self._rows.append(self._rows[-1] + len(t))
+        self.nominal.append(nominal)
+        self._start.append(t0)
+
+    def finish(self) -> None:
+        """After the last `add`."""
+        self.t, self.q = np.concatenate(self._t), np.concatenate(self._q)
+        self.torque = np.concatenate(self._torque)
+        self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
+        self.series = np.concatenate(self._series)
+        self._series = []  # long recordings of many joints are gigabytes: one copy is enough
+        self._consts = np.zeros(pk.CONSTS)
+        c = self.constants
+        kp = max(float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])), 1e-9)
+        stiff = 30.0 * kp + c.inertia * (2 * np.pi * 40.0) ** 2
+        self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
+                           c.low, c.high, stiff, c.slide, 0)
+        self.contact_stiffness = stiff
+        self._d = {}
+        self._ready = True
+
+    @property
+    def command_times(self) -> list[np.ndarray]:
+        """[K] s of each run: when its targets were sent."""
+        return self._cmd_t
+
+    def set_series(self, series: np.ndarray) -> None:
+        """Other series [G, E] in the place of those that were added."""
+        self.series, self._d = series, {}
+
+    def refined(self, times: int) -> JointPlant:
+        """The same joint in steps `times` as short, the series between their samples on straight lines."""
+        out = copy.copy(self)
+        out.dt, out._d = self.dt / times, {}
+        parts, out._grid = [], [0]
+        for a, b in zip(self._grid[:-1], self._grid[1:], strict=True):
+            at = np.arange((b - a - 1) * times + 1)
+            low = np.minimum(at // times, b - a - 2)
+            share = (at / times - low)[:, None]
+            parts.append((1 - share) * self.series[a + low] + share * self.series[a + low + 1])
+            out._grid.append(out._grid[-1] + len(at))
+        out.series = np.concatenate(parts)
+        return out
+
+    @property
+    def runs(self) -> int:
+        return len(self._t)
+
+    def rows(self, run: int) -> slice:
+        """Rows of a run in the measurements."""
+        return slice(self._rows[run], self._rows[run + 1])
+
+    def windows(self, length: float | None, runs: list[int] | None = None, warm: float = 0.15, stride: float | None = None,
+                span: dict[int, tuple[float, float]] | None = None) -> Windows:
+        """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
+
+        span: part of a run [s from its start] to keep to.
+        """
+        window, window_t, step, part, of, row, run_of = [], [], [], [], [], [], []
+        for r in range(self.runs) if runs is None else runs:
+            t = self._t[r]
+            begin, stop = 0.0, t[-1] - t[0]
+            if span and r in span:
+                begin, stop = max(begin, span[r][0]), min(stop, span[r][1])
+            size = (stop - begin) if length is None else min(length, stop - begin)
+            if size <= 0:
+                continue
+            count = max(int((stop - begin) / (stride or size) + 1e-6), 1)
+            if length is not None and stride is None:
+                size = (stop - begin) / count  # no remainder is lost
+            for i in range(count):
+                a = begin + i * (stride or size)
+                b = a + size
+                w = min(warm, a) if length is not None else 0.0
+                lo, hi = np.searchsorted(t - t[0], [a - 1e-9, b - 1e-9])
+                if i == count - 1 and b >= stop - 1e-6:
+                    hi = int(np.searchsorted(t - t[0], b + 1e-9))
+                if hi - lo < 3:
+                    continue
+                g = int(round((a - w) / self.dt))
+                first_time = self._start[r] + g * self.dt
+                warm_steps = int(round(w / self.dt))
+                at = (t[lo:hi] - first_time) / self.dt
+                at = np.maximum(at, 0.0)
+                total = int(np.floor(at[-1])) + 1
+                total = min(total, self._grid[r + 1] - self._grid[r] - g)
+                s = np.minimum(np.floor(at).astype(int), total - 1)
+                c0, c1 = self._cmds[r], self._cmds[r + 1]
+                k = c0 + int(np.clip(np.searchsorted(self._cmd_t[r], first_time - 0.6) - 1, 0, c1 - c0 - 1))
+                window.append([self._grid[r] + g, total, warm_steps, len(row), hi - lo, c0, c1, k])
+                window_t.append(first_time)
+                step.extend(s)
+                part.extend(at - s)
+                of.extend([len(window) - 1] * (hi - lo))
+                row.extend(range(self._rows[r] + lo, self._rows[r] + hi))
+                run_of.append(r)
+        return Windows(
+            np.array(window, np.int32).reshape(-1, 8), np.array(window_t), np.array(step, np.int32), np.array(part, float),
+            np.array(of, int), np.array(row, int), np.array(run_of, int),
+        )  # fmt: skip
+
+    def simulate(self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None,
+                 open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Reported position [H, n] rad and motor torque [H, n] N.m at the windows' samples.
+
+        params [H, R, C]: plant parameters by run; inits [H, 2]: added to the initial position and velocity.
+        """
+        H, n = len(params), windows.n
+        if inits is None:
+            inits = np.zeros((H, 2))
+        q, torque = np.empty((H, n)), np.empty((H, n))
+        # one launch a set of runs that shares its parameters: a guess is a row, so rows are (guess, distinct run)
+        groups: dict[bytes, list[int]] = {}
+        for r in np.unique(windows.run):
+            groups.setdefault(params[:, r].tobytes(), []).append(int(r))
+        consts = self._consts.copy()
+        consts[pk.C_OPEN] = open_stage
+        if self._on_cpu(H * len(windows.window)):
+            for group in groups.values():
+                keep, count, rest = self._inputs(windows, tuple(group), "cpu")
+                oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
+                out = [wp.array(x, dtype=wp.float64, device="cpu", copy=False) for x in (oq, ot)]
+                self._split(H, count, [_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out])
+                q[:, keep], torque[:, keep] = oq, ot
+            return q, torque
+        with _GPU:
+            mine = lane(self.device)
+            with wp.ScopedStream(mine.stream, sync_enter=False):
+                host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
+                moves, constants, *guesses = mine.up([inits, consts, *(params[:, group[0]] for group in groups.values())])
+                at, parts = 0, []
+                for group, guess in zip(groups.values(), guesses, strict=True):
+                    keep, count, rest = self._inputs(windows, tuple(group), self.device)
+                    size = H * len(keep)
+                    oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
+                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, guess, moves, constants, *rest, oq, ot], device=self.device, block_dim=BLOCK)
+                    parts.append((keep, at, size))
+                    at += 2 * size
+                wp.copy(host, out, count=at)
+        wp.synchronize_stream(mine.stream)
+        numbers = host.numpy()
+        for keep, at, size in parts:
+            q[:, keep] = numbers[at : at + size].reshape(H, -1)
+            torque[:, keep] = numbers[at + size : at + 2 * size].reshape(H, -1)
+        return q, torque
+
+    def _on_cpu(self, threads: int) -> bool:
+        return self.device == "cpu" or threads <= FEW
+
+    def _inputs(self, windows: Windows, group: tuple[int, ...], device: str) -> tuple[np.ndarray, int, list[wp.array]]:
+        """(samples of the windows that are of these runs, number of windows, the kernel's arrays of them), made once a device."""
+        if windows.device is None:
+            windows.device = {}
+        if device not in self._d:
+            self._d[device] = [_up(x, device=device, copy=False) for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))]
+        key = (group, device)
+        if key not in windows.device:
+            pick = np.flatnonzero(np.isin(windows.run, group))
+            keep = np.isin(windows.sample_window, pick)
+            w = windows.window[pick].copy()
+            w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
+            windows.device[key] = (
+                np.flatnonzero(keep), len(pick),
+                [_up(w, wp.int32, device), _up(windows.window_t[pick], device=device), _up(windows.sample_step[keep], wp.int32, device),
+                 _up(windows.sample_part[keep], device=device)],
+            )  # fmt: skip
+        keep, count, arrays = windows.device[key]
+        return keep, count, [*self._d[device], *arrays]
+
+    def _split(self, H: int, count: int, args: list[wp.array]) -> None:
+        """H guesses on the CPU, in two halves side by side."""
+        kernel = pk.plant_kernel()
+
+        def launch(first: int, number: int) -> None:
+            wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, *args], device="cpu")
+
+        if H > 1 and THREADS > 1:
+            half = (H + 1) // 2
+            helper = threading.Thread(target=launch, args=(half, H - half))
+            helper.start()
+            launch(0, half)
+            helper.join()
+        else:
+            launch(0, H)
+
+    def base(self) -> np.ndarray:
+        """[R, C] nominal parameters by run."""
+        return np.stack(self.nominal)
+
+
+def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:
+    return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device, copy=copy or device != "cpu")
+
+
+def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:
+    """[C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor [kg.m2]: where the row has none."""
+    row = NEUTRAL.copy()
+    row[: len(servo_row)] = servo_row
+    row[INDEX["rotor"]] = row[INDEX["rotor"]] or rotor
+    row[~np.isfinite(row)] = 1e9
+    assert len(row) == len(NAMES)
+    return row

@@ -1,0 +1,305 @@
+"""From recordings to one simulated case a joint: measurements, the model along them, typical sizes, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from dexsim.actuator.columns import INDEX as SERVO_INDEX
+from dexsim.actuator.columns import NAMES as SERVO_NAMES
+from dexsim.gap.effects.catalogue import Scales
+from dexsim.gap.plant.batch import JointPlant, nominal_row
+from dexsim.gap.plant.columns import SERIES_INDEX
+from dexsim.gap.plant.mechanics import JointConstants, along
+from dexsim.gap.read.runs import Run
+
+REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
+BELIEF = 0.05  # nominal figures of a real machine are off by as much, and no finding before
+
+
+@dataclass
+class Case:
+    """One joint's problem: its plant over all runs, its sizes and its noise (sigma rad, sigma_torque N.m or 0)."""
+
+    joint: str
+    index: int
+    plant: JointPlant
+    constants: JointConstants
+    scales: Scales
+    sigma: float
+    quantum: float
+    sigma_torque: float
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # servo columns believed in a range
+    unknown: tuple[str, ...] = ()
+    regimes: dict[str, np.ndarray] = field(default_factory=dict)  # what residuals are set against, by measurement row
+    moved: bool = True
+    loop_rate: float | None = None
+    factors: dict[str, tuple[float, float]] = field(default_factory=dict)  # of what the model says, by nuisance, where more than BELIEF is known
+    told: bool = False  # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
+
+
+def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
+    """(standard deviation of the measurement noise, quantum) of one signal, from each sample's misfit to a local
+    parabola through its neighbours without it. The quantum is 0 where the values are not on a grid."""
+    steps = np.unique(np.round(np.abs(np.diff(x)), 9))
+    steps = steps[steps > 1e-7]
+    quantum = 0.0
+    if len(steps):
+        smallest = steps[0]
+        if len(steps) < 0.2 * len(x) + 20 and np.mean(np.abs(steps[:20] / smallest - np.round(steps[:20] / smallest)) < 0.05) > 0.9:
+            quantum = float(smallest)
+    if len(x) < 9:
+        return max(quantum / np.sqrt(12), 1e-9), quantum
+    k = 3
+    index = np.arange(k, len(x) - k)[:, None] + np.r_[-k:0, 1 : k + 1]
+    dt = t[index] - t[k:-k, None]
+    scale = max(float(np.median(np.diff(t))) * k, 1e-9)
+    basis = np.stack([np.ones_like(dt), dt / scale, (dt / scale) ** 2, (dt / scale) ** 3], -1)
+    normal = np.einsum("smd,sme->sde", basis, basis) + 1e-9 * np.eye(4)
+    c = np.linalg.solve(normal, np.einsum("smd,sm->sd", basis, x[index])[..., None])[..., 0]
+    lever = np.linalg.inv(normal)[:, 0, 0]
+    miss = (x[k:-k] - c[:, 0]) / np.sqrt(1 + lever)
+    # a robust mean: what the parabola cannot follow is not noise
+    cut = 4 * np.median(np.abs(miss)) + 1e-12
+    rms = float(np.sqrt(np.mean(np.minimum(miss**2, cut**2))))
+    return max(rms, quantum / np.sqrt(12), 1e-9), quantum
+
+
+def demand(row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np.ndarray, clip: bool = True) -> np.ndarray:
+    """Motor torque [S] that the believed law gives along the measured motion, delay and lag aside. N.m"""
+    p = lambda n: row[SERVO_INDEX[n]]  # noqa: E731
+    pd = p("kp") * (cmd - q) - p("kd") * v
+    if voltage:
+        tau0 = p("torque_limit")
+        out = np.clip(pd, -1, 1) if clip else pd
+        return tau0 * out - (tau0 / p("no_load_speed") * v if np.isfinite(p("no_load_speed")) else 0.0)
+    if not clip:
+        return pd
+    limit = p("torque_limit") * np.maximum(1 - np.abs(v) / p("no_load_speed"), 0) if np.isfinite(p("torque_limit")) else np.inf
+    return np.clip(pd, -limit, limit)
+
+
+def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float = 1e-3, progress=None, only: set[str] | None = None) -> list[Case]:
+    """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
+    joints = runs[0].joints
+    J = len(joints)
+    voltage = runs[0].servo.drive == "voltage"
+    mech, constants = [], None
+    for i, run in enumerate(runs):
+        times, values, c = along(model, run, joints)
+        mech.append((times, values))
+        constants = constants or c
+        if progress:
+            progress(i + 1, len(runs))
+    rows = [run.servo.nominal(joints) for run in runs]
+    torques = []
+    for run, row in zip(runs, rows, strict=True):
+        cmd = run.command_at(run.t)
+        torques.append(np.stack([demand(row[j], voltage, cmd[:, j], run.q[:, j], run.vs[:, j]) for j in range(J)], 1))
+    given = [_given(run, row, *m[:2], voltage) for run, row, m in zip(runs, rows, mech, strict=True)] if J > 1 else []
+    cases = []
+    for j, joint in enumerate(joints):
+        if only is not None and joint not in only:
+            continue
+        c = constants[j]
+        inertia = float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
+        rotor = c.armature if c.armature > 0 else 0.3 * inertia
+        servo = runs[0].servo
+        plant = JointPlant(joint, c, dt, voltage, servo.encoder("loop", [joint])[0], servo.encoder("position", [joint])[0], device)
+        others = _draggers(model, joints, j, runs)
+        believed = [_drags(run, rows[i][j], others) for i, run in enumerate(runs)]
+        for i, run in enumerate(runs):
+            exact = {}
+            if run.supply is not None and servo.supply_voltage:
+                exact["supply"] = _mean(run.supply / servo.supply_voltage, run.t, 0.05)
+            if run.enabled is not None:
+                exact["enabled"] = (run.enabled[:, j] > 0.5).astype(float)
+            if run.temperature is not None:
+                exact["warmth"] = run.temperature[:, j] - REFERENCE
+            if J > 1:
+                mech[i][1][j][:, SERIES_INDEX["others_torque"]] = np.delete(given[i], j, 1).sum(1)
+            for k, o in enumerate(others[:4]):
+                exact[f"drag{k}"] = run.qs[:, o] - run.qs[0, o]
+                _linked(mech[i][0], mech[i][1][j], mech[i][1][o], k, constants[o].armature)
+            if run.duty is not None:
+                exact["drive"] = run.duty[:, j]
+            elif run.torque is not None:
+                exact["drive"] = np.nan_to_num(run.torque[:, j])
+            effort = None if run.torque is None else run.torque[:, j]
+            plant.add(run.name, nominal_row(believed[i], rotor), mech[i][0], mech[i][1][j], run.cmd_t, run.cmd[:, j], run.t,
+                      run.q[:, j], effort, exact)  # fmt: skip
+        plant.finish()
+        cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
+    return cases
+
+
+def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
+    """Median over recordings of each one's median over its pieces (a contact cuts one into several): noise is the sensor's, and a recording
+    that moves too fast to tell the two apart counts once."""
+    by: dict[str, list[float]] = {}
+    for run, value in zip(runs, values, strict=True):
+        by.setdefault(run.name, []).append(value)
+    return float(np.median([np.median(x) for x in by.values()]))
+
+
+def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia, voltage) -> Case:
+    cat = lambda get: np.concatenate([get(i) for i in range(len(runs))])  # noqa: E731
+    t = plant.t
+    q, v, a = (cat(lambda i, n=n: getattr(runs[i], n)[:, j]) for n in ("qs", "vs", "as_"))
+    tau = cat(lambda i: torques[i][:, j])
+    cmd = cat(lambda i: runs[i].command_at(runs[i].t)[:, j])
+    asked = cat(lambda i: demand(rows[i][j], voltage, runs[i].command_at(runs[i].t)[:, j], runs[i].q[:, j], runs[i].vs[:, j], clip=False))
+    if voltage:
+        limit = rows[0][j][SERVO_INDEX["torque_limit"]]
+    else:
+        limit = rows[0][j][SERVO_INDEX["torque_limit"]]
+    estimates = [noise(run.t, run.q[:, j]) for run in runs]
+    sigma = _of_recordings(runs, [e[0] for e in estimates])
+    quantum = _of_recordings(runs, [e[1] for e in estimates])
+    series = lambda name: np.concatenate([np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]])  # noqa: E731
+                                          for i in range(len(runs))])
+    gravity, load_t, load_i = series("gravity_cos"), series("load_cos"), series("load_inertia")
+    spring = max(float(np.median([r[j][SERVO_INDEX["kp"]] for r in rows])) * (limit if voltage else 1.0), 1e-9)
+    big = lambda x, p=95: float(np.percentile(np.abs(x), p)) if len(x) else 0.0  # noqa: E731
+    load = gravity + series("rest") + inertia * a
+    tau_scale = max(min(big(tau), 3 * big(load) + 1e-12) if big(tau) > 0 else big(load), 1e-3 * spring * max(np.ptp(q), 1e-6), 1e-9)
+    nominal = {name: float(np.median([r[j][i] for r in rows])) for i, name in enumerate(SERVO_NAMES)}
+    nominal["torque_limit"] = min(nominal["torque_limit"], 1e9)
+    nominal["no_load_speed"] = min(nominal["no_load_speed"], 1e9)
+    effort_noise = 0.0
+    if np.isfinite(plant.torque).mean() > 0.5:
+        e = [noise(run.t, np.nan_to_num(run.torque[:, j]))[0] for run in runs if run.torque is not None]
+        effort_noise = max(float(np.median(e)), 0.01 * big(plant.torque[np.isfinite(plant.torque)]), 1e-9)
+    warm = 0.0
+    if runs[0].temperature is not None:
+        heat = cat(lambda i: runs[i].temperature[:, j])
+        warm = float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
+    scales = Scales(
+        tau=tau_scale, demand=max(big(asked, 99.8) if not voltage else limit, tau_scale), speed=max(big(v), 1e-6),
+        peak_speed=max(big(v, 99.8), 1e-6), error=max(big(cmd - plant.q, 90), sigma), stiffness=spring, inertia=inertia,
+        gravity=big(gravity, 99), span=max(float(np.ptp(q)), 1e-9), sigma=sigma, nominal=nominal,
+        others=tuple(runs[0].joints[o] for o in others[:4]),
+        others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99), load_torque=big(load_t), load_inertia=float(np.median(load_i)),
+        tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"}, warm=warm, slide=constants.slide, voltage=voltage,
+        effort=effort_noise > 0, saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
+        base_friction=constants.friction, base_damping=constants.damping, armature=constants.armature,
+        own_torque=big(series("own_cos")), own_inertia=float(np.median(series("own_inertia"))), leaf_mass=constants.leaf_mass, own_mass=constants.own_mass,
+    )  # fmt: skip
+    table = runs[0].servo
+    ranges, unknown = {}, []
+    for name in SERVO_NAMES:
+        value = table.value(joint, name)
+        if value.unknown:
+            unknown.append(name)
+        elif value.low < value.high:
+            ranges[name] = (value.low, value.high)
+    regimes_extra = {"_gravity": gravity}
+    for k in range(4):
+        moved_by = lambda i, k=k: runs[i].qs[:, others[k]] - runs[i].qs[0, others[k]] if k < len(others) else np.zeros(len(runs[i].t))  # noqa: E731
+        regimes_extra[f"_drag{k}"] = cat(moved_by)
+    regimes_extra["_error"] = cmd - plant.q
+    regimes_extra["_speed"] = v
+    regimes_extra["_command_rate"] = np.concatenate([np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs])
+    regimes_extra["_torque_rate"] = np.concatenate([np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)])
+    regimes_extra["_added"], regimes_extra["_added_own"] = load_t, series("own_cos")
+    regimes_extra["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
+    moved = scales.span > 6 * sigma
+    regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
+    regimes |= regimes_extra
+    return Case(joint, j, plant, constants, scales, sigma, quantum, effort_noise, ranges, tuple(unknown), regimes, moved,
+                table.loop_rate)
+
+
+def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[str, np.ndarray]:
+    """Variables [n] of each measured sample, that a residual may depend on."""
+    since = np.full(len(t), 9.0)
+    small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
+    for r in np.unique(run_of):
+        rows = np.flatnonzero(run_of == r)
+        sign, last = 0, -np.inf
+        for i in rows:
+            s = 0 if abs(v[i]) < small else (1 if v[i] > 0 else -1)
+            if s and s != sign:
+                if sign:
+                    last = t[i]
+                sign = s
+            since[i] = min(t[i] - last, 9.0)
+    out = {
+        "time since reversal": since, "speed": np.abs(v), "acceleration": np.abs(a), "load": np.abs(load), "position": q,
+        "direction": np.sign(v), "driven against its load": np.sign(v * tau), "position error": np.abs(cmd - q),
+        "saturation": np.abs(asked) / limit if np.isfinite(limit) else np.zeros_like(t), "time": t.copy(),
+    }  # fmt: skip
+    out |= {"_torque": tau, "_asked": asked, "_load": load, "_friction": 0.0 * tau}
+    if runs[0].temperature is not None:
+        out["temperature"] = np.concatenate([r.temperature[:, j] for r in runs])
+    J = len(runs[0].joints)
+    for o in range(J):
+        if o != j and J <= 16:
+            out[f"motion of {runs[0].joints[o]}"] = np.abs(np.concatenate([r.vs[:, o] for r in runs]))
+    return out
+
+
+def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, armature: float) -> None:
+    """Writes rate, acceleration and link-side torque of another joint (its series [n, E] at times [n]) as dragger k of a joint."""
+    speed = other[:, SERIES_INDEX["v"]]
+    acceleration = np.gradient(speed, times)
+    series[:, SERIES_INDEX[f"drag_v{k}"]] = speed
+    series[:, SERIES_INDEX[f"drag_a{k}"]] = acceleration
+    load = (other[:, SERIES_INDEX["inertia"]] - armature) * acceleration + other[:, SERIES_INDEX["gravity_cos"]] + other[:, SERIES_INDEX["rest"]]
+    series[:, SERIES_INDEX[f"pull{k}"]] = load
+
+
+def _draggers(model, joints, j, runs) -> list[int]:
+    """Other joints that move, the nearest in the kinematic tree first."""
+    moved = [o for o in range(len(joints)) if o != j and max(np.ptp(r.qs[:, o]) for r in runs) > 0.01]
+    body = [int(model.jnt_bodyid[model.joint(n).id]) for n in joints]
+
+    def chain(b):
+        out = []
+        while b:
+            out.append(b)
+            b = int(model.body_parentid[b])
+        return out
+
+    own = chain(body[j])
+
+    def far(o):
+        other = chain(body[o])
+        shared = len(set(own) & set(other))
+        return (len(own) - shared) + (len(other) - shared) - 0.1 * shared, o
+
+    return sorted(moved, key=far)
+
+
+def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: Sequence[np.ndarray], voltage: bool) -> np.ndarray:
+    """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed: by commands of
+    those moments, which are finer than the samples. N.m"""
+    cmd = run.command_at(times)
+    q, v = SERIES_INDEX["q"], SERIES_INDEX["v"]
+    return np.abs(np.stack([demand(rows[j], voltage, cmd[:, j], x[:, q], x[:, v]) for j, x in enumerate(series)], 1))
+
+
+def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
+    """A joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of which the first four are
+    simulated, and the one that is believed to drag goes first), not among the mechanism's joints."""
+    row = row.copy()
+    if row[SERVO_INDEX["coupling"]]:
+        name = (run.counted or run.joints)[int(row[SERVO_INDEX["coupling_from"]])]
+        source = run.joints.index(name) if name in run.joints else -1
+        if source in others:
+            others.remove(source)
+            others.insert(0, source)
+        else:  # it stands still
+            row[SERVO_INDEX["coupling"]] = 0.0
+    row[SERVO_INDEX["coupling_from"]] = 0.0
+    return row
+
+
+def _mean(x: np.ndarray, t: np.ndarray, seconds: float) -> np.ndarray:
+    """Moving mean over +- seconds."""
+    n = max(int(round(seconds / max(float(np.median(np.diff(t))), 1e-6))), 1)
+    kernel = np.ones(2 * n + 1) / (2 * n + 1)
+    return np.convolve(np.pad(x, n, mode="edge"), kernel, mode="valid")

@@ -1,0 +1,1 @@
+"""Step 1: recordings in, their signals tested, runs of plain arrays out."""

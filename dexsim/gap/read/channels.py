@@ -1,0 +1,209 @@
+"""Signals that are not what they say, found before any physics: what they are, and what must be left out because of them.
+
+The reader's audit names what a recording alone shows. Beside the model and the commands more can be told: degrees on both sides,
+a position that runs against its target or before it, readings that are repeated while the joint moves, an encoder that stops.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.gap.read import stale
+from dexsim.gap.read.runs import Run
+from dexsim.recording.schema import COMMANDS, STATES, Recording
+
+SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
+HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
+BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judged before and after it
+EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
+TURN = 180 / np.pi
+
+
+def finding(kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9) -> dict[str, Any]:
+    """A finding bad_channel as `diagnosis.json` has it."""
+    return {
+        "effect": "bad_channel", "confidence": confidence, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
+        "where": {"joints": [joint] if joint else [], "taxels": [], "topics": topics}, "regime": f"{kind}: {text}", "when": when,
+        "parameters": {}, "held_out": None,
+    }  # fmt: skip
+
+
+def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
+    """(recording, joint) whose position or target the audit found wrong -> why."""
+    out = {}
+    for r in recordings:
+        for f in r.findings:
+            if f.severity == "error" and f.kind in SPOILS and f.joint and f.text.split(" ")[0] in ("position", "command"):
+                out.setdefault((r.path.name, f.joint), f"{f.kind}: {f.text}")
+    return out
+
+
+def secondary(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The findings without those that follow from another: an effort's sign is read against the position."""
+    wrong = {j for f in findings for j in f["where"]["joints"] if f["regime"].split(":")[0] in SPOILS and "position" in f["regime"]}
+    return [f for f in findings if not (f["regime"].startswith(("sign_mismatch", "lost_sign")) and set(f["where"]["joints"]) & wrong)]
+
+
+def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]
+            ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
+    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by run in s in which
+    nothing is known of a joint). `known`: what the audit has named already. Repeated readings are taken out of the runs, which can then be
+    used, but for those stretches."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    out = dict(known)
+    long = {joint: stale.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
+    blind: dict[str, list[tuple[float, float]]] = {}
+
+    def add(kind: str, text: str, run: Run, joint: str, topics: list[str], spans: list[tuple[float, float]], confidence: float = 0.9, drop: bool = True):
+        entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
+        entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
+        if drop:
+            out[run.name, joint] = f"{kind}: {text}"
+
+    for i, run in enumerate(runs):
+        stale = np.zeros(len(run.t), bool)
+        for j, joint in enumerate(run.joints):
+            if (run.name, joint) in out:
+                continue
+            q, whole = run.q[:, j], [(run.t[0], run.t[-1])]
+            cmd = run.command_at(run.t)[:, j]
+            limits = _range(model, joint)
+            if limits is not None and _degrees(q, cmd, limits):
+                add("unit", f"position and target of {joint} reach {np.abs(q).max():.3g}, where the model allows {np.abs(limits).max():.3g}: degrees? "
+                    "(state meta.position_unit=deg)", run, joint, [STATES, COMMANDS], whole)  # fmt: skip
+                continue
+            if np.ptp(cmd) > 1e-3 and np.ptp(q) > 0.2 * np.ptp(cmd) and _sign(run, q, j) < -0.7:
+                add("sign", f"{joint} follows the negative of its target: another direction of its position or its commands", run, joint, [STATES, COMMANDS], whole)
+                continue
+            lead = _lead(run, j)
+            if lead > EARLY:
+                add("clock_skew", f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on different clocks", run, joint,
+                    [COMMANDS, STATES], whole)  # fmt: skip
+                continue
+            stop = _stops(run, j, cmd)
+            if stop is not None:
+                add("stuck", f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a drive that is off", run, joint,
+                    [STATES], [(stop, run.t[-1])], 0.7)  # fmt: skip
+                continue
+            held, single = _held(run.t, q), stale.duplicates(run.t, q)
+            for a, b in long[joint][i]:
+                held[a + 1 : b + 1] = True
+                if run.t[b] - run.t[a] > BLIND:
+                    blind.setdefault(run.name, []).append((float(run.t[a]), float(run.t[b])))
+            if held.any():
+                edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
+                add("stale", f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old readings, sent again", run, joint,
+                    [STATES], [(run.t[a], run.t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)], drop=False)  # fmt: skip
+            elif single.any():
+                add("stale", f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: old readings, sent again", run, joint,
+                    [STATES], [(run.t[0], run.t[-1])], drop=False)  # fmt: skip
+            stale |= held | single
+        if stale.any() and (~stale).sum() >= 20:
+            _keep(run, ~stale)
+    return list(found.values()), out, blind
+
+
+def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str]) -> list[Run]:
+    """The runs without the joints that must be left out; a run without joints is gone."""
+    kept = []
+    for run in runs:
+        bad = [j for j in run.joints if (run.name, j) in out]
+        if bad:
+            notes += [f"{run.name}: {j} is left out ({out[run.name, j]})" for j in bad]
+            k = [i for i, j in enumerate(run.joints) if j not in bad]
+            if not k:
+                continue
+            run.joints = tuple(run.joints[i] for i in k)
+            run.cmd, run.q = run.cmd[:, k], run.q[:, k]
+            for name in ("v", "torque", "temperature", "duty", "enabled"):
+                x = getattr(run, name)
+                setattr(run, name, None if x is None else x[:, k])
+        kept.append(run)
+    return kept
+
+
+def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
+    i = model.joint(joint).id
+    hinge = int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    return model.jnt_range[i] if model.jnt_limited[i] and hinge else None
+
+
+def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
+    """Far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn outside: the
+    model's range may be the one in degrees.)"""
+    wide = 0.1 * (limits[1] - limits[0])
+    outside = lambda x: max(x.max() - limits[1], limits[0] - x.min()) > 3 * (limits[1] - limits[0])  # noqa: E731
+    inside = (q / TURN).min() > limits[0] - wide and (q / TURN).max() < limits[1] + wide
+    return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
+
+
+def _sign(run: Run, q: np.ndarray, j: int) -> float:
+    """Correlation of the position with its target of a little before, the most of a few delays in size."""
+    best = 0.0
+    for delay in (0.0, 0.03, 0.08, 0.15):
+        c = run.command_at(run.t - delay)[:, j]
+        if c.std() > 0 and q.std() > 0:
+            r = float(np.corrcoef(c, q)[0, 1])
+            best = r if abs(r) > abs(best) else best
+    return best
+
+
+def _lead(run: Run, j: int) -> float:
+    """Time [s] by which the joint moves before its target: 0 where it does not."""
+    grid = np.arange(run.t[0], run.t[-1], 0.005)
+    if len(grid) < 200:
+        return 0.0
+    q = np.interp(grid, run.t, run.q[:, j])
+    dq = np.gradient(q)
+    shifts = np.arange(-0.6, 0.401, 0.005)
+    scores = []
+    for s in shifts:
+        dc = np.gradient(run.command_at(grid - s)[:, j])
+        dc = np.convolve(dc, np.ones(9) / 9, "same")
+        scores.append(float(dc @ dq) / (np.linalg.norm(dc) * np.linalg.norm(dq) + 1e-12))
+    best = int(np.argmax(scores))
+    causal = max(s for s, x in zip(scores, shifts, strict=True) if x >= 0)
+    # periodic motion fits at many shifts: only a clear gain before the target counts
+    return float(-shifts[best]) if shifts[best] < 0 and scores[best] > 0.6 and scores[best] > causal + 0.15 else 0.0
+
+
+def _stops(run: Run, j: int, cmd: np.ndarray) -> float | None:
+    """When [s] the position stops for good although its target goes on; None where it does not."""
+    q = run.q[:, j]
+    last = np.flatnonzero(q != q[-1])
+    if not len(last) or last[-1] > 0.75 * len(q) or np.ptp(q[: last[-1] + 1]) < 1e-3:
+        return None
+    k = last[-1] + 1
+    if run.enabled is not None and (run.enabled[k:, j] < 0.5).any():
+        return None
+    moved = np.ptp(cmd[:k])
+    return float(run.t[k]) if np.ptp(cmd[k:]) > 0.3 * max(moved, np.ptp(q)) else None
+
+
+def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[S] readings that repeat the one before and end in a jump that a joint of this speed cannot make in one sample."""
+    same = np.r_[False, np.diff(q) == 0]
+    step = np.abs(np.diff(q))
+    moving = step[step > 0]
+    out = np.zeros(len(q), bool)
+    if len(moving) < 20:
+        return out
+    usual = float(np.percentile(moving, 90))
+    edge = np.flatnonzero(np.diff(np.r_[0, same.astype(int), 0]))
+    jumps = [(a, b) for a, b in zip(edge[::2], edge[1::2], strict=True)
+             if b < len(q) and t[b - 1] - t[a - 1] >= HELD and abs(q[b] - q[b - 1]) > 2.5 * usual]  # fmt: skip
+    # a joint at rest may start with a jump: at least two must have been moving when they froze
+    if sum(a >= 4 and np.median(step[a - 4 : a - 1]) > 0.1 * usual for a, _ in jumps) >= 2:
+        for a, b in jumps:
+            out[a:b] = True
+    return out
+
+
+def _keep(run: Run, on: np.ndarray) -> None:
+    run.t, run.q = run.t[on], run.q[on]
+    for name in ("v", "torque", "temperature", "duty", "enabled", "supply"):
+        x = getattr(run, name)
+        setattr(run, name, None if x is None else x[on])

@@ -1,0 +1,290 @@
+"""From recording files to runs: joints matched, clocks aligned, faults of the signals told apart from physics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.actuator.table import ServoTable
+from dexsim.errors import UserError
+from dexsim.gap.read.runs import Run
+from dexsim.recording.mechanism import Mechanism, merged
+from dexsim.recording.schema import Recording, Series
+
+# kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
+BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
+SHORTEST = 1.0  # s
+
+
+class Unusable(Exception):
+    """A recording that cannot carry an answer, with the reason: a verdict, not a crash."""
+
+
+def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
+    """The recording as plain arrays. Raises Unusable where it cannot be used; what is left out goes to notes."""
+    name = recording.path.name
+    joints = tuple(j for j in m.joints if j in recording.joints)
+    foreign = [j for j in recording.joints if j not in m.joints]
+    if foreign:
+        notes.append(f"{name}: joints that the model has not are left out: {', '.join(foreign)}")
+    if not joints:
+        raise Unusable(f"{name}: none of its joints ({', '.join(recording.joints) or 'none named'}) is in the model, whose joints are"
+                       f" {', '.join(m.joints)}; name them with remap.OURS=THEIRS or give its own model=")
+    if not len(recording.states.position):
+        raise Unusable(f"{name}: commands without states: no /joint_states to compare with")
+    if not len(recording.commands):
+        raise Unusable(f"{name}: states without commands: no /joint_commands, so what the servo was asked is unknown")
+    column = [recording.joints.index(j) for j in joints]
+    p = recording.states.position
+    t, q = np.asarray(p.t, float), p.value[:, column]
+    keep = np.r_[True, np.diff(t) > 1e-6] & np.isfinite(q).any(1)
+    t, q = t[keep], q[keep].copy()
+    if len(t) < 20 or t[-1] - t[0] < SHORTEST:
+        span = t[-1] - t[0] if len(t) else 0.0
+        raise Unusable(f"{name}: {len(t)} samples over {span:.2f} s; at least 20 samples and {SHORTEST:g} s are needed")
+    good = []
+    for j in range(q.shape[1]):
+        finite = np.isfinite(q[:, j])
+        if finite.mean() < 0.5:
+            notes.append(f"{name}: {joints[j]} has {100 * (1 - finite.mean()):.0f} % of its positions missing; left out")
+            continue
+        if not finite.all():
+            notes.append(f"{name}: {joints[j]}: {int((~finite).sum())} missing positions are interpolated")
+            q[:, j] = np.interp(t, t[finite], q[finite, j])
+        good.append(j)
+    ct, c = np.asarray(recording.commands.t, float), recording.commands.value[:, column].copy()
+    kept = []
+    for j in good:
+        finite = np.isfinite(c[:, j])
+        if not finite.any():
+            notes.append(f"{name}: {joints[j]} has states but no commands; left out")
+            continue
+        index = np.maximum.accumulate(np.where(finite, np.arange(len(c)), -1))
+        first = int(np.argmax(finite))
+        c[:, j] = np.where(index >= 0, c[np.maximum(index, 0), j], c[first, j])
+        kept.append(j)
+    if not kept:
+        raise Unusable(f"{name}: no joint has both commands and positions")
+    joints = tuple(joints[j] for j in kept)
+    column = [column[j] for j in kept]
+    q, c = q[:, kept], c[:, kept]
+    # a command from before the first state still holds; the clock starts at the first state
+    order = np.argsort(ct, kind="stable")
+    ct, c = ct[order], c[order]
+    if ct[0] > t[-1]:
+        raise Unusable(f"{name}: the commands begin {ct[0] - t[-1]:.1f} s after the last state: the clocks do not belong together")
+    if ct[0] > t[0] + 0.05:
+        # what held before is not known: begin where it is
+        start = np.searchsorted(t, ct[0])
+        if t[-1] - t[min(start, len(t) - 1)] < SHORTEST:
+            raise Unusable(f"{name}: states and commands overlap for less than {SHORTEST:g} s")
+        notes.append(f"{name}: the first {ct[0] - t[0]:.2f} s have no command and are left out")
+        t, q = t[start:], q[start:]
+    table = m.table
+    if recording.meta.get("servo"):
+        import yaml
+
+        table = ServoTable.from_dict(merged(table.to_dict(), yaml.safe_load(recording.meta["servo"])), source=f"servo of {name}")
+    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
+    run.v = _at(recording.states.velocity, t, column)
+    effort = recording.signed_effort()
+    if effort is not None and recording.effort_is != "none" and not _bad(recording, "/joint_states", "effort"):
+        values = _at(effort, t, column)
+        if values is not None and recording.effort_is == "current_A":
+            per = table.current(joints)
+            values = values / per[None]
+            if np.isnan(per).all():
+                notes.append(f"{name}: current_per_torque is unknown, so the current is not compared (python calibrate.py measures it)")
+        if values is not None and np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0:
+            run.torque = values
+    run.temperature = _at(recording.temperature, t, column)
+    if not any(f.kind == "wrap" and f.topic == "/joint_duty" for f in recording.findings):
+        run.duty = _at(recording.duty, t, column)
+    run.enabled = _at(recording.enabled, t, column, hold=True)
+    if recording.supply_voltage is not None and len(recording.supply_voltage):
+        s = recording.supply_voltage
+        finite = np.isfinite(s.value)
+        if finite.any():
+            run.supply = np.interp(t, s.t[finite], s.value[finite])
+    return run
+
+
+def _bad(recording: Recording, topic: str, word: str) -> bool:
+    return any(f.kind in ("wrap", "lost_sign") and f.topic == topic and word in f.text.lower() for f in recording.findings)
+
+
+def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool = False) -> np.ndarray | None:
+    """Columns of a series at times t, interpolated (held where hold)."""
+    if series is None or not len(series):
+        return None
+    out = np.empty((len(t), len(columns)))
+    for k, c in enumerate(columns):
+        x = series.value[:, c]
+        finite = np.isfinite(x)
+        if not finite.any():
+            out[:, k] = np.nan
+        elif hold:
+            i = np.clip(np.searchsorted(series.t[finite], t, side="right") - 1, 0, finite.sum() - 1)
+            out[:, k] = x[finite][i]
+        else:
+            out[:, k] = np.interp(t, series.t[finite], x[finite])
+    return None if np.isnan(out).all() else out
+
+
+def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[float, float]]], notes: list[str],
+             why: str = "something is touched, or links touch each other", rest: str = "in free air", room: tuple[float, float] = (0.1, 0.3),
+             least: float = 2.0) -> tuple[list[Run], list[int]]:
+    """The runs without the stretches in which something is touched (by recording: start, end in s; `why`, and what is left, `rest`, in
+    words) and `room` s before and after, and which are held out. Pieces shorter than `least` s are left out.
+
+    A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in between
+    becomes several of the same name, on its own clock.
+    """
+    out: list[Run] = []
+    kept: list[int] = []
+    for i, run in enumerate(runs):
+        spans = touched.get(run.name, [])
+        if not spans:
+            kept += [len(out)] if i in held else []
+            out.append(run)
+            continue
+        edges = [float(run.t[0])]
+        for a, b in spans:
+            edges += [a - room[0], b + room[1]]
+        edges.append(float(run.t[-1]))
+        pieces = [cut(run, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= least]
+        pieces = [p for p in pieces if len(p.t) >= 20 and (np.ptp(p.q, axis=0) > 2e-3).any()]
+        share = sum(p.duration for p in pieces) / max(run.duration, 1e-9)
+        notes.append(f"{run.name}: {why}; joints are judged by the {100 * share:.0f} % of its time {rest}" if pieces
+                     else f"{run.name}: {why}, nearly all the time; its joints are not judged")  # fmt: skip
+        kept += range(len(out), len(out) + len(pieces)) if i in held else []
+        out += pieces
+    return out, kept
+
+
+def cut(run: Run, start: float, end: float) -> Run:
+    """The run between two times [s]; commands stay, for what was sent before still acts."""
+    on = (run.t >= start) & (run.t <= end)
+    part = lambda x: None if x is None else x[on]  # noqa: E731
+    return Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[on], run.q[on], run.servo, run.gravity, part(run.v), part(run.torque), run.torque_unit,
+               part(run.duty), part(run.temperature), part(run.enabled), part(run.supply), notes=list(run.notes))  # fmt: skip
+
+
+def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
+    """The runs with the joints that all of them have, in one order."""
+    shared = [j for j in runs[0].joints if all(j in r.joints for r in runs)]
+    if not shared:
+        raise Unusable("the recordings have no joint in common: " + "; ".join(f"{r.name}: {', '.join(r.joints)}" for r in runs))
+    for r in runs:
+        extra = [j for j in r.joints if j not in shared]
+        if extra:
+            notes.append(f"{r.name}: {', '.join(extra)} not in every recording; left out")
+            k = [r.joints.index(j) for j in shared]
+            r.cmd, r.q = r.cmd[:, k], r.q[:, k]
+            for name in ("v", "torque", "temperature", "duty", "enabled"):
+                x = getattr(r, name)
+                setattr(r, name, None if x is None else x[:, k])
+        else:
+            k = [r.joints.index(j) for j in shared]
+            r.cmd, r.q = r.cmd[:, k], r.q[:, k]
+            for name in ("v", "torque", "temperature", "duty", "enabled"):
+                x = getattr(r, name)
+                setattr(r, name, None if x is None else x[:, k])
+        r.joints = tuple(shared)
+    for name in ("torque", "temperature", "duty", "enabled"):  # a signal counts only where every run has it
+        have = [getattr(r, name) is not None for r in runs]
+        if any(have) and not all(have):
+            for r in runs:
+                setattr(r, name, None)
+            notes.append(f"{name} is not in every recording and is left out")
+    return runs
+
+
+def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list[dict[str, Any]]:
+    """Findings of signals that are not what they say, as `diagnosis.json` has them (effect bad_channel)."""
+    out: dict[tuple, dict[str, Any]] = {}
+    for r in recordings:
+        for f in r.findings:
+            if f.kind not in BAD_CHANNEL or f.severity != "error":
+                continue
+            key = (f.kind, f.topic, f.joint)
+            entry = out.setdefault(key, {
+                "effect": "bad_channel", "confidence": 0.9, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
+                "where": {"joints": [f.joint] if f.joint in joints else [], "taxels": [], "topics": [f.topic] if f.topic else []},
+                "regime": f"{f.kind}: {f.text}", "when": [], "parameters": {}, "held_out": None,
+            })  # fmt: skip
+            if np.isfinite(f.time):
+                end = f.end if np.isfinite(f.end) else f.time
+                entry["when"].append({"recording": r.path.name, "start": float(f.time), "end": float(max(end, f.time))})
+    return list(out.values())
+
+
+def files(given: Any, key: str) -> list[Path]:
+    """A list of recording paths from a setting; UserError where it is empty or a file is missing."""
+    items = given if isinstance(given, (list, tuple)) else [given]
+    out = []
+    for item in items:
+        path = Path(str(item)).expanduser()
+        if any(ch in str(item) for ch in "*?"):
+            found = sorted(path.parent.glob(path.name))
+            if not found:
+                raise UserError(f"{key}={item}: no file matches")
+            out += found
+        elif not path.exists():
+            raise UserError(f"{key}: recording '{path}' does not exist")
+        else:
+            out.append(path)
+    if not out:
+        raise UserError(f"{key}: say which, e.g. {key}='[a.mcap,b.mcap]'")
+    return out
+
+
+def self_touch(runs: list[Run], model: mujoco.MjModel, rate: float = 25.0, depth: float = 3e-4) -> dict[str, list[tuple[float, float]]]:
+    """By recording, the stretches [s] in which links of the model press on one another along the measured motion.
+
+    A pair that touches nearly always overlaps by design and says nothing. depth [m]: less is left to the geometry's accuracy.
+    """
+    data = mujoco.MjData(model)
+    seen: list[tuple[str, float, set[tuple[int, int]]]] = []
+    for run in runs:
+        address = [int(model.joint(j).qposadr[0]) for j in run.joints]
+        for t in np.arange(run.t[0], run.t[-1], 1 / rate):
+            data.qpos[address] = [np.interp(t, run.t, run.q[:, j]) for j in range(len(run.joints))]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            contacts = data.contact
+            deep = np.flatnonzero(contacts.dist[: data.ncon] < -depth) if data.ncon else ()
+            pairs = {tuple(sorted(int(model.geom_bodyid[g]) for g in contacts.geom[c])) for c in deep}
+            seen.append((run.name, float(t), pairs))
+    counts: dict[tuple[int, int], int] = {}
+    for _, _, pairs in seen:
+        for p in pairs:
+            counts[p] = counts.get(p, 0) + 1
+    always = {p for p, n in counts.items() if n > 0.9 * len(seen)}
+    out: dict[str, list[tuple[float, float]]] = {}
+    for name, t, pairs in seen:
+        if pairs - always:
+            spans = out.setdefault(name, [])
+            if spans and t - spans[-1][1] < 0.3:
+                spans[-1] = (spans[-1][0], t + 1 / rate)
+            else:
+                spans.append((t - 1 / rate, t + 1 / rate))
+    return out
+
+
+def merged_spans(*several: dict[str, list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
+    """Stretches of several sources by recording, sorted, those that overlap joined."""
+    out: dict[str, list[tuple[float, float]]] = {}
+    for name in {n for s in several for n in s}:
+        joined: list[tuple[float, float]] = []
+        for a, b in sorted(x for s in several for x in s.get(name, [])):
+            if joined and a <= joined[-1][1]:
+                joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
+            else:
+                joined.append((a, b))
+        out[name] = joined
+    return out

@@ -1,0 +1,97 @@
+"""Stage tests: where a signal inside the drive was logged, each stage is tested with its own recorded input.
+
+The firmware's law along the measured motion against the logged duty or effort exonerates (or accuses) everything before
+the motor at no cost; what is after it is the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexsim.actuator.columns import INDEX
+from dexsim.gap.plant.case import Case
+from dexsim.gap.read.runs import Run
+
+GOOD_FIT, GOOD_SLOPE = 0.95, 0.05
+
+
+@dataclass
+class Stage:
+    """The law of one joint's drive against what was logged. slope: logged over predicted, with its 90 % interval by a block
+    bootstrap; offset in the logged unit; delay [s] at which they agree best; fit: share of the variance explained;
+    residual rms over the logged rms."""
+
+    joint: str
+    signal: str
+    slope: float
+    slope_low: float
+    slope_high: float
+    offset: float
+    delay: float
+    fit: float
+
+    @property
+    def sound(self) -> bool:
+        """The drive does what is believed: gain within 5 % and nearly all of the signal."""
+        return self.fit > GOOD_FIT and abs(self.slope - 1) < GOOD_SLOPE and abs(self.delay) < 0.008
+
+    @property
+    def text(self) -> str:
+        """The result in words."""
+        head = f"{self.joint}: the believed law explains {100 * self.fit:.0f} % of the logged {self.signal}, at {self.slope:.3f} of its size"
+        head += f" ({self.slope_low:.3f} to {self.slope_high:.3f})"
+        if abs(self.delay) >= 0.002:
+            head += f", {1e3 * self.delay:.0f} ms {'later' if self.delay > 0 else 'earlier'}"
+        return head + ("; what is missing lies after the motor" if self.sound else "; the drive itself is not as believed")
+
+
+def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -> list[Stage]:
+    """One Stage for each joint whose duty (voltage drives) or effort was logged."""
+    out = []
+    rng = np.random.default_rng(seed)
+    for case in cases:
+        x, y, block, signal = [], [], [], ""
+        shifts = np.arange(-0.01, 0.0401, 0.002)
+        for r in train:
+            run = runs[r]
+            j = case.index
+            row = run.servo.nominal(run.joints)[j]
+            kp, kd, limit = (row[INDEX[n]] for n in ("kp", "kd", "torque_limit"))
+            logged = None
+            if run.duty is not None and run.servo.drive == "voltage":
+                logged, top, signal = run.duty[:, j], 1.0, "duty"
+            elif run.torque is not None and run.servo.drive == "torque":
+                logged, top, signal = run.torque[:, j], limit, "effort"
+            if logged is None:
+                continue
+            on = np.isfinite(logged)
+            if run.enabled is not None:
+                on &= run.enabled[:, j] > 0.5
+            law = []
+            for d in shifts + row[INDEX["delay"]]:
+                cmd = run.command_at(run.t - d)[:, j]
+                law.append(np.clip(kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j])) - kd * np.interp(run.t - d, run.t, run.vs[:, j]), -top, top))
+            x.append(np.array(law)[:, on])
+            y.append(logged[on])
+            block.append(1000 * r + (run.t[on] / 0.5).astype(int))
+        if not x or sum(len(v) for v in y) < 50:
+            continue
+        law, logged = np.concatenate(x, 1), np.concatenate(y)
+        _, blocks = np.unique(np.concatenate(block), return_inverse=True)
+        if logged.std() < 1e-9 or law.std() < 1e-9:
+            continue
+        correlation = [np.corrcoef(row, logged)[0, 1] if row.std() > 0 else 0.0 for row in law]
+        best = int(np.argmax(correlation))
+        p = law[best]
+        count = int(blocks.max()) + 1
+        sums = np.stack([np.bincount(blocks, v, count) for v in (np.ones_like(p), p, logged, p * p, p * logged)])
+        pick = rng.integers(0, count, (300, count))
+        n, sx, sy, sxx, sxy = sums[:, pick].sum(-1)
+        slopes = (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)
+        slope, offset = np.polyfit(p, logged, 1)
+        fit = 1 - np.var(logged - slope * p - offset) / np.var(logged)
+        out.append(Stage(case.joint, signal, float(slope), float(np.quantile(slopes, 0.05)), float(np.quantile(slopes, 0.95)), float(offset),
+                         float(shifts[best]), float(fit)))  # fmt: skip
+    return out

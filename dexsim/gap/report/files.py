@@ -1,0 +1,98 @@
+"""A diagnosis as files: diagnosis.json, details.json, report.html, servo.yaml and the rest."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.gap.judge import residual_fit
+from dexsim.gap.judge.findings import save_model
+from dexsim.gap.result import Diagnosis
+from dexsim.gap.touch import handed_on as touch_handed
+
+
+def save(d: Diagnosis, out: Path) -> list[Path]:
+    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and tactile.yaml; returns
+    what was written."""
+    from dexsim.gap.report.page import page
+
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    d.notes = grouped(d.notes)
+    path = out / "diagnosis.json"
+    asked, more = specified(d.data)
+    path.write_text(json.dumps(plain(asked), indent=1, allow_nan=False), encoding="utf-8")
+    written.append(path)
+    more |= {"notes": d.notes, "seconds": d.shares}
+    path = out / "details.json"
+    path.write_text(json.dumps(plain(more), indent=1, allow_nan=False), encoding="utf-8")
+    written.append(path)
+    if d.evidence:
+        path = out / "evidence.json"
+        path.write_text(json.dumps(plain([e.plain() for e in d.evidence]), indent=1, allow_nan=False), encoding="utf-8")
+        written.append(path)
+    if d.servo is not None:
+        d.servo.save(out / "servo.yaml")
+        written.append(out / "servo.yaml")
+    if d.touch is not None and touch_handed.save(touch_handed.handed(d.touch.findings, d.touch.facts), out / "tactile.yaml"):
+        written.append(out / "tactile.yaml")
+    if d.standins:
+        residual_fit.write(d.servo, d.standins, out / "servo_standin.yaml")
+        written.append(out / "servo_standin.yaml")
+    if d.model_spec is not None:
+        try:
+            d.model_spec.compile()
+            save_model(d.model_spec, out / "model.xml")
+            written.append(out / "model.xml")
+        except (ValueError, OSError, mujoco.FatalError) as error:
+            d.notes.append(f"model.xml could not be written: {error}")
+    if (d.data["next_recording"] or {}).get("commands"):
+        written.append(out / d.data["next_recording"]["commands"])
+    path = out / "report.html"
+    path.write_text(page(d), encoding="utf-8")
+    written.append(path)
+    return written
+
+
+BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexplained", "not_considered"))
+
+
+def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for details.json)."""
+    asked, more = copy.deepcopy(data), {}
+    for *parents, key in BEYOND:
+        there = asked[parents[0]] if parents else asked
+        if key in there:
+            (more.setdefault(parents[0], {}) if parents else more)[key] = there.pop(key)
+    return asked, more
+
+
+def grouped(notes: Sequence[str]) -> list[str]:
+    """Notes that several recordings share, said once: "a.mcap, b.mcap: ..." with at most three names."""
+    out: dict[str, list[str]] = {}
+    for note in notes:
+        name, colon, text = note.partition(": ")
+        if colon and name.endswith((".mcap", ".bag")) and " " not in name:
+            out.setdefault(text, []).append(name)
+        else:
+            out.setdefault(note, [])
+    join = lambda names: ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")  # noqa: E731
+    return [f"{join(list(dict.fromkeys(names)))}: {text}" if names else text for text, names in out.items()]
+
+
+def plain(x: Any) -> Any:
+    if isinstance(x, dict):
+        return {str(k): plain(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [plain(v) for v in x]
+    if isinstance(x, (np.floating, float)):
+        return float(x) if np.isfinite(x) else None
+    if isinstance(x, np.integer):
+        return int(x)
+    return x

@@ -1,0 +1,166 @@
+"""A picture of the mechanism as inline SVG: outlines of its links, joints coloured by error, taxels where they sit."""
+
+from __future__ import annotations
+
+import html
+
+import mujoco
+import numpy as np
+
+from dexsim.gap.report.charts import INK, SOFT, number, text
+
+PALE, HOT = (247, 243, 236), (196, 38, 46)
+
+
+def pad(error: np.ndarray, marked: set[int], size: float = 15.0) -> str:
+    """One pad's taxels [K] N as its lattice, rows from the joint (below) to the tip, coloured by error; the marked ringed."""
+    from dexsim.assets.xhand import COLUMNS, ROWS
+
+    most = max(float(error.max()), 1e-9)
+    width, height = COLUMNS * size + 2, ROWS * size + 2
+    out = [f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error of each taxel">']
+    for k, e in enumerate(error):
+        c, r = divmod(k, ROWS)
+        x, y = 1 + c * size, 1 + (ROWS - 1 - r) * size
+        ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
+        out.append(f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>')
+    return "".join(out) + "</svg>"
+
+
+def heat(share: float) -> str:
+    """Colour of an error, as a share of the largest."""
+    share = float(np.clip(share, 0.0, 1.0)) ** 0.7
+    return "#" + "".join(f"{int(a + share * (b - a)):02x}" for a, b in zip(PALE, HOT, strict=True))
+
+
+def scale(most: float, unit: str, width: int = 360) -> str:
+    """The colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
+    left, right, steps = 60, width - 96, 24
+    part = (right - left) / steps
+    out = [f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">', text(left - 8, 14, "0", "end")]
+    out += [f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>' for k in range(steps)]
+    return "".join(out) + text(right + 8, 14, f"{number(1e3 * most)} {unit}") + "</svg>"
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
+    """Points [n, 3] whose hull is the geom, world frame."""
+    kind, size = int(model.geom_type[g]), model.geom_size[g]
+    if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
+        m = model.geom_dataid[g]
+        p = model.mesh_vert[model.mesh_vertadr[m] : model.mesh_vertadr[m] + model.mesh_vertnum[m]].astype(float)
+    elif kind == int(mujoco.mjtGeom.mjGEOM_PLANE):
+        return np.zeros((0, 3))
+    else:
+        u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(0, np.pi, 7))
+        ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], -1).reshape(-1, 3)
+        if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
+            p = ball * size[0]
+        elif kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+            p = np.concatenate([ball * size[0] + [0, 0, size[1]], ball * size[0] - [0, 0, size[1]]])
+        elif kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER):
+            ring = np.stack([np.cos(u[0]), np.sin(u[0]), 0 * u[0]], -1) * size[0]
+            p = np.concatenate([ring + [0, 0, size[1]], ring - [0, 0, size[1]]])
+        elif kind == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+            p = ball * size
+        else:
+            p = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * size
+    return p @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+
+
+def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
+    """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side stands."""
+    centred = cloud - cloud.mean(0)
+    _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=True)
+    front = axes[2]
+    if facing is not None and abs(front @ facing) > 0.2:
+        front = front * np.sign(front @ facing)
+    up = np.array([0.0, 0.0, 1.0]) - front * front[2]
+    if np.linalg.norm(up) < 0.6:  # seen from above or below
+        up = axes[0] * (1 if axes[0][int(np.argmax(np.abs(axes[0])))] > 0 else -1)
+    up = up / np.linalg.norm(up)
+    return np.stack([np.cross(up, front), up, front])
+
+
+def mechanism(model: mujoco.MjModel, error: dict[str, float], found: set[str], taxels: np.ndarray | None = None, marked: set[str] = frozenset(),
+              unit: str = "mrad", width: int = 360, height: int = 400) -> str:
+    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where found.
+    taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    from dexsim.assets import xhand
+
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    groups = [g for g in range(model.ngeom) if int(model.geom_group[g]) <= 2] or list(range(model.ngeom))
+    shapes = [(g, _corners(model, data, g)) for g in groups]
+    shapes = [(g, p) for g, p in shapes if len(p) >= 4]
+    if not error and shapes:  # touch alone: what is small beside the rest is no part of the picture
+        most = max(float(np.ptp(p, axis=0).max()) for _, p in shapes)
+        shapes = [(g, p) for g, p in shapes if float(np.ptp(p, axis=0).max()) > 0.15 * most]
+    names = [model.joint(i).name for i in range(model.njnt)]
+    joints = [i for i, n in enumerate(names) if n in error]
+    cloud = np.concatenate([*[p for _, p in shapes], data.xanchor[joints].reshape(-1, 3)])
+    if len(cloud) < 3:
+        return ""
+    pads = []
+    facing = None
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    if taxels is not None or any(b in bodies for b in xhand.TIP_BODIES):
+        for f, (finger, body) in enumerate(zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)):
+            if body in bodies:
+                table, b = xhand.taxel_table(finger), data.body(body)
+                R = b.xmat.reshape(3, 3)
+                pads.append((f, table["position"] @ R.T + b.xpos))
+                facing = (0 if facing is None else facing) + (table["normal"] @ R.T).mean(0)
+    axes = _view(cloud, facing)
+    flat = cloud @ axes.T
+    low, high = flat[:, :2].min(0), flat[:, :2].max(0)
+    scale = min((width - 60) / max(high[0] - low[0], 1e-6), (height - 60) / max(high[1] - low[1], 1e-6))
+    middle = 0.5 * (low + high)
+
+    def at(p):
+        u = (np.atleast_2d(p) @ axes.T)[:, :2]
+        return np.stack([width / 2 + (u[:, 0] - middle[0]) * scale, height / 2 - (u[:, 1] - middle[1]) * scale], 1)
+
+    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="the mechanism, coloured by error">']
+    hot = {int(model.jnt_bodyid[i]) for i in joints if names[i] in found}
+    for g, p in sorted(shapes, key=lambda s: float((s[1] @ axes[2]).mean())):
+        xy = at(p)
+        try:
+            xy = xy[ConvexHull(xy).vertices]
+        except QhullError:
+            continue
+        fill = "#f4d9c0" if int(model.geom_bodyid[g]) in hot else "#e3e8ee"
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in xy)
+        out.append(f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>')
+    # links between joints, so that a mechanism without shapes still shows
+    for i in joints:
+        parent = int(model.body_parentid[int(model.jnt_bodyid[i])])
+        while parent:
+            inside = [k for k in joints if int(model.jnt_bodyid[k]) == parent]
+            if inside:
+                a, b = at(data.xanchor[inside[-1]])[0], at(data.xanchor[i])[0]
+                out.append(f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" stroke-width="2"/>')
+                break
+            parent = int(model.body_parentid[parent])
+    if taxels is not None:
+        most = max(float(taxels.max()), 1e-9)
+        for f, p in pads:
+            for k, (x, y) in enumerate(at(p)):
+                mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
+                size = 2.2 if scale < 4000 else 5.0
+                out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} mN</title></circle>')
+    top = max([*error.values(), 1e-12])
+    labels = []
+    for i in joints:
+        (x, y) = at(data.xanchor[i])[0]
+        small = error[names[i]]
+        ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>' if names[i] in found else ""
+        out.append(f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>')
+        if names[i] in found:
+            labels.append((x, y, names[i]))
+    for x, y, name in labels:
+        side = "end" if x > 0.62 * width else "start"
+        dx = -17 if side == "end" else 17
+        out.append(f'<g stroke="#fff" stroke-width="3" paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>')
+    return "".join(out) + "</svg>"

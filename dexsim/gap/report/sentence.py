@@ -1,0 +1,114 @@
+"""The verdict in words: what was found, where it sits, how large it is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexsim.gap.effects.touch import entry
+from dexsim.gap.report.charts import number
+from dexsim.gap.result import Diagnosis
+from dexsim.recording.mechanism import Mechanism
+
+WEAK = 0.3  # confidence below which a finding is not in the first sentence
+
+
+def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
+    """The verdict in one or two sentences."""
+    h = data["held_out"]
+    metric = h["error"]
+    effort = metric.startswith("effort")
+    unit = ("mN" if metric.endswith("_N") else "mN.m") if effort else "mN" if metric.startswith("tactile") else "mm" if metric.endswith("_m") else "mrad"
+    if unit == "mN" and not effort:
+        floor = data["noise_floor"].get("tactile_N")
+    before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
+    limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
+    named = [f for f in data["findings"] if entry(f) is not None]
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
+    if data["verdict"] == "none":
+        return prefix + f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
+    if not named:
+        depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
+        return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
+    of = ""
+    alone = {j for f in named for j in f["where"]["joints"]}
+    if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):  # not thinned by joints that are well
+        of, mine = " of that joint", d.joints[next(iter(alone))]
+        before, after = 1e3 * mine["before"], 1e3 * mine["after"]
+    parts = []
+    strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
+    for f in strong[:2]:
+        words = words_of(f, d.mechanism)
+        others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
+        parts.append(f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else ""))
+    parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] or strong[0]["where"]["joints"][0] in spoken(strong[0])[1:] else parts[0]
+    left_out = len(named) - len(parts)
+    more = f" ({left_out} more, {'smaller or less sure, ' if len(strong) < len(named) else ''}below)" if left_out else ""
+    it = "it" if len(named) == 1 else "them"
+    if h["before"] is None:
+        return prefix + "; ".join(parts) + more + "."
+    tail = f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on recordings not used for the fit"
+    return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
+
+
+ORDER = {"1": "first", "2": "second"}
+
+
+def spoken(f: dict) -> str:
+    """Where a finding sits as a person says it: the xHand's joints by finger, another mechanism's by name."""
+    from dexsim.assets import xhand
+
+    if len(f["where"]["joints"]) != 1:
+        return place(f)
+    joint = f["where"]["joints"][0]
+    if joint not in xhand.JOINTS:
+        return joint if "joint" in joint.lower() else f"joint {joint}"
+    finger, _, rest = joint.partition("_")
+    whose = {"thumb": "the thumb's", "mid": "the middle finger's", "pinky": "the little finger's"}.get(finger, f"the {finger} finger's")
+    kind = "sideways joint" if "bend" in rest and finger != "thumb" else "bending joint" if "bend" in rest else f"{ORDER.get(rest[-1], '')} joint".strip()
+    return f"{whose} {kind} ({joint})"
+
+
+def words_of(f: dict, m: Mechanism | None) -> str:
+    """What an effect does, in words, with its direction where its size tells that."""
+    words, p = entry(f).words, f["parameters"]
+    joint = next(iter(f["where"]["joints"]), None)
+    if f["effect"] == "coulomb_friction" and m is not None and joint in m.joints:
+        believed = float(m.column("coulomb_friction")[m.joints.index(joint)]) + float(np.ravel(m.spec.joint(joint).frictionloss)[0])
+        return words.replace("more (or less)", "more" if p["torque"]["value"] > believed else "less")
+    if f["effect"] == "inertia":
+        return words.replace("more (or less)", "more" if p["armature"]["value"] > 0 else "less")
+    if f["effect"] == "payload" and "mass" in p:
+        return f"carries {'more' if p['mass']['value'] > 0 else 'less'} mass than the model"
+    if f["effect"] == "payload":
+        return "hangs in another direction of gravity than the model"
+    return words
+
+
+def place(f: dict) -> str:
+    """Where a finding sits, in words."""
+    if f["where"]["joints"]:
+        return ", ".join(f["where"]["joints"])
+    if f["where"]["taxels"]:
+        from dexsim.assets import xhand
+
+        pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
+        count = len(f["where"]["taxels"])
+        fingers = " and ".join(xhand.FINGERS[p] for p in pads)
+        return f"the {fingers}'s pad" if count > 12 or f["effect"] != "tactile_gain" else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+    return ", ".join(f["where"]["topics"])
+
+
+def _size(f: dict) -> str:
+    """The first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
+    name, p = next(iter(f["parameters"].items()), (None, None))
+    if p is None or p["value"] is None or isinstance(p["value"], str):
+        return ""
+    number = np.atleast_1d(p["value"])  # com and tilt are vectors, gains one a taxel
+    if len(number) > 4:
+        return f" ({name} {number.min():.2g} to {number.max():.2g})"
+    if p["unit"] == "rad" and len(number) == 1:
+        return f" ({name} {np.degrees(number[0]):.3g} degrees)"
+    if p["unit"] == "s" and len(number) == 1:
+        return f" ({name.replace('_', ' ')} {1e3 * number[0]:.3g} ms)"
+    return f" ({name.replace('_', ' ')} {' '.join(f'{v:.3g}' for v in number)}{' ' + p['unit'] if p['unit'] not in ('1', '') else ''})"

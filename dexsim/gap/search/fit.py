@@ -1,0 +1,386 @@
+"""Bounded least squares on a joint's windows: batched finite differences, several damped steps tried at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from dexsim.gap.plant.batch import JointPlant, Windows
+from dexsim.gap.plant.columns import INDEX
+
+STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
+STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
+PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
+PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
+
+EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
+
+
+@dataclass(frozen=True)
+class Param:
+    """One number that is fitted. `key` is unique in a fit; it acts on plant columns [.., R, C].
+
+    mode: `factor` multiplies the believed value, `add` adds to it, `set` replaces it, `inverse` sets 1 / x.
+    runs: the runs it acts in (None: all).
+    """
+
+    key: str
+    columns: tuple[str, ...]
+    mode: str
+    low: float
+    high: float
+    start: float
+    unit: str = "1"
+    nuisance: bool = False
+    sd: float = 0.0  # what is believed of it beforehand: its start to this standard deviation; 0: nothing inside the bounds
+
+    @property
+    def span(self) -> float:
+        return self.high - self.low
+
+    def apply(self, params: np.ndarray, x: np.ndarray, base: np.ndarray) -> None:
+        """Writes x [H] into params [H, R, C], base [R, C] being what is believed."""
+        for name in self.columns:
+            c = INDEX[name]
+            if self.mode == "factor":
+                params[:, :, c] = params[:, :, c] * x[:, None]
+            elif self.mode == "add":
+                params[:, :, c] = params[:, :, c] + x[:, None]
+            elif self.mode == "inverse":
+                params[:, :, c] = 1.0 / np.maximum(x[:, None], 1e-12)
+            else:
+                params[:, :, c] = x[:, None]
+
+
+def centre_of(params: list[Param]) -> np.ndarray:
+    """[P] value at which each parameter is not there."""
+    return np.array([{"add": 0.0, "factor": 1.0}.get(p.mode, p.start) for p in params], float)
+
+
+def prior_weight(params: list[Param]) -> np.ndarray:
+    """[P] weight of each belief on the sum of squares, per squared unit of its parameter."""
+    return np.array([PRIOR / p.sd**2 if p.sd > 0 else 0.0 for p in params])
+
+
+def disbelief(params: list[Param], x: np.ndarray) -> float:
+    """How far x [P] is from what is believed, on the scale of a sum of squared residuals."""
+    return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
+
+
+def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
+    """[H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after."""
+    base = plant.base()
+    out = np.repeat(base[None], len(x), 0)
+    for modes in (("set", "inverse"), ("factor", "add")):
+        for i, p in enumerate(params):
+            if p.mode in modes:
+                p.apply(out, x[:, i], base)
+    lag = INDEX["stribeck_speed"]
+    out[:, :, lag] = np.maximum(out[:, :, lag], 1e-4)
+    for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
+        c = INDEX[name]
+        out[:, :, c] = np.maximum(out[:, :, c], 0.0)
+    return out
+
+
+@dataclass
+class Residuals:
+    """How residuals are weighed: sigma_q rad, sigma_torque N.m (0: not used), spread of the initial state, Huber knee."""
+
+    sigma_q: float
+    sigma_torque: float = 0.0
+    sigma_q0: float = 0.0
+    sigma_v0: float = 0.0
+    knee: float = 0.0  # in sigmas; 0: plain squares
+    current_factor: float = 1.0
+
+
+@dataclass
+class Fitted:
+    """A fit: x [P]; residual [m], jacobian [m, P] in sigmas at x with the initial states eliminated; of each residual
+    the window [m]; loss, the mean (Huber) square; by window loss [W]."""
+
+    params: list[Param]
+    x: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    window: np.ndarray
+    loss: float
+    by_window: np.ndarray
+    weight: np.ndarray | None = None
+    iterations: int = 0
+    extra: dict = field(default_factory=dict)
+
+    def value(self, key: str) -> float:
+        return float(self.x[[p.key for p in self.params].index(key)])
+
+
+class Fitter:
+    """Fits parameter sets of one joint on given windows."""
+
+    def __init__(self, plant: JointPlant, windows: Windows, residuals: Residuals):
+        self.plant, self.w, self.r = plant, windows, residuals
+        self.q = plant.q[windows.sample_row]
+        tau = plant.torque[windows.sample_row]
+        self.use_torque = residuals.sigma_torque > 0 and bool(np.isfinite(tau).any())
+        self.tau = np.where(np.isfinite(tau), tau, 0.0)
+        self.tau_on = np.isfinite(tau)
+        n = windows.n
+        self.window = np.concatenate([windows.sample_window, windows.sample_window]) if self.use_torque else windows.sample_window
+        self.count = len(windows.window)
+        order = np.flatnonzero(np.r_[True, np.diff(windows.sample_window) != 0])
+        self.starts = np.concatenate([order, order + n]) if self.use_torque else order
+        self.eliminate = residuals.sigma_q0 > 0
+
+    def residuals(self, params: list[Param], x: np.ndarray, inits: np.ndarray | None = None) -> np.ndarray:
+        """[H, m] measured minus simulated, in sigmas."""
+        plants = expand(self.plant, params, x)
+        q, tau = self.plant.simulate(plants, self.w, inits)
+        return self.compare(q, tau, plants)
+
+    def compare(self, q: np.ndarray, tau: np.ndarray, plants: np.ndarray) -> np.ndarray:
+        """[H, m] measured minus simulated position [H, n] and effort [H, n], in sigmas; plants [H, R, C] for what the
+        effort's sensor makes of it."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            out = (self.q - q) / self.r.sigma_q
+            if self.use_torque:
+                gain, offset = plants[:, 0, EFFORT_GAIN, None], plants[:, 0, EFFORT_OFFSET, None]
+                rt = np.where(self.tau_on, (self.tau - gain * tau - offset) / self.r.sigma_torque, 0.0)
+                out = np.concatenate([out, rt], 1)
+        return np.clip(np.nan_to_num(out, nan=1e6), -1e6, 1e6)
+
+    def init_directions(self, params: list[Param], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals at x [m], and their change [2, m] per sigma of the initial position and speed."""
+        r = self.r
+        inits = np.array([[0.0, 0.0], [r.sigma_q0, 0.0], [0.0, r.sigma_v0]])
+        res = self.residuals(params, np.repeat(x[None], 3, 0), inits)
+        return res[0], res[1:] - res[0]
+
+    def eliminated(self, res: np.ndarray, s: np.ndarray | None) -> np.ndarray:
+        """res [H, m] after the best initial state of each window (with its prior) is taken out."""
+        if s is None:
+            return res
+        W = self.count
+        sums = lambda v: np.stack([np.bincount(self.window, row, W) for row in np.atleast_2d(v)])  # noqa: E731
+        a11, a22, a12 = (sums(v)[0] for v in (s[0] ** 2, s[1] ** 2, s[0] * s[1]))
+        a11, a22 = a11 + 1.0, a22 + 1.0
+        det = a11 * a22 - a12**2
+        b1, b2 = sums(res * s[0]), sums(res * s[1])
+        c1, c2 = (a22 * b1 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
+        return res - c1[:, self.window] * s[0] - c2[:, self.window] * s[1]
+
+    def loss(self, res: np.ndarray) -> np.ndarray:
+        """[H] mean of Huber's square."""
+        k = self.r.knee
+        a = np.abs(res)
+        if k > 0:
+            a = np.where(a <= k, a * a, 2 * k * a - k * k)
+        else:
+            a = a * a
+        return a.mean(-1)
+
+    def window_loss(self, res: np.ndarray) -> np.ndarray:
+        """[W] sum of Huber's square by window."""
+        k = self.r.knee
+        a = np.abs(res)
+        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+        return np.bincount(self.window, a, self.count)
+
+    def evaluate(self, params: list[Param], x: np.ndarray) -> np.ndarray:
+        """[m] residuals at x, initial states taken out."""
+        if not self.eliminate:
+            return self.residuals(params, x[None])[0]
+        res, s = self.init_directions(params, x)
+        return self.eliminated(res[None], s)[0]
+
+    def shake(self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 32) -> Fitted:
+        """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the loss
+        rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
+        P = len(params)
+        if P == 0:
+            return f
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        centre, believed = np.array([p.start for p in params], float), prior_weight(params)
+        for _ in range(rounds):
+            span = high - low
+            J = f.jacobian * span
+            k = self.r.knee
+            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+            A = (J * w[:, None]).T @ J + np.diag(believed * span**2)
+            # what a rise of the loss by 5 % allows
+            A = A / (0.05 * max(f.loss, 1e-12) * len(f.residual)) + 4.0 * np.eye(P)
+            values, vectors = np.linalg.eigh(A)
+            size = np.where(np.arange(count) % 2, 1.0, 0.3)[:, None]
+            z = (rng.standard_normal((count, P)) / np.sqrt(P) * size) @ (vectors / np.sqrt(np.maximum(values, 1e-12))).T
+            trial = np.clip(f.x + z * span, low, high)
+            s = self.init_directions(params, f.x)[1] if self.eliminate else None
+            score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: B023, E731
+            tried = score(trial, self.eliminated(self.residuals(params, trial), s))
+            here = float(score(f.x, f.residual))
+            best = int(np.argmin(tried))
+            start = trial[best] if tried[best] < here else f.x
+            again = self.fit(params, x0=start, iterations=4, tolerance=5e-3)
+            if not float(score(again.x, again.residual)) < here * (1 - 5e-3):
+                break
+            f = again
+        return f
+
+    def homeward(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
+        """The fit again from where one belief, or all of them, are back at what is believed, all else following by its slopes, where that is
+        better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at kinks, steps end before they are there."""
+        P = len(params)
+        nuisance = np.array([p.nuisance for p in params], bool)
+        if not nuisance.any():
+            return f
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        span, centre, believed = high - low, np.array([p.start for p in params], float), prior_weight(params)
+        score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: E731
+        for _ in range(rounds):
+            k = self.r.knee
+            w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
+            J = f.jacobian * span
+            A = (J * w[:, None]).T @ J
+            A[np.diag_indices(P)] += believed * span**2 + 1e-3 * np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
+            b = -(J * w[:, None]).T @ f.residual - believed * (f.x - centre) * span
+            away = nuisance & (np.abs(f.x - centre) > AWAY * span)
+            guesses = []
+            if not away.any():
+                return f
+            for back in [np.arange(P) == i for i in np.flatnonzero(away)] + [nuisance]:
+                # all else follows, or an effect alone: an inertia's takes over exactly, slopes of rough losses say so only nearly
+                for rest, pull in ((np.flatnonzero(~back), 1.0), (np.flatnonzero(~back & ~nuisance), 0.0)):
+                    z = (centre - f.x) / span * back
+                    if len(rest):
+                        root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
+                        right = np.linalg.solve(root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back])
+                        z[rest] = lsq_linear(root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)).x
+                    guesses.append(np.clip(f.x + z * span, low, high))
+            guesses = np.array(guesses)
+            s = self.init_directions(params, f.x)[1] if self.eliminate else None
+            tried = score(guesses, self.eliminated(self.residuals(params, guesses), s))
+            here, best = float(score(f.x, f.residual)), int(np.argmin(tried))
+            if not tried[best] < here * (1 - 5e-3):
+                return f
+            f = self.fit(params, x0=guesses[best], iterations=4, tolerance=5e-3)
+        return f
+
+    def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
+        """[H, P] guesses about x [P]: each effect's parameter scaled, each belief moved, one at a time."""
+        out = []
+        for i, p in enumerate(params):
+            zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
+            moves = [0.1 * p.span, -0.1 * p.span, 0.03 * p.span, -0.03 * p.span] if p.nuisance else [(f - 1) * (x[i] - zero) for f in PATTERN]
+            for d in moves:
+                g = x.copy()
+                g[i] += d
+                out.append(g)
+        return np.array(out)
+
+    def fit(self, params: list[Param], x0: np.ndarray | None = None, iterations: int = 10, tolerance: float = 2e-3,
+            step: float = 0.01) -> Fitted:
+        """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts)."""
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        x = np.array([p.start for p in params], float) if x0 is None else np.array(x0, float)
+        x = np.clip(x, low, high)
+        span = high - low
+        belief = np.array([p.nuisance for p in params], bool)
+        damping = 1e-2
+        P = len(params)
+        believed, centre = prior_weight(params), np.array([p.start for p in params], float)
+        res = jac = s = None
+        fresh = True
+        it = 0
+        for it in range(iterations + 1):
+            if fresh:
+                # one batch: here, each parameter moved, the initial state moved
+                # small beside the value too: a range may be wide, and many effects are kinked where they begin
+                size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
+                size = np.where(belief, STEP_OF_BELIEF * span, size)
+                delta = np.where(x + size <= high, size, -size)
+                guesses = np.concatenate([x[None], x[None] + np.diag(delta), np.repeat(x[None], 2, 0)])
+                inits = np.zeros((P + 3, 2))
+                inits[P + 1, 0], inits[P + 2, 1] = self.r.sigma_q0, self.r.sigma_v0
+                if not self.eliminate:
+                    guesses, inits = guesses[: P + 1], inits[: P + 1]
+                raw = self.residuals(params, guesses, inits)
+                s = raw[P + 1 :] - raw[0] if self.eliminate else None
+                clean = self.eliminated(raw[: P + 1], s)
+                res = clean[0]
+                jac = (clean[1:] - res).T / (delta / span)  # per span
+                loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
+            if it == iterations or P == 0:
+                break
+            k = self.r.knee
+            weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
+            A = (jac * weight[:, None]).T @ jac
+            b = -(jac * weight[:, None]).T @ res - believed * (x - centre) * span
+            A[np.diag_indices(P)] += believed * span**2
+            at_low, at_high = x <= low + 1e-12, x >= high - 1e-12
+            free = ~((at_low & (b < 0)) | (at_high & (b > 0)))
+            scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
+            lambdas = damping * np.array([1e-2, 0.1, 1.0, 10.0, 100.0, 1000.0])
+            steps = np.zeros((len(lambdas), P))
+            f = np.flatnonzero(free)
+            if len(f) == 0:
+                break
+            for i, lam in enumerate(lambdas):
+                M = A[np.ix_(f, f)] + lam * np.diag(scale[f])
+                try:
+                    steps[i, f] = np.linalg.solve(M, b[f])
+                except np.linalg.LinAlgError:
+                    steps[i, f] = np.linalg.lstsq(M, b[f], rcond=None)[0]
+            steps = np.clip(steps, -0.5, 0.5)
+            trial = np.clip(x + steps * span, low, high)
+            tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
+            best = int(np.argmin(tried))
+            if not tried[best] < loss * (1 - 1e-6):
+                if damping <= 1e2:
+                    damping *= 1e3
+                    fresh = False
+                    continue
+                # a kinked loss has no slope to follow: try sizes outright
+                trial = np.clip(self.pattern(params, x), low, high)
+                tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
+                best = int(np.argmin(tried))
+                if not tried[best] < loss * (1 - tolerance):
+                    break
+                x, damping, fresh = trial[best], 1e-2, True
+                continue
+            gain = (loss - tried[best]) / max(loss, 1e-30)
+            x, damping, fresh = trial[best], max(lambdas[best] * 0.3, 1e-6), True
+            if gain < tolerance:
+                # one more Jacobian at the new point, for the intervals
+                iterations = min(iterations, it + 1)
+        return Fitted(list(params), x, res, jac / span if P else np.zeros((len(res), 0)), self.window, float(self.loss(res)),
+                      self.window_loss(res), iterations=it)
+
+
+def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, knee: float = 0.0) -> np.ndarray:
+    """[P, 2] 90 % intervals that let residuals be correlated inside a block: the sandwich over blocks [m] of each
+    residual, with the small-sample factor of the number of blocks."""
+    P = len(fitted.params)
+    if P == 0:
+        return np.zeros((0, 2))
+    J, r = fitted.jacobian, fitted.residual
+    psi = r if knee <= 0 else np.clip(r, -knee, knee)
+    low, high = np.array([p.low for p in fitted.params]), np.array([p.high for p in fitted.params])
+    span = high - low
+    Js = J * span
+    # the bounds are priors: a parameter is not known worse than its range
+    A = Js.T @ Js
+    ridge = np.full(P, 1e-9 * max(np.trace(A), 1e-30))
+    count = int(blocks.max()) + 1
+    scores = np.stack([np.bincount(blocks, Js[:, i] * psi, count) for i in range(P)], 1)
+    centre = scores.mean(0)
+    B = (scores - centre).T @ (scores - centre) * count / max(count - 1, 1)
+    # prior of a quarter of the span on nuisances, which are known to that
+    prior = np.array([12.0 if p.nuisance else 0.0 for p in fitted.params])
+    typical = float(np.mean(psi**2)) * max(len(r) / max(count, 1) * 0.1, 1.0)
+    inverse = np.linalg.pinv(A + np.diag(ridge) + np.diag(prior * typical))
+    cov = inverse @ (B + np.diag(prior * typical)) @ inverse
+    se = np.sqrt(np.maximum(np.diag(cov), 0.0)) * span
+    x = fitted.x
+    return np.stack([np.maximum(x - level * se, low), np.minimum(x + level * se, high)], 1)

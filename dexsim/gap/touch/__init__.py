@@ -1,0 +1,1 @@
+"""The same steps for touch: taxels and contact."""

@@ -1,0 +1,67 @@
+"""Touch beside the joints: one verdict, one list of findings, one figure of what is left."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexsim.gap.judge import errors
+from dexsim.gap.report.sentence import sentence
+from dexsim.gap.result import Diagnosis, empty
+from dexsim.gap.touch import touch
+
+
+def _touch_verdict(felt: touch.TouchResult) -> str | None:
+    """The word for touch alone; None where it was not judged."""
+    if felt.before is None:
+        return "explained" if felt.findings else None
+    named = [{"held_out": True} for f in felt.findings]
+    word = errors.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    return "partly_explained" if word == "explained" and felt.structured else word
+
+
+def add_touch(d: Diagnosis, felt: touch.TouchResult) -> None:
+    """Touch into the diagnosis of the joints: findings, the verdict of both, the metric of what was found."""
+    d.touch = felt
+    word = _touch_verdict(felt)
+    if word is None:
+        return
+    data = d.data
+    joints = data["verdict"]
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    rest = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] |= felt.nuisance
+    if felt.floor is not None:
+        data["noise_floor"]["tactile_N"] = felt.floor
+    if "none" in (joints, word):
+        data["verdict"] = word if joints == "none" else joints
+    elif joints != word:
+        data["verdict"] = "partly_explained"
+    if not rest and (felt.findings or joints == "none") and felt.before is not None and word != "none":
+        _touch_metric(data, felt)
+    data["unexplained"]["depends_on"] += felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
+
+
+def _touch_metric(data: dict, felt: touch.TouchResult) -> None:
+    (b, bl, bh), (a, al, ah) = felt.before, felt.after
+    data["held_out"] = {"recordings": felt.recordings, "error": "tactile_rmse_N", "before": b, "after": a, "before_low": bl, "before_high": bh,
+                        "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
+    gap = b**2 - felt.floor**2
+    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
+
+
+def touch_alone(channel, felt: touch.TouchResult, notes, m) -> Diagnosis:
+    """A diagnosis of touch where no joint could be judged."""
+    data = empty(_touch_verdict(felt) or "unusable")
+    data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
+    data["findings"] = channel + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] = dict(felt.nuisance)
+    if felt.before is not None:
+        _touch_metric(data, felt)
+    else:
+        data["held_out"]["error"] = "tactile_rmse_N"
+    data["unexplained"]["depends_on"] = felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    out = Diagnosis(data, "", notes, mechanism=m, touch=felt)
+    out.sentence = sentence(data, out, felt.floor or 0.0)
+    return out
