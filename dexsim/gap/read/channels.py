@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim.gap.read import stale
+from dexsim.gap.read import repeated
 from dexsim.gap.read.runs import Run
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
@@ -54,7 +54,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     used, but for those stretches."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     out = dict(known)
-    long = {joint: stale.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
+    long = {joint: repeated.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
 
     def add(kind: str, text: str, run: Run, joint: str, topics: list[str], spans: list[tuple[float, float]], confidence: float = 0.9, drop: bool = True):
@@ -88,7 +88,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                 add("stuck", f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a drive that is off", run, joint,
                     [STATES], [(stop, run.t[-1])], 0.7)  # fmt: skip
                 continue
-            held, single = _held(run.t, q), stale.duplicates(run.t, q)
+            held, single = _held(run.t, q), repeated.duplicates(run.t, q)
             for a, b in long[joint][i]:
                 held[a + 1 : b + 1] = True
                 if run.t[b] - run.t[a] > BLIND:
