@@ -27,9 +27,11 @@ settings (key=default):
   check=              a bundle to recompute
   steps=64            golden rows from a simulated episode; as many again are drawn at random
   seed=0              of both
+  agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class): typed here, its code runs
 """
 KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed")
 TOLERANCE = 1e-5
+MOST_GOLDEN = 512 << 20  # bytes
 OPSET = 17
 BUILDERS = ("grasp", "rotate")
 """Tasks whose observation the real-time loop can build."""
@@ -48,12 +50,14 @@ def main(argv: Sequence[str]) -> int:
     for key in ("checkpoint", "out"):
         if not given.get(key):
             raise UserError(f"say {key}=... (python -m dexsim.export --help)")
-    out = export(given["checkpoint"], given["out"], given.get("calibration"), _whole(given, "steps", 64), _whole(given, "seed", 0))
+    out = export(given["checkpoint"], given["out"], given.get("calibration"), _whole(given, "steps", 64), _whole(given, "seed", 0),
+                 frozenset((k, v) for k, v in given.items() if k.startswith("agent.")))
     return 0 if check(out) else 1
 
 
-def export(checkpoint: str, out: str | Path, calibration: str | None = None, steps: int = 64, seed: int = 0) -> Path:
-    """Write the bundle of a checkpoint; returns its folder. Raises UserError."""
+def export(checkpoint: str, out: str | Path, calibration: str | None = None, steps: int = 64, seed: int = 0,
+           typed: frozenset[tuple[str, Any]] = frozenset()) -> Path:
+    """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
     from dexsim.calibration.file import Calibration
     from dexsim.cli import folder
     from dexsim.cli.build import quiet_warp
@@ -80,7 +84,7 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
     print("building the task, for its scales and for golden episodes ...", flush=True)
     env = make_env(cfg, 1, "cpu", seed, "mujoco")
     checkpoints.check_layout(data, checkpoints.layout_of(env), checkpoint)
-    policy = load_policy(data, env, str(checkpoint))
+    policy = load_policy(data, env, str(checkpoint), typed)
     model = policy.as_onnx(verbose=False).eval().to("cpu")
     path = out / bundle.POLICY
     with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
@@ -109,7 +113,9 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     import numpy as np
     import torch
 
-    observations = builder(env.task["name"])
+    from dexsim.deploy import bundle
+
+    observations = bundle.builder(env.task["name"])
     seen: list[tuple] = []
     build = observations.build
     kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))}
@@ -146,13 +152,6 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     return out | {"observation": everything.numpy(), "action": action.numpy()}
 
 
-def builder(task: str) -> Any:
-    """The module that builds a task's observation: `Signals` and `build(signals, settings)`."""
-    from dexsim.deploy import observations, observations_rotate
-
-    return {"grasp": observations, "rotate": observations_rotate}[task]
-
-
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
     """Everything that a robot must know, as plain data."""
     from dexsim.assets import xhand
@@ -162,8 +161,8 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
     own = _grasp(env) if task["name"] == "grasp" else _rotate(env)
     table, at = [], 0
     for name, width, unit, source, scaling in own.pop("rows"):
-        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": builder(task["name"]).FRAME[name],
-                      "order": builder(task["name"]).ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
+        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": bundle.builder(task["name"]).FRAME[name],
+                      "order": bundle.builder(task["name"]).ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
         at += width
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]), "lead": float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": _floats(env.q_low), "high": _floats(env.q_high),
@@ -266,31 +265,32 @@ def check(path: str | Path) -> bool:
     m = b.manifest
     file = b.path / bundle.GOLDEN
     try:
-        rows = dict(np.load(file, allow_pickle=False))
+        rows = _golden_rows(file)
         observation, expected = rows["observation"], rows["action"]
         n = len(rows["q"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise UserError(f"{file}: cannot be read ({str(error).splitlines()[0][:100]}); export the bundle again") from None
-    observations, settings = builder(m["task"]), m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"]
-    here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
-    ours = [tuple(row[:3]) for row in (observations.rows(settings) if m["task"] == "rotate" else observations.OBSERVATION)]
-    if here != ours:
-        bad = next(i for i in range(len(here) + 1) if here[: i + 1] != ours[: i + 1])
-        raise UserError(f"{path}: observation {here[bad:bad + 1]} is not this dexsim's {ours[bad:bad + 1]}: use the dexsim of its versions")
+    except UserError:
+        raise
+    except Exception as error:  # a damaged zip or array header ends in many ways
+        raise UserError(f"{file}: cannot be read ({' '.join(str(error).split())[:100]}); export the bundle again") from None
+    observations, settings = bundle.builder(m["task"]), m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"]
+    rule = ActionRule.from_manifest(m["action"])
     try:
         signals = observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields))
+        built = observations.build(signals, settings).numpy() - observation[:n]
+        targets = np.stack([rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)])
+        single = np.concatenate([b.act(row[None]) for row in observation])
+        whole, aimed = b.act(observation), targets - rows["target"]
+        single - expected, whole - expected
     except KeyError as error:
         raise UserError(f"{file}: lacks {error}; export the bundle again") from None
-    built = observations.build(signals, settings)
-    rule = ActionRule.from_manifest(m["action"])
-    targets = np.stack([rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)])
-    single = np.concatenate([b.act(row[None]) for row in observation])
+    except Exception as error:  # onnxruntime's, numpy's and torch's for arrays of the wrong shape or type
+        raise UserError(f"{file}: its arrays do not fit the bundle ({' '.join(str(error).split())[:160]}); export it again") from None
     apart = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
     found = {
-        "actions": float(apart(b.act(observation), expected).max()),
+        "actions": float(apart(whole, expected).max()),
         "actions, one row at a time": float(apart(single, expected).max()),
-        "observations": float(np.abs(built.numpy() - observation[:n]).max()),
-        "targets [rad]": float(np.abs(targets - rows["target"]).max()),
+        "observations": float(np.abs(built).max()),
+        "targets [rad]": float(np.abs(aimed).max()),
     }
     limit = float(m["golden"]["tolerance"])
     for name, value in found.items():
@@ -301,11 +301,25 @@ def check(path: str | Path) -> bool:
     return good
 
 
+def _golden_rows(file: Path) -> dict[str, Any]:
+    """The arrays of a golden file, which may unpack to MOST_GOLDEN bytes."""
+    import zipfile
+
+    import numpy as np
+
+    with zipfile.ZipFile(file) as archive:
+        size = sum(i.file_size for i in archive.infolist())
+    if size > MOST_GOLDEN:
+        raise UserError(f"{file}: unpacks to {size / 2**20:.0f} MiB, allowed {MOST_GOLDEN >> 20} MiB; export the bundle again")
+    with np.load(file, allow_pickle=False) as stored:
+        return {k: stored[k] for k in stored.files}
+
+
 def _settings(argv: Sequence[str]) -> dict[str, str]:
     out = {}
     for argument in argv:
         key, equals, value = argument.partition("=")
-        if not equals or key not in KEYS:
+        if not equals or (key not in KEYS and not key.startswith("agent.")):
             raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
         out[key] = value
     return out

@@ -127,6 +127,23 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
     return cfg
 
 
+def typed(request: Request) -> frozenset[tuple[str, Any]]:
+    """The value overrides as (dotted name, value), those inside a typed mapping one by one."""
+    found: set[tuple[str, Any]] = set()
+
+    def add(key: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                add(f"{key}.{name}", inner)
+        elif isinstance(value, str):
+            found.add((key, value))
+
+    for item in request.values:
+        if item.type != OverrideType.DEL:
+            add(item.key_or_group, item.value())
+    return frozenset(found)
+
+
 def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfig:
     """Merge ``task.presets.<name>`` (a partial config) over cfg, then the user's overrides again over that."""
     presets = OmegaConf.select(cfg, "task.presets") or {}

@@ -29,12 +29,14 @@ class Start:
 
     cfg: resolved config. play: play.py's own settings ({} for train.py). source: the checkpoint's path, or None.
     data: the checkpoint, as :func:`dexsim.learning.checkpoint.load` returns it, or None.
+    typed: the settings of the command line itself, (name, value), which alone may name code (dexsim.learning.names).
     """
 
     cfg: dict[str, Any]
     play: dict[str, Any]
     source: str | None = None
     data: dict[str, Any] | None = None
+    typed: frozenset[tuple[str, Any]] = frozenset()
 
 
 def for_train(argv: list[str], config_dir: Path) -> Start | None:
@@ -59,7 +61,7 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
     plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
     checks.check(plain)
-    return None if only_show and _show(plain) else Start(plain, {}, source, data)
+    return None if only_show and _show(plain) else Start(plain, {}, source, data, settings.typed(request))
 
 
 def for_play(argv: list[str], config_dir: Path) -> Start | None:
@@ -101,7 +103,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
     plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
     checks.check(plain | {"agent": {}})
-    return None if only_show and _show(plain | play) else Start(plain, play, play["checkpoint"], data)
+    return None if only_show and _show(plain | play) else Start(plain, play, play["checkpoint"], data, settings.typed(request))
 
 
 def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | None, bool]:

@@ -49,7 +49,7 @@ def _run(start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
     stop.asked()  # Ctrl-C while compiling: nothing to save
-    runner = Runner(env, cfg, machine.versions(), ranks)
+    runner = Runner(env, cfg, machine.versions(), ranks, start.typed)
     if start.data is not None:
         runner.restore(start.data, str(start.source))
         print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps")

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from dexsim import yaml_text
+from dexsim.deploy import manifests
 from dexsim.errors import UserError
 
-FORMAT, VERSION = "dexsim-bundle", 1
+FORMAT, VERSION = manifests.FORMAT, manifests.VERSION
 POLICY, MANIFEST, GOLDEN, CONFIG = "policy.onnx", "manifest.yaml", "golden.npz", "config.yaml"
-KEYS = ("format", "version", "task", "policy", "observation", "joints", "fingers", "action", "rates", "normalization",
-        "calibration", "perception", "servo", "initial_pose", "golden", "versions", "trained")  # fmt: skip
+MOST_BYTES = 256 << 20
+"""Of a policy's network."""
 
 
 @dataclass
@@ -33,49 +35,108 @@ class Bundle:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved training config."""
-        return yaml.safe_load((self.path / CONFIG).read_text(encoding="utf-8"))
+        """The resolved training config. Raises UserError where there is none."""
+        return _mapping(self.path / CONFIG)
 
 
 def load(path: str | Path) -> Bundle:
-    """The bundle in a folder. Raises UserError: a file missing or changed, another version, no onnxruntime."""
+    """The bundle in a folder. Raises UserError: a file missing or changed, a manifest of the wrong types or beyond the hand's limits,
+    another version, a network that does not fit it or reads other files, no onnxruntime."""
     path = Path(path).expanduser()
     if not (path / MANIFEST).is_file():
         raise UserError(f"{path}: no {MANIFEST} there; python -m dexsim.export checkpoint=... out=DIR writes a bundle")
-    try:
-        manifest = yaml.safe_load((path / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path / MANIFEST}: cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise UserError(f"{path / MANIFEST}: not the manifest of a policy bundle")
-    if manifest.get("version") != VERSION:
-        raise UserError(f"{path}: bundle version {manifest.get('version')}; this dexsim reads {VERSION}: export it again")
-    missing = [k for k in KEYS if k not in manifest]
-    if missing:
-        raise UserError(f"{path / MANIFEST}: lacks {', '.join(missing)}")
+    manifest = _mapping(path / MANIFEST)
+    manifests.check(manifest, path / MANIFEST)
+    _same_table(manifest, path / MANIFEST)
     policy = path / POLICY
     if not policy.is_file():
         raise UserError(f"{path}: {POLICY} is missing; export the bundle again")
-    if sha256(policy) != manifest["policy"]["sha256"]:
+    if policy.stat().st_size > MOST_BYTES:
+        raise UserError(f"{policy}: {policy.stat().st_size / 2**20:.0f} MiB, allowed {MOST_BYTES >> 20} MiB")
+    data = policy.read_bytes()
+    if hashlib.sha256(data).hexdigest() != manifest["policy"]["sha256"]:
         raise UserError(f"{policy}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
-    if manifest["task"] == "rotate" and not {"task_settings", "grip"} <= set(manifest):
-        raise UserError(f"{path / MANIFEST}: lacks task_settings or grip, which task=rotate needs; export the bundle again")
-    return Bundle(path, manifest, session(policy))
+    bundle = Bundle(path, manifest, session(data, policy))
+    _try(bundle, policy)
+    return bundle
 
 
-def session(policy: Path) -> Any:
-    """onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander."""
+def builder(task: str) -> Any:
+    """The module that builds a task's observation: `Signals` and `build(signals, settings)`."""
+    from dexsim.deploy import observations, observations_rotate
+
+    return {"grasp": observations, "rotate": observations_rotate}[task]
+
+
+def _same_table(m: dict[str, Any], file: Path) -> None:
+    """The observation that the network was trained on is the one that is built here, row by row."""
+    here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
+    own = builder(m["task"])
+    ours = [tuple(row[:3]) for row in (own.rows(m["task_settings"]) if m["task"] == "rotate" else own.OBSERVATION)]
+    if here != ours:
+        bad = next(i for i in range(max(len(here), len(ours))) if here[i : i + 1] != ours[i : i + 1])
+        raise UserError(f"{file}: observation {here[bad:bad + 1]} is not this dexsim's {ours[bad:bad + 1]}: use the dexsim of its versions")
+
+
+def _mapping(file: Path) -> dict[str, Any]:
     try:
+        with open(file, "rb") as opened:
+            text = opened.read(yaml_text.MOST_BYTES + 1)  # a device file has no end
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read: {error.strerror}") from None
+    data = yaml_text.parse(text, file)
+    if not isinstance(data, dict):
+        raise UserError(f"{file}: is {type(data).__name__}, must map keys to values; export the bundle again")
+    return data
+
+
+def session(data: bytes, policy: Path) -> Any:
+    """onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander. The network is
+    taken from `data` alone: one that keeps weights in other files is refused, so that it reads none."""
+    try:
+        import onnx
         import onnxruntime
     except ImportError:
         raise UserError("onnxruntime is not installed: pip install 'dexsim[deploy]' (or pip install onnxruntime)") from None
+    try:
+        model = onnx.ModelProto.FromString(data)
+        outside = next((t.name for t in _tensors(model) if t.data_location == onnx.TensorProto.EXTERNAL or t.external_data), None)
+    except Exception as error:  # protobuf's
+        raise UserError(f"{policy}: not an ONNX network ({' '.join(str(error).split())[:120]})") from None
+    if outside is not None:
+        raise UserError(f"{policy}: refused, its tensor {outside[:60]!r} is kept in another file; a bundle's network is one file")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
+    options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(str(policy), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own exceptions have no common base
         raise UserError(f"{policy}: onnxruntime cannot load it: {str(error).splitlines()[0][:160]}") from None
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """Every TensorProto in a protobuf message, at any depth: initializers, attributes, sub-graphs, functions."""
+    for field, value in message.ListFields():
+        if field.message_type is None:
+            continue
+        for inner in value if hasattr(value, "__len__") else (value,):
+            if field.message_type.name == "TensorProto":
+                yield inner
+            yield from _tensors(inner)
+
+
+def _try(bundle: Bundle, policy: Path) -> None:
+    """The network answers an observation of zeros with one finite action a joint."""
+    p = bundle.manifest["policy"]
+    try:
+        out = np.asarray(bundle.act(np.zeros((1, p["observation_size"]), np.float32)))
+    except Exception as error:  # onnxruntime's
+        raise UserError(f"{policy}: does not take the observations that {MANIFEST} states: {str(error).splitlines()[0][:160]}") from None
+    if out.shape != (1, p["action_size"]) or not np.issubdtype(out.dtype, np.floating):
+        raise UserError(f"{policy}: gives {out.dtype} of shape {list(out.shape)}, must give floats of shape [1, {p['action_size']}]; export the"
+                        " bundle again")
+    if not np.isfinite(out).all():
+        raise UserError(f"{policy}: its action is not finite: its weights are not, or overflow; export another checkpoint")
 
 
 def sha256(path: Path) -> str:

@@ -28,6 +28,8 @@ import numpy as np
 import torch
 
 from dexsim.errors import UserError
+from dexsim.learning import parts
+
 
 class SaveError(UserError):
     """A checkpoint could not be written; what was there before is whole."""
@@ -95,7 +97,7 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     """Read a checkpoint; ``config`` comes back as a dict, tensors on ``device``.
 
     Raises UserError, one line each: no such file, truncated or damaged, pickled code (refused), not a dexsim
-    checkpoint, another format version, a missing part.
+    checkpoint, another format version, a missing part, one of the wrong type, weights that are not finite.
     """
     path = Path(path).expanduser()
     _check_whole(path)
@@ -104,8 +106,8 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     except pickle.UnpicklingError:
         raise UserError(f"{path}: refused, it holds pickled code; a dexsim checkpoint holds only tensors, numbers and"
                         " text") from None
-    except (RuntimeError, EOFError, OSError, KeyError, ValueError) as error:
-        raise UserError(f"{path}: damaged or not a checkpoint ({str(error).splitlines()[0][:120]})") from None
+    except Exception as error:  # a damaged pickle ends in whatever its wrong opcodes meet
+        raise UserError(f"{path}: damaged or not a checkpoint ({_first_line(error)})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise UserError(f"{path}: not a dexsim checkpoint (train.py writes them, as last.pt in the run folder)")
     if data.get("version") != VERSION:
@@ -114,13 +116,18 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     missing = [k for k in KEYS + (TRAIN_KEYS if data.get("kind") == "train" else ()) if k not in data]
     if missing:
         raise UserError(f"{path}: damaged checkpoint, it lacks {', '.join(missing)}")
+    if "${" in str(data["config"]):  # what train.py stores is resolved; another's could read this machine's environment
+        raise UserError(f"{path}: refused, its config holds an interpolation (${{...}}), which that of a dexsim checkpoint never does")
     try:
         data["config"] = json.loads(data["config"])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         raise UserError(f"{path}: damaged checkpoint, its config is not JSON") from None
-    if not isinstance(data["config"], dict):
-        raise UserError(f"{path}: damaged checkpoint, its config is {type(data['config']).__name__}, not a mapping")
+    parts.check(data, path)
     return data
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
 def _check_whole(path: Path) -> None:
@@ -136,8 +143,14 @@ def _check_whole(path: Path) -> None:
             raise UserError(f"{path}: refused, it is a raw pickle, which can run code; a dexsim checkpoint holds only"
                             " tensors, numbers and text")
         with zipfile.ZipFile(path) as archive:
+            if head != b"PK" or min(i.header_offset for i in archive.infolist()) != 0:
+                raise UserError(f"{path}: refused, something else stands before its archive, which a dexsim checkpoint never has")
+            if any(i.compress_type != zipfile.ZIP_STORED for i in archive.infolist()):
+                raise UserError(f"{path}: refused, its parts are compressed, which those of a dexsim checkpoint never are")
             bad = archive.testzip()
-    except zipfile.BadZipFile:
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, ValueError, RuntimeError) as error:
+        if isinstance(error, UserError):
+            raise
         what = "truncated" if head == b"PK" else "empty" if not head else "not a checkpoint"
         raise UserError(f"{path}: {what} ({path.stat().st_size} bytes); use another checkpoint of its run folder") from None
     except OSError as error:

@@ -16,13 +16,21 @@ from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
 from dexsim.errors import UserError
+from dexsim.learning import names
 
 Policy = Callable[[TensorDict], torch.Tensor]  # observations -> actions [N, A]
 
 
-def agent_config(cfg: dict[str, Any], device: str) -> dict[str, Any]:
-    """The nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep."""
+def agent_config(cfg: dict[str, Any], device: str, typed: names.Typed = frozenset(), where: str = "agent settings") -> dict[str, Any]:
+    """The nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep.
+
+    typed: settings that the user typed, which alone may name code of another package. where: whose settings these are.
+    Raises UserError for others that do (see :mod:`dexsim.learning.names`).
+    """
     agent = copy.deepcopy(cfg["agent"])
+    if not isinstance(agent, dict):
+        raise UserError(f"{where}: agent is {type(agent).__name__}, must be a group of settings")
+    names.check(agent, typed, where)
     agent["seed"], agent["save_interval"] = cfg["seed"], cfg["save_interval"]
     if agent.get("check_for_nan") is None:
         agent["check_for_nan"] = device == "cpu"
@@ -35,29 +43,30 @@ def agent_errors() -> Iterator[None]:
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             yield
-    except (TypeError, ImportError, AttributeError) as error:
-        raise UserError(f"agent settings: rsl-rl refuses them: {str(error).splitlines()[0]}") from error
+    except (TypeError, ImportError, AttributeError, KeyError, IndexError, AssertionError, NotImplementedError) as error:
+        raise UserError(f"agent settings: rsl-rl refuses them: {(str(error) or type(error).__name__).splitlines()[0]}") from error
     except ValueError as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"agent settings: {str(error).splitlines()[0]}") from error
 
 
-def load_policy(data: dict[str, Any], env: Any, path: str) -> Policy:
+def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> Policy:
     """The trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:
         data: what :func:`dexsim.learning.checkpoint.load` returned.
         env: the environment rebuilt from its config; gives observation sizes.
         path: the file's name, for messages.
+        typed: settings that the user typed (see :func:`agent_config`).
     """
-    agent = agent_config(data["config"], str(env.device))
+    agent = agent_config(data["config"], str(env.device), typed, path)
     with agent_errors():
         kind, settings = resolve_class(agent["actor"])
         actor = kind(env.get_observations(), agent["obs_groups"], "actor", env.num_actions, **settings).to(env.device)
     try:
         actor.load_state_dict(data["actor"])
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: its policy does not fit this environment ({reason})") from None
     return actor.eval()

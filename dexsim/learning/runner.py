@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.learning import checkpoint
+from dexsim.learning import checkpoint, names
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import agent_config, agent_errors
 from dexsim.learning.ranks import Ranks, seed_all
@@ -32,18 +32,20 @@ class Runner(OnPolicyRunner):
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
         ranks: the processes that learn together, already joined; one alone where not given.
+        typed: settings that the user typed, which alone may name code of another package (:mod:`dexsim.learning.names`).
 
     ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included; steps are those of all ranks.
     """
 
-    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str], ranks: Ranks | None = None) -> None:
+    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str], ranks: Ranks | None = None,
+                 typed: names.Typed = frozenset()) -> None:
         self.ranks = ranks or Ranks({})
         self.full_cfg, self._versions, self._git = cfg, versions, checkpoint.git_state()
         device = str(env.device)
         # Networks of noisy gradients do not need the last bits of a product; the update takes a quarter less time (H200).
         torch.backends.cuda.matmul.allow_tf32 = bool(cfg.get("tf32", True))
         with agent_errors():
-            super().__init__(env, agent_config(cfg, device), log_dir=None, device=device)
+            super().__init__(env, agent_config(cfg, device, typed), log_dir=None, device=device)
         self.iteration, self.steps = 0, 0
         self._meter = Meter(env.num_envs, device)
         self._layout = checkpoint.layout_of(env)
@@ -170,12 +172,17 @@ class Runner(OnPolicyRunner):
         try:
             self.alg.load({"actor_state_dict": data["actor"], "critic_state_dict": data["critic"],
                            "optimizer_state_dict": data["optimizer"]}, None, True)
-        except (RuntimeError, ValueError) as error:
+        except Exception as error:  # torch's optimizers meet a wrong state with any of Python's exceptions
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path}: does not fit the networks of this run ({reason})") from None
         self.iteration, self.steps = int(data["iteration"]), int(data["steps"])
-        self.env.load_state_dict(data["env"])
-        checkpoint.set_rng_state(data["rng"])
+        try:
+            self.env.load_state_dict(data["env"])
+            checkpoint.set_rng_state(data["rng"])
+        except Exception as error:
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path}: damaged checkpoint, its env or rng does not fit ({type(error).__name__}: {reason}); use another"
+                            " checkpoint of its run folder") from None
         if self.ranks.rank:
             seed = self.ranks.seed(self.full_cfg["seed"], self.iteration)
             seed_all(seed)

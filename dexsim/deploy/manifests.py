@@ -1,0 +1,183 @@
+"""What a bundle's manifest must say: names, types, and limits that the hand itself has."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from dexsim.assets import xhand
+from dexsim.errors import UserError
+from dexsim.typed import Count, Positive, Real, convert
+
+FORMAT, VERSION = "dexsim-bundle", 1
+AGAIN = "export the bundle again"
+Joints = Annotated[list[Real], msgspec.Meta(min_length=12, max_length=12)]
+Several = Annotated[list[Real], msgspec.Meta(max_length=4096)]
+Any_ = dict[str, Any]
+
+
+class Network(msgspec.Struct):
+    """The file's digest, names and sizes of its input and output."""
+
+    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+    input: str
+    output: str
+    observation_size: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
+    action_size: Literal[12]
+
+
+class Row(msgspec.Struct):
+    """One row of the observation's table: entries start to stop."""
+
+    name: str
+    start: Count
+    stop: Count
+    unit: str
+
+
+class Action(msgspec.Struct):
+    """See `dexsim.deploy.action.ActionRule`."""
+
+    mode: Literal["relative", "absolute"]
+    scale: Annotated[float, msgspec.Meta(gt=0, le=10)]
+    lead: Annotated[float, msgspec.Meta(gt=0, le=10)]
+    low: Joints
+    high: Joints
+    speed_limit_rad_s: Annotated[list[Positive], msgspec.Meta(min_length=12, max_length=12)]
+
+
+class Rates(msgspec.Struct):
+    """s."""
+
+    policy_period_s: Annotated[float, msgspec.Meta(ge=1e-3, le=1.0)]
+
+
+class Normalization(msgspec.Struct):
+    """N.m and N."""
+
+    tau_max: Annotated[list[Positive], msgspec.Meta(min_length=12, max_length=12)]
+    force_max_N: Positive | None = None
+
+
+class Golden(msgspec.Struct):
+    """Of python -m dexsim.export check=DIR."""
+
+    rows: Count
+    tolerance: Annotated[float, msgspec.Meta(gt=0, le=1.0)]
+
+
+class Goal(msgspec.Struct):
+    """axis: unit vector, palm frame; angle: degrees."""
+
+    axis: Annotated[list[Real], msgspec.Meta(min_length=3, max_length=3)]
+    angle: Annotated[float, msgspec.Meta(gt=0, le=180)]
+    keep_tilt: bool
+
+
+class Reached(msgspec.Struct):
+    """rad."""
+
+    delta_rot: Annotated[float, msgspec.Meta(gt=0, le=3.2)]
+
+
+class Observe(msgspec.Struct):
+    """Which rows the rotation's observation has (`observations_rotate.rows`)."""
+
+    orientation: Literal["6d", "quaternion", "none"]
+    force_weighted: bool = True
+    last_action: Literal["step", "target"] | bool = "step"
+
+
+class TaskSettings(msgspec.Struct):
+    """The rotation's."""
+
+    perception: Literal["imu", "proprioception"]
+    history: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    observe: Any_
+    goal: Goal
+    reward: Reached
+
+
+class Grip(msgspec.Struct):
+    """The held pose that a rotation begins with."""
+
+    hand: Joints
+    target: Joints
+    object_pose: Annotated[list[Real], msgspec.Meta(min_length=7, max_length=7)]
+    object_edge_m: Annotated[float, msgspec.Meta(gt=0, le=1.0)]
+
+
+class Manifest(msgspec.Struct):
+    """What `dexsim.export.manifest` writes, as far as the loop and its check depend on it."""
+
+    task: Literal["grasp", "rotate"]
+    policy: Network
+    observation: Annotated[list[Row], msgspec.Meta(min_length=1, max_length=1000)]
+    joints: list[str]
+    fingers: list[str]
+    action: Action
+    rates: Rates
+    normalization: Normalization
+    calibration: Any_
+    perception: Any_
+    servo: Any_
+    initial_pose: Joints
+    golden: Golden
+    versions: Any_
+    trained: Any_
+    task_settings: TaskSettings | None = None
+    grip: Grip | None = None
+
+
+def check(raw: dict[str, Any], source: object) -> Manifest:
+    """The manifest as declared above. Raises UserError, one line: not a manifest, another version, a key missing or of the wrong
+    type, a value outside its range or beyond what the hand can do."""
+    if raw.get("format") != FORMAT:
+        raise UserError(f"{source}: not the manifest of a policy bundle")
+    if raw.get("version") != VERSION:
+        raise UserError(f"{source}: bundle version {raw.get('version')}; this dexsim reads version {VERSION}: {AGAIN}")
+    m = convert(raw, Manifest, source, AGAIN)
+    if m.task == "rotate" and (m.task_settings is None or m.grip is None):
+        raise UserError(f"{source}: lacks task_settings or grip, which task=rotate needs; {AGAIN}")
+    if m.task == "rotate":
+        convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", AGAIN)
+        if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
+            raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {AGAIN}")
+    if m.task == "grasp" and m.normalization.force_max_N is None:
+        raise UserError(f"{source}: lacks normalization.force_max_N, which task=grasp needs; {AGAIN}")
+    for key, ours in (("joints", xhand.JOINTS), ("fingers", xhand.FINGERS)):
+        if getattr(m, key) != list(ours):
+            raise UserError(f"{source}: {key} are {', '.join(getattr(m, key))[:120]}; this hand's are {', '.join(ours)}, in this order")
+    _table(m, source)
+    _limits(m, source)
+    return m
+
+
+def _table(m: Manifest, source: object) -> None:
+    """The rows follow one another and fill the observation."""
+    at = 0
+    for k, row in enumerate(m.observation):
+        if row.start != at or row.stop <= row.start:
+            raise UserError(f"{source}: observation[{k}] ({row.name}) is {row.start} to {row.stop}, must begin at {at}; {AGAIN}")
+        at = row.stop
+    if at != m.policy.observation_size:
+        raise UserError(f"{source}: policy.observation_size={m.policy.observation_size}, its observation table has {at}; {AGAIN}")
+
+
+def _limits(m: Manifest, source: object) -> None:
+    """Ranges and speeds lie within the hand's own, poses within the ranges."""
+    low, high = xhand.joint_limits().T
+    slack = 1e-3
+    checks = [("action.low", m.action.low, low, high), ("action.high", m.action.high, low, high),
+              ("action.speed_limit_rad_s", m.action.speed_limit_rad_s, np.zeros(12), xhand.speeds()), ("initial_pose", m.initial_pose, low, high)]
+    if m.grip is not None:
+        checks += [("grip.target", m.grip.target, low, high)]
+    for key, values, least, most in checks:
+        for joint, value, a, b in zip(xhand.JOINTS, values, least, most, strict=True):
+            if not a - slack <= value <= b + slack:
+                raise UserError(f"{source}: {key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}; {AGAIN}")
+    for joint, a, b in zip(xhand.JOINTS, m.action.low, m.action.high, strict=True):
+        if not a < b:
+            raise UserError(f"{source}: action.low of {joint} is {a:g}, action.high {b:g}; low must be below high; {AGAIN}")

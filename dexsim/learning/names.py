@@ -1,0 +1,57 @@
+"""Which classes agent settings may name: rsl-rl imports and calls whatever its settings name, so a checkpoint that names code of
+its own would run it. Names come from the lists here, unless the user types them on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from dexsim.errors import UserError
+
+MODELS = ("MLPModel", "RNNModel", "CNNModel")
+DISTRIBUTIONS = ("GaussianDistribution", "HeteroscedasticGaussianDistribution", "BetaDistribution")
+ALLOWED: dict[str, tuple[str, ...]] = {
+    "class_name": ("OnPolicyRunner",),
+    "actor.class_name": MODELS,
+    "critic.class_name": MODELS,
+    "actor.distribution_cfg.class_name": DISTRIBUTIONS,
+    "critic.distribution_cfg.class_name": DISTRIBUTIONS,
+    "algorithm.class_name": ("PPO",),
+    "logger": ("tensorboard",),  # the others send what they log to another machine
+}
+"""Settings below `agent` that name code, and the names that need no typing; a setting that is not here has none."""
+LEAVES = ("class_name", "data_augmentation_func", "logger", "_target_")
+"""Last parts of the settings that rsl-rl, or Hydra, turns into code, wherever they stand."""
+
+Typed = frozenset[tuple[str, Any]]
+"""Settings (whole dotted name, value) that the user typed on the command line."""
+
+
+def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: str = "agent settings") -> None:
+    """Raise UserError where a setting of `agent` names code that is neither on the lists above nor in `typed`.
+
+    where: whose settings these are (a checkpoint's path), for the message.
+    """
+    trusted = set(typed)
+    for key, value in leaves(agent):
+        last = key.rpartition(".")[2]
+        if last not in LEAVES or value is None:
+            continue
+        allowed = ALLOWED.get(key, ())
+        if value in allowed or (f"agent.{key}", value) in trusted:
+            continue
+        shown = str(value)[:120]
+        known = f"dexsim takes {', '.join(allowed)} from a file" if allowed else "dexsim takes none from a file"
+        raise UserError(f"{where}: agent.{key}={shown} names code to run, and {known}; only if you trust it, type"
+                        f" agent.{key}={shown} on the command line")
+
+
+def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of every single value below a nest of dicts and lists; a logger's own mapping is looked into too."""
+    items = node.items() if isinstance(node, dict) else enumerate(node)
+    for name, value in items:
+        key = f"{prefix}{name}"
+        if isinstance(value, (dict, list, tuple)):
+            yield from leaves(value, f"{key}.")
+        else:
+            yield key, value

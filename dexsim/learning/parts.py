@@ -1,0 +1,113 @@
+"""What the parts of a checkpoint must be: types, sizes and finite weights, told in one line where one is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import msgspec
+import torch
+
+from dexsim import typed
+from dexsim.errors import UserError
+from dexsim.typed import Count
+
+Size = Annotated[int, msgspec.Meta(ge=1, le=10**6)]
+Group = dict[str, Any]
+
+
+class Layout(msgspec.Struct):
+    """See :func:`dexsim.learning.checkpoint.layout_of`."""
+
+    joints: list[str]
+    action: list[list[str | float]]
+    observations: dict[str, list[tuple[str, Size]]]
+
+
+class Git(msgspec.Struct):
+    """See :func:`dexsim.learning.checkpoint.git_state`."""
+
+    commit: str
+    dirty: bool
+
+
+class Optimizer(msgspec.Struct):
+    """A torch optimizer's state dict."""
+
+    state: dict[int, Group]
+    param_groups: list[Group]
+
+
+class Random(msgspec.Struct):
+    """See :func:`dexsim.learning.checkpoint.rng_state`."""
+
+    torch: torch.Tensor
+    cuda: list[torch.Tensor]
+    numpy: tuple[str, torch.Tensor, int, int, float]
+    python: tuple[int, torch.Tensor, float | None]
+
+
+class Settings(msgspec.Struct):
+    """The parts of a resolved config that every command relies on; what is inside them is checked where it is used."""
+
+    agent: Group
+    task: Group
+    choices: dict[str, str | None]
+    sim: Group = {}
+    servo: Group = {}
+    tactile: Group = {}
+    randomize: Group = {}
+    reality: Group | None = None
+    seed: Count = 0
+
+
+class Policy(msgspec.Struct):
+    """The parts of a ``policy`` file."""
+
+    kind: Literal["policy", "train"]
+    config: Settings
+    versions: dict[str, str]
+    git: Git
+    layout: Layout
+    iteration: Count
+    steps: Count
+    actor: dict[str, torch.Tensor]
+
+
+class Train(Policy):
+    """The parts of a ``train`` file."""
+
+    critic: dict[str, torch.Tensor]
+    optimizer: Optimizer
+    env: dict[str, Any]
+    rng: Random
+
+
+def check(data: dict[str, Any], path: object) -> None:
+    """Raise UserError naming the part of a checkpoint that is not what it must be, and what it is.
+
+    data: with ``config`` as a dict. Weights must be finite, and no tensor larger than the bytes that it was stored in.
+    """
+    again = "use another checkpoint of its run folder"
+    typed.convert(data, Train if data["kind"] == "train" else Policy, f"{path}: damaged checkpoint", again)
+    for name, tensor in tensors(data):
+        if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+            raise UserError(f"{path}: damaged checkpoint, {name} is said to have the shape {list(tensor.shape)}, which is more than"
+                            f" was stored; {again}")
+    for group in ("actor", "critic"):
+        for name, tensor in data.get(group, {}).items():
+            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+                bad = int((~tensor.isfinite()).sum())
+                raise UserError(f"{path}: {group}.{name} holds {bad} of {tensor.numel()} weights that are not finite: learning had"
+                                " diverged; use an earlier checkpoint of its run folder")
+
+
+def tensors(node: Any, prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
+    """(dotted name, tensor) of all below a nest of dicts and lists."""
+    items = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, value in items:
+        name = f"{prefix}{key}"
+        if isinstance(value, torch.Tensor):
+            yield name, value
+        elif isinstance(value, (dict, list, tuple)):
+            yield from tensors(value, f"{name}.")

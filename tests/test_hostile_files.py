@@ -1,0 +1,404 @@
+"""Files that carry code: none of it runs, whatever opens them. And checkpoints and bundles of wrong parts: one line each."""
+
+from __future__ import annotations
+
+import copy
+import gzip
+import io
+import json
+import pickle
+import shutil
+import sys
+import tarfile
+import time
+import zipfile
+
+import dummy_task
+import numpy as np
+import pytest
+import torch
+import yaml
+from bundles import make_checkpoint
+from shell import call, configs
+from test_learning import config, runner
+
+from dexsim import export, yaml_text
+from dexsim.errors import UserError
+from dexsim.learning import checkpoint
+from dexsim.learning.ppo import load_policy
+from dexsim.learning.runner import Runner
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def payload():
+    made = runner()
+    made.learn(1)
+    return made.payload()
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch):
+    """A module `trap` on the path, and what shows that it, or a pickle, ran: the file RAN."""
+    ran = tmp_path / "RAN"
+    (tmp_path / "trap.py").write_text(f"""
+from pathlib import Path
+Path({str(ran)!r}).write_text("imported")
+def go(*a, **k):
+    Path({str(ran)!r}).write_text("called")
+    raise RuntimeError("it ran")
+class Net:
+    def __init__(self, *a, **k): go()
+""")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield ran
+    sys.modules.pop("trap", None)
+
+
+def bait(ran):
+    """An object whose unpickling writes the file."""
+
+    class Bait:
+        def __reduce__(self):
+            return exec, (f"open({str(ran)!r}, 'w').close()",)
+
+    return Bait()
+
+
+def one_line(error) -> str:
+    text = str(error.value)
+    assert "\n" not in text and 10 < len(text) < 700, text
+    return text
+
+
+# -- names of classes in the stored settings ---------------------------------------------------------------------------------
+NAMED = [
+    ("actor.class_name", "trap:Net"), ("actor.class_name", "trap.Net"), ("actor.class_name", "os:system"),
+    ("actor.distribution_cfg.class_name", "trap:Net"), ("critic.class_name", "trap:go"),
+    ("critic.distribution_cfg", {"class_name": "trap:go"}), ("algorithm.class_name", "trap:Net"), ("algorithm.class_name", "builtins:exec"),
+    ("algorithm.symmetry_cfg", {"use_data_augmentation": True, "use_mirror_loss": False, "data_augmentation_func": "trap:go"}),
+    ("algorithm.rnd_cfg", {"class_name": "trap:Net"}), ("logger", {"class_name": "trap:Net"}), ("logger", "wandb"),
+    ("_target_", "trap.go"), ("actor._target_", "trap.go"), ("class_name", "trap:Net"),
+]  # fmt: skip
+
+
+def set_in(node, key, value):
+    *path, last = key.split(".")
+    for part in path:
+        node = node[part]
+    node[last] = value
+
+
+@pytest.mark.parametrize("key, value", NAMED)
+def test_a_class_that_a_checkpoint_names_is_neither_imported_nor_called(payload, trap, tmp_path, key, value):
+    evil = copy.deepcopy(payload)
+    set_in(evil["config"]["agent"], key, value)
+    data = checkpoint.load(checkpoint.save(tmp_path / "evil.pt", evil))
+    env = dummy_task.make_env(data["config"], 4, "cpu", 0, "none")
+    with pytest.raises(UserError, match="names code to run.*type agent\\.") as error:
+        load_policy(data, env, "evil.pt")
+    one_line(error)
+    with pytest.raises(UserError, match="names code to run"):
+        Runner(env, data["config"], {}).open_writer(tmp_path)
+    assert not trap.exists() and "trap" not in sys.modules
+
+
+def test_a_class_that_the_user_types_is_used(payload, trap, tmp_path, capsys):
+    """play.py with the checkpoint refuses; the same with the name typed calls it."""
+    evil = copy.deepcopy(payload)
+    evil["config"]["agent"]["actor"]["class_name"] = "trap:Net"
+    evil["config"] = config_of_a_run(evil["config"])
+    where, out = checkpoint.save(tmp_path / "evil.pt", evil), f"out={tmp_path / 'out'}"
+    assert call("play", configs(tmp_path), f"checkpoint={where}", out, "device=cpu") == 2
+    assert "agent.actor.class_name=trap:Net names code" in capsys.readouterr().err and not trap.exists()
+    assert call("train", tmp_path / "configs", f"resume={where}", "iterations=3", f"{out}2", "device=cpu") == 2
+    assert "agent.actor.class_name=trap:Net names code" in capsys.readouterr().err and not trap.exists()
+    with pytest.raises(RuntimeError, match="it ran"):
+        call("play", tmp_path / "configs", f"checkpoint={where}", out, "device=cpu", "agent.actor.class_name=trap:Net")
+    assert trap.read_text() == "called"
+
+
+def config_of_a_run(cfg):
+    """The whole config of a run on the dummy task, with the agent of `cfg`."""
+    base = {"choices": {"task": "dummy"}, "worlds": 4, "iterations": 2, "preset": "none", "device": "cpu", "run": None, "out": None, "resume": None,
+            "sim": {"engine": "auto"}, "tactile": {"raw": False}, "save_interval": 10, "final_episodes": 0, "servo_file": None, "servo": {},
+            "randomize": {}}  # fmt: skip
+    return base | {k: v for k, v in cfg.items() if k in ("agent", "seed")} | {"task": {"name": "dummy", "steps": 20}}
+
+
+def test_a_stored_setting_reads_no_environment(payload, tmp_path):
+    evil = copy.deepcopy(payload)
+    evil["config"]["task"]["name"] = "${oc.env:HOME}"
+    with pytest.raises(UserError, match="interpolation"):
+        checkpoint.load(checkpoint.save(tmp_path / "evil.pt", evil))
+
+
+# -- archives -------------------------------------------------------------------------------------------------------------------
+def whole(tmp_path, payload) -> bytes:
+    return checkpoint.save(tmp_path / "good.pt", payload).read_bytes()
+
+
+def torch_file(data, **how) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(data, buffer, **how)
+    return buffer.getvalue()
+
+
+def zipped(parts: dict[str, bytes], how=zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", how) as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def tarred(parts: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as archive:
+        for name, data in parts.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def script_module(bad) -> bytes:
+    buffer = io.BytesIO()
+    torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), buffer)
+    return buffer.getvalue()
+
+
+def with_part(data: bytes, name: str, part: bytes) -> bytes:
+    buffer = io.BytesIO(data)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.writestr(name, part)
+    return buffer.getvalue()
+
+
+ARCHIVES = {
+    "a raw pickle": lambda good, bad: pickle.dumps(bad),
+    "a raw pickle of protocol 0": lambda good, bad: pickle.dumps(bad, 0),
+    "a raw pickle, then a whole checkpoint": lambda good, bad: pickle.dumps(bad) + good,
+    "a pickle of protocol 0, then a whole checkpoint": lambda good, bad: pickle.dumps(bad, 0) + good,
+    "a whole checkpoint, then a pickle": lambda good, bad: good + pickle.dumps(bad),
+    "torch's old format": lambda good, bad: torch_file({"format": checkpoint.FORMAT, "x": bad}, _use_new_zipfile_serialization=False),
+    "torch's zip": lambda good, bad: torch_file({"format": checkpoint.FORMAT, "version": 1, "x": bad}),
+    "code as a key": lambda good, bad: torch_file({"format": checkpoint.FORMAT, bad: 1}),
+    "a tar, as torch once wrote": lambda good, bad: tarred({"sys_info": pickle.dumps(bad), "pickle": pickle.dumps(bad)}),
+    "a tar and a zip in one": lambda good, bad: tarred({"pickle": pickle.dumps(bad)}) + good,
+    "a compiled module": lambda good, bad: script_module(bad),
+    "a zip of code": lambda good, bad: zipped({"archive/data.pkl": pickle.dumps(bad), "archive/version": b"3"}),
+    "a compressed zip": lambda good, bad: zipped({"archive/data.pkl": pickle.dumps(bad)}, zipfile.ZIP_DEFLATED),
+    "a gzip": lambda good, bad: gzip.compress(pickle.dumps(bad)),
+    "python's own archive": lambda good, bad: zipped({"__main__.py": b"import trap"}),
+    "two parts of one name": lambda good, bad: with_part(good, zipfile.ZipFile(io.BytesIO(good)).namelist()[0], pickle.dumps(bad)),
+    "numpy objects": lambda good, bad: npz(bad),
+}  # fmt: skip
+
+
+def npz(bad) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, observation=np.array([bad], object))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("kind", ARCHIVES)
+@pytest.mark.filterwarnings("ignore")
+def test_an_archive_that_holds_code_runs_none(payload, trap, tmp_path, kind):
+    file = tmp_path / "evil.pt"
+    file.write_bytes(ARCHIVES[kind](whole(tmp_path, payload), bait(trap)))
+    try:
+        checkpoint.load(file)
+    except UserError as error:
+        assert "\n" not in str(error)
+    else:
+        assert kind == "a whole checkpoint, then a pickle", "only this one is a checkpoint, with bytes that nothing reads"
+    assert not trap.exists()
+
+
+def test_a_part_that_unpacks_without_end_is_refused_at_once(tmp_path):
+    file = tmp_path / "bomb.pt"
+    file.write_bytes(zipped({"archive/data.pkl": bytes(200 << 20)}, zipfile.ZIP_DEFLATED))
+    begun = time.process_time()
+    with pytest.raises(UserError, match="compressed"):
+        checkpoint.load(file)
+    assert time.process_time() - begun < 0.1
+
+
+# -- YAML, npz, ONNX ---------------------------------------------------------------------------------------------------------------
+TAGS = ["!!python/object/apply:trap.go []", "!!python/object/new:trap.Net []", "!!python/name:trap.go ''", "!!python/module:trap ''",
+        "!!python/object:trap.Net {}"]  # fmt: skip
+
+
+@pytest.mark.parametrize("tag", TAGS)
+def test_yaml_tags_build_nothing(trap, tmp_path, tag):
+    from dexsim.actuator.table import ServoTable
+    from dexsim.calibration.file import Calibration
+    from dexsim.deploy import bundle
+
+    text = f"format: dexsim-bundle\nversion: 1\nschema: 1\nx: {tag}\n"
+    for name in ("manifest.yaml", "file.yaml"):
+        (tmp_path / name).write_text(text)
+    for opens in (lambda: bundle.load(tmp_path), lambda: Calibration.load(tmp_path / "file.yaml"), lambda: ServoTable.load(tmp_path / "file.yaml")):
+        with pytest.raises(UserError) as error:
+            opens()
+        one_line(error)
+    assert not trap.exists()
+
+
+LIMITS = {
+    "aliases of aliases": "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
+    "merges of merges": "a0: &a0 {k: 1}\n" + "".join(f"a{k}: &a{k}\n  <<: [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
+    "lists in lists": "[" * 5000, "maps in maps": "{a: " * 5000, "a list that holds itself": "a: &a [*a]", "a date that is none": "x: 2020-99-99",
+    "a list as a key": "? [a]\n: b", "no text": "\x00", "more than the limit": "x: " + "y" * yaml_text.MOST_BYTES,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", LIMITS)
+def test_yaml_keeps_its_limits(kind):
+    begun = time.process_time()
+    with pytest.raises(UserError, match="^file.yaml: ") as error:
+        yaml_text.parse(LIMITS[kind], "file.yaml")
+    one_line(error)
+    assert time.process_time() - begun < 1.0
+
+
+def test_yaml_within_limits_reads_as_ever():
+    text = yaml.safe_dump({"a": [1, 2.5, None, True, "x"], "b": {"c": [[1], [2]]}, "d": (same := [1, 2]), "e": same})
+    assert "*id" in text and yaml_text.parse(text, "x") == yaml.safe_load(text)
+    assert yaml_text.parse("", "x") is None
+
+
+@pytest.fixture(scope="module")
+def bundled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hostile")
+    return export.export(str(make_checkpoint(folder / "policy.pt")), folder / "out", steps=2)
+
+
+@pytest.fixture
+def b(bundled, tmp_path):
+    return shutil.copytree(bundled, tmp_path / "bundle")
+
+
+def sealed(folder, data: bytes) -> None:
+    """Put a network into a bundle, its digest with it."""
+    import hashlib
+
+    (folder / "policy.onnx").write_bytes(data)
+    m = yaml.safe_load((folder / "manifest.yaml").read_text())
+    m["policy"]["sha256"] = hashlib.sha256(data).hexdigest()
+    (folder / "manifest.yaml").write_text(yaml.safe_dump(m))
+
+
+def test_objects_in_golden_arrays_stay_pickled(b, trap):
+    (b / "golden.npz").write_bytes(npz(bait(trap)))
+    with pytest.raises(UserError, match="golden.npz") as error:
+        export.check(b)
+    one_line(error)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("where", ["initializer", "attribute", "branch"])
+def test_a_network_reads_no_other_file(b, tmp_path, where, monkeypatch):
+    import onnx
+    from onnx import TensorProto, helper
+
+    (tmp_path / "secret.bin").write_bytes(np.ones(66 * 12, np.float32).tobytes())
+    away = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[66, 12], data_location=TensorProto.EXTERNAL)
+    for key, value in (("location", "../secret.bin"), ("offset", "0"), ("length", str(66 * 12 * 4))):
+        entry = away.external_data.add()
+        entry.key, entry.value = key, value
+    x, y = helper.make_tensor_value_info("observation", 1, ["n", 66]), helper.make_tensor_value_info("action", 1, ["n", 12])
+    nodes, weights = [helper.make_node("MatMul", ["observation", "w"], ["action"])], [away]
+    constant = helper.make_node("Constant", [], ["w"], value=away)
+    if where == "attribute":
+        nodes, weights = [constant, *nodes], []
+    elif where == "branch":
+        inner = helper.make_graph([constant], "inner", [], [helper.make_tensor_value_info("w", 1, [66, 12])])
+        yes = helper.make_tensor("yes", TensorProto.BOOL, [], [True])
+        nodes = [helper.make_node("If", ["yes"], ["w"], then_branch=inner, else_branch=inner), *nodes]
+        weights = [yes]
+    model = helper.make_model(helper.make_graph(nodes, "g", [x], [y], weights), opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    assert onnx.ModelProto.FromString(model.SerializeToString()) == model
+    sealed(b, model.SerializeToString())
+    monkeypatch.chdir(b)  # where a network without a folder would look
+    with pytest.raises(UserError, match="kept in another file") as error:
+        export.check(b)
+    one_line(error)
+
+
+def test_a_network_of_other_sizes_or_of_nonsense_is_named(b):
+    from onnx import helper
+
+    x, y = helper.make_tensor_value_info("observation", 1, ["n", 66]), helper.make_tensor_value_info("action", 1, ["n", 66])
+    model = helper.make_model(helper.make_graph([helper.make_node("Identity", ["observation"], ["action"])], "g", [x], [y]),
+                              opset_imports=[helper.make_opsetid("", 17)], ir_version=8)  # fmt: skip
+    sealed(b, model.SerializeToString())
+    with pytest.raises(UserError, match=r"shape \[1, 66\], must give floats of shape \[1, 12\]"):
+        export.check(b)
+    model.graph.node[0].op_type, model.graph.node[0].domain = "Run", "trap"
+    sealed(b, model.SerializeToString())
+    with pytest.raises(UserError, match="onnxruntime cannot load"):
+        export.check(b)
+    sealed(b, b"not a network")
+    with pytest.raises(UserError, match="not an ONNX network|cannot load"):
+        export.check(b)
+
+
+# -- parts of the wrong kind -----------------------------------------------------------------------------------------------------
+WRONG = [
+    ("kind", "other"), ("kind", 3), ("kind", []), ("config", None), ("config", "x"), ("config", {"agent": []}), ("config", []), ("versions", []),
+    ("versions", {"dexsim": 1}),
+    ("git", None), ("git", {"commit": 1, "dirty": False}), ("layout", []), ("layout", {}), ("layout", {"joints": 3, "action": [], "observations": {}}),
+    ("layout", {"joints": ["a"], "action": [], "observations": {"actor": [["x"]]}}), ("iteration", "3"), ("iteration", -1), ("iteration", None),
+    ("iteration", float("nan")), ("steps", [1]), ("steps", 2**70), ("actor", []), ("actor", {"w": 1.0}), ("actor", {1: torch.zeros(1)}), ("critic", None),
+    ("critic", {"w": [1.0]}), ("optimizer", {}), ("optimizer", {"state": [], "param_groups": {}}), ("optimizer", {"state": {}, "param_groups": []}),
+    ("optimizer", {"state": {0: {"step": "x"}}, "param_groups": [{"params": [0]}]}), ("env", None), ("env", {}), ("env", {"x": torch.zeros(99)}),
+    ("rng", {}), ("rng", {"torch": 1, "cuda": [], "numpy": [], "python": []}), ("actor", {"w": torch.zeros(1).expand(10**9)}),
+    ("actor", {"w": torch.tensor([1.0, float("nan")])}), ("critic", {"w": torch.tensor([float("inf")])}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("part, value", WRONG, ids=[f"{k}-{p}" for k, (p, _) in enumerate(WRONG)])
+def test_a_part_of_the_wrong_kind_is_named(payload, tmp_path, part, value):
+    buffer = io.BytesIO()
+    text = json.dumps(value if part == "config" else payload["config"])
+    torch.save({"format": checkpoint.FORMAT, "version": 1, **payload, part: value, "config": text}, buffer)
+    (tmp_path / "wrong.pt").write_bytes(buffer.getvalue())
+    with pytest.raises(UserError, match=f"{part}|networks of this run") as error:
+        data = checkpoint.load(tmp_path / "wrong.pt")
+        again = runner()
+        again.restore(data, "wrong.pt")
+    assert "wrong.pt" in one_line(error)
+
+
+def edits():
+    nan, inf = float("nan"), float("inf")
+    for key, value in (
+        ("policy", None), ("policy", "x"), ("policy.sha256", 1), ("policy.observation_size", "66"), ("policy.observation_size", 67), ("policy.action_size", 5),
+        ("policy.input", "other"), ("policy.output", None), ("observation", {}), ("observation", []), ("observation.0.start", 3), ("observation.0", None),
+        ("joints", None), ("joints", ["a"]), ("fingers", "thumb"), ("action", []), ("action.mode", "fast"), ("action.scale", nan), ("action.scale", "0.1"),
+        ("action.lead", -1.0), ("action.low", [0.0]), ("action.low.3", nan), ("action.low.3", -9.0), ("action.high.3", inf), ("action.high.0", -2.0),
+        ("action.high.5", 40.0), ("action.speed_limit_rad_s.2", 0.0), ("action.speed_limit_rad_s.2", 1e6), ("rates", 5), ("rates.policy_period_s", 0),
+        ("rates.policy_period_s", nan), ("rates.policy_period_s", "1e-2 s"), ("normalization.tau_max", [1] * 11), ("normalization.tau_max.1", -1.0),
+        ("normalization.force_max_N", None), ("normalization.force_max_N", 0), ("initial_pose.4", 9.0), ("initial_pose", "open"), ("golden.tolerance", "x"),
+        ("golden", None), ("task", "walk"), ("task", ["grasp"]), ("calibration", 3), ("calibration.touch", "x"), ("versions", 1),
+        ("servo", []), ("task", "rotate"), ("version", "1"), ("format", None),
+    ):
+        yield key, value
+
+
+@pytest.mark.parametrize("key, value", list(edits()))
+def test_a_manifest_of_the_wrong_kind_is_named(b, tmp_path, key, value):
+    from dexsim.deploy.__main__ import main
+
+    m = yaml.safe_load((b / "manifest.yaml").read_text())
+    node, (*path, last) = m, key.split(".")
+    for part in path:
+        node = node[int(part) if isinstance(node, list) else part]
+    node[int(last) if isinstance(node, list) else last] = value
+    (b / "manifest.yaml").write_text(yaml.safe_dump(m))
+    with pytest.raises(UserError) as error:
+        main([f"bundle={b}", "record=none", "driver=xhand"])  # ends before a hand is asked for
+    assert "manifest" in (text := one_line(error)) or "calibration" in text or "policy.onnx" in text, text
