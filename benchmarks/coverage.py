@@ -28,7 +28,7 @@ import torch
 from benchmarks import tools
 from dexsim.assets import xhand
 from dexsim.cli import machine, start
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.tactile.layout import xhand_layout
 
@@ -80,7 +80,7 @@ def of_contact(force: np.ndarray, local: np.ndarray, block: np.ndarray) -> list[
 
 def played(argv: list[str], worlds: int, seconds: float, seed: int) -> list[Contacts]:
     """Samples of a policy that plays (`of_contact`)."""
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.learning import checkpoint
     from dexsim.learning.ppo import load_policy
     from dexsim.tasks import make_env

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 DEFAULTS = {"joints": "12", "seconds": "60", "device": "cpu", "hidden": "true", "recordings": "4", "seed": "0", "next": "false", "replay": "mujoco", "out": ""}
@@ -113,7 +113,7 @@ def main(argv: list[str]) -> int:
         print(__doc__)
         return 0
     s = settings(argv)
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap import demo
     from dexsim.gap.command import available
     from dexsim.gap.diagnosis import Settings, diagnose, save

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[1]

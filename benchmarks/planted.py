@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 TIERS = {"large": 8.0, "medium": 4.0, "small": 2.0}
@@ -459,7 +459,7 @@ def _one(job: tuple) -> dict:
     if done.is_file():
         return json.loads(done.read_text(encoding="utf-8"))
     os.environ["OMP_NUM_THREADS"] = "1"
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     from dexsim.gap.plant import batch as plant
@@ -555,7 +555,7 @@ def main(argv: list[str]) -> dict:
 def _warm(kernel) -> None:
     import warp as wp
 
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     wp.load_module(module=kernel().module, device="cpu")

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 PERIOD = 1 / 90.0  # s between readings: the sensor shows its last one that is older than the delay
@@ -47,7 +47,7 @@ def main(argv: list[str]) -> int:
         if not equals or key not in s:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.touch import handed_on as touch_handed, press_rig, touch
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism

@@ -51,7 +51,7 @@ def main(argv: list[str]) -> dict:
 def environment(worlds: int, device: str, tactile: str) -> tuple:
     """(environment, its config) of the grasp task, reset."""
     from dexsim.cli import start
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_env
 
     quiet_warp(device)

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 COUNTS = {"cuda": (1, 16, 256, 1024, 4096, 8192, 16384, 32768, 65536, 131072), "cpu": (1, 4, 16, 64, 256)}

@@ -29,7 +29,7 @@ from scipy import stats
 from dexsim.cli import build, folder, machine
 from dexsim.cli import start as start_up
 from dexsim.cli import train as training
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.learning.runner import Runner
 

@@ -16,7 +16,7 @@ import torch
 from dexsim.actuator.kernel import QUEUE
 from dexsim.cli import machine
 from dexsim.cli import start as start_up
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.sim.scene import OBJECT_FIELDS
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def command(main: Callable[[list[str]], object], about: str | None = None) -> None:
-    """Run `main` on the command line's arguments (or print `about` for --help) and end the process as every command of dexsim ends (`dexsim.cli.ending`)."""
+    """Run `main` on the command line's arguments (or print `about` for --help) and end the process as every command of dexsim ends (`dexsim.console.ending`)."""
 
     def run(argv: list[str]) -> int:
         main(argv)
@@ -57,7 +57,7 @@ def numbers(text: str, name: str) -> list[int]:
 
 
 def config(argv: Sequence[str]) -> dict[str, Any]:
-    """The resolved settings of `python train.py ARGV`; torch's threads set as there."""
+    """The resolved settings of `dexsim train ARGV`; torch's threads set as there."""
     cfg = start_up.for_train(list(argv), ROOT / "configs").cfg
     machine.set_threads(cfg["device"])
     return cfg

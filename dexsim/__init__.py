@@ -1,3 +1,5 @@
 """dexsim: train, feel and diagnose dexterous hands on MuJoCo-Warp."""
 
-__version__ = "0.1.0"
+from dexsim.version import VERSION as __version__
+
+__all__ = ["__version__"]

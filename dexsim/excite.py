@@ -1,4 +1,4 @@
-"""Safe command trajectories for a real hand: python -m dexsim.excite out=DIR."""
+"""Safe command trajectories for a real hand: dexsim excite out=DIR."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m dexsim.excite out=DIR [key=value ...]
+USAGE = """usage: dexsim excite out=DIR [key=value ...]
 
 Write commands that show what a hand's drives do: slow triangles, a speed ladder, a chirp, steps, holds, random motion
 and repeats, in shuffled order. Every motion is simulated with the servo and made smaller until it keeps the limits of
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = _settings(argv)
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording.excitation import Limits, plan, write_plan
     from dexsim.recording.mechanism import mechanism
     from dexsim.recording.schema import numbers
@@ -133,6 +133,6 @@ def _number(given: dict[str, str], key: str, default: float = 0.0) -> float:
 
 
 if __name__ == "__main__":
-    from dexsim.cli.ending import guard
+    from dexsim.console.ending import guard
 
     sys.exit(guard(main, sys.argv[1:]))

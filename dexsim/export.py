@@ -1,4 +1,4 @@
-"""A policy bundle: python -m dexsim.export checkpoint=... out=DIR; python -m dexsim.export check=DIR."""
+"""A policy bundle: dexsim export checkpoint=... out=DIR; dexsim export check=DIR."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m dexsim.export checkpoint=FILE out=DIR [key=value ...]
-       python -m dexsim.export check=DIR
+USAGE = """usage: dexsim export checkpoint=FILE out=DIR [key=value ...]
+       dexsim export check=DIR
 
 Write a policy as one folder that a robot can run:
 
@@ -23,7 +23,7 @@ Write a policy as one folder that a robot can run:
 settings (key=default):
   checkpoint=         policy.pt, last.pt or model_*.pt
   out=                a new or empty folder
-  calibration=        calibration.yaml of python calibrate.py (default: nothing measured, assumptions stated)
+  calibration=        calibration.yaml of dexsim calibrate (default: nothing measured, assumptions stated)
   check=              a bundle to recompute
   steps=64            golden rows from a simulated episode; as many again are drawn at random
   seed=0              of both
@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
         return 0 if check(given["check"]) else 1
     for key in ("checkpoint", "out"):
         if not given.get(key):
-            raise UserError(f"say {key}=... (python -m dexsim.export --help)")
+            raise UserError(f"say {key}=... (dexsim export --help)")
     out = export(given["checkpoint"], given["out"], given.get("calibration"), _whole(given, "steps", 64), _whole(given, "seed", 0),
                  frozenset((k, v) for k, v in given.items() if k.startswith("agent.")))
     return 0 if check(out) else 1
@@ -59,8 +59,8 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
            typed: frozenset[tuple[str, Any]] = frozenset()) -> Path:
     """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
     from dexsim.calibration.file import Calibration
-    from dexsim.cli import folder
-    from dexsim.cli.build import quiet_warp
+    from dexsim.console import folders
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.deploy import bundle
     from dexsim.learning import checkpoint as checkpoints
     from dexsim.learning.ppo import load_policy
@@ -73,7 +73,7 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
     out = Path(out).expanduser()
     if out.is_dir() and any(out.iterdir()):
         raise UserError(f"out={out}: already holds files; choose another folder")
-    out = folder.make(out, "out=")
+    out = folders.make(out, "out=")
     import torch
 
     from dexsim.tasks import make_env
@@ -333,6 +333,6 @@ def _whole(given: dict[str, str], key: str, default: int) -> int:
 
 
 if __name__ == "__main__":
-    from dexsim.cli.ending import guard
+    from dexsim.console.ending import guard
 
     sys.exit(guard(main, sys.argv[1:]))

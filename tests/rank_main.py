@@ -1,4 +1,4 @@
-"""train.py on the dummy task, for torchrun in tests: rank_main.py CONFIGS MODE [key=value ...].
+"""`dexsim train` on the dummy task, for torchrun in tests: rank_main.py CONFIGS MODE [key=value ...].
 
 MODE: plain; report: each rank writes what it had and learned into out=; slow: steps take time;
 fail<k>: rank k meets an error at its 60th step; bug<k>: an exception there instead.
@@ -14,10 +14,8 @@ from pathlib import Path
 
 import dummy_task
 import torch
-from shell import script
-
-from dexsim.cli import train
-from dexsim.cli.ending import guard
+from dexsim.cli import commands, train
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.learning.runner import Runner
 
@@ -59,8 +57,7 @@ class ReportingRunner(Runner):
 
 
 if __name__ == "__main__":
-    MODE = sys.argv[2]
+    CONFIGS, MODE = Path(sys.argv[1]), sys.argv[2]
     if MODE == "report":
         train.Runner = ReportingRunner
-    module = script("train", Path(sys.argv[1]))
-    sys.exit(guard(lambda argv: module.main(argv, RankEnv), sys.argv[3:]))
+    sys.exit(guard(lambda argv: commands.train(argv, CONFIGS, RankEnv), sys.argv[3:]))

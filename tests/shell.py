@@ -1,12 +1,13 @@
-"""Running train.py and play.py inside a test, on the dummy task and a copy of the configs."""
+"""Running `dexsim train` and `dexsim play` inside a test, on the dummy task and a copy of the configs."""
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 from pathlib import Path
 
-from dexsim.cli.ending import guard
+from dexsim.cli import commands
+from dexsim.console.ending import guard
+from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).resolve().parents[1]
 DUMMY = """name: dummy
@@ -23,7 +24,7 @@ presets:
 def configs(folder: Path) -> Path:
     """A copy of configs/ with `task=dummy` and without what other tasks need."""
     target = folder / "configs"
-    shutil.copytree(ROOT / "configs", target)
+    shutil.copytree(CONFIGS, target)
     for group in ("task", "servo", "tactile", "randomize"):
         (target / group).mkdir(exist_ok=True)
     (target / "task" / "dummy.yaml").write_text(DUMMY)
@@ -32,18 +33,8 @@ def configs(folder: Path) -> Path:
     return target
 
 
-def script(name: str, config_dir: Path):
-    """The module train.py or play.py, reading its settings from `config_dir`."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.CONFIGS = config_dir
-    return module
-
-
 def call(name: str, config_dir: Path, *argv: str) -> int:
-    """Exit status of `python <name>.py argv...` with the dummy task's make_env."""
+    """Exit status of `dexsim <name> argv...` with the dummy task's make_env and the settings of `config_dir`."""
     import dummy_task
 
-    module = script(name, config_dir)
-    return guard(lambda arguments: module.main(arguments, dummy_task.make_env), list(argv))
+    return guard(lambda arguments: getattr(commands, name)(arguments, config_dir, dummy_task.make_env), list(argv))

@@ -17,7 +17,8 @@ import shell
 import torch
 import yaml
 
-from dexsim.cli import checks, console, folder, machine, report, settings
+from dexsim.cli import checks, console, folder, machine, settings
+from dexsim.console import tables
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 
@@ -63,7 +64,7 @@ def test_a_run_from_start_to_play_command(configs, place, capfd):
     for part in ("dexsim 0.1.0", "torch ", "warp-lang 1.19", "mujoco 4.0", "rsl-rl-lib 5.5", "device", "memory", "4 worlds",
                  "compiling kernels (first run only; cached afterwards)", "observations of the actor (2)", "rewards (1)",
                  "randomization (1)", "2/2", "steps/s", " left",
-                 "play it:  python play.py checkpoint=runs/dummy/first/policy.pt"):
+                 "play it:  dexsim play checkpoint=runs/dummy/first/policy.pt"):
         assert part in out, part
     assert "Actor Model" not in out and "Learning iteration" not in out  # rsl-rl's own printing
     names = {p.name for p in where.iterdir()}
@@ -102,10 +103,9 @@ def test_resume_continues_counters_curves_and_config(configs, place, run_folder,
 
 
 def test_resume_takes_overrides_of_groups_and_values(configs, place, run_folder):
-    start = shell.script("train", configs)
     from dexsim.cli.start import for_train
 
-    ready = for_train([f"resume={run_folder / 'last.pt'}", "servo=ideal", "save_interval=7", "iterations=9"], start.CONFIGS)
+    ready = for_train([f"resume={run_folder / 'last.pt'}", "servo=ideal", "save_interval=7", "iterations=9"], configs)
     assert ready.cfg["choices"]["servo"] == "ideal" and ready.cfg["save_interval"] == 7
     assert ready.cfg["servo"] == yaml.safe_load((configs / "servo" / "ideal.yaml").read_text())
     assert ready.cfg["run"] is None and ready.cfg["task"]["name"] == "dummy"
@@ -317,7 +317,7 @@ def test_ctrl_c_saves_and_says_where(configs, place, capfd, monkeypatch, number,
     before = signal.getsignal(number)
     assert shell.call("train", configs, *QUICK, "iterations=50", "run=cut") == status
     out = capfd.readouterr().out
-    assert "stopping and saving" in out and "python train.py resume=runs/dummy/cut/last.pt" in out
+    assert "stopping and saving" in out and "dexsim train resume=runs/dummy/cut/last.pt" in out
     assert checkpoint.load("runs/dummy/cut/last.pt")["iteration"] == 1
     assert Path("runs/dummy/cut/curves.png").exists() and signal.getsignal(number) is before
 
@@ -331,12 +331,12 @@ def test_ctrl_c_while_building(configs, place, capfd, monkeypatch):
 # --- small parts
 
 def test_tables_and_numbers():
-    text = report.table("t", ("name", "n"), [("a", 1.23456), ("long name", 20.0)])
+    text = tables.table("t", ("name", "n"), [("a", 1.23456), ("long name", 20.0)])
     assert text.splitlines() == ["t", "  name           n", "  a          1.235", "  long name     20"]
-    assert report.table("t", ("name",), []) == "t\n  name"
-    assert [report.duration(s) for s in (5.4, 187, 3727)] == ["5 s", "3:07", "1:02:07"]
-    assert [report.count(v) for v in (950, 12345, 4.56e6, 1.2e9)] == ["950", "12.3k", "4.56M", "1.2G"]
-    assert [report.cell(v) for v in (True, None, (0, 1.5), [1, 2, 3], "x")] == ["yes", "-", "0 .. 1.5", "1, 2, 3", "x"]
+    assert tables.table("t", ("name",), []) == "t\n  name"
+    assert [tables.duration(s) for s in (5.4, 187, 3727)] == ["5 s", "3:07", "1:02:07"]
+    assert [tables.count(v) for v in (950, 12345, 4.56e6, 1.2e9)] == ["950", "12.3k", "4.56M", "1.2G"]
+    assert [tables.cell(v) for v in (True, None, (0, 1.5), [1, 2, 3], "x")] == ["yes", "-", "0 .. 1.5", "1, 2, 3", "x"]
 
 
 def test_progress_file_gains_columns(tmp_path):

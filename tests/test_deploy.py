@@ -14,13 +14,13 @@ from dexsim import export
 from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy import bundle
-from dexsim.deploy.__main__ import main as command
+from dexsim.cli.deploy import main as command
 from dexsim.deploy.driver import Clock, HandCommand, HandState, VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.recorder import Recorder
 from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.safety import Guard
-from dexsim.deploy.simulated import SimulatedXHand, choose_gl
+from dexsim.tasks.simulated_hand import SimulatedXHand, choose_gl
 from dexsim.deploy.timing import Timing
 from dexsim.deploy.vendor import VendorXHand
 from dexsim.deploy.vision import CameraPose, FixedPlace, Frame, Vision, centroid
@@ -489,7 +489,7 @@ CAMERA = """
 import sys
 from dexsim.calibration.file import Calibration
 from dexsim.deploy import bundle
-from dexsim.deploy.simulated import SimulatedHand
+from dexsim.tasks.simulated_hand import SimulatedHand
 hand = SimulatedHand(bundle.load(sys.argv[1]).config, Calibration.default(), seed=4, camera=True, shape="sphere")
 for dz in (0.0, 0.02, -0.03):
     hand._start[0][0, 2] += dz

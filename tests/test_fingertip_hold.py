@@ -9,7 +9,8 @@ import torch
 
 from dexsim.cli import start
 from dexsim.tasks.rotate import RotateEnv
-from dexsim.tasks.stable_grasps import FINGER_OF, GraspSet
+from dexsim.tasks.make_grasps import FINGER_OF
+from dexsim.tasks.stable_grasps import GraspSet
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 MASS, FRICTION, EDGE = 0.05, 0.9, 0.0403  # kg, 1, m

@@ -7,9 +7,9 @@ import pytest
 import torch
 from worlds import grasp_env
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
-from dexsim.tasks import nan_dump
+from dexsim.tasks import nan_dump, nan_replay
 
 N = 4
 
@@ -65,8 +65,8 @@ def test_a_replay_fails_again_and_a_sound_world_repeats_its_step(tmp_path, capsy
         env.step(torch.full((N, 12), 0.2))
     blow_up(env, 1)
     env.check()
-    assert bool(nan_dump.replay(tmp_path / "nan_0.npz", engine=engine).nan[0])
-    assert nan_dump.main([str(tmp_path / "nan_0.npz"), f"engine={engine}"]) == 0
+    assert bool(nan_replay.replay(tmp_path / "nan_0.npz", engine=engine).nan[0])
+    assert nan_replay.main([str(tmp_path / "nan_0.npz"), f"engine={engine}"]) == 0
     assert "it fails again" in capsys.readouterr().out
     # a step that stays finite, dumped as if it had not: the replay moves the world as the environment did
     env.reset_all()
@@ -77,7 +77,7 @@ def test_a_replay_fails_again_and_a_sound_world_repeats_its_step(tmp_path, capsy
     env._reset_done = keep
     env._nan_dump.after(torch.arange(N) == 3)
     env.check()
-    again = nan_dump.replay(tmp_path / "nan_1.npz", engine=engine).engine.t
+    again = nan_replay.replay(tmp_path / "nan_1.npz", engine=engine).engine.t
     torch.testing.assert_close(again.qpos[0], env.engine.t.qpos[3], rtol=0, atol=1e-5)
     torch.testing.assert_close(again.qvel[0], env.engine.t.qvel[3], rtol=0, atol=1e-3)
 
@@ -86,5 +86,5 @@ def test_a_file_that_is_none(tmp_path, capsys):
     (tmp_path / "x.npz").write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(UserError, match="x.npz"):
         nan_dump.load(tmp_path / "x.npz")
-    assert guard(nan_dump.main, [str(tmp_path / "missing.npz")]) == 2
+    assert guard(nan_replay.main, [str(tmp_path / "missing.npz")]) == 2
     assert "missing.npz" in capsys.readouterr().err

@@ -167,7 +167,7 @@ def test_a_killed_rank_ends_the_run(configs, tmp_path, lost, by):
     assert status != 0 and time.monotonic() - start < 20  # most of it torchrun's own start and end on a busy machine
     lines = [x for x in err.splitlines() if x.startswith("error:")]
     assert len(lines) == 1, err
-    assert f"rank {lost} is gone" in lines[0] and "torchrun --nproc_per_node=2 train.py resume=run/last.pt" in lines[0]
+    assert f"rank {lost} is gone" in lines[0] and "torchrun --nproc_per_node=2 -m dexsim train resume=run/last.pt" in lines[0]
     saved = checkpoint.load(tmp_path / "run" / "last.pt")
     status, out, err = finish(torchrun(configs, tmp_path, "plain", "resume=run/last.pt", f"iterations={saved['iteration'] + 1}", "out=again"))
     assert status == 0 and checkpoint.load(tmp_path / "again" / "last.pt")["iteration"] == saved["iteration"] + 1

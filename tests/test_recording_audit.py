@@ -7,7 +7,8 @@ import pytest
 import recordings
 
 from dexsim.recording import Series, read, write
-from dexsim.recording.audit import KINDS, audit, main, table
+from dexsim.recording.audit import KINDS, audit, table
+from dexsim.recording.command import main
 from dexsim.recording.schema import DUTY
 
 

@@ -11,10 +11,12 @@ import torch
 
 from dexsim.cli import start
 from dexsim.errors import UserError
-from dexsim.tasks import make_env, rotation
+from dexsim import rotation
+from dexsim.tasks import make_env
 from dexsim.tasks.rotate import ACTOR_SIZE, CRITIC_SIZE
 from dexsim.tasks.rotate_eval import summary
-from dexsim.tasks.stable_grasps import DEFAULT, DRIFT, GraspSet
+from dexsim.tasks.make_grasps import DRIFT
+from dexsim.tasks.stable_grasps import DEFAULT, GraspSet
 
 torch.set_num_threads(1)
 CONFIGS = Path(__file__).parents[1] / "configs"

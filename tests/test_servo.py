@@ -16,7 +16,7 @@ from dexsim.actuator.columns import FEATURES, INDEX, column
 from dexsim.actuator.reference import servo as servo_reference
 from dexsim.actuator.reference import target_in_force
 from dexsim.errors import UserError
-from dexsim.sim.engine import make_engine
+from dexsim.sim import make_engine
 
 G = 9.81
 

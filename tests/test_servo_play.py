@@ -13,7 +13,7 @@ import torch
 from dexsim.actuator import FIELDS, Servo, ServoTable
 from dexsim.actuator.kernel import STOP_GAIN, STOP_RATE
 from dexsim.errors import UserError
-from dexsim.sim.engine import make_engine
+from dexsim.sim import make_engine
 
 G, MASS, ARM = 9.81, 0.1, 0.05  # of the link: kg, m
 LINK, ROTOR = 1e-3, 5e-4  # kg.m2

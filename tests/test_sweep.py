@@ -11,6 +11,7 @@ import shell
 
 from dexsim.cli import sweep
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 STUB = """import sys, pathlib
 out = pathlib.Path(next(a for a in sys.argv if a.startswith("out="))[4:])
@@ -29,7 +30,7 @@ def script(tmp_path):
 
 def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
     argv = ["--multirun", "task=grasp", "servo=xhand,ideal", "seed=1,3", "iterations=7", f"sweep={tmp_path / 's'}"]
-    assert sweep.run(argv, shell.ROOT / "configs", script) == 0
+    assert sweep.run(argv, CONFIGS, [sys.executable, str(script)]) == 0
     runs = {p.parent.name: set(p.read_text().split("\n")) for p in (tmp_path / "s").glob("*/argv.txt")}
     assert set(runs) == {"0", "1", "2", "3"}
     assert {tuple(sorted(x for x in r if x[:5] in ("servo", "seed="))) for r in runs.values()} == {
@@ -41,14 +42,14 @@ def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
 
 
 def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
-    assert sweep.run(["-m", "seed=1,2,3", f"sweep={tmp_path / 's'}"], shell.ROOT / "configs", script) == 1
+    assert sweep.run(["-m", "seed=1,2,3", f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)]) == 1
     assert [json.loads((tmp_path / "s" / str(k) / "job.json").read_text())["status"] for k in range(3)] == [0, 3, 0]
 
 
 @pytest.mark.parametrize("argv, said", [(["wrlds=1,2"], "wrlds"), (["task=grsp,grasp"], "grsp"), (["seed=1,2", "out=x"], "sweep=FOLDER")])
 def test_a_slip_is_one_line(argv, said, script, tmp_path):
     with pytest.raises(UserError, match=said) as error:
-        sweep.run(["--multirun", *argv, f"sweep={tmp_path / 's'}"], shell.ROOT / "configs", script)
+        sweep.run(["--multirun", *argv, f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)])
     assert "\n" not in str(error.value)
 
 
@@ -56,7 +57,7 @@ def test_a_sweep_is_not_written_over(script, tmp_path):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "x").touch()
     with pytest.raises(UserError, match="already holds a sweep"):
-        sweep.run(["-m", "seed=1,2", f"sweep={tmp_path / 's'}"], shell.ROOT / "configs", script)
+        sweep.run(["-m", "seed=1,2", f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)])
 
 
 def test_without_multirun_a_list_is_still_refused(capfd):

@@ -17,7 +17,7 @@ ALL = ["box", "sphere", "capsule", *(n for n, s in library().items() if s.kind =
 
 
 def grasp_cfg(*settings: str, worlds: int = 8) -> dict:
-    """The resolved configuration of `python train.py task=grasp preset=none SETTINGS`: all objects, on the CPU too."""
+    """The resolved configuration of `dexsim train task=grasp preset=none SETTINGS`: all objects, on the CPU too."""
     return task_cfg(*settings, worlds=worlds)
 
 

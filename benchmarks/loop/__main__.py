@@ -37,7 +37,7 @@ from scipy.stats import t as student
 
 from benchmarks.loop import presses
 from benchmarks.loop.steps import FAST, KEPT
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[2]

@@ -141,7 +141,7 @@ def used(own: list, believed) -> float:
 
 
 def _world(name: str) -> dict:
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     return yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))

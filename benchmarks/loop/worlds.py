@@ -65,6 +65,6 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    from dexsim.cli.ending import guard
+    from dexsim.console.ending import guard
 
     sys.exit(guard(main, sys.argv[1:], __doc__))

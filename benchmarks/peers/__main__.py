@@ -19,8 +19,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from dexsim.cli import folder
-from dexsim.cli.ending import guard
+from dexsim.console import folders
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 HERE = Path(__file__).parent
@@ -96,7 +96,7 @@ def main(argv: list[str]) -> int:
         if key not in OWN:
             raise UserError(f"unknown setting {key!r}; there are {', '.join(OWN)}")
         own[key] = value
-    out = folder.make(Path(own.get("out", "out/peers")).resolve(), "out=")
+    out = folders.make(Path(own.get("out", "out/peers")).resolve(), "out=")
     if argv[0] == "gpu":
         return 0 if all("error" not in r for r in gpu(own, out)) else 1
     if argv[0] == "cpu":

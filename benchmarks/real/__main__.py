@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.real.fold import brief, fold, joint
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [fit=20] [figure=FILE.png]
@@ -168,7 +168,7 @@ def main(argv: list[str]) -> int:
     data = Path(plain[1]).expanduser()
     if not data.is_dir():
         raise UserError(f"{data} is not a folder; download the recordings first (see benchmarks/real/convert_{plain[0]}.py for where from)")
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     out = Path(given.get("out", f"out/real/{plain[0]}"))

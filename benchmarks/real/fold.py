@@ -11,7 +11,7 @@ from typing import Any
 def fold(job: tuple[Path, Path, int]) -> dict:
     """One gain of BAM left out: fitted on the other three, judged on its four recordings."""
     from benchmarks.real.convert_bam import convert
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
     data, out, gain = job
@@ -32,7 +32,7 @@ def fold(job: tuple[Path, Path, int]) -> dict:
 
 def joint(job: tuple[Any, Path, str]) -> dict:
     """One joint of SAGE: fitted on the motions to fit, judged on those held out."""
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
 
     made, out, name = job

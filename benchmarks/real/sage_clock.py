@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 JAW = 2.34  # rad per unit of the jaw's 0..1

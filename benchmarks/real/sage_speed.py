@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.real import sage_clock
 from benchmarks.real.convert_sage import JOINTS
 from benchmarks.real.sage_clock import JAW
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 SLOWEST, FASTEST = 0.1, 1.0  # rad/s

@@ -31,7 +31,7 @@ import torch
 
 from benchmarks import tools
 from benchmarks.reproduce import jobs, report, rows
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 STEPS = 150e6

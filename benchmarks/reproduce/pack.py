@@ -17,7 +17,7 @@ from pathlib import Path
 
 from benchmarks import tools
 from benchmarks.reproduce.jobs import done
-from dexsim.cli.ending import guard
+from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 

@@ -1,4 +1,4 @@
-"""`python calibrate.py`: reads presses, fits, says where a fit fails, writes calibration.yaml and plots."""
+"""`dexsim calibrate`: reads presses, fits, says where a fit fails, writes calibration.yaml and plots."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     """Everything that the settings ask for."""
     from dexsim.calibration import charts, current, simulate
     from dexsim.calibration.file import Calibration, save
-    from dexsim.cli import folder
-    from dexsim.cli.build import quiet_warp
+    from dexsim.console import folders
+    from dexsim.sim.quiet import quiet_warp
 
-    out = folder.make(Path(str(s["out"])).expanduser(), "out=")
+    out = folders.make(Path(str(s["out"])).expanduser(), "out=")
     report: dict[str, Any] = {"schema": 1, "robot": "xhand_right", "normalization": s["normalization"], "source": {}}
     real = sim = None
     if s["simulate"]:
@@ -84,7 +84,7 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
 
 def _print_half(half: Any, key: str, symbol: str) -> None:
     from dexsim.assets import xhand
-    from dexsim.cli.report import table
+    from dexsim.console.tables import table
 
     rows = []
     for joint in xhand.JOINTS:
@@ -101,7 +101,7 @@ def _print_half(half: Any, key: str, symbol: str) -> None:
 
 
 def _print_ratio(joints: dict[str, Any]) -> None:
-    from dexsim.cli.report import table
+    from dexsim.console.tables import table
 
     rows = []
     for joint, e in joints.items():
@@ -233,7 +233,7 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
 
 def _help(file: Path) -> str:
     what = "Fit what a hand's currents and taxel counts mean, from press recordings; writes calibration.yaml."
-    lines = ["usage: python calibrate.py key=value ...", "", what, ""]
+    lines = ["usage: dexsim calibrate key=value ...", "", what, ""]
     for line in file.read_text(encoding="utf-8").splitlines():
         if ":" in line and not line.startswith("#"):
             setting, _, comment = line.partition("  # ")

@@ -1,4 +1,4 @@
-"""`calibration.yaml`: what `python calibrate.py` writes and the deployed policy reads.
+"""`calibration.yaml`: what `dexsim calibrate` writes and the deployed policy reads.
 
     schema: 1
     normalization: matched          # matched: tau/tau_max from tau = alpha I / beta; paper: I / I_max
@@ -90,7 +90,7 @@ class Calibration:
         try:
             raw = yaml.safe_load(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise UserError(f"calibration {path}: no such file (python calibrate.py writes one)") from None
+            raise UserError(f"calibration {path}: no such file (dexsim calibrate writes one)") from None
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise UserError(f"calibration {path}: cannot be read: {' '.join(str(error).split())}") from None
         return cls.from_dict(raw, str(path), torque_max)

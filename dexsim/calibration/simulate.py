@@ -69,11 +69,11 @@ def press_recording(joint: str, servo: dict | str | Path | None = None, levels: 
 def make(out: str | Path, joints: Sequence[str] = xhand.JOINTS, servo: dict | str | Path | None = None, levels: int = 8, realistic: bool = False,
          seed: int = 0, say: Callable[[str], None] = print) -> list[Path]:
     """Write press_<joint>.mcap of each joint into a folder; realistic: as the hardware would have delivered it (mA, counts)."""
-    from dexsim.cli import folder
+    from dexsim.console import folders
     from dexsim.recording.realistic import realistic as as_hardware
     from dexsim.recording.writer import write
 
-    out = folder.make(Path(out).expanduser(), "out=")
+    out = folders.make(Path(out).expanduser(), "out=")
     paths = []
     for k, joint in enumerate(joints):
         recording = press_recording(joint, servo, levels)
@@ -155,7 +155,7 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
 def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: bool = False, say: Callable[[str], None] = print) -> Path:
     """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on the index finger, as a
     rehearsal; what was planted is said."""
-    from dexsim.cli import folder
+    from dexsim.console import folders
     from dexsim.recording.writer import write
 
     recording = rolled_recording(seed=seed)
@@ -168,7 +168,7 @@ def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: 
         say(f"planted  index finger: dead {list(PLANTED_DEAD)}, swapped {PLANTED_SWAP}; every pad: gains of 15 % spread")
     if realistic:
         recording = delivered(recording, seed)
-    path = folder.make(Path(out).expanduser(), "out=") / "rolled.mcap"
+    path = folders.make(Path(out).expanduser(), "out=") / "rolled.mcap"
     write(path, recording)
     say(f"mcap     {path}: {recording.duration:.1f} s")
     return path

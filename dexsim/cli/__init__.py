@@ -1,4 +1,4 @@
-"""What the entry scripts share: settings from the command line, value checks, start-up printout, clear endings.
+"""The command `dexsim` and its jobs: settings from the command line, value checks, start-up printout, runs, replays.
 
-Part of the entry scripts, not of the library: nothing else in dexsim imports it.
+The top floor: nothing in dexsim below it imports it.
 """

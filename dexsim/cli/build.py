@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +11,7 @@ import torch
 from dexsim.cli import machine
 from dexsim.cli.report import describe_env, versions_line
 from dexsim.learning.ranks import seed_all
+from dexsim.sim.quiet import quiet_warp
 
 MakeEnv = Callable[..., Any]
 
@@ -41,25 +40,6 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
         env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
     print(f"ready after {time.perf_counter() - start:.1f} s", flush=True)
     return env
-
-
-def quiet_warp(device: str) -> None:
-    """Start Warp without its banner and, where only the CPU is wanted, without its warning that there is no GPU driver
-    (printed by its native library, hence the file descriptor)."""
-    import warp
-
-    warp.config.log_level = warp.LOG_WARNING
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        if device == "cpu":
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, 2)
-            os.close(nowhere)
-        warp.init()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
 
 
 def print_tables(env: Any) -> None:

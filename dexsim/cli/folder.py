@@ -10,27 +10,7 @@ from typing import Any
 
 import yaml
 
-from dexsim.errors import UserError
-
-
-def make(folder: Path, setting: str, empty: bool = False) -> Path:
-    """Create a folder and make sure that it can be written. Raises UserError naming the setting to change.
-
-    Args:
-        setting: the settings that choose the folder, for the message.
-        empty: refuse one that already holds something.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable.tmp"
-        probe.write_bytes(b"x")
-        probe.unlink()
-        if empty and any(folder.iterdir()):
-            raise UserError(f"{folder} already holds a run: choose another {setting}, or continue it with"
-                            f" resume={folder / 'last.pt'}")
-    except OSError as error:
-        raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
-    return folder
+from dexsim.console.folders import make
 
 
 def for_run(cfg: dict[str, Any]) -> Path:

@@ -1,4 +1,4 @@
-"""``--help`` of the entry scripts, written from the config files themselves so that it cannot go stale."""
+"""``--help`` of train and play, written from the config files themselves so that it cannot go stale."""
 
 from __future__ import annotations
 
@@ -6,35 +6,36 @@ import re
 from pathlib import Path
 
 from dexsim.cli.settings import groups
+from dexsim.console import program
 
-TRAIN = """usage: python train.py [key=value ...]
+TRAIN = """usage: dexsim train [key=value ...]
 
 Train a policy in many simulated worlds at once. Ctrl-C stops and saves.
 
 examples:
-  python train.py task=grasp                                the whole job, sized for this machine
-  python train.py worlds=64 iterations=10 device=cpu        a quick look
-  python train.py servo=ideal agent.algorithm.learning_rate=5e-4
-  python train.py resume=runs/grasp/<run>/last.pt iterations=2000
-  python train.py --multirun seed=1,2,3 servo=xhand,ideal   every combination, one run each (docs/scale.md)
-  torchrun --nproc_per_node=8 train.py task=grasp           one run on eight GPUs, worlds= for each of them (docs/scale.md)
+  dexsim train task=grasp                                the whole job, sized for this machine
+  dexsim train worlds=64 iterations=10 device=cpu        a quick look
+  dexsim train servo=ideal agent.algorithm.learning_rate=5e-4
+  dexsim train resume=runs/grasp/<run>/last.pt iterations=2000
+  dexsim train --multirun seed=1,2,3 servo=xhand,ideal   every combination, one run each (docs/scale.md)
+  torchrun --nproc_per_node=8 -m dexsim train task=grasp    one run on eight GPUs, worlds= for each of them (docs/scale.md)
 """
-PLAY = """usage: python play.py checkpoint=PATH [key=value ...]
-       python play.py policy=random|zero|scripted task=grasp [key=value ...]
+PLAY = """usage: dexsim play checkpoint=PATH [key=value ...]
+       dexsim play policy=random|zero|scripted task=grasp [key=value ...]
 
 Play a policy: a metrics table, metrics.json, plots and, unless video=false, an mp4.
 
 examples:
-  python play.py checkpoint=checkpoints/grasp.pt
-  python play.py checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
-  python play.py checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
-  python play.py policy=random task=grasp tactile=raw record=a.mcap realistic=true
-  python play.py checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install -e ".[view]")
-  python play.py replay=a.mcap                                        recorded against simulated: plots, video
-  python play.py replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
+  dexsim play checkpoint=checkpoints/grasp.pt
+  dexsim play checkpoint=runs/grasp/<run>/last.pt episodes=1024 seed=7 video=false
+  dexsim play checkpoint=checkpoints/grasp.pt servo=ideal          change its own config
+  dexsim play policy=random task=grasp tactile=raw record=a.mcap realistic=true
+  dexsim play checkpoint=checkpoints/grasp.pt view=true            live in a browser (pip install "dexsim[view]")
+  dexsim play replay=a.mcap                                        recorded against simulated: plots, video
+  dexsim play replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
 """
 END = """
-  python {script}.py --cfg      every setting with the value it would have, then stop
+  dexsim {script} --cfg      every setting with the value it would have, then stop
 """
 
 
@@ -44,9 +45,9 @@ def text(script: str, config_dir: Path) -> str:
     lines = [TRAIN if script == "train" else PLAY, "settings (key=default):"]
     for file in files:
         lines += [f"  {f'{key}={value}':<28}{comment}" for key, value, comment in settings(config_dir / file)]
-    lines += ["", "groups (one file of configs/<group>/ each):"]
+    lines += ["", "groups (one file of dexsim/configs/<group>/ each):"]
     lines += [f"  {name + '=':<14}{' | '.join(options)}" for name, options in groups(config_dir).items()]
-    return "\n".join(lines) + "\n" + END.format(script=script)
+    return program.words("\n".join(lines) + "\n" + END.format(script=script))
 
 
 def settings(path: Path) -> list[tuple[str, str, str]]:

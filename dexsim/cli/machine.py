@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from dexsim.errors import UserError
+from dexsim.version import VERSION
 
 PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 
@@ -46,9 +47,7 @@ def set_threads(where: str) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of dexsim, Python and what it stands on, for the printout and for checkpoints."""
-    from dexsim import __version__
-
-    found = {"dexsim": __version__, "python": platform.python_version()}
+    found = {"dexsim": VERSION, "python": platform.python_version()}
     for name in PACKAGES:
         try:
             found[name] = version(name)

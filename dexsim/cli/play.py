@@ -1,4 +1,4 @@
-"""One replay from resolved settings to metrics and video. Called by play.py in the root folder."""
+"""One replay from resolved settings to metrics and video."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.cli import folder
-from dexsim.cli.report import table
+from dexsim.console.tables import table
 from dexsim.errors import UserError
 
 KEYS = ("replay", "model", "servo", "servo_file", "out", "video", "timestep", "object", "object_size", "object_mass", "object_friction")
@@ -87,7 +87,7 @@ def run(play: dict[str, Any]) -> int:
     video.mp4."""
     import yaml
 
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording import audit, compare, led_object, mechanism
     from dexsim.recording.reader import read
     from dexsim.recording.writer import write
@@ -154,7 +154,7 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
     import mujoco
     import numpy as np
 
-    from dexsim.cli.console import Ticker
+    from dexsim.console.ticker import Ticker
     from dexsim.view.video import Clip, NoRenderer, render
 
     model = m.spec.compile()

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from dexsim.cli.console import Ticker
-from dexsim.cli.report import table
+from dexsim.console.ticker import Ticker
+from dexsim.console.tables import table
 from dexsim.learning.ppo import Policy
 
 

@@ -1,6 +1,6 @@
-"""Several runs from one command, through Hydra's sweeper and launcher: python train.py --multirun seed=1,2,3 servo=xhand,ideal.
+"""Several runs from one command, through Hydra's sweeper and launcher: dexsim train --multirun seed=1,2,3 servo=xhand,ideal.
 
-Hydra expands the lists into jobs and hands them to its launcher; each job is train.py again, in a process of its own. The basic
+Hydra expands the lists into jobs and hands them to its launcher; each job is `dexsim train` again, in a process of its own. The basic
 launcher runs them one after the other; a launcher plugin (hydra/launcher=joblib, submitit_slurm, ...) runs them as it does.
 """
 
@@ -12,13 +12,15 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dexsim.cli.report import table
+from dexsim.console.tables import table
 from dexsim.errors import UserError
 
 FLAGS = ("--multirun", "-m")
+COMMAND = (sys.executable, "-m", "dexsim", "train")
 
 
 def wanted(argv: list[str]) -> bool:
@@ -26,7 +28,7 @@ def wanted(argv: list[str]) -> bool:
     return any(a in FLAGS for a in argv)
 
 
-def run(argv: list[str], config_dir: Path, script: Path) -> int:
+def run(argv: list[str], config_dir: Path, command: Sequence[str] = COMMAND) -> int:
     """Run all jobs; returns 0 when all ended with 0, else 1. Raises UserError for what Hydra refuses.
 
     Each job's run folder is `<sweep>/<number>`; the sweep folder is runs/<task>/sweep_<date and time>, or `sweep=FOLDER`.
@@ -43,7 +45,7 @@ def run(argv: list[str], config_dir: Path, script: Path) -> int:
         raise UserError(f"{folder} already holds a sweep: choose another sweep=")
     places = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${hydra.job.num}", "hydra.output_subdir=null", "hydra.job.chdir=false",
               "hydra/job_logging=disabled", "hydra/hydra_logging=none"]
-    _hydra(argv, places, config_dir, Job(script))
+    _hydra(argv, places, config_dir, Job(command))
     rows, failed = _collect(folder)
     print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
     return 1 if failed or not rows else 0
@@ -52,8 +54,8 @@ def run(argv: list[str], config_dir: Path, script: Path) -> int:
 class Job:
     """What a launcher calls for each job; picklable, so that a launcher may run it elsewhere (with the same files)."""
 
-    def __init__(self, script: Path) -> None:
-        self.script = str(script)
+    def __init__(self, command: Sequence[str]) -> None:
+        self.command = list(command)
 
     def __call__(self, _cfg: Any) -> int:
         from hydra.core.hydra_config import HydraConfig
@@ -66,7 +68,7 @@ class Job:
             env["CUDA_VISIBLE_DEVICES"] = devices[number % len(devices)]
         print(f"job {number}: {' '.join(settings)}", flush=True)
         start = time.perf_counter()
-        status = subprocess.run([sys.executable, self.script, *settings, f"out={folder}"], env=env).returncode
+        status = subprocess.run([*self.command, *settings, f"out={folder}"], env=env).returncode
         note = {"settings": settings, "status": status, "seconds": round(time.perf_counter() - start, 1)}
         (folder / "job.json").write_text(json.dumps(note))
         if status in (130, 143):

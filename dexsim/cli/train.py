@@ -1,4 +1,4 @@
-"""One training run from resolved settings to the ``play.py`` command. Called by train.py in the root folder."""
+"""One training run from resolved settings to the command that plays its policy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import Any
 from dexsim.cli import build, folder, machine
 from dexsim.cli.console import TrainingLines
 from dexsim.cli.replay import replay
-from dexsim.cli.report import count, duration
+from dexsim.console import program
+from dexsim.console.tables import count, duration
 from dexsim.cli.start import Start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -72,12 +73,12 @@ def _run(start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop)
         print(f"\nstopped after {runner.iteration} iterations; saved {where / 'last.pt'}\ncontinue: {resume}")
         return stop.status
     status = _final_episodes(runner, cfg, where) if ranks.leader else 0
-    print(f"\nplay it:  python play.py checkpoint={shlex.quote(str(where / 'policy.pt'))}")
+    print(f"\nplay it:  {program.name('play')} checkpoint={shlex.quote(str(where / 'policy.pt'))}")
     return status
 
 
 def _command(ranks: Ranks) -> str:
-    return "python train.py" if ranks.size == 1 else f"torchrun --nproc_per_node={ranks.here} train.py"
+    return program.name("train") if ranks.size == 1 else program.torchrun("train", ranks.here)
 
 
 def _check_resume(start: Start) -> None:

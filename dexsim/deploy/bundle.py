@@ -1,4 +1,4 @@
-"""A policy bundle, read: the folder that `python -m dexsim.export` writes."""
+"""A policy bundle, read: the folder that `dexsim export` writes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def load(path: str | Path) -> Bundle:
     another version, a network that does not fit it or reads other files, no onnxruntime."""
     path = Path(path).expanduser()
     if not (path / MANIFEST).is_file():
-        raise UserError(f"{path}: no {MANIFEST} there; python -m dexsim.export checkpoint=... out=DIR writes a bundle")
+        raise UserError(f"{path}: no {MANIFEST} there; dexsim export checkpoint=... out=DIR writes a bundle")
     manifest = _mapping(path / MANIFEST)
     manifests.check(manifest, path / MANIFEST)
     _same_table(manifest, path / MANIFEST)

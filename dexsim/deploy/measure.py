@@ -12,7 +12,7 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy import observations, observations_rotate
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
-from dexsim.tasks import rotation
+from dexsim import rotation
 
 PLACE, ORIENTATION = "place", "orientation"
 """What a policy needs to know of the object, beside what the hand reads."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from dexsim.tasks import rotation
+from dexsim import rotation
 
 ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from dexsim.console import program
 from dexsim.errors import UserError
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
@@ -101,7 +102,7 @@ def _hidden(text: str) -> str | None:
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status. Raises UserError."""
     if not argv or argv[0] in ("-h", "--help", "help"):
-        print(HELP, end="")
+        print(program.words(HELP), end="")
         return 0 if argv else 2
     given = parse(argv)
     if given.get("columns"):
@@ -110,7 +111,7 @@ def main(argv: list[str]) -> int:
         print(describe())
         return 0
     from dexsim.actuator.columns import did_you_mean
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.gap.effects.catalogue import EFFECTS
     from dexsim.gap.effects.touch import BY_ID

@@ -1,4 +1,4 @@
-"""Faults of a recording's signals, found before any physics is: `python -m dexsim.recording.audit FILE`.
+"""Faults of a recording's signals, found before any physics is: `dexsim audit FILE`.
 
 A finding names topic, time and count; nothing is repaired. Kinds and severities: `KINDS`.
 """
@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from dexsim.errors import UserError
 from dexsim.recording import audit_time, audit_values
 from dexsim.recording.schema import SEVERITIES, Finding, Recording, Series
 
@@ -123,31 +121,8 @@ def summary(r: Recording) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Print what is in a recording and what is wrong with it; status 1 where a channel cannot be used as it is."""
-    from dexsim.recording.arguments import read_arguments
-    from dexsim.recording.reader import read
+if __name__ == "__main__":  # python -m dexsim.recording.audit FILE
+    from dexsim.console.ending import guard
+    from dexsim.recording.command import main
 
-    if not argv or argv[0] in ("-h", "--help"):
-        print(
-            "usage: python -m dexsim.recording.audit FILE [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]\n\n"
-            "kinds of findings:"
-        )
-        print("\n".join(f"  {kind:<20}{text}" for kind, text in KINDS.items()))
-        return 0 if argv else 2
-    paths, remap, meta = read_arguments(argv)
-    worst = 0
-    for path in paths:
-        recording = read(Path(path), remap, meta)
-        print(summary(recording) + "\n")
-        print(table(recording.findings) + "\n")
-        worst = max(worst, int(any(f.severity == "error" for f in recording.findings)))
-    return worst
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(guard(main, sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""Safe command trajectories that show what a mechanism's drives do. Used by `python -m dexsim.excite` and the
+"""Safe command trajectories that show what a mechanism's drives do. Used by `dexsim excite` and the
 diagnosis."""
 
 from __future__ import annotations

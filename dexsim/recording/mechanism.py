@@ -20,6 +20,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
@@ -56,15 +57,8 @@ class Mechanism:
 
 
 def xhand_servo_dict() -> dict[str, Any]:
-    """The xHand's nominal servo table: configs/servo/xhand.yaml beside the package, else what its URDF states."""
-    path = Path(__file__).resolve().parents[2] / "configs" / "servo" / "xhand.yaml"
-    if path.is_file():
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    rows = zip(xhand.JOINTS, xhand.efforts(), xhand.speeds(), strict=True)
-    return {
-        "joints": {"*": {"kp": 4.0, "kd": 0.1}}
-        | {j: {"torque_limit": float(e), "no_load_speed": float(v)} for j, e, v in rows}
-    }
+    """The xHand's nominal servo table: `configs/servo/xhand.yaml`."""
+    return yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
 
 
 def mechanism(

@@ -51,6 +51,7 @@ def read(
     reading.findings += findings
     recording = reading.build(stated, joints)
     if audit:
+        # here, so that `python -m dexsim.recording.audit` does not find its module loaded by the package
         from dexsim.recording.audit import audit as find_faults
 
         recording.findings += find_faults(recording)

@@ -6,6 +6,7 @@ graphs, nor contact buffers, nor which engine runs.
 
 from __future__ import annotations
 
-from dexsim.sim.engine import ContactPair, Engine, make_engine
+from dexsim.sim.engine import ContactPair, Engine
+from dexsim.sim.make import make_engine
 
 __all__ = ["ContactPair", "Engine", "make_engine"]

@@ -406,7 +406,7 @@ class HandEnv(VecEnv):
         path = self._nan_dump.write(Path(self.dump_folder))
         if path is not None:
             print(f"a world was not finite and began anew ({int(self.nan_count)} so far); one is kept in {path}: "
-                  f"python -m dexsim.tasks.nan_dump {path} repeats the step", flush=True)
+                  f"dexsim nan-dump {path} repeats the step", flush=True)
         self.engine.check_overflow()
 
     @property

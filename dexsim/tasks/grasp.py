@@ -17,7 +17,8 @@ from dexsim.deploy import observations
 from dexsim.deploy.observations import ACTOR_SIZE, OBSERVATION
 from dexsim.errors import UserError
 from dexsim.tactile.clearance import Clearance
-from dexsim.tasks import rotation, terms
+from dexsim import rotation
+from dexsim.tasks import terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
 from dexsim.tasks.servos import ServoRandomizer

@@ -1,9 +1,6 @@
-"""What a world was before its state stopped being finite: kept on the device, written once an iteration, replayed here.
+"""What a world was before its state stopped being finite: kept on the device, written once an iteration.
 
-    python -m dexsim.tasks.nan_dump nan_0.npz [engine=mujoco|warp] [device=cpu]
-
-repeats the control step that failed, in one world of the same configuration, and prints what becomes of it. The solver
-starts cold in the replay: what hung on its warm start may not come back.
+`dexsim nan-dump FILE` repeats the step (`dexsim.tasks.nan_replay`).
 """
 
 from __future__ import annotations
@@ -93,57 +90,8 @@ def load(path: Path) -> dict[str, np.ndarray]:
     return data
 
 
-def replay(path: Path, device: str = "cpu", engine: str = "auto"):
-    """The environment (one world) after the step that failed. Raises UserError."""
-    from dexsim.tasks import make_env
+if __name__ == "__main__":  # python -m dexsim.tasks.nan_dump FILE
+    from dexsim.console.ending import guard
+    from dexsim.tasks.nan_replay import main
 
-    data = load(path)
-    env = make_env(json.loads(str(data["config"])), 1, device, 0, engine)
-    e = env.engine
-
-    def put(own: torch.Tensor, name: str) -> None:
-        if own.shape[1:] != data[name].shape:
-            raise UserError(f"{path}: {name} is {data[name].shape} there and {tuple(own.shape[1:])} in this scene: another version of dexsim")
-        own.copy_(torch.as_tensor(data[name], device=own.device)[None])
-
-    for name in [k for k in data if k.startswith("field.")]:
-        put(e.field(name[len("field."):]), name)
-    e.set_state(torch.ones(1, dtype=torch.bool, device=device), torch.as_tensor(data["qpos"], device=device)[None],
-                torch.as_tensor(data["qvel"], device=device)[None])
-    for own, name in ((e.t.time, "time"), (e.t.xfrc_applied, "xfrc_applied"), (env.servo.params, "servo_params"), (env.servo.state, "servo_state")):
-        put(own, name)
-    e.step(env.decimation, env.servo.before_each)
-    env.read_state()
-    return env
-
-
-def main(argv: list[str]) -> int:
-    """Prints the state before and after; returns 0."""
-    files = [a for a in argv if "=" not in a]
-    given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if len(files) != 1 or set(given) - {"engine", "device"}:
-        raise UserError("usage: python -m dexsim.tasks.nan_dump FILE.npz [engine=mujoco|warp] [device=cpu]")
-    from dexsim.cli.build import quiet_warp
-
-    device = given.get("device", "cpu")
-    quiet_warp(device)
-    data = load(Path(files[0]))
-    env = replay(Path(files[0]), device, given.get("engine", "auto"))
-    print(f"{files[0]}: world {int(data['world'])}, control step {int(data['episode_step'])} of its episode, action {np.round(data['action'], 3).tolist()}")
-    for name in ("qpos", "qvel"):
-        before, after = data[name], getattr(env.engine.t, name)[0].cpu().numpy()
-        print(f"{name} before: {int((~np.isfinite(before)).sum())} of {before.size} not finite, largest {_largest(before)}; "
-              f"after: {int((~np.isfinite(after)).sum())} not finite, largest {_largest(after)}")
-    print("it fails again here" if bool(env.nan[0]) else f"it stays finite here (engine {env.engine.kind})")
-    return 0
-
-
-def _largest(x: np.ndarray) -> str:
-    x = np.abs(x[np.isfinite(x)])
-    return f"{x.max():.4g}" if x.size else "-"
-
-
-if __name__ == "__main__":
-    from dexsim.cli.ending import guard
-
-    sys.exit(guard(main, sys.argv[1:], __doc__))
+    sys.exit(guard(main, sys.argv[1:]))

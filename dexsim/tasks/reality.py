@@ -25,6 +25,7 @@ import yaml
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tasks.servos import RELATIVE
 
 CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
@@ -210,7 +211,7 @@ def main(argv: list[str]) -> int:
         raise UserError(f"seed={own['seed']}: must be a whole number from 0 up")
     if own["out"] is None:
         raise UserError("out=PATH: say where to write the world, e.g. out=configs/reality/bench.yaml")
-    servo = yaml.safe_load((Path(__file__).parents[2] / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    servo = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     out = Path(own["out"]).expanduser()
     world = draw(own["seed"], servo)
     world["name"] = out.stem
@@ -220,6 +221,6 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    from dexsim.cli.ending import guard
+    from dexsim.console.ending import guard
 
     sys.exit(guard(main, sys.argv[1:], __doc__))

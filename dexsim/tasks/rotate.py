@@ -19,7 +19,7 @@ from dexsim.deploy import observations_rotate as observations
 from dexsim.deploy.observations_rotate import ACTOR, ORIENTATION
 from dexsim.errors import UserError
 from dexsim.tactile.layout import xhand_layout
-from dexsim.tasks import rotation
+from dexsim import rotation
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import GraspSet

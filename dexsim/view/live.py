@@ -1,6 +1,6 @@
 """A live view of a policy in a browser: the hand, the object, what the fingertips feel, rewards, and controls.
 
-`python play.py checkpoint=PATH view=true` serves one web page (viser, the extra `view`), on this machine only unless `view_host` says
+`dexsim play checkpoint=PATH view=true` serves one web page (viser, the extra `view`), on this machine only unless `view_host` says
 otherwise; nothing here needs a display. The environment steps in the main thread, in real time where it can; the page's controls
 only set what the loop reads next.
 """
@@ -22,12 +22,12 @@ import torch
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.learning.ppo import Policy
 from dexsim.sim.scene import OBJECT
 from dexsim.view import live_panels as panels
 from dexsim.view.live_meshes import body_meshes
 from dexsim.view.render import CAMERA, backdrop
 
+Policy = Callable[[Any], torch.Tensor]  # observations -> actions [N, A]
 SPEEDS = ("1/10", "1/4", "1/2", "1", "fastest")
 SCENE_HZ, PANEL_HZ = 30.0, 8.0
 LIFT = 4e-4  # m, taxels are drawn this much above the skin

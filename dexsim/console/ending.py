@@ -25,7 +25,7 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
         return _say(error, 2) if not _silent() else 2
     except KeyboardInterrupt:
         return 130 if _silent() else _say("stopped by Ctrl-C before there was anything to save", 130, "")
-    except BrokenPipeError:  # e.g. `python train.py --help | head`
+    except BrokenPipeError:  # e.g. `dexsim train --help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (RuntimeError, MemoryError) as error:

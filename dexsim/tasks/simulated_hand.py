@@ -205,7 +205,7 @@ class SimulatedImu:
         """A reading of time t [s]."""
         import torch
 
-        from dexsim.tasks import rotation
+        from dexsim import rotation
 
         step = t - self._at
         self._at = t
@@ -468,7 +468,7 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
 
     import torch
 
-    from dexsim.cli.build import quiet_warp
+    from dexsim.sim.quiet import quiet_warp
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's to handle: it relaxes first
     torch.set_num_threads(1)

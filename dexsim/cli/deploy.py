@@ -1,0 +1,203 @@
+"""A policy on a hand: dexsim deploy bundle=DIR driver=sim seconds=10."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dexsim.errors import UserError
+
+USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
+
+Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C relaxes at once. Stand clear of a real hand,
+and try driver=sim first. On a machine that does other work too, run it with real-time priority (chrt -r 10 python -m ...).
+
+settings (key=default):
+  bundle=             folder of dexsim export
+  driver=sim          sim, or xhand (the vendor's package) with port=
+  port=               serial port of the hand (/dev/ttyUSB0), or ethercat
+  seconds=10          of the policy, after homing
+  command=0.5         grasp: commanded force, 0..1 of F_max
+  calibration=        calibration.yaml instead of the bundle's
+  record=             FILE.mcap of everything seen and sent (default: out/deploy_<date>.mcap; record=none: nothing)
+  vision=truth        driver=sim: truth, or camera (a rendered depth image and mask); driver=xhand: place="x y z" [m]
+  place=              the object's place in the palm frame where nothing sees it, e.g. place="0.055 0 0.04"
+  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours sends lines "w x y z"
+  shape=              driver=sim, grasp: the object's shape
+  seed=0              driver=sim
+safety (key=default):
+  tor_max=            firmware current limit [mA] (default: the calibration's current_max)
+  kp=100              firmware stiffness
+  speed=0.6           largest speed of targets, over the joints' no-load speed
+  margin=0            rad kept free at the joint limits
+  home_speed=0.5      rad/s of the homing
+  wait=3              rotate: s that the open hand then waits for the cube; grip=1: s its fingers take to close on it
+  stale=0.1           s: a reading older than this relaxes the hand; late=0.1, hang=0.3, overruns=10 likewise
+  read_hz=100         readings a second
+  recover=false       home again when readings are good again, instead of ending
+"""
+OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "imu", "shape", "seed")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C. Raises UserError."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(USAGE, end="")
+        return 0 if argv else 2
+    given, changes = _settings(argv)
+    import torch
+
+    from dexsim.calibration.file import Calibration
+    from dexsim.deploy import bundle as bundles
+    from dexsim.deploy.loop import Loop, LoopSettings
+
+    torch.set_num_threads(1)
+    if "bundle" not in given:
+        raise UserError("say which policy: bundle=DIR (dexsim export writes one)")
+    b = bundles.load(given["bundle"])
+    base = b.manifest["normalization"]["tau_max"]
+    calibration = (Calibration.load(given["calibration"], base) if "calibration" in given
+                   else Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base))  # fmt: skip
+    settings = LoopSettings(**changes)
+    if "command" in changes and b.manifest["task"] != "grasp":
+        raise UserError(f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force")
+    driver, eye = _hand(given, b, calibration)
+    for text in calibration.assumed:
+        print(f"note     {text}")
+    recorder = _recorder(given, b, settings, calibration)
+    print(f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g} Hz")
+    print(f"driver   {driver.name}; starting ...", flush=True)
+    loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        report = loop.run()
+    finally:
+        driver.close()
+        signal.signal(signal.SIGTERM, before)
+    print(f"\nended    {report.ended} after {report.acts} actions; the hand is relaxed")
+    print(report.timing.table())
+    print("counts   " + (", ".join(f"{k} {v}" for k, v in sorted(report.counts.items())) or "none"))
+    if recorder is not None:
+        lost = f"; {recorder.error}" if recorder.error else ""
+        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}")
+    return 0 if report.ended == "done" else 130 if "Ctrl-C" in report.ended else 1
+
+
+def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
+    import numpy as np
+
+    from dexsim.deploy.vision import FixedPlace
+    kind, task = given.get("driver", "sim"), b.manifest["task"]
+    for key in ("vision", "place", "shape") if task == "rotate" else ("imu",):
+        if key in given:
+            raise UserError(f"{key}={given[key]}: the policy in {b.path} is of task={task}, which does not use it")
+    place = None
+    if "place" in given:
+        try:
+            at = np.array([float(x) for x in given["place"].replace(",", " ").split()])
+        except ValueError:
+            at = np.zeros(0)
+        if at.shape != (3,) or not (np.abs(at) < 0.5).all():
+            raise UserError(f"place={given['place']}: must be x y z in the palm frame, three numbers within 0.5 m")
+        place = FixedPlace(at)
+    if kind == "sim":
+        from dexsim.tasks.simulated_hand import SimulatedXHand
+
+        vision = given.get("vision", "truth")
+        if vision not in ("truth", "camera"):
+            raise UserError(f"vision={vision}: must be truth or camera")
+        if not given.get("seed", "0").isdigit():
+            raise UserError(f"seed={given['seed']}: must be a whole number")
+        if "imu" in given:
+            raise UserError("imu=: driver=sim has its own")
+        config = b.config
+        shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
+        if given.get("shape", shapes[0]) not in shapes:
+            raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
+        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera", shape=given.get("shape"),
+                                grip=b.manifest.get("grip"))  # fmt: skip
+        return driver, place or driver
+    if kind == "xhand":
+        from dexsim.deploy.vendor import VendorXHand
+
+        if "port" not in given:
+            raise UserError("driver=xhand: say port=/dev/ttyUSB0 (or port=ethercat)")
+        if task == "rotate":
+            return VendorXHand(given["port"]), _imu(given, b)
+        if place is None:
+            raise UserError("driver=xhand: nothing sees the object; state place=\"x y z\" [m, palm frame], or run the Loop with your own"
+                            " HeightSource (dexsim.deploy.vision)")
+        return VendorXHand(given["port"]), place
+    raise UserError(f"driver={kind}: must be sim or xhand")
+
+
+def _imu(given: dict[str, str], b: Any) -> Any:
+    """The IMU in the object; None where the policy does without."""
+    from dexsim.deploy.imu import UdpImu
+
+    if b.manifest["task_settings"]["perception"] != "imu":
+        return None
+    how, _, port = given.get("imu", "").partition(":")
+    if how != "udp" or not port.isdigit():
+        raise UserError(f"imu={given.get('imu', '')}: nothing says how the object is turned; say imu=udp:PORT and send lines \"w x y z\" there, or run"
+                        " the Loop with your own OrientationSource (dexsim.deploy.imu)")
+    imu = UdpImu(int(port))
+    if not imu.wait(5.0):
+        raise UserError(f"imu=udp:{port}: no orientation came within 5 s; send lines of text \"w x y z\" to 127.0.0.1:{port}")
+    return imu
+
+
+def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) -> Any:
+    import yaml
+
+    from dexsim.console import folders
+    from dexsim.deploy.recorder import Recorder
+
+    where = given.get("record") or f"out/deploy_{time.strftime('%Y-%m-%d_%H-%M-%S')}.mcap"
+    if where == "none":
+        return None
+    path = Path(where).expanduser()
+    path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
+    folders.make(path.parent, "record=")
+    sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
+    meta = {
+        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": "xhand_right", "effort_is": "current_A", "effort_sign": sign,
+        "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}", "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),
+        "tactile_layout": "xhand_right", "gravity": "0 0 -9.81", "notes": f"deployed policy {b.manifest['policy']['sha256'][:12]}",
+    }  # fmt: skip
+    config = yaml.safe_dump({"deploy": dataclasses.asdict(settings), "bundle": b.manifest["versions"]}, sort_keys=False)
+    return Recorder(path, b.manifest["joints"], meta, config, time.monotonic())
+
+
+def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
+    from dexsim.deploy.loop import LoopSettings
+
+    fields = {f.name: f.type for f in dataclasses.fields(LoopSettings) if f.name != "home"}
+    given: dict[str, str] = {}
+    changes: dict[str, Any] = {}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if not equals or key not in (*OWN, *fields):
+            raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join((*OWN, *fields))}")
+        if key in OWN:
+            given[key] = value
+            continue
+        try:
+            if "bool" in fields[key]:
+                changes[key] = {"true": True, "false": False}[value]
+            else:
+                changes[key] = int(value) if fields[key] == "int" else float(value)
+                if not 0 <= changes[key] < float("inf"):
+                    raise ValueError
+        except (ValueError, KeyError):
+            raise UserError(f"{key}={value}: must be {'true or false' if 'bool' in fields[key] else 'a number of at least 0'}") from None
+    return given, changes

@@ -1,0 +1,92 @@
+"""`dexsim COMMAND [key=value ...]`: finds the command, loads nothing else."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from dataclasses import dataclass
+
+from dexsim.console.ending import guard
+from dexsim.errors import UserError
+from dexsim.version import VERSION
+
+
+@dataclass(frozen=True)
+class Command:
+    """One sub-command. where: "module:function" of (arguments) -> exit status; about: one line for the first screen."""
+
+    where: str
+    about: str
+
+
+COMMANDS: dict[str, Command] = {
+    "train": Command("dexsim.cli.commands:train", "train a policy in many simulated worlds at once"),
+    "play": Command("dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"),
+    "diagnose": Command("dexsim.gap.command:main", "find the physics that the simulator leaves out of your recordings"),
+    "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
+    "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
+    "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
+    "export": Command("dexsim.export:main", "write a policy as one folder that a robot can run"),
+    "deploy": Command("dexsim.cli.deploy:main", "run an exported policy on a hand, real or simulated"),
+    "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from"),
+    "nan-dump": Command("dexsim.tasks.nan_replay:main", "repeat the step at which a world stopped being finite"),
+}
+RARER = ("stable-grasps", "nan-dump")
+FIRST_SCREEN = """usage: dexsim COMMAND [key=value ...]
+
+Train dexterous hands in simulation, feel like the real hand, and find what the simulator left out.
+
+commands:
+{common}
+
+rarer:
+{rarer}
+
+first steps:
+  dexsim diagnose demo=true                          hides an effect in a simulated joint, finds it, shows the answer
+  dexsim train worlds=64 iterations=10 device=cpu    a first look at training
+  dexsim play policy=scripted task=grasp             a policy that needs no training
+
+  dexsim COMMAND --help     its settings (key=default) and examples
+  dexsim --version
+
+Results go into runs/ and out/ of the folder you are in, or where out= says.
+"""
+
+
+def first_screen() -> str:
+    """What `dexsim --help` prints."""
+
+    def lines(names: list[str]) -> str:
+        return "\n".join(f"  {name:<15}{COMMANDS[name].about}" for name in names)
+
+    return FIRST_SCREEN.format(common=lines([n for n in COMMANDS if n not in RARER]), rarer=lines(list(RARER)))
+
+
+def dispatch(argv: list[str]) -> int:
+    """Run one command; returns its exit status. Raises UserError for a command that does not exist."""
+    if argv and argv[0] in ("--version", "-V", "version"):
+        print(f"dexsim {VERSION}")
+        return 0
+    if argv[:1] == ["help"] and len(argv) > 1:
+        argv = [argv[1], "--help"]
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(first_screen(), end="")
+        return 0 if argv else 2
+    name = argv[0]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"did you mean {near[0]}? " if near else f"there are {', '.join(COMMANDS)} "
+        raise UserError(f"unknown command '{name}': {hint}(dexsim --help)")
+    module, _, function = COMMANDS[name].where.partition(":")
+    return getattr(importlib.import_module(module), function)(argv[1:])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The console command `dexsim`, `python -m dexsim` and the scripts at the top; returns the exit status."""
+    return guard(dispatch, sys.argv[1:] if argv is None else argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What every command shares, whichever package it stands in: how it ends, what it is called, tables, progress, output folders."""

@@ -1,0 +1,34 @@
+"""What a user typed to get here, so that help pages and hints name commands that work for them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+DOORS = ("train", "play", "diagnose", "calibrate")
+"""Jobs that also have a script at the top of the repository."""
+
+
+def name(job: str) -> str:
+    """The command of a job, called the way this process was: "dexsim play", "python -m dexsim play" or "python play.py"."""
+    called = Path(sys.argv[0])
+    if _by_door() and job in DOORS:
+        return f"python {job}.py"
+    return f"python -m dexsim {job}" if (called.parent.name, called.name) == ("dexsim", "__main__.py") else f"dexsim {job}"
+
+
+def torchrun(job: str, processes: int) -> str:
+    """The command that starts a job in this many processes of this machine at once."""
+    return f"torchrun --nproc_per_node={processes} " + (f"{job}.py" if _by_door() and job in DOORS else f"-m dexsim {job}")
+
+
+def words(text: str) -> str:
+    """A text that says `dexsim train` or `python train.py`, with the commands of :func:`name` instead."""
+    jobs = "|".join(DOORS)
+    return re.sub(rf"python ({jobs})\.py|(?<!-m )\bdexsim ({jobs})\b", lambda match: name(match[1] or match[2]), text)
+
+
+def _by_door() -> bool:
+    called = Path(sys.argv[0])
+    return called.suffix == ".py" and called.stem in DOORS

@@ -1,0 +1,52 @@
+"""Which engine steps a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+
+from dexsim.errors import UserError
+from dexsim.sim.engine import ContactPair, Engine
+
+
+def no_log_file() -> None:
+    """MuJoCo's warnings go to stderr; not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that somebody chose stays."""
+    log = mujoco.MjLogConfig.get()
+    if log.logto_file and log.logfile == "MUJOCO_LOG.TXT":
+        log.logto_file = False
+        log.set()
+
+
+def make_engine(
+    spec: mujoco.MjSpec,
+    worlds: int,
+    device: str = "cpu",
+    engine: str = "auto",
+    fields: Sequence[str] = (),
+    pairs: Sequence[ContactPair] = (),
+    deterministic: bool = False,
+    nconmax: int = 40,
+    njmax: int = 160,
+    threads: int = 0,
+) -> Engine:
+    """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a CPU).
+
+    fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
+    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all.
+    """
+    no_log_file()
+    if engine not in ("auto", "warp", "mujoco"):
+        raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
+    device = "cuda:0" if device == "cuda" else device  # torch.cuda.set_device wants a number
+    if engine == "auto":
+        engine = "warp" if device.startswith("cuda") else "mujoco"
+    if engine == "mujoco" and device != "cpu":
+        raise UserError(f"sim.engine=mujoco runs on the CPU only, not on device={device}; use sim.engine=warp or device=cpu")
+    if engine == "warp":
+        from dexsim.sim.warp_engine import WarpEngine
+
+        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax)
+    from dexsim.sim.mujoco_engine import MujocoEngine, compile_with_sensors
+
+    return MujocoEngine(compile_with_sensors(spec, pairs), worlds, fields, pairs, threads)
