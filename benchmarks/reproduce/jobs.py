@@ -24,7 +24,7 @@ from pathlib import Path
 from benchmarks import tools
 from benchmarks.reproduce.rows import Row
 from benchmarks.reproduce.schedule import PIECES, Schedule
-from dexsim.cli.report import duration
+from dexsim.console.tables import duration
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 
