@@ -89,7 +89,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     wrong, out, blind = channels.inspect(runs, m.spec.compile(), channels.spoiled(readable))
     channel = channels.secondary(channel + wrong)
     before = {id(r): k for k, r in enumerate(runs)}
-    runs = channels.drop(runs, out, notes)
+    runs = channels.drop(runs, out, notes, m.spec.compile(), held)
     held = [k for k, r in enumerate(runs) if before[id(r)] in held]
     if blind:
         runs, held = inputs.free_air(runs, held, inputs.merged_spans(blind), notes, "readings are old ones, sent again", "in which they are not", (0.0, 0.0), inputs.SHORTEST)
@@ -292,7 +292,8 @@ def _split(runs, held, group):
         return train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held)
     groups = sorted(set(group))
     if len(groups) >= 3:
-        test = [i for i in range(len(runs)) if group[i] == groups[-1]]
+        tells = [g for g in groups if not any(runs[i].left_out for i in range(len(runs)) if group[i] == g)] or groups
+        test = [i for i in range(len(runs)) if group[i] == tells[-1]]
         train = [i for i in range(len(runs)) if i not in test]
         if sum(runs[i].duration for i in train) > sum(runs[i].duration for i in test):
             return train, test, None, None, "one condition, " + ", ".join(runs[i].name for i in test)

@@ -60,7 +60,7 @@ def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSear
         notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
                      "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
     findings.sort(key=lambda f: -_weight(f))
-    _doubts(out, findings, channel)
+    _doubts(out, findings, [f for f in channel if not _elsewhere(f, kept)])
     _hand_on(out, m, [a for a in answers if a.case.joint not in refuted], findings)
     findings = _linkages(findings, answers)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
@@ -163,6 +163,12 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
         f["confidence"] = round(e.confidence, 3)
         d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]
     d.evidence = mine
+
+
+def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
+    """Whether a signal is wrong only where its joint is not judged: that casts no doubt on what the other recordings tell of it."""
+    left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
+    return bool(channel["when"]) and all((w["recording"], j) in left_out for w in channel["when"] for j in channel["where"]["joints"])
 
 
 def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:

@@ -27,7 +27,9 @@ def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
                 continue
             t = np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
             # repeats are aligned by their commands, which were sent at the same times from the start
-            for j in range(len(a.joints)):
+            for j, joint in enumerate(a.joints):
+                if joint in a.left_out | b.left_out:
+                    continue
                 d = np.interp(a.t[0] + t, a.t, a.q[:, j]) - np.interp(b.t[0] + t, b.t, b.q[:, j])
                 sums, count = sums + float((d**2).sum()) / 2.0, count + len(t)
     split = float(np.sqrt(np.mean([c.sigma**2 for c in cases])))

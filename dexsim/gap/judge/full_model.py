@@ -283,7 +283,7 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
     kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
     device = "cpu" if replay == "mujoco" else device
-    windows = [c.plant.windows(None, test, span=span_test) for c in cases]
+    windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if not cases or not len(windows[0].window):
         return None
     seconds = np.cumsum(windows[0].window[:, 1]) * cases[0].plant.dt
@@ -298,9 +298,14 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
         q = free_runs(parts[group[0]][0], m.joints, [w for i in group for w in worlds[i]], device, timestep, replay)
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
+
+    def told(case: Case, ws) -> np.ndarray:
+        """[n] bool: samples of the windows replayed, in recordings that tell of this joint."""
+        return np.isin(ws.sample_window, use) & ~np.isin(ws.run[ws.sample_window], list(case.plant.left_out))
+
     def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
         """(simulated position, squared error) [n] of one joint at its samples."""
-        on = np.isin(ws.sample_window, use)
+        on = told(case, ws)
         t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]
         out = np.empty(len(t))
         for k, w in enumerate(use):
@@ -313,8 +318,10 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     for i, h in enumerate(hypotheses):
         square, own = [], []
         for case, ws, fine in zip(cases, windows, finer or cases, strict=True):
-            trial, on = h.trials[case.joint], np.isin(ws.sample_window, use)
-            same = ws if fine is case else fine.plant.windows(None, test, span=span_test)
+            trial, on = h.trials[case.joint], told(case, ws)
+            if not on.any():
+                continue
+            same = ws if fine is case else fine.plant.windows(None, test, span=span_test, every_run=True)
             fast = free_run(fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed])[0][on]
             there, miss = error(found[i], timestep, case, ws)
             square.append(miss)

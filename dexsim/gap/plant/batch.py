@@ -106,6 +106,7 @@ class JointPlant:
         self._series, self._cmd_t, self._cmd = [], [], []
         self._t, self._q, self._torque, self._start, self._grid, self._cmds = [], [], [], [], [0], [0]
         self._rows = [0]
+        self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
         self.open_stage = 0  # 0 whole loop; 1 recorded motor torque; 2 recorded duty drives the joint
         self._ready = False
 
@@ -182,13 +183,15 @@ class JointPlant:
         return slice(self._rows[run], self._rows[run + 1])
 
     def windows(self, length: float | None, runs: list[int] | None = None, warm: float = 0.15, stride: float | None = None,
-                span: dict[int, tuple[float, float]] | None = None) -> Windows:
+                span: dict[int, tuple[float, float]] | None = None, every_run: bool = False) -> Windows:
         """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
 
-        span: part of a run [s from its start] to keep to.
+        span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint.
         """
         window, window_t, step, part, of, row, run_of = [], [], [], [], [], [], []
         for r in range(self.runs) if runs is None else runs:
+            if r in self.left_out and not every_run:
+                continue
             t = self._t[r]
             begin, stop = 0.0, t[-1] - t[0]
             if span and r in span:

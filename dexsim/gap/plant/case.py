@@ -131,6 +131,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
             effort = None if run.torque is None else run.torque[:, j]
             plant.add(run.name, nominal_row(believed[i], rotor), mech[i][0], mech[i][1][j], run.cmd_t, run.cmd[:, j], run.t,
                       run.q[:, j], effort, exact)  # fmt: skip
+        plant.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
         plant.finish()
         cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
     return cases
@@ -157,8 +158,8 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     else:
         limit = rows[0][j][SERVO_INDEX["torque_limit"]]
     estimates = [noise(run.t, run.q[:, j]) for run in runs]
-    sigma = _of_recordings(runs, [e[0] for e in estimates])
-    quantum = _of_recordings(runs, [e[1] for e in estimates])
+    told = [i for i in range(len(runs)) if i not in plant.left_out]
+    sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
     series = lambda name: np.concatenate([np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]])  # noqa: E731
                                           for i in range(len(runs))])
     gravity, load_t, load_i = series("gravity_cos"), series("load_cos"), series("load_inertia")

@@ -6,10 +6,12 @@ a position that runs against its target or before it, readings that are repeated
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+from scipy import signal
 
 from dexsim.gap.read import repeated
 from dexsim.gap.read.runs import Run
@@ -19,6 +21,10 @@ SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position 
 HELD = 0.06  # s: readings that stay the same for as long, and then jump, are repeated
 BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judged before and after it
 EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
+PAUSE = 1.0  # s without a sample, over which no lag is measured
+STILL = 0.1  # rad that the target of a joint that never moves must span
+REST = 0.05  # s
+HOLDS = 1.5  # x the error at which dry friction has held the joint before
 TURN = 180 / np.pi
 
 
@@ -83,7 +89,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                 add("clock_skew", f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on different clocks", run, joint,
                     [COMMANDS, STATES], whole)  # fmt: skip
                 continue
-            stop = _stops(run, j, cmd)
+            stop = _stops(runs, run, joint, cmd)
             if stop is not None:
                 add("stuck", f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a drive that is off", run, joint,
                     [STATES], [(stop, run.t[-1])], 0.7)  # fmt: skip
@@ -106,13 +112,27 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     return list(found.values()), out, blind
 
 
-def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str]) -> list[Run]:
-    """The runs without the joints that must be left out; a run without joints is gone."""
+def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], model: mujoco.MjModel, held: Sequence[int] = ()) -> list[Run]:
+    """The runs without what must be left out of them.
+
+    A joint that others of the recordings tell of stays in a run in which it is spoiled, as one of `Run.left_out`: it is not judged there, and
+    what the joints beside it feel of it is that of its targets (where those are spoiled too, of a joint at rest). A joint that is spoiled in
+    every run, in all that are held out (`held`) or in all others, goes altogether; a run without joints is gone."""
+    every = {j for run in runs for j in run.joints}
+    sides = [[r for i, r in enumerate(runs) if (i in held) == side] for side in ((True, False) if held else (False,))]
+    told = {j for j in every if all(any(j in r.joints and (r.name, j) not in out for r in part) for part in sides)}
     kept = []
     for run in runs:
-        bad = [j for j in run.joints if (run.name, j) in out]
+        wrong = [j for j in run.joints if (run.name, j) in out]
+        notes += [f"{run.name}: {j} is left out ({out[run.name, j]})" for j in wrong]
+        bad = [j for j in run.joints if j not in told]
+        notes += [f"{run.name}: {j} is left out, for no recording on one side of the fit tells of it" for j in bad if j not in wrong]
+        if all((run.name, j) in out for j in run.joints):
+            continue
+        run.left_out = frozenset(j for j in wrong if j in told)
+        for j in run.left_out:
+            _assume(run, run.joints.index(j), out[run.name, j].startswith("stuck"), model)
         if bad:
-            notes += [f"{run.name}: {j} is left out ({out[run.name, j]})" for j in bad]
             k = [i for i, j in enumerate(run.joints) if j not in bad]
             if not k:
                 continue
@@ -123,6 +143,23 @@ def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str]) -> 
                 setattr(run, name, None if x is None else x[:, k])
         kept.append(run)
     return kept
+
+
+def _assume(run: Run, j: int, follows: bool, model: mujoco.MjModel) -> None:
+    """What a joint without usable readings is taken to do: to follow its targets smoothly, or to rest where the model does."""
+    if follows:
+        rate = 1 / max(float(np.median(np.diff(run.t))), 1e-4)
+        width = int(np.clip(round(0.1 * rate), 1, len(run.t) // 4))
+        q = run.command_at(run.t)[:, j]
+        for _ in range(2):
+            q = np.convolve(np.pad(q, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
+        run.q[:, j] = q
+    else:
+        run.q[:, j] = run.cmd[:, j] = model.qpos0[model.joint(run.joints[j]).qposadr[0]]
+    for name in ("v", "torque"):
+        x = getattr(run, name)
+        if x is not None:
+            x[:, j] = np.nan
 
 
 def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
@@ -152,35 +189,53 @@ def _sign(run: Run, q: np.ndarray, j: int) -> float:
 
 
 def _lead(run: Run, j: int) -> float:
-    """Time [s] by which the joint moves before its target: 0 where it does not."""
-    grid = np.arange(run.t[0], run.t[-1], 0.005)
+    """Time [s] by which the joint moves before its target: 0 where it does not.
+
+    Correlation of the speed with the target's, shifted by -0.6 to 0.4 s, over the longest stretch without a pause."""
+    pause = np.flatnonzero(np.diff(run.t) > PAUSE)
+    edges = np.r_[0, pause + 1, len(run.t)]
+    k = int(np.argmax(np.diff(edges)))
+    t, q = run.t[edges[k] : edges[k + 1]], run.q[edges[k] : edges[k + 1], j]
+    step, before, after = 0.005, 120, 80
+    grid = np.arange(t[0], t[-1], step)
     if len(grid) < 200:
         return 0.0
-    q = np.interp(grid, run.t, run.q[:, j])
-    dq = np.gradient(q)
-    shifts = np.arange(-0.6, 0.401, 0.005)
-    scores = []
-    for s in shifts:
-        dc = np.gradient(run.command_at(grid - s)[:, j])
-        dc = np.convolve(dc, np.ones(9) / 9, "same")
-        scores.append(float(dc @ dq) / (np.linalg.norm(dc) * np.linalg.norm(dq) + 1e-12))
+    dq = np.gradient(np.interp(grid, t, q))
+    wide = t[0] + step * np.arange(-after, len(grid) + before)
+    dc = np.convolve(np.gradient(run.command_at(wide)[:, j]), np.ones(9) / 9, "same")
+    power = np.concatenate([[0.0], np.cumsum(dc**2)])
+    norm = np.sqrt(np.maximum(power[len(grid) :] - power[: -len(grid)], 0.0)) * np.linalg.norm(dq) + 1e-12
+    scores = signal.correlate(dc, dq, "valid", "fft") / norm  # by the sample at which the target's stretch begins: shift = 80 - sample
     best = int(np.argmax(scores))
-    causal = max(s for s, x in zip(scores, shifts, strict=True) if x >= 0)
+    causal = float(scores[: after + 1].max())
     # periodic motion fits at many shifts: only a clear gain before the target counts
-    return float(-shifts[best]) if shifts[best] < 0 and scores[best] > 0.6 and scores[best] > causal + 0.15 else 0.0
+    return step * (best - after) if best > after and scores[best] > 0.6 and scores[best] > causal + 0.15 else 0.0
 
 
-def _stops(run: Run, j: int, cmd: np.ndarray) -> float | None:
-    """When [s] the position stops for good although its target goes on; None where it does not."""
+def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float | None:
+    """When [s] the position stops for good although its target goes on; None where it does not, and where dry friction may hold it: where its
+    target goes no further away than it has been when the joint broke away from rest before."""
+    j = run.joints.index(joint)
     q = run.q[:, j]
     last = np.flatnonzero(q != q[-1])
-    if not len(last) or last[-1] > 0.75 * len(q) or np.ptp(q[: last[-1] + 1]) < 1e-3:
+    k = last[-1] + 1 if len(last) else 0
+    if k > 0.75 * len(q) or (len(last) and np.ptp(q[:k]) < 1e-3):
         return None
-    k = last[-1] + 1
     if run.enabled is not None and (run.enabled[k:, j] < 0.5).any():
         return None
-    moved = np.ptp(cmd[:k])
-    return float(run.t[k]) if np.ptp(cmd[k:]) > 0.3 * max(moved, np.ptp(q)) else None
+    moved = np.ptp(cmd[:k]) if k else 0.0
+    if np.ptp(cmd[k:]) <= max(0.3 * max(moved, np.ptp(q)), 0.0 if k else STILL):
+        return None
+    held = [_holds(r, r.joints.index(joint), k if r is run else len(r.t)) for r in runs if joint in r.joints]
+    return None if np.abs(cmd[k:] - q[-1]).max() < HOLDS * max(held) else float(run.t[k])
+
+
+def _holds(run: Run, j: int, end: int) -> float:
+    """The largest error [rad] at which a joint stood still for 50 ms and more, and then moved, in the samples before `end`."""
+    q = run.q[:end, j]
+    error = np.abs(run.command_at(run.t[:end])[:, j] - q)
+    rests = [(a, b) for a, b in repeated.rests(q) if b + 1 < end and run.t[b] - run.t[a] >= REST]
+    return max((float(np.median(error[max(b - 2, a) : b + 1])) for a, b in rests), default=0.0)
 
 
 def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:

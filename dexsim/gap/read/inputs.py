@@ -17,7 +17,7 @@ from dexsim.recording.schema import Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
-SHORTEST = 1.0  # s
+SHORTEST = 0.5  # s
 
 
 class Unusable(Exception):
@@ -105,6 +105,8 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     if not any(f.kind == "wrap" and f.topic == "/joint_duty" for f in recording.findings):
         run.duty = _at(recording.duty, t, column)
     run.enabled = _at(recording.enabled, t, column, hold=True)
+    if run.enabled is not None:
+        run.enabled = np.where(np.isfinite(run.enabled), run.enabled, 1.0)  # a joint that it does not tell of is driven
     if recording.supply_voltage is not None and len(recording.supply_voltage):
         s = recording.supply_voltage
         finite = np.isfinite(s.value)
@@ -171,7 +173,7 @@ def cut(run: Run, start: float, end: float) -> Run:
     on = (run.t >= start) & (run.t <= end)
     part = lambda x: None if x is None else x[on]  # noqa: E731
     return Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[on], run.q[on], run.servo, run.gravity, part(run.v), part(run.torque), run.torque_unit,
-               part(run.duty), part(run.temperature), part(run.enabled), part(run.supply), notes=list(run.notes))  # fmt: skip
+               part(run.duty), part(run.temperature), part(run.enabled), part(run.supply), notes=list(run.notes), counted=run.counted, left_out=run.left_out)  # fmt: skip
 
 
 def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
@@ -183,19 +185,13 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
         extra = [j for j in r.joints if j not in shared]
         if extra:
             notes.append(f"{r.name}: {', '.join(extra)} not in every recording; left out")
-            k = [r.joints.index(j) for j in shared]
-            r.cmd, r.q = r.cmd[:, k], r.q[:, k]
-            for name in ("v", "torque", "temperature", "duty", "enabled"):
-                x = getattr(r, name)
-                setattr(r, name, None if x is None else x[:, k])
-        else:
-            k = [r.joints.index(j) for j in shared]
-            r.cmd, r.q = r.cmd[:, k], r.q[:, k]
-            for name in ("v", "torque", "temperature", "duty", "enabled"):
-                x = getattr(r, name)
-                setattr(r, name, None if x is None else x[:, k])
+        k = [r.joints.index(j) for j in shared]
+        r.cmd, r.q = r.cmd[:, k], r.q[:, k]
+        for name in ("v", "torque", "temperature", "duty", "enabled"):
+            x = getattr(r, name)
+            setattr(r, name, None if x is None else x[:, k])
         r.joints = tuple(shared)
-    for name in ("torque", "temperature", "duty", "enabled"):  # a signal counts only where every run has it
+    for name in ("torque", "temperature", "duty"):  # counts only where every run has it; enabled and supply act in the run that has them
         have = [getattr(r, name) is not None for r in runs]
         if any(have) and not all(have):
             for r in runs:
@@ -210,6 +206,8 @@ def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list
     for r in recordings:
         for f in r.findings:
             if f.kind not in BAD_CHANNEL or f.severity != "error":
+                continue
+            if f.kind == "stuck" and f.text.startswith("position"):  # dry friction may hold it: `channels.inspect` tells beside the others
                 continue
             key = (f.kind, f.topic, f.joint)
             entry = out.setdefault(key, {

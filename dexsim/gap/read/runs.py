@@ -17,7 +17,7 @@ class Run:
     Optional, None where not logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or
     the plain current in A where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V.
     gravity: the world's, m/s2, [3]. servo: the table believed for this recording; counted: the mechanism's joints, by whose number its
-    `coupling_from` counts (empty: `joints`).
+    `coupling_from` counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of them.
     """
 
     name: str
@@ -38,6 +38,7 @@ class Run:
     tactile: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
     counted: tuple[str, ...] = ()
+    left_out: frozenset[str] = frozenset()
     # filled by `smooth`
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None
