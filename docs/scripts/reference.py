@@ -1,0 +1,172 @@
+"""Reference pages written from the code and the config files, so that they cannot go stale.
+
+    python docs/scripts/reference.py settings | columns | effects | audit | metadata
+
+prints one as Markdown; `hooks.py` puts them into the site where a page says `<!-- GENERATED: name -->`.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+ORDER = ("config.yaml", "task", "agent", "servo", "tactile", "randomize", "reality", "play.yaml", "calibrate.yaml")
+LONGEST = 90  # characters of a default that are shown
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One leaf of a config file: dotted key, default as YAML text, and the comment behind it ("" where there is none)."""
+
+    key: str
+    default: str
+    comment: str
+
+
+def config_folder() -> Path:
+    """Where the config files lie: inside the package, or beside it."""
+    for folder in (ROOT / "dexsim" / "configs", ROOT / "configs"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise FileNotFoundError(f"no config.yaml in {ROOT}/dexsim/configs or {ROOT}/configs")
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table; bars in cells are escaped."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(_cell(str(cell)) for cell in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    """Bars would end the cell; outside code, <word> would be taken for HTML."""
+    text = text.replace("|", "\\|")
+    return text if text.startswith("`") else text.replace("<", "&lt;")
+
+
+def leaves(path: Path) -> list[Setting]:
+    """Every setting of a config file in its order; Hydra's `defaults` list is left out.
+
+    A mapping written on one line is one setting. Comments are those on the line on which a key stands.
+    """
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    out: list[Setting] = []
+
+    def visit(node: yaml.Node, prefix: str) -> None:
+        for key, value in node.value:
+            dotted = f"{prefix}.{key.value}" if prefix else key.value
+            if dotted == "defaults":
+                continue
+            if isinstance(value, yaml.MappingNode) and not value.flow_style and value.value:
+                visit(value, dotted)
+                continue
+            default = " ".join(text[value.start_mark.index : value.end_mark.index].split())
+            default = re.sub(r"\s+#.*", "", default) if value.start_mark.line == key.start_mark.line else default
+            comment = lines[value.end_mark.line if value.end_mark.column else value.start_mark.line]
+            comment = comment[value.end_mark.column if value.end_mark.line == key.start_mark.line else 0 :]
+            found = re.search(r"#\s*(.+)$", comment)
+            out.append(Setting(dotted, default if len(default) <= LONGEST else default[: LONGEST - 3] + "...", found[1].strip() if found else ""))
+
+    root = yaml.compose(text)
+    if root is not None:
+        visit(root, "")
+    return out
+
+
+def heading_comment(path: Path) -> str:
+    """The comment lines at the top of a config file as one text."""
+    top: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        top.append(line.lstrip("# ").rstrip())
+    return " ".join(top)
+
+
+def settings() -> str:
+    """All groups, their options, and every setting of every config file but the drawn numbers of realities."""
+    folder, out = config_folder(), []
+    names = [*ORDER, *sorted(p.name for p in folder.iterdir() if p.name not in ORDER and (p.is_dir() or p.suffix == ".yaml") and not p.name.startswith("__"))]
+    for name in names:
+        path = folder / name
+        if path.is_file():
+            out += [f"## {path.stem}", "", heading_comment(path), "", _rows(path)]
+        elif path.is_dir():
+            options = sorted(path.glob("*.yaml"))
+            if not options:
+                continue
+            out += [f"## {name}=", "", "Options: " + ", ".join(f"`{o.stem}`" for o in options) + ".", ""]
+            for option in options:
+                out += [f"### {name}={option.stem}", "", heading_comment(option), ""]
+                out += ["Its numbers are drawn once from a seed; read the file itself.", ""] if name == "reality" else [_rows(option, name + ".")]
+    return "\n".join(out)
+
+
+def _rows(path: Path, prefix: str = "") -> str:
+    found = leaves(path)
+    return table(("setting", "default", "meaning"), [(f"`{prefix}{s.key}`", f"`{s.default}`", s.comment) for s in found]) if found else ""
+
+
+def columns() -> str:
+    """The servo table's columns."""
+    from dexsim.actuator.columns import COLUMNS
+
+    return table(("column", "unit", "neutral", "allowed", "meaning"),
+                 [(f"`{c.name}`", c.unit, f"{c.neutral:g}", f"{c.low:g} to {c.high:g}", c.text) for c in COLUMNS])
+
+
+def effects() -> str:
+    """The catalogue of the diagnosis: effects of joints, then of touch and contact."""
+    from dexsim.gap.catalogue import CATALOGUE, CONFUSED
+    from dexsim.gap.touch_effects import CONFUSED as TOUCH_CONFUSED
+    from dexsim.gap.touch_effects import TOUCH
+
+    def others(name: str, classes: Sequence[frozenset[str]]) -> str:
+        return ", ".join(f"`{x}`" for x in sorted({x for c in classes if name in c for x in c} - {name})) or "-"
+
+    joint = [(f"`{e.id}`", f"the joint {e.words}", e.shows, e.experiment, others(e.id, CONFUSED), ", ".join(f"`{c}`" for c in e.columns) or "-")
+             for e in CATALOGUE]
+    touch = [(f"`{e.id}`", f"the fingertip {e.words}", e.shows, e.experiment, others(e.id, TOUCH_CONFUSED)) for e in TOUCH]
+    head = ("effect", "what it means", "where it shows", "motion that shows it", "may be confused with")
+    return f"## Joints\n\n{table((*head, 'servo columns'), joint)}\n## Touch and contact\n\n{table(head, touch)}"
+
+
+def audit() -> str:
+    """Kinds of findings of the recording's audit."""
+    from dexsim.recording.audit import KINDS
+
+    return table(("kind", "meaning"), [(f"`{k}`", v) for k, v in KINDS.items()])
+
+
+def metadata() -> str:
+    """Topics and metadata keys of a recording."""
+    from dexsim.recording.schema import DEFAULTS, KEYS, TOPICS, UNIT_KEYS
+
+    topics = table(("topic", "ROS 2 type"), [(f"`{k}`", f"`{v}`") for k, v in TOPICS.items()])
+    keys = table(("key", "meaning", "where it is not stated"), [(f"`{k}`", v, f"`{DEFAULTS[k]}`" if DEFAULTS.get(k) else "-") for k, v in KEYS.items()])
+    units = table(("key", "values"), [(f"`{k}`", ", ".join(f"`{u}`" for u in v)) for k, v in UNIT_KEYS.items()])
+    return f"### Topics\n\n{topics}\n### Metadata\n\n{keys}\nFor recordings in other units:\n\n{units}"
+
+
+PAGES = {"settings": settings, "columns": columns, "effects": effects, "audit": audit, "metadata": metadata}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print one page; returns the exit status."""
+    if len(argv) != 1 or argv[0] not in PAGES:
+        print(__doc__)
+        return 2
+    print(PAGES[argv[0]]())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+    sys.exit(main(sys.argv[1:]))
