@@ -124,9 +124,9 @@ def columns() -> str:
 
 def effects() -> str:
     """The catalogue of the diagnosis: effects of joints, then of touch and contact."""
-    from dexsim.gap.catalogue import CATALOGUE, CONFUSED
-    from dexsim.gap.touch_effects import CONFUSED as TOUCH_CONFUSED
-    from dexsim.gap.touch_effects import TOUCH
+    from dexsim.gap.effects.catalogue import CATALOGUE, CONFUSED
+    from dexsim.gap.effects.touch import CONFUSED as TOUCH_CONFUSED
+    from dexsim.gap.effects.touch import TOUCH
 
     def others(name: str, classes: Sequence[frozenset[str]]) -> str:
         return ", ".join(f"`{x}`" for x in sorted({x for c in classes if name in c for x in c} - {name})) or "-"
