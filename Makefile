@@ -1,6 +1,7 @@
 # make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
 # make test    the tests
 # make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
+# make docs    this documentation as a site, in out/site/
 # Another Python: make train PYTHON=python3.12
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -9,10 +10,10 @@ VENV ?= .venv
 PY := $(VENV)/bin/python
 ARGS ?=
 
-.PHONY: help train test play
+.PHONY: help train test play docs
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -4
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
 
 train: $(VENV)/.installed
 	$(PY) train.py $(or $(filter task=%,$(ARGS)),task=grasp) $(filter-out task=%,$(ARGS))
@@ -23,6 +24,9 @@ play: $(VENV)/.installed
 test: $(VENV)/.installed-test
 	$(PY) -m pytest -q -m "not slow" $(ARGS)
 
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+
 # Installed again only when pyproject.toml changes.
 $(VENV)/.installed: pyproject.toml | $(PY)
 	$(PY) -m pip install --quiet --disable-pip-version-check -e .
@@ -30,6 +34,10 @@ $(VENV)/.installed: pyproject.toml | $(PY)
 
 $(VENV)/.installed-test: pyproject.toml | $(PY)
 	$(PY) -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(PY)
+	$(PY) -m pip install --quiet --disable-pip-version-check -e ".[docs]"
 	@touch $@ $(VENV)/.installed
 
 $(PY):

@@ -1,0 +1,158 @@
+"""README and docs/: short enough, their commands and links exist, tables made from the code are whole."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+SCRIPTS = ("train", "play", "diagnose", "calibrate")
+HYDRA = {"task", "agent", "servo", "tactile", "randomize", "reality", "sweep", "hydra/launcher", "hydra.launcher.n_jobs"}
+
+
+def _reference():
+    spec = importlib.util.spec_from_file_location("docs_reference", DOCS / "scripts" / "reference.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+REFERENCE = _reference()
+
+
+def _fences(text: str) -> list[str]:
+    """Lines of a page's fenced blocks without a language."""
+    return [line.strip() for block in re.findall(r"^```\n(.*?)^```$", text, re.M | re.S) for line in block.splitlines()]
+
+
+def _commands() -> list[tuple[str, str]]:
+    """(page, command) of every command in README, tutorials and how-to, without its comment."""
+    found = []
+    for path in (ROOT / "README.md", *sorted((DOCS / "tutorials").glob("*.md")), *sorted((DOCS / "howto").glob("*.md"))):
+        for line in _fences(path.read_text(encoding="utf-8")):
+            line = re.sub(r"\s+#\s.*$", "", line)
+            if re.match(r"(torchrun \S+ |chrt \S+ \S+ )?(python |dexsim |train\.py)|make ", line) and "python -c" not in line and "-m venv" not in line:
+                found.append((path.name, line))
+    return found
+
+
+@cache
+def _keys(script: str) -> set[str]:
+    """Every setting of a script, with the groups of settings above them."""
+    folder = REFERENCE.config_folder()
+    if script == "diagnose":
+        from dexsim.gap.command import KEYS
+
+        return set(KEYS)
+    if script == "calibrate":
+        return {s.key for s in REFERENCE.leaves(folder / "calibrate.yaml")}
+    keys = {s.key for s in REFERENCE.leaves(folder / "config.yaml")} | HYDRA
+    if script == "play":
+        from dexsim.cli.recorded import KEYS as replay_keys
+
+        keys |= {s.key for s in REFERENCE.leaves(folder / "play.yaml")} | set(replay_keys)
+    for group in folder.iterdir():
+        if group.is_dir():
+            for option in group.glob("*.yaml"):
+                keys |= {f"{group.name}.{s.key}" for s in REFERENCE.leaves(option)}
+    return keys
+
+
+def test_readme_is_read_in_five_minutes():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    assert max(map(len, lines)) <= 120
+    assert {"make train", "make test"} <= {re.sub(r"\s+#.*", "", line) for line in lines}
+
+
+def test_there_are_commands_to_check():
+    assert len(_commands()) > 50
+
+
+@pytest.mark.parametrize(("page", "command"), _commands())
+def test_command_exists(page, command):
+    words = shlex.split(command)
+    if words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M), f"{page}: no target {words[1]}"
+        return
+    while words[0] in ("torchrun", "chrt", "python") or words[0].startswith("-") or words[0].isdigit():
+        word = words.pop(0)
+        if word == "-m":
+            break
+    name, given = words[0], [w.partition("=")[0] for w in words[1:] if "=" in w and not w.startswith("-")]
+    if not name.endswith(".py"):
+        where = ROOT / name.replace(".", "/")
+        assert name == "pytest" or where.with_suffix(".py").is_file() or (where / "__init__.py").is_file(), f"{page}: no module {name}"
+        return
+    assert (ROOT / name).is_file(), f"{page}: no file {name}"
+    script = name.removesuffix(".py")
+    if script in SCRIPTS:
+        unknown = [k for k in given if k not in _keys(script) and not k.startswith(("remap.", "meta."))]
+        assert not unknown, f"{page}: {command}: {script}.py has no {unknown}"
+
+
+def test_links_of_the_readme_exist():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)#]+)", text) + re.findall(r"^\[[^]]+\]: (\S+)", text, re.M)
+    assert len(targets) > 10
+    missing = [t for t in targets if not t.startswith("http") and not (ROOT / t.partition("#")[0]).exists()]
+    assert not missing
+    prose = re.sub(r"^```.*?^```$|`[^`]*`", "", text, flags=re.M | re.S)
+    for label in re.findall(r"\[([^]\[]+)\](?![(\[:])", prose):
+        assert re.search(rf"^\[{re.escape(label)}\]:", text, re.M), f"[{label}] leads nowhere"
+
+
+def test_every_page_is_in_the_menu():
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert [str(p.relative_to(DOCS)) for p in PAGES if f" {p.relative_to(DOCS)}\n" not in menu] == []
+
+
+def test_seeds_and_commits_stay_with_the_results():
+    for path in (ROOT / "README.md", *(p for p in PAGES if p.parent.name != "results")):
+        text = path.read_text(encoding="utf-8")
+        hashes = [w for w in re.findall(r"\b[0-9a-f]{7}\b", text) if re.search(r"\d", w) and re.search(r"[a-f]", w)]
+        assert not hashes and not re.search(r"\bseeds? \d", text), f"{path.name}: {hashes or 'a seed'}"
+
+
+def test_tables_from_the_code_are_whole():
+    from dexsim.actuator.columns import NAMES
+    from dexsim.recording.audit import KINDS
+    from dexsim.recording.schema import KEYS
+
+    for page, names in (("columns", NAMES), ("audit", KINDS), ("metadata", KEYS)):
+        text = REFERENCE.PAGES[page]()
+        assert [n for n in names if f"| `{n}` |" not in text] == []
+    assert {"backlash", "command_delay", "tactile_gain", "contact_stiffness"} <= set(re.findall(r"^\| `(\w+)` \|", REFERENCE.effects(), re.M))
+
+
+def test_settings_are_listed_with_their_comments(tmp_path):
+    file = tmp_path / "x.yaml"
+    file.write_text("# top\ndefaults: [a]\nseed: 1  # of all\npart:\n  low: [0, 1]  # m\n  inner: {a: 1, b: 2}\nlast: null\n")
+    assert [(s.key, s.default, s.comment) for s in REFERENCE.leaves(file)] == [
+        ("seed", "1", "of all"), ("part.low", "[0, 1]", "m"), ("part.inner", "{a: 1, b: 2}", ""), ("last", "null", "")]  # fmt: skip
+    task = next(REFERENCE.config_folder().glob("task/grasp.yaml"))
+
+    def leaves(node, prefix="task"):
+        for key, value in node.items():
+            if isinstance(value, dict) and value and key not in ("cuda", "task", "contact", "emphasis", "objects"):
+                yield from leaves(value, f"{prefix}.{key}")
+            elif not isinstance(value, dict):
+                yield f"{prefix}.{key}"
+
+    text = REFERENCE.settings()
+    assert [k for k in leaves(yaml.safe_load(task.read_text())) if f"`{k}`" not in text] == []
+
+
+def test_generated_tables_that_pages_ask_for_exist():
+    asked = [name for p in PAGES for name in re.findall(r"<!-- GENERATED: (\w+) -->", p.read_text(encoding="utf-8"))]
+    assert sorted(asked) == sorted(REFERENCE.PAGES)
