@@ -8,7 +8,7 @@ state: positions, velocities, warm start, servo queues, random numbers. What is 
 - In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so the worst
   is compared only loosely.
 - Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact. Training stops at 8
-  and 20 (configs/config.yaml: the rest costs 7 % and changes no held grasp, docs/benchmarks.md), and where a solver is cut
+  and 20 (configs/config.yaml: the rest costs 7 % and changes no held grasp, docs/results/speed.md), and where a solver is cut
   off depends on rounding: 5 % of impacts then differ by 0.3 mm and more. Here both solvers may finish.
 Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 8e-8, 2e-7, 2e-6 rad; object 7e-9, 7e-8, 2e-7 m; contact
 forces 1e-5, 8e-4, 2e-3 N; reward 1e-7, 2e-6, 1e-5.

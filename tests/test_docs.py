@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from dexsim.cli.main import COMMANDS
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-SCRIPTS = ("train", "play", "diagnose", "calibrate")
+LISTED = ("train", "play", "diagnose", "calibrate")
 HYDRA = {"task", "agent", "servo", "tactile", "randomize", "reality", "sweep", "hydra/launcher", "hydra.launcher.n_jobs"}
 
 
@@ -41,7 +43,7 @@ def _commands() -> list[tuple[str, str]]:
     for path in (ROOT / "README.md", *sorted((DOCS / "tutorials").glob("*.md")), *sorted((DOCS / "howto").glob("*.md"))):
         for line in _fences(path.read_text(encoding="utf-8")):
             line = re.sub(r"\s+#\s.*$", "", line)
-            if re.match(r"(torchrun \S+ |chrt \S+ \S+ )?(python |dexsim |train\.py)|make ", line) and "python -c" not in line and "-m venv" not in line:
+            if re.match(r"(torchrun|chrt|python|dexsim|make) ", line) and "python -c" not in line and "-m venv" not in line:
                 found.append((path.name, line))
     return found
 
@@ -86,19 +88,16 @@ def test_command_exists(page, command):
         assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M), f"{page}: no target {words[1]}"
         return
     while words[0] in ("torchrun", "chrt", "python") or words[0].startswith("-") or words[0].isdigit():
-        word = words.pop(0)
-        if word == "-m":
-            break
+        words.pop(0)
     name, given = words[0], [w.partition("=")[0] for w in words[1:] if "=" in w and not w.startswith("-")]
-    if not name.endswith(".py"):
+    if name != "dexsim":
         where = ROOT / name.replace(".", "/")
         assert name == "pytest" or where.with_suffix(".py").is_file() or (where / "__init__.py").is_file(), f"{page}: no module {name}"
         return
-    assert (ROOT / name).is_file(), f"{page}: no file {name}"
-    script = name.removesuffix(".py")
-    if script in SCRIPTS:
-        unknown = [k for k in given if k not in _keys(script) and not k.startswith(("remap.", "meta."))]
-        assert not unknown, f"{page}: {command}: {script}.py has no {unknown}"
+    assert words[1] in COMMANDS or words[1].startswith("--"), f"{page}: no command dexsim {words[1]}"
+    if words[1] in LISTED:
+        unknown = [k for k in given if k not in _keys(words[1]) and not k.startswith(("remap.", "meta."))]
+        assert not unknown, f"{page}: {command}: dexsim {words[1]} has no {unknown}"
 
 
 def test_links_of_the_readme_exist():
@@ -156,3 +155,10 @@ def test_settings_are_listed_with_their_comments(tmp_path):
 def test_generated_tables_that_pages_ask_for_exist():
     asked = [name for p in PAGES for name in re.findall(r"<!-- GENERATED: (\w+) -->", p.read_text(encoding="utf-8"))]
     assert sorted(asked) == sorted(REFERENCE.PAGES)
+
+
+def test_pages_that_the_code_names_exist():
+    named = {(p, m) for folder in ("dexsim", "benchmarks") for p in (ROOT / folder).rglob("*.[py]*") if p.suffix in (".py", ".yaml")
+             for m in re.findall(r"docs/[\w/]+\.md", p.read_text(encoding="utf-8"))}
+    assert len(named) > 5
+    assert [f"{p}: {m}" for p, m in sorted(named) if not (ROOT / m).is_file()] == []

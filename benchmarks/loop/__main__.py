@@ -308,7 +308,7 @@ class Loop:
     def diagnose(self, world: str):
         """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast that has to be, and are
         not fitted: a joint is judged while nothing is touched, and most of what they touch carries no taxels. What they command, played again
-        on the empty hand, throws the joints against the ends of their motion (docs/loop.md)."""
+        on the empty hand, throws the joints against the ends of their motion (docs/results/loop.md)."""
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
             excited, fast = sorted((self.out / f"excited_{world}").glob("excite_*.mcap")), [self.out / f"excited_{world}" / name for name in FAST]

@@ -30,11 +30,8 @@ class Setting:
 
 
 def config_folder() -> Path:
-    """Where the config files lie: inside the package, or beside it."""
-    for folder in (ROOT / "dexsim" / "configs", ROOT / "configs"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise FileNotFoundError(f"no config.yaml in {ROOT}/dexsim/configs or {ROOT}/configs")
+    """Where the config files lie."""
+    return ROOT / "dexsim" / "configs"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

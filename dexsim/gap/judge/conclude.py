@@ -19,7 +19,7 @@ from dexsim.gap.result import Diagnosis, Settings, empty
 from dexsim.gap.search.search import ENOUGH, JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
-DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/concealed.md)
+DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/results/concealed.md)
 NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
 SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
