@@ -92,7 +92,7 @@ def random_params(rng, shape) -> np.ndarray:
         "eccentric_sin": 0.05, "eccentric_cos": 0.05, "speed_lag": 0.02, "deadband_kind": 2.9,
         "backlash": 0.05, "rebound": 0.5, "softness": 0.2, "hardening": 0.5, "rotor": 3e-3,
         "thermal_torque": -0.01, "thermal_friction": 0.02, "thermal_resistance": 0.004, "warmth": 40.0,
-        "sag": 0.3, "coupling": 0.3, "coupling_from": 2.9,
+        "sag": 0.3, "braking_slope": 1.0, "coupling": 0.3, "coupling_from": 2.9,
         "standin_constant": 0.05, "standin_position": -0.2, "standin_speed": -0.01, "standin_drag": -0.002,
     }  # fmt: skip
     around = ("efficiency", "supply", "position_scale")
@@ -102,6 +102,8 @@ def random_params(rng, shape) -> np.ndarray:
         out[..., i] = np.where(rng.random(shape) < (0.4 if c.name in ("backlash", "softness") else 0.15), c.neutral, u)
         if c.name in ("deadband_kind", "coupling_from"):
             out[..., i] = np.floor(out[..., i])
+        if c.name == "braking_slope":
+            out[..., i] = np.where(out[..., i] == c.neutral, c.neutral, rng.uniform(-1.0, 1.0, shape))
     return out
 
 
@@ -110,7 +112,7 @@ def test_every_column_is_randomized_here():
 
 
 @pytest.mark.parametrize("voltage", [False, True])
-@pytest.mark.parametrize("features", [(), ("play",), ("play", "sag", "rare")])
+@pytest.mark.parametrize("features", [(), ("braking",), ("play",), tuple(FEATURES)])
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     """Also that a kernel built without a feature does not see its columns."""

@@ -36,6 +36,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("deadband", "rad", 0.0, 0.0, 1.0, "no torque while |target - position| is less (the paper's epsilon)"),
     Column("torque_limit", "N.m", INF, 0.0, INF, "stall torque tau0: the clamp at zero speed"),
     Column("no_load_speed", "rad/s", INF, 1e-3, INF, "speed at which the torque-speed line reaches zero"),
+    Column("braking_slope", "1", 1.0, -1.0, 1.0, "fall of the torque limit with speed while braking, over its fall while driving: "
+           "limit = torque_limit * max(0, 1 - braking_slope * |speed| / no_load_speed); 1 the paper's, 0 all of it, -1 the driving line goes on"),
     Column("efficiency", "1", 1.0, 0.0, 2.0, "eta: torque at the joint over motor torque"),
     Column("delay", "s", 0.0, 0.0, 0.5, "time from a target being sent to the servo acting on it"),
     Column("lag", "s", 0.0, 0.0, 1.0, "time constant of a first-order lag on the motor torque"),
@@ -89,6 +91,7 @@ INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
 FEATURES: dict[str, tuple[str, ...]] = {
     "play": ("backlash", "softness"),
     "sag": ("sag",),
+    "braking": ("braking_slope",),
     "rare": ("eccentric_sin", "eccentric_cos", "speed_lag", "deadband_kind", "thermal_torque", "thermal_friction", "thermal_resistance", "coupling"),
 }
 """What is compiled into a servo only where one of these columns differs from its neutral value."""

@@ -5,7 +5,7 @@ The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is
     e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder
     tau_c  = kp * e - kd * qd_m
     tau_b  = 0 if |e| < deadband else tau_c
-    limit  = torque_limit * max(0, 1 - |qd| / no_load_speed)
+    limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b = 1 where motor * qd >= 0, braking_slope where it brakes
     motor  = clip(tau_b, -limit, +limit)                                   what the motor's current shows
     joint  = efficiency * lag(motor) + ripple(q) - friction
 
@@ -20,7 +20,7 @@ which implicitfast and discrete integrate implicitly: M (v' - v) = dt (qfrc_appl
   - At the limits the line goes through (v, T = +-limit) and the velocity at which the law itself is zero: the unlimited
     PD's zero or the no-load speed, whichever comes first. Driving along the torque-speed line D is that line's slope; a
     drive at its limit never overshoots in one step, whatever the inertia. While it brakes, the paper's limit grows as
-    the speed falls, exponentially with rate r = efficiency * tau0 / no_load_speed / inertia; a tiny link does so within one
+    the speed falls, exponentially with rate r = braking_slope * efficiency * tau0 / no_load_speed / inertia; a tiny link does so within one
     step, so T takes the mean over the step, limit * (exp(r dt) - 1) / (r dt), `inertia` being 1 / dof_invweight0.
   All differences from the law are O(dt).
 
@@ -43,6 +43,7 @@ from functools import lru_cache
 import warp as wp
 
 from dexsim.actuator.columns import INDEX
+from dexsim.actuator.laws import torque_limit
 
 # Slots of state[world, joint, slot] before the queue: `queue` stamps [s], then `queue` targets [rad], oldest first.
 MOTOR, ENABLED, QUEUE = 0, 1, 2
@@ -77,14 +78,16 @@ BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (INDEX[n] for n in ("bac
 THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE, WARMTH = (
     INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance", "warmth")
 )
+BRAKING = INDEX["braking_slope"]
 SAG, COUPLING, COUPLING_FROM = INDEX["sag"], INDEX["coupling"], INDEX["coupling_from"]
 REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
 REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
 @lru_cache(maxsize=None)
-def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rare: bool = False):
+def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`."""
+    play, sag, rare, braking = (name in features for name in ("play", "sag", "rare", "braking"))
     extended = play or rare
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -263,18 +266,27 @@ def servo_kernel(real, voltage: bool, play: bool = False, sag: bool = False, rar
                 on_drive = damping
         else:
             x = wp.abs(v_drive) / (no_load * supply)  # speed over no-load speed
-            limit = zero
-            if x < one:
-                limit = tau0 * (one - x)
-            motor_now = wp.clamp(now, -limit, limit)
-            motor = wp.clamp(pd, -limit, limit)
+            upper = torque_limit(tau0, x, one)
+            lower = upper
+            steep = one  # how the limit falls with the speed while braking
+            if wp.static(braking):
+                steep = params[w, j, BRAKING]
+                if v_drive > zero:
+                    lower = torque_limit(tau0, x, steep)
+                elif v_drive < zero:
+                    upper = torque_limit(tau0, x, steep)
+            motor_now = wp.clamp(now, -lower, upper)
+            motor = wp.clamp(pd, -lower, upper)
+            limit = upper
+            if pd < zero:
+                limit = lower
             damping = slope
             if wp.abs(pd) > limit:
                 line = tau0 / (no_load * supply)
                 size = limit
                 if pd * v_drive < zero:  # braking: the limit grows as the speed falls, by this factor within the step
-                    growth = wp.min(efficiency * line * dt / inertia_drive, real(60.0))
-                    if growth > real(SNAP) and x < real(EDGE):
+                    growth = wp.min(steep * efficiency * line * dt / inertia_drive, real(60.0))
+                    if growth > real(SNAP) and steep * x < real(EDGE):
                         size = wp.max(limit, real(SEED) * tau0) * (wp.exp(growth) - one) / growth
                         size = wp.min(size, wp.min(tau0, wp.abs(pd)))
                         motor = wp.sign(pd) * size

@@ -117,15 +117,18 @@ def servo(
             damping = np.where(np.abs(pd) > 1.0, on_drive, damping)
         else:
             x = np.abs(v_drive) / (no_load * supply)
-            limit = np.where(x < 1.0, tau0 * (1.0 - x), 0.0)
-            motor_now = np.clip(now, -limit, limit)
-            motor = np.clip(pd, -limit, limit)
+            steep = p["braking_slope"] if "braking" in features else np.ones_like(v)
+            drives, brakes = (np.where(k * x < 1.0, tau0 * (1.0 - k * x), 0.0) for k in (1.0, steep))
+            upper, lower = np.where(v_drive < 0.0, brakes, drives), np.where(v_drive > 0.0, brakes, drives)
+            motor_now = np.clip(now, -lower, upper)
+            motor = np.clip(pd, -lower, upper)
+            limit = np.where(pd < 0.0, lower, upper)
             line = tau0 / (no_load * supply)
             braking = pd * v_drive < 0.0
-            growth = np.minimum(efficiency * line * dt / inertia_drive, 60.0)
+            growth = np.minimum(steep * efficiency * line * dt / inertia_drive, 60.0)
             grown = np.maximum(limit, SEED * tau0) * (np.exp(growth) - 1.0) / growth
             grown = np.minimum(grown, np.minimum(tau0, np.abs(pd)))
-            grows = (np.abs(pd) > limit) & braking & (growth > SNAP) & (x < EDGE)
+            grows = (np.abs(pd) > limit) & braking & (growth > SNAP) & (steep * x < EDGE)
             size = np.where(grows, grown, limit)
             motor = np.where(grows, np.sign(pd) * size, motor)
             line = np.where(limit == 0.0, 0.0, line)

@@ -124,7 +124,7 @@ class Servo:
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
-        self._servo = servo_kernel(real, table.drive == "voltage", *(name in self.features for name in ("play", "sag", "rare")))
+        self._servo = servo_kernel(real, table.drive == "voltage", self.features)
         self._send, self._reset, self._sum = send_kernel(real), reset_kernel(real, extended), given_kernel(real)
         self._period = 1.0 / table.control_rate if table.control_rate else 0.0
         self._shape = (n, j)

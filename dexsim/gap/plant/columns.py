@@ -24,7 +24,6 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("feedback_delay", 0.0, "s", "age of the position that the loop acts on: it is sampled, and its torque holds until the next sample"),
     ("limit_speed", 0.5, "1", "speed that the torque limit falls with: 0 the motor's, 1 what the loop takes for it (they part with play, elasticity, scale, filter)"),
     ("presliding", 0.0, "rad", "how far the joint gives way elastically before its dry friction slides"),
-    ("brake", 1.0, "1", "slope of the torque limit over speed while braking, over that while driving (-1: the same line goes on)"),
     ("bias", 0.0, "N.m", "constant torque on the joint"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),

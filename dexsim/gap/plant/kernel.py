@@ -16,6 +16,7 @@ from functools import lru_cache
 
 import warp as wp
 
+from dexsim.actuator.laws import torque_limit
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
@@ -64,7 +65,7 @@ XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
 P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FRESH = INDEX["effort_fresh"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
-P_PRESLIDE, P_BRAKE, P_DEADKIND = INDEX["presliding"], INDEX["brake"], INDEX["deadband_kind"]
+P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
@@ -77,7 +78,7 @@ def plant_kernel():
     @wp.func
     def law(
         e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
-        dt: f64, voltage: f64, gain: f64, drift: f64, brake: f64, kind: f64, age: f64, v_lim: f64,
+        dt: f64, voltage: f64, gain: f64, drift: f64, steep: f64, kind: f64, age: f64, v_lim: f64,
     ):  # fmt: skip
         """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
         motor's speed). gain, drift: the change of speed in this step is gain * torque + drift.
@@ -118,13 +119,17 @@ def plant_kernel():
             slope = tau0 * supply * slope
         else:
             x = wp.abs(v_lim) / (nls * supply)
-            if pd * v_lim < zero:  # what a drive gives while it brakes differs between makes
-                x = x * brake
-            limit = zero
-            if x < one:
-                limit = tau0 * (one - x)
-            motor_now = wp.clamp(now, -limit, limit)
-            motor = wp.clamp(pd, -limit, limit)
+            upper = torque_limit(tau0, x, one)
+            lower = upper
+            if v_lim > zero:
+                lower = torque_limit(tau0, x, steep)
+            elif v_lim < zero:
+                upper = torque_limit(tau0, x, steep)
+            motor_now = wp.clamp(now, -lower, upper)
+            motor = wp.clamp(pd, -lower, upper)
+            limit = upper
+            if pd < zero:
+                limit = lower
             if wp.abs(pd) > limit:
                 end = pd - slope * (gain * motor + drift)
                 if end * wp.sign(pd) >= limit:
@@ -133,7 +138,7 @@ def plant_kernel():
                         line = tau0 / (nls * supply)
                     elif pd * v_lim < zero and limit > zero:
                         # it grows as the speed falls, exponentially: taken at the step's start it would come late
-                        line = -wp.min(brake * tau0 / (nls * supply), half / wp.max(gain, f64(1.0e-12)))
+                        line = -wp.min(steep * tau0 / (nls * supply), half / wp.max(gain, f64(1.0e-12)))
                 else:
                     slope = slope * limit / wp.abs(pd)
         return wp.vec4d(motor_now, motor, slope, line)
@@ -378,7 +383,7 @@ def plant_kernel():
                 step = theta * dts
                 torque = law(
                     e, shows * v_f, v_drive, kp, kd, shows, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
-                    eff * step / body, -load * step / body, params[h, P_BRAKE], params[h, P_DEADKIND], age,
+                    eff * step / body, -load * step / body, params[h, P_BRAKING], params[h, P_DEADKIND], age,
                     v_drive + params[h, P_LIMITSPEED] * (shows * v_f - v_drive),
                 )
                 now = torque[0]

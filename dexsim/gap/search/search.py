@@ -36,7 +36,7 @@ SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
 FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
 PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
-MAYBE = {"brake": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
+MAYBE = {"braking_slope": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 PIN = 1e-6  # of room for what is held at a value
 LATE = 0.75  # periods of its loop by which any drive may act on its commands late
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
@@ -188,7 +188,8 @@ class JointSearch:
         give = GIVE_SLIDE if s.slide else GIVE
         out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
         if not s.voltage and s.nominal["no_load_speed"] < 1e8:
-            out.append(Param("brake", ("brake",), "set", -1.0, 1.0, 1.0, nuisance=True))
+            if "braking_slope" not in taken:
+                out.append(Param("braking_slope", ("braking_slope",), "set", -1.0, 1.0, s.nominal["braking_slope"], nuisance=True))
             if s.nominal["kd"] > 0:  # a limit of the motor, or of a firmware that goes by its own reading
                 out.append(Param("limit_speed", ("limit_speed",), "set", 0.0, 1.0, 0.5, nuisance=True))
         low, high = c.factors.get("inertia", (1 - BELIEF, 1 + BELIEF))

@@ -1,0 +1,103 @@
+"""Laws of the drive that the training's servo, its NumPy reference and the search's plant share, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
+from dexsim.actuator.columns import INDEX
+from dexsim.actuator.reference import servo as servo_reference
+from dexsim.gap.plant.batch import JointPlant, nominal_row
+from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
+from dexsim.gap.plant.mechanics import JointConstants
+from dexsim.sim.engine import make_engine
+from tests.test_servo import link_spec
+
+FREE = {"kp": 100.0, "kd": 0.0, "torque_limit": 0.4, "no_load_speed": 10.0}
+INERTIA = 1e-3
+
+
+def servo_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0, dt: float = 0.001) -> np.ndarray:
+    """[steps, 3] q, v, motor torque at the begin of each step: a free link on the servo's kernel in C MuJoCo."""
+    engine = make_engine(link_spec(INERTIA, dt), 1, engine="mujoco", fields=FIELDS, threads=1)
+    servo = Servo(engine, ["joint"], ServoTable.from_dict({"joints": {"joint": columns}}), control_period=0.005)
+    engine.t.qvel[:] = v0
+    out, k = [], 0
+    for i in range(round(seconds / dt)):
+        while k < len(times) and times[k] <= i * dt + 1e-9:
+            servo.send(torch.full((1, 1), float(targets[k])), stamp=float(times[k]))
+            k += 1
+        q, v = engine.t.qpos[0, 0].item(), engine.t.qvel[0, 0].item()
+        engine.step(1, servo.before_each)
+        out.append((q, v, servo.torque[0, 0].item()))
+    return np.array(out)
+
+
+def plant_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0, dt: float = 0.001) -> np.ndarray:
+    """[steps, 2] q, motor torque of the same link in the search's plant."""
+    steps = round(seconds / dt)
+    t = dt * np.arange(steps)
+    constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, INERTIA, 0.0)
+    plant = JointPlant("joint", constants, dt, False, "joint", "joint")
+    series = np.zeros((2, len(SERIES)))
+    for name, value in (("inertia", INERTIA), ("supply", 1.0), ("enabled", 1.0)):
+        series[:, SERIES_INDEX[name]] = value
+    row = nominal_row(ServoTable.from_dict({"joints": {"joint": columns}}).nominal(["joint"])[0], 0.0)
+    early = [-2.0, *times], [0.0, *targets]
+    plant.add("run", row, np.array([0.0, seconds]), series, *(np.array(x, float) for x in early), t, np.zeros(steps), None, {})
+    plant.finish()
+    q, torque = plant.simulate(plant.base()[None], plant.windows(None), np.array([[0.0, v0]]))
+    return np.stack([q[0], torque[0]], 1)
+
+
+# -- the torque limit in four quadrants --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.4, 0.0, -1.0])
+def test_torque_limit_in_four_quadrants(slope):
+    """limit = tau0 max(0, 1 - b |v| / v0), b = 1 where torque and speed agree, braking_slope where they do not: kernel, reference."""
+    tau0, v0 = FREE["torque_limit"], FREE["no_load_speed"]
+    cases = [(sign * v, toward) for v in (0.0, 3.0, 9.0, 14.0) for sign in (1, -1) for toward in (1, -1)]
+    engine = make_engine(link_spec(1.0, 1e-4), len(cases), engine="mujoco", fields=FIELDS, threads=1)
+    table = ServoTable.from_dict({"joints": {"joint": FREE | {"braking_slope": slope}}})
+    servo = Servo(engine, ["joint"], table)
+    engine.t.qvel[:, 0] = torch.tensor([v for v, _ in cases])
+    servo.send(torch.tensor([[50.0 * toward] for _, toward in cases]))
+    servo.before_each()
+    v, toward = np.array(cases, float).T
+    b = np.where(v * toward < 0, slope, 1.0)
+    expected = toward * tau0 * np.maximum(0.0, 1.0 - b * np.abs(v) / v0)
+    np.testing.assert_allclose(servo.torque[:, 0].numpy(), expected, atol=1e-6)
+    params = np.tile(table.nominal(["joint"]), (len(cases), 1))
+    np.testing.assert_allclose(servo_reference(params, 50.0 * toward, 0.0, v, dt=1e-4, features=("braking",))["torque"], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.5, 0.0, -0.5, -1.0])
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+def test_braking_follows_the_closed_form(motion, slope):
+    """I v' = -tau0 (1 - b v / v0) from 0.8 v0 until it stands: v0/b - (v0/b - v) exp(b r t); then the driving line, b = -1."""
+    tau0, no_load, v0 = FREE["torque_limit"], FREE["no_load_speed"], 8.0
+    out = motion(FREE | {"braking_slope": slope}, [0.0], [-1e4], 0.08, v0)
+    t = 0.001 * np.arange(len(out))
+    r = tau0 / no_load / INERTIA
+
+    def fall(t):
+        return v0 - tau0 / INERTIA * t if slope == 0 else no_load / slope - (no_load / slope - v0) * np.exp(slope * r * t)
+
+    stands = v0 * INERTIA / tau0 if slope == 0 else -np.log(1 - slope * v0 / no_load) / (slope * r)
+    v = np.where(t < stands, fall(t), -no_load * (1 - np.exp(-r * (t - stands))))
+    q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1])) * 0.001])
+    assert 0.01 < stands < 0.06
+    assert np.abs(out[:, 0] - q).max() < (0.012 if motion is servo_motion else 0.005)
+
+
+def test_braking_slope_round_trip_and_range(tmp_path):
+    table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "braking_slope": [-1.0, 0.0]}, "a": {"braking_slope": 0.5}}})
+    table.save(tmp_path / "servo.yaml")
+    again = ServoTable.load(tmp_path / "servo.yaml")
+    np.testing.assert_array_equal(again.nominal(["a", "b"])[:, INDEX["braking_slope"]], [0.5, -0.5])
+    assert COLUMNS[INDEX["braking_slope"]].neutral == 1.0
+    low, high = again.bounds(["b"])
+    assert (low[0, INDEX["braking_slope"]], high[0, INDEX["braking_slope"]]) == (-1.0, 0.0)
