@@ -12,7 +12,7 @@ from dexsim.actuator.reference import servo as servo_reference
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants
-from dexsim.sim.engine import make_engine
+from dexsim.sim import make_engine
 from tests.test_servo import link_spec
 
 FREE = {"kp": 100.0, "kd": 0.0, "torque_limit": 0.4, "no_load_speed": 10.0}
