@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.effects.thermal import temperature_follows
 from dexsim.gap.judge import confidence, errors
 from dexsim.gap.judge.confidence import DOUBTED, Evidence
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.search.fit import Param
+from dexsim.gap.plant.param import Param
 
 CASE = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0}))
 
@@ -78,13 +80,13 @@ def test_weigh_takes_every_doubt_into_account():
 
 
 def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_is_a_crowd():
-    sure, doubtful = evidence(effect="a", confidence=0.99), evidence(effect="b", confidence=0.4)
-    later = evidence(effect="c", confidence=0.99)
+    sure, doubtful = evidence(effect="backlash", confidence=0.99), evidence(effect="deadband", confidence=0.4)
+    later = evidence(effect="supply_sag", confidence=0.99)
     confidence.together([sure, doubtful])
     assert sure.confidence == 0.99
     confidence.together([doubtful, later])
-    assert later.confidence == DOUBTED and "b" in later.reasons[0]
-    crowd = [evidence(effect=x, confidence=0.99) for x in "abc"]
+    assert later.confidence == DOUBTED and "deadband" in later.reasons[0]
+    crowd = [evidence(effect=x, confidence=0.99) for x in ("backlash", "deadband", "supply_sag")]
     confidence.together(crowd)
     assert [e.confidence for e in crowd] == [0.99, DOUBTED, DOUBTED]
 
@@ -98,8 +100,8 @@ def test_a_joint_that_drags_another_or_has_a_bad_signal_is_doubted():
 
 def test_two_torques_of_the_pose_can_be_any():
     case = SimpleNamespace(scales=SimpleNamespace(span=1.5))
-    assert confidence.of_pose("payload", {"mass": 0.1}, case) and confidence.of_pose("torque_ripple", {"per_turn": 4.9}, case)
-    assert not confidence.of_pose("torque_ripple", {"per_turn": 20}, case) and not confidence.of_pose("lag", {}, case)
+    assert EFFECTS["payload"].of_pose({"mass": 0.1}, case) and EFFECTS["torque_ripple"].of_pose({"per_turn": 4.9}, case)
+    assert not EFFECTS["torque_ripple"].of_pose({"per_turn": 20}, case) and not EFFECTS["lag"].of_pose({}, case)
     load, slow, fast = (evidence(effect=e, confidence=0.99, of_pose=o) for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False)))
     confidence.together([load, fast])
     assert load.confidence == fast.confidence == 0.99
@@ -125,7 +127,7 @@ def test_temperature_that_follows_something_else(starts, gains, what):
     warm = np.concatenate([s + np.linspace(0, 1.0, n) for s in starts])
     nominal = [np.where(np.arange(len(INDEX)) == INDEX["kp"], g, 0.0) for g in gains]
     case = SimpleNamespace(regimes={"temperature": warm}, plant=SimpleNamespace(rows=rows, t=np.tile(np.linspace(0, 7, n), 4), nominal=nominal))
-    assert confidence.temperature_follows(case, range(4)) == what
+    assert temperature_follows(case, range(4)) == what
 
 
 @pytest.mark.parametrize(("before", "low", "structured", "word"), [(1.2, 1.1, True, "none"), (4.0, 1.1, True, "none"), (4.0, 3.0, False, "none"),

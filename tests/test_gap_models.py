@@ -10,7 +10,8 @@ from test_gap import demo, model, plant_run
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.judge.findings import add_mass, finding_parameters
+from dexsim.gap.effects.effect import FittedEffect
+from dexsim.gap.effects.payload import add_mass
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.plant.mechanics import leaf_of
@@ -35,7 +36,7 @@ def found(changes: dict[str, float], effect: str) -> tuple[dict, str]:
     keys, member = [p.key for p in best.fit.params], best.members[0]
     at = {p.key: keys.index(f"{effect}.{p.key}") for p in member.variant.params}
     raw, spread = {k: float(best.fit.x[i]) for k, i in at.items()}, {k: (float(bounds[i][0]), float(bounds[i][1])) for k, i in at.items()}
-    return finding_parameters(member, raw, spread, case, runs[0].servo), member.variant.label
+    return member.effect.parameters(FittedEffect(member.variant, raw, spread, case, runs[0].servo)), member.variant.label
 
 
 def mass_matrix(m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,8 @@ from test_gap import demo, model, plant_run
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.effects.catalogue import CONFUSED, EFFECTS, SEPARATED, separating
+from dexsim.gap.effects.catalogue import EFFECTS, members, separating
+from dexsim.gap.effects.confusion import CLASSES
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.report import next_experiment
@@ -50,8 +51,8 @@ def test_the_same_hypothesis_disagrees_nowhere_and_others_do(hypotheses):
 
 
 def test_every_class_has_the_experiment_that_separates_it():
-    joints = [c for c in CONFUSED if c <= set(EFFECTS)]
-    assert len(joints) == len(SEPARATED) and "turned over" in separating(["payload", "position_offset"])
+    assert all(len(members(c)) > 1 and separating(sorted(members(c))) == said for c, said in CLASSES.items())
+    assert {c for e in EFFECTS.values() for c in e.classes} == set(CLASSES) and "turned over" in separating(["payload", "position_offset"])
     assert separating(["lag", "command_delay"]) != EFFECTS["lag"].experiment and separating(["lag", "backlash"]) == EFFECTS["lag"].experiment
 
 

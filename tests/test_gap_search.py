@@ -12,8 +12,9 @@ from dexsim.gap.command import Progress
 from dexsim.gap.judge import conclude, errors
 from dexsim.gap.judge.joint import STRETCHED, stretched
 from dexsim.gap.plant.case import REFERENCE, build
+from dexsim.gap.plant.param import Param
 from dexsim.gap.search import parallel
-from dexsim.gap.search.fit import Fitted, Fitter, Param, prior_weight
+from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
 

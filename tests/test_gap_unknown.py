@@ -9,8 +9,8 @@ from test_gap import SERVO, motion, plant_run
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
-from dexsim.gap.effects import not_considered
 from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.judge import not_considered
 from dexsim.gap.judge.findings import servo_changes
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX

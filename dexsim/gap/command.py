@@ -92,8 +92,9 @@ def parse(argv: list[str]) -> dict:
 def _hidden(text: str) -> str | None:
     """The effect that a demo hides; None for no demo."""
     from dexsim.gap.demo import HIDDEN
+    from dexsim.gap.effects.command_delay import CommandDelay
 
-    value = {"true": "command_delay", "false": None}.get(text.lower(), text)
+    value = {"true": CommandDelay.id, "false": None}.get(text.lower(), text)
     if value is not None and value not in HIDDEN:
         raise UserError(f"demo={text}: must be true, false or one of {', '.join(sorted(HIDDEN))}")
     return value

@@ -8,6 +8,8 @@ import numpy as np
 import yaml
 
 from dexsim.actuator.table import ServoTable
+from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS
+from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import Hardware, realistic
@@ -34,10 +36,7 @@ BELIEVED = {
     "joints": {"*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}},
     "loop_rate": 1000,
 }
-HIDDEN = {"stribeck_friction": {"stribeck_peak": 0.06, "stribeck_speed": 0.25}, "command_delay": {"delay": 0.02},
-          "load_friction": {"load_friction": 0.25, "load_friction_backdriven": 0.25}, "coulomb_friction": {"coulomb_friction": 0.06},
-          "deadband": {"deadband": 0.03}, "backlash": {"backlash": 0.06}, "compliance": {"softness": 0.5}}  # fmt: skip
-ON_MOTOR = ("backlash", "compliance")  # hidden behind a loop whose encoder sits on the motor, as most hands have it
+HIDDEN = {e.id: e.demo for e in CATALOGUE if e.demo}
 
 
 def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -54,14 +53,14 @@ def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.nd
     return t, 0.4 * np.sin(2 * np.pi * np.cumsum(f) * 0.01)
 
 
-def make(folder: Path, effect: str = "stribeck_friction", seed: int = 0, seconds: float = 6.0, joint: str = "joint") -> tuple[list[Path], Path, Path, dict]:
+def make(folder: Path, effect: str = StribeckFriction.id, seed: int = 0, seconds: float = 6.0, joint: str = "joint") -> tuple[list[Path], Path, Path, dict]:
     """Writes four recordings of one joint that hides an effect of HIDDEN (another name: nothing), the model and the believed servo; returns their paths and the hidden columns."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     model, servo = folder / "rig.xml", folder / "rig.yaml"
     drawn = MODEL.replace("<worldbody>", f"<worldbody>{DRAWN}").replace('name="joint"', f'name="{joint}"').replace('<geom name="bob"', f'{LINK}<geom name="bob"')
     model.write_text(drawn, encoding="utf-8")
-    believed = BELIEVED | ({"loop_encoder": "motor"} if effect in ON_MOTOR else {})
+    believed = BELIEVED | ({"loop_encoder": "motor"} if effect in EFFECTS and EFFECTS[effect].demo_on_motor else {})
     servo.write_text(yaml.safe_dump(believed, sort_keys=False), encoding="utf-8")
     true = yaml.safe_load(yaml.safe_dump(believed))
     for name in ("kp", "kd", "torque_limit", "coulomb_friction", "viscous_friction"):  # as real machines are: a little off

@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.gap.effects import not_considered
-from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.effects.touch import entry
-from dexsim.gap.judge import confidence, errors, full_model, residual_fit
+from dexsim.gap.effects.catalogue import EFFECTS, entry
+from dexsim.gap.judge import confidence, errors, full_model, not_considered, residual_fit
 from dexsim.gap.judge.conclude import add_behind, assemble
 from dexsim.gap.judge.joint import Kept
 from dexsim.gap.plant.case import Case, build

@@ -54,10 +54,3 @@ def confusable(a: str, b: str) -> bool:
     return any(a in c and b in c for c in CONFUSED)
 
 
-def entry(finding: dict):
-    """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
-    from dexsim.gap.effects.catalogue import EFFECTS
-
-    if finding["where"]["joints"]:
-        return EFFECTS.get(finding["effect"])
-    return BY_ID.get(finding["effect"])

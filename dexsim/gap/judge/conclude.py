@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.effects.touch import entry
+from dexsim.gap.effects.catalogue import EFFECTS, entry
 from dexsim.gap.judge import confidence, errors
 from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances
@@ -54,7 +54,7 @@ def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSear
             out.curves.append(curve)
     out.spots = bins.control(spots)
     refuted = _take_back(out, answers, findings)
-    findings = [f for f in findings if f["effect"] == "current_sensor" or not set(f["where"]["joints"]) & refuted]
+    findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
     for joint in _shown_there_alone(out.joints, findings) if s.held_out else ():
         v = out.joints[joint]
         notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
@@ -74,14 +74,14 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
     refuted = set()
     for a in answers:
         joint = a.case.joint
-        mine = [f for f in findings if joint in f["where"]["joints"] and f["effect"] != "current_sensor"]
+        mine = [f for f in findings if joint in f["where"]["joints"] and not EFFECTS[f["effect"]].effort_only]
         v = d.joints[joint]
         if not mine or v["after"] < 0.98 * v["before"]:
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
         if reason:
             for e in d.evidence:
-                if e.joint == joint and e.effect != "current_sensor":
+                if e.joint == joint and not EFFECTS[e.effect].effort_only:
                     e.reasons.append(reason)
                     e.confidence = min(e.confidence, confidence.DOUBTED)
             continue
@@ -119,7 +119,7 @@ def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings:
                         "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}  # fmt: skip
     structured = any(x.outcome.none.fit.loss > 1.3**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
     data["verdict"] = errors.verdict(data["findings"], floor, b, bl, a, structured, errors.FAR)
-    if findings and all(f["effect"] == "current_sensor" for f in findings):
+    if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
         squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
         eb, ea = (float(np.sqrt(np.concatenate([x for x in xs if x is not None]).mean())) for xs in squares)
@@ -157,7 +157,7 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
     mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
     for joint in {e.joint for e in mine}:
         confidence.together([e for e in mine if e.joint == joint])
-    coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if f["effect"] == "joint_coupling"}
+    coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if EFFECTS[f["effect"]].couples}
     confidence.of_the_whole(mine, coupled, {j for f in channel for j in f["where"]["joints"]})
     for f, e in zip(findings, mine, strict=True):
         f["confidence"] = round(e.confidence, 3)
@@ -174,8 +174,8 @@ def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
 def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:
     """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is the end that is
     dragged, where one of them feels only the pull; the name is as sure as its surer end."""
-    pulled = {a.case.joint for a in answers for mm in a.outcome.best.members if mm.id == "joint_coupling" and mm.variant.params[0].columns == ("reaction",)}
-    ends = {(f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f for f in findings if f["effect"] == "joint_coupling"}
+    pulled = {a.case.joint for a in answers for mm in a.outcome.best.members if mm.effect.couples and mm.variant.params[0].columns == ("reaction",)}
+    ends = {(f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f for f in findings if EFFECTS[f["effect"]].couples}
     out = list(findings)
     for (joint, other), f in ends.items():
         second = ends.get((other, joint))

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 
@@ -21,9 +22,6 @@ CROWD = 3  # effects on one joint from which on the smaller ones are taken for a
 NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
 SPREAD = 0.15  # share that neighbours may take over because pressure spreads by another law (foundation or half-space) than the plant's
-FROM_POSES = ("payload", "inertia", "joint_coupling")  # effects told from the pose and the motion of other joints
-FAST = ("command_delay", "lag", "inertia")  # effects that hold back what is fast: what one's size is off by another makes up for
-ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
 
 
 @dataclass
@@ -101,40 +99,6 @@ def trusted(before: float, after: float, noise: float) -> float:
     return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - 0.05) / 0.28, 0.0, 1.0))
 
 
-def temperature_follows(case: Case, runs: Sequence[int]) -> str:
-    """What the temperature follows, in words: the clock since the first recording (then whatever drifts looks like heat), or the
-    gain that the drive was set to; empty where it follows neither."""
-    if "temperature" not in case.regimes or not len(runs):
-        return ""
-    warm, clock = [], []
-    for k, r in enumerate(runs):
-        rows = case.plant.rows(r)
-        t = case.plant.t[rows]
-        warm.append(case.regimes["temperature"][rows])
-        clock.append(k + (t - t[0]) / max(float(t[-1] - t[0]), 1e-9))
-    if abs(_rank_correlation(np.concatenate(clock), np.concatenate(warm))) > ORDERED:
-        return "the clock"
-    if len(warm) < 3:
-        return ""
-    means = np.array([x.mean() for x in warm])
-    if abs(_rank_correlation(np.arange(float(len(means))), means)) > ORDERED:
-        return "the order of the recordings"
-    gain = np.array([case.plant.nominal[r][INDEX["kp"]] for r in runs])
-    return "the gain" if abs(_rank_correlation(gain, means)) > ORDERED else ""
-
-
-def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's, with ties at their middle rank; 0 where one does not change."""
-    if np.ptp(a) <= 0 or np.ptp(b) <= 0:
-        return 0.0
-
-    def ranks(x: np.ndarray) -> np.ndarray:
-        _, inverse, count = np.unique(x, return_inverse=True, return_counts=True)
-        return (np.cumsum(count) - 0.5 * (count - 1))[inverse]
-
-    return float(np.corrcoef(ranks(a), ranks(b))[0, 1])
-
-
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
     """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing is asked for,
     or is a trifle beside what others removed of the error before; empty where it is not."""
@@ -143,12 +107,6 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
     if not alone and without**2 - after**2 < SMALL * max(before, without) ** 2:
         return "it is a trifle beside what another effect explains, whose law need not be exact"
     return ""
-
-
-def of_pose(effect: str, values: dict[str, float], case: Case) -> bool:
-    """Whether an effect is a torque that follows the pose and changes slowly along it: a load, an encoder's zero or scale, a ripple of
-    which the motion shows less than two periods. Two of them together are any such torque: a cable, a spring."""
-    return effect in ("payload", "position_offset", "position_scale") or (effect == "torque_ripple" and 2 * np.pi / max(values["per_turn"], 1e-9) > 0.5 * case.scales.span)
 
 
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
@@ -169,7 +127,7 @@ def together(mine: list[Evidence]) -> None:
         doubtful = next((x for x in mine[:k] if x.confidence < DOUBTED), None)
         if doubtful is not None:
             _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
-        alike = next((x for x in mine[:k] if e.effect in FAST and x.effect in FAST), None)
+        alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
         if alike is not None:
             _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
         if len(mine) >= CROWD and k > 0:
@@ -199,13 +157,13 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
 def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str]) -> None:
     """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that is not
     what it says."""
-    misread = [e.joint for e in all_ if e.effect in ("position_scale", "position_offset")]
+    misread = [e.joint for e in all_ if EFFECTS[e.effect].misreads]
     for e in all_:
         elsewhere = [j for j in misread if j != e.joint]
-        if elsewhere and e.effect in FROM_POSES:
+        if elsewhere and EFFECTS[e.effect].from_poses:
             _doubt(e, f"the position of {elsewhere[0]} is not what it says, and with it what the other joints load")
         pulls = [j for j, k in coupled.items() if k == e.joint]
-        if pulls and e.effect != "joint_coupling":
+        if pulls and not EFFECTS[e.effect].couples:
             _doubt(e, f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
         if e.joint in bad:
             _doubt(e, f"a signal of {e.joint} is not what it says")

@@ -1,14 +1,14 @@
-"""Errors on what was kept out of the fit, the floor, the regime and the samples of an effect, the verdict."""
+"""Errors on what was kept out of the fit, the floor, when an effect acts, the verdict."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dexsim.gap.plant.batch import Windows
-from dexsim.gap.plant.case import REFERENCE, Case
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.read.runs import Run, same_commands
-from dexsim.gap.search.fit import Param, expand
 
 FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
@@ -90,86 +90,6 @@ def rms_interval(squares: list[np.ndarray], times: list[np.ndarray], seed: int =
     pick = rng.integers(0, n, (400, n))
     values = np.sqrt(sums[pick].sum(1) / counts[pick].sum(1))
     return float(np.sqrt(sums.sum() / counts.sum())), float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))
-
-
-def own_signal(effect: str, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
-    """[n] how strongly the effect acts at each measured sample (its own torque, or the signal it changes)."""
-    m = case.regimes
-    v, a, load, e = m["speed"], m["acceleration"], m["load"], m["position error"]
-    s = case.scales
-    small = 0.02 * s.speed
-    tau = np.abs(m["_torque"])
-    if effect == "coulomb_friction":
-        return (v > small).astype(float)
-    if effect == "stribeck_friction":
-        return np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2)) * ((v > 0.2 * small) | (tau > 0))
-    moving = (v > small).astype(float)
-    if effect == "viscous_friction":
-        return v
-    if effect == "command_delay":
-        return np.abs(m["_command_rate"])
-    if effect == "lag":
-        return np.abs(m["_torque_rate"]) if note.get("of", "drive") == "drive" else a
-    if effect == "load_friction":
-        return np.abs(m["_load"]) * moving
-    if effect == "backlash":
-        return _near_sign_change(case, m["_load"] + m["_friction"], 0.04)
-    if effect == "compliance":
-        return load
-    if effect == "torque_limit":
-        return _lost(s, m, values.get("torque", s.demand), s.nominal["no_load_speed"])
-    if effect == "torque_speed_limit":
-        return _lost(s, m, s.nominal["torque_limit"], values.get("no_load_speed", s.peak_speed))
-    if effect == "torque_ripple":
-        return np.abs(np.sin(values.get("per_turn", 1) * m["position"] + values.get("phase", 0.0)))
-    if effect == "thermal":
-        warm = np.abs(m["temperature"] - REFERENCE) if "temperature" in m else m["time"]
-        return warm * (moving if note.get("of") == "friction" else tau)
-    if effect == "joint_coupling":
-        k = list(s.others).index(note["from_joint"]) if note.get("from_joint") in s.others else 0
-        return np.abs(m.get(f"_drag{k}", v))
-    if effect == "supply_sag":
-        return m.get("_others", v)
-    if effect == "payload":
-        return np.abs(m["_added_own" if note.get("own") else "_added"] if "mass" in values else m["_gravity"])
-    if effect == "position_scale":
-        if "scale" in values:
-            return np.abs(m["position"])
-        return np.abs(values.get("ecc_sin", 0.0) * np.sin(m["position"]) + values.get("ecc_cos", 0.0) * (np.cos(m["position"]) - 1))
-    if effect == "inertia":
-        return a
-    if effect == "gain_mismatch":  # the torque that the other gains make more or less
-        more = (values.get("kp_factor", 1.0) - 1) * s.nominal["kp"] * m["_error"] - (values.get("kd_factor", 1.0) - 1) * s.nominal["kd"] * m["_speed"]
-        return np.abs(more)
-    if effect == "deadband":
-        return (e < values.get("width", 0.0)).astype(float)
-    if effect == "current_sensor":
-        return np.abs((values.get("gain", 1.0) - 1) * m["_torque"] + values.get("offset", 0.0))
-    return np.ones_like(v)
-
-
-def _lost(s, m: dict[str, np.ndarray], limit: float, no_load_speed: float) -> np.ndarray:
-    """[n] torque that the drive would give by its believed limits and does not give by these."""
-    asked, v = m["_asked"], m["_speed"]
-
-    def give(most: float, fastest: float) -> np.ndarray:
-        most = min(most, 1e9)
-        if s.voltage:
-            return most * (np.clip(asked, -1, 1) - v / fastest)
-        edge = most * np.maximum(1 - np.abs(v) / fastest, 0)
-        return np.clip(asked, -edge, edge)
-
-    return np.abs(give(s.nominal["torque_limit"], s.nominal["no_load_speed"]) - give(limit, no_load_speed))
-
-
-def _near_sign_change(case: Case, x: np.ndarray, seconds: float) -> np.ndarray:
-    t, run = case.plant.t, case.plant.run_of
-    out = np.zeros(len(t))
-    change = np.flatnonzero((np.sign(x[1:]) != np.sign(x[:-1])) & (run[1:] == run[:-1]))
-    for i in change:
-        j = np.searchsorted(t[case.plant.rows(int(run[i]))], [t[i] - 0.25 * seconds, t[i] + 0.75 * seconds]) + case.plant.rows(int(run[i])).start
-        out[j[0] : j[1] + 1] = 1.0
-    return out
 
 
 def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int], join: float = 0.03) -> list[dict]:

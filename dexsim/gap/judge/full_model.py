@@ -22,12 +22,13 @@ from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
+from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.errors import free_run
-from dexsim.gap.judge.findings import MODEL_COLUMNS, columns_beside, handed, model_changes, undamped
+from dexsim.gap.judge.findings import columns_beside, handed, model_changes, undamped
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX
+from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run
-from dexsim.gap.search.fit import expand
 from dexsim.gap.search.search import Trial
 from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
@@ -157,7 +158,7 @@ def missing_of(h: Hypothesis) -> list[str]:
         for x in trial.members:
             columns = {c for p in x.variant.params for c in p.columns}
             fixed = {name for name, value in x.variant.fixed if value}
-            if (columns | fixed) - set(SERVO_INDEX) - set(MODEL_COLUMNS):
+            if (columns | fixed) - set(SERVO_INDEX) - model_columns():
                 out.append(f"{x.id} ({x.variant.label})@{joint}" if x.variant.label else f"{x.id}@{joint}")
     return sorted(out)
 

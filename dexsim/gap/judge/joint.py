@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import EFFECTS, confusable, separating
+from dexsim.gap.effects.catalogue import confusable, separating
+from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.judge import confidence, errors
-from dexsim.gap.judge.findings import finding_parameters
 from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
@@ -93,12 +93,12 @@ class JointAnswer:
         trial = without(self.search, best, mm) if rest else self.none
         q, effort = errors.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True)
         error_without = rms((self.measured - q) ** 2)
-        effort_only = mm.id == "current_sensor"
+        effort_only = mm.effect.effort_only
         evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
-        signal = errors.own_signal(mm.id, case, raw, mm.variant.note)
+        signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
         of_effort = effort_only and self.effort_after is not None
@@ -109,13 +109,13 @@ class JointAnswer:
             "indistinguishable": [mm.id, *(e for e, _ in same)] if same else [],
             "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
             "where": {"joints": [case.joint], "taxels": [], "topics": []},
-            "regime": EFFECTS[mm.id].shows,
+            "regime": mm.effect.shows,
             "when": errors.intervals_of(active, case, self.kept.runs, self.kept.train),
-            "parameters": finding_parameters(mm, raw, spread, case, m.table),
+            "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
             "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)} if of_effort else
                         {"before": error_without, "after": rms(self.after)},
         }  # fmt: skip
-        late = jitter.estimate(self.search, best) if mm.id == "command_delay" and best.fit.loss > jitter.LEFT else None
+        late = jitter.estimate(self.search, best) if mm.effect.jitters and best.fit.loss > jitter.LEFT else None
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
@@ -127,8 +127,9 @@ class JointAnswer:
         raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
         spread = {p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
         for p, x, b in zip(best.fit.params, best.fit.x, bounds, strict=True):  # a level that was unknown and is fitted anyway
-            if mm.id == "coulomb_friction" and p.key == "coulomb_friction" and "torque" not in raw:
-                raw["torque"], spread["torque"] = float(x), (float(b[0]), float(b[1]))
+            key = mm.effect.fitted_anyway.get(p.key)
+            if key is not None and key not in raw:
+                raw[key], spread[key] = float(x), (float(b[0]), float(b[1]))
         return raw, spread
 
     def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, effort_only: bool) -> confidence.Evidence:
@@ -146,10 +147,8 @@ class JointAnswer:
         stopped = confidence.at_bound(mm.variant.params, raw, case)
         if stopped:
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
-        follows = confidence.temperature_follows(case, sorted({*self.kept.train, *self.kept.test})) if mm.id == "thermal" else ""
-        if follows:
-            evidence.reasons.append(f"temperature follows {follows}, so it may stand for anything that changes with it")
-        evidence.of_pose = confidence.of_pose(mm.id, raw, case)
+        evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
+        evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, case.sigma)
         return evidence
 

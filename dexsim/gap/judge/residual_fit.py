@@ -15,8 +15,8 @@ import numpy as np
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
+from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run
-from dexsim.gap.search.fit import expand
 from dexsim.gap.search.search import Trial
 
 COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")

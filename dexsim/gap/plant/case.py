@@ -10,10 +10,10 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
-from dexsim.gap.effects.catalogue import Scales
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants, along
+from dexsim.gap.plant.scales import Scales
 from dexsim.gap.read.runs import Run
 
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold

@@ -16,8 +16,8 @@ import numpy as np
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
+from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run, local_polynomial
-from dexsim.gap.search.fit import expand
 
 WIDTH = 0.06  # s: of the smoothing of the difference
 EVERY = 2e-3  # s between the samples of the sharpened motion
@@ -56,7 +56,7 @@ def again(model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted:
             with_fixed[:, :, INDEX[name]] = value
         at.append(with_fixed)
     motion = [[_one(case.plant, i, run.t, run.q[:, j], at[j]) for j, case in enumerate(cases)] for i, run in enumerate(runs)]
-    misread = [j for j, trial in enumerate(fitted) if any(m.id in ("position_scale", "position_offset") for m in trial.members)]
+    misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
         for i, run in enumerate(runs):

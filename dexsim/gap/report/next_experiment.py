@@ -13,8 +13,8 @@ import numpy as np
 
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run
-from dexsim.gap.search.fit import expand
 from dexsim.gap.search.search import JointSearch, Trial
 from dexsim.recording.excitation import Limits, Plan, plan
 from dexsim.recording.mechanism import Mechanism

@@ -6,20 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from dexsim.errors import UserError
-from dexsim.gap.effects.catalogue import EFFECTS, separating
-from dexsim.gap.effects.touch import entry
+from dexsim.gap.effects.catalogue import EFFECTS, entry, separating
+from dexsim.gap.effects.effect import Effect
 from dexsim.gap.plant.case import Case
 from dexsim.gap.report import next_experiment
 from dexsim.gap.report.sentence import place
 from dexsim.gap.result import Diagnosis, Settings
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
-
-TABLE = {"coulomb_friction": ["triangles", "steps"], "stribeck_friction": ["triangles", "ladder"], "backlash": ["triangles", "chirp"],
-         "load_friction": ["triangles", "holds"], "command_delay": ["steps", "chirp"], "lag": ["steps", "chirp"], "viscous_friction": ["ladder"],
-         "torque_speed_limit": ["ladder", "steps"], "gain_mismatch": ["steps", "holds"], "inertia": ["chirp"], "payload": ["holds"],
-         "position_offset": ["holds"]}  # fmt: skip
-"""Motions that show an effect, where its hypotheses cannot be simulated over candidates."""
 
 
 def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (), recordings: Sequence[Any] = ()) -> None:
@@ -35,7 +29,7 @@ def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[
         f = unsure[0]
         rivals = list(dict.fromkeys(f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])]))
         joints = f["where"]["joints"]
-        kinds = sorted({k for e in rivals for k in TABLE.get(e, ["steps", "chirp", "triangles"])})
+        kinds = sorted({k for e in rivals for k in EFFECTS.get(e, Effect).motions})
         head = f"to tell {' from '.join(rivals)} on {joints[0]}" if len(rivals) > 1 else f"to make sure of {rivals[0]} on {joints[0]}"
         experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f["effect"]].experiment
         why = f"{head}: {experiment}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.touch import entry
+from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.judge.full_model import TASKS
 from dexsim.gap.report import charts
 from dexsim.gap.report.picture import mechanism, pad, scale
@@ -251,7 +251,7 @@ def _metric(d: Diagnosis, f: dict) -> str:
     """The metric of a finding's held-out error."""
     if not f["where"]["joints"]:
         return "tactile_rmse_N"
-    if f["effect"] == "current_sensor":
+    if (e := entry(f)) is not None and e.effort_only:
         return "effort_rmse_Nm"
     h = d.data["held_out"]["error"]
     return h if not h.startswith("tactile") else "position_rmse_rad"

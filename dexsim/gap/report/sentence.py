@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexsim.gap.effects.touch import entry
+from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.report.charts import number
 from dexsim.gap.result import Diagnosis
 from dexsim.recording.mechanism import Mechanism
@@ -71,18 +71,15 @@ def spoken(f: dict) -> str:
 
 def words_of(f: dict, m: Mechanism | None) -> str:
     """What an effect does, in words, with its direction where its size tells that."""
-    words, p = entry(f).words, f["parameters"]
     joint = next(iter(f["where"]["joints"]), None)
-    if f["effect"] == "coulomb_friction" and m is not None and joint in m.joints:
-        believed = float(m.column("coulomb_friction")[m.joints.index(joint)]) + float(np.ravel(m.spec.joint(joint).frictionloss)[0])
-        return words.replace("more (or less)", "more" if p["torque"]["value"] > believed else "less")
-    if f["effect"] == "inertia":
-        return words.replace("more (or less)", "more" if p["armature"]["value"] > 0 else "less")
-    if f["effect"] == "payload" and "mass" in p:
-        return f"carries {'more' if p['mass']['value'] > 0 else 'less'} mass than the model"
-    if f["effect"] == "payload":
-        return "hangs in another direction of gravity than the model"
-    return words
+    if joint is None:
+        return entry(f).words
+    believed = {}
+    if m is not None and joint in m.joints:
+        row = m.joints.index(joint)
+        friction = float(np.ravel(m.spec.joint(joint).frictionloss)[0])
+        believed = {"coulomb_friction": float(m.column("coulomb_friction")[row]) + friction}
+    return entry(f).said(f, believed)
 
 
 def place(f: dict) -> str:

@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import Param, expand
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
@@ -17,42 +18,6 @@ AWAY = 0.02  # of a belief's range: one that was moved farther from what is beli
 PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
 
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
-
-
-@dataclass(frozen=True)
-class Param:
-    """One number that is fitted. `key` is unique in a fit; it acts on plant columns [.., R, C].
-
-    mode: `factor` multiplies the believed value, `add` adds to it, `set` replaces it, `inverse` sets 1 / x.
-    runs: the runs it acts in (None: all).
-    """
-
-    key: str
-    columns: tuple[str, ...]
-    mode: str
-    low: float
-    high: float
-    start: float
-    unit: str = "1"
-    nuisance: bool = False
-    sd: float = 0.0  # what is believed of it beforehand: its start to this standard deviation; 0: nothing inside the bounds
-
-    @property
-    def span(self) -> float:
-        return self.high - self.low
-
-    def apply(self, params: np.ndarray, x: np.ndarray, base: np.ndarray) -> None:
-        """Writes x [H] into params [H, R, C], base [R, C] being what is believed."""
-        for name in self.columns:
-            c = INDEX[name]
-            if self.mode == "factor":
-                params[:, :, c] = params[:, :, c] * x[:, None]
-            elif self.mode == "add":
-                params[:, :, c] = params[:, :, c] + x[:, None]
-            elif self.mode == "inverse":
-                params[:, :, c] = 1.0 / np.maximum(x[:, None], 1e-12)
-            else:
-                params[:, :, c] = x[:, None]
 
 
 def centre_of(params: list[Param]) -> np.ndarray:
@@ -68,22 +33,6 @@ def prior_weight(params: list[Param]) -> np.ndarray:
 def disbelief(params: list[Param], x: np.ndarray) -> float:
     """How far x [P] is from what is believed, on the scale of a sum of squared residuals."""
     return float(prior_weight(params) @ (x - np.array([p.start for p in params], float)) ** 2) if params else 0.0
-
-
-def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
-    """[H, R, C] plant parameters of the guesses x [H, P]: what replaces first, factors and additions after."""
-    base = plant.base()
-    out = np.repeat(base[None], len(x), 0)
-    for modes in (("set", "inverse"), ("factor", "add")):
-        for i, p in enumerate(params):
-            if p.mode in modes:
-                p.apply(out, x[:, i], base)
-    lag = INDEX["stribeck_speed"]
-    out[:, :, lag] = np.maximum(out[:, :, lag], 1e-4)
-    for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
-        c = INDEX[name]
-        out[:, :, c] = np.maximum(out[:, :, c], 0.0)
-    return out
 
 
 @dataclass

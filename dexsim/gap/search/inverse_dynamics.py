@@ -245,7 +245,7 @@ def write(given: Sequence[tuple], servo, joints: Sequence[str]) -> None:
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[int]) -> list[dict]:
     """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed (`unknown`)."""
     from dexsim.gap.effects.catalogue import EFFECTS
-    from dexsim.gap.judge.errors import intervals_of, own_signal
+    from dexsim.gap.judge.errors import intervals_of
 
     out = []
     for case, x, judged in given:
@@ -264,7 +264,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[i
                 parameters = {"coefficient": entry(f, f * 0.95, f * 1.05, f"{force}.s/{length}"),
                               "asymmetry": entry(2 * n.value / f, 2 * n.low / f, 2 * n.high / f, "1")}  # fmt: skip
             same = [LAG, "command_delay"] if n.effect == LAG else []
-            signal = own_signal(n.effect, case, {k: v["value"] for k, v in parameters.items()}, {})
+            signal = EFFECTS[n.effect].signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
             confidence = min(n.share, 0.95) * (1.0 if helped > LEAST else 0.5)

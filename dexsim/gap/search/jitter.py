@@ -20,7 +20,8 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq, minimize
 
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS
-from dexsim.gap.search.fit import Fitter, expand
+from dexsim.gap.plant.param import expand
+from dexsim.gap.search.fit import Fitter
 from dexsim.gap.search.search import JointSearch, Trial, subset
 
 LATE = 2e-3  # s: by what a command is late to see what it does, at most a fifth of the time between commands

@@ -7,11 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, Effect, Scales, Variant, confusable
+from dexsim.gap.effects.catalogue import CATALOGUE, compatible, confusable
+from dexsim.gap.effects.effect import Effect, Variant
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import BELIEF, Case
-from dexsim.gap.plant.columns import INDEX, NAMES
-from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Param, Residuals, disbelief, prior_weight
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.plant.scales import Scales
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, disbelief, prior_weight
 
 USUAL = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
          "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
@@ -35,7 +38,6 @@ CLEAR = 0.11  # of the squared error: what an effect must remove where the error
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
 FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
-PARTING = ("backlash", "compliance", "position_scale")  # effects with which the motor's speed is not what the loop reads
 MAYBE = {"braking_slope": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 PIN = 1e-6  # of room for what is held at a value
 LATE = 0.75  # periods of its loop by which any drive may act on its commands late
@@ -210,7 +212,7 @@ class JointSearch:
         mine = [p for m in members for p in _named(m)]
         taken = {c for p in mine for c in p.columns}
         # what left no trace without them may with them: a motor that rattles behind its joint turns faster than the loop knows
-        others = self.all_nuisances if any(m.id in PARTING for m in members) else self.nuisances
+        others = self.all_nuisances if any(m.effect.parts_motor for m in members) else self.nuisances
         return mine + [p for p in others if not taken & set(p.columns)]
 
     def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None):
@@ -622,7 +624,7 @@ class JointSearch:
             g, p, m, _ = row
             if g < 0.25 * LEAST * min(1.0, ROUGH / loss) or (p > 4 * PRICE and loss < ROUGH):
                 continue
-            if seen.get(m.id, 0) >= (2 if m.id in ("torque_ripple", "payload", "thermal", "joint_coupling") else 1):
+            if seen.get(m.id, 0) >= m.effect.kinds:
                 continue
             if any(not _compatible(m, other) for other in members):
                 continue
@@ -941,15 +943,11 @@ def _dear(trial: Trial) -> float:
 
 
 def _compatible(a: Member, b: Member) -> bool:
-    if {a.id, b.id} == {"position_offset", "payload"} and any(m.variant.label.startswith("tilt") for m in (a, b)):
-        return False  # the same turn, once of the encoder and once of gravity: both at once mean neither
-    return not ({c for p in a.variant.params for c in p.columns} & {c for p in b.variant.params for c in p.columns})
+    return compatible(a.effect, a.variant, b.effect, b.variant)
 
 
 def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
     """[R, C] plant parameters at one guess."""
-    from dexsim.gap.search.fit import expand
-
     return expand(case.plant, params, x[None])[0]
 
 
@@ -982,4 +980,4 @@ def subset(w: Windows, keep: np.ndarray) -> Windows:
                    w.sample_row[samples], w.run[pick])
 
 
-__all__ = ["EFFECTS", "JointSearch", "Member", "NAMES", "Outcome", "Trial", "subset"]
+__all__ = ["JointSearch", "Member", "Outcome", "Trial", "subset"]

@@ -4,51 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from dexsim.gap.effects.catalogue import EFFECTS, MIN_WARMTH, Scales
+from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.touch import BY_ID
 from dexsim.gap.search.search import unknown
 from dexsim.gap.touch.touch import TouchResult
 
 
-def why(effect: str, s: Scales) -> str:
-    """Why a joint's motion cannot show an effect; empty where it can."""
-    if effect == "supply_sag":
-        if not s.others:
-            return "no other joint moves, so none can load the supply"
-        if s.others_torque <= 0:
-            return "the other joints give no torque"
-    if effect == "joint_coupling" and not s.others:
-        return "no other joint moves"
-    if effect == "thermal":
-        if s.warm <= 0:
-            return "no temperature is recorded"
-        if s.warm < MIN_WARMTH:
-            return f"the temperature changes by {s.warm:.1f} degC, less than {MIN_WARMTH:g}"
-    if effect == "current_sensor" and not s.effort:
-        return "no effort is recorded (or current_per_torque is unknown)"
-    if effect == "position_offset" and not EFFECTS[effect].variants(s):
-        return "gravity hardly acts on the joint, so its zero leaves no trace"
-    if effect == "payload" and not EFFECTS[effect].variants(s):
-        return "neither gravity nor the inertia of the last link shows at the joint"
-    if effect == "torque_ripple" and not EFFECTS[effect].variants(s):
-        return "it slides and has no turn" if s.slide else f"it moves over {s.span:.2g} rad, less than a period of any gear"
-    if effect == "torque_speed_limit" and not EFFECTS[effect].variants(s):
-        return "it moves far too slowly for its no-load speed"
-    return "" if EFFECTS[effect].variants(s) else "these recordings cannot show it"
-
-
 def reasons(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:
-    """Effect id -> why it was not considered on any joint or pad (or on which), in the catalogue's order. cases: `prepare.Case`."""
+    """Effect id -> why it was not considered on any joint or pad (or on which), in the catalogue's order.
+
+    cases: `plant.case.Case`."""
     out: dict[str, str] = {}
     moved = [c for c in cases if c.moved]
-    for e in EFFECTS:
+    for e, x in EFFECTS.items():
         if allowed is not None and e not in allowed:
             out[e] = "not asked for (effects=)"
             continue
         if not moved:
             out[e] = "no joint is judged" if not cases else "no joint moves"
             continue
-        given = {c.joint: why(e, c.scales) for c in moved}
+        given = {c.joint: x.unseen(c.scales) for c in moved}
         lacking = {j: r for j, r in given.items() if r}
         if not lacking:
             continue
@@ -77,6 +52,3 @@ def not_fitted(cases: Sequence) -> list[str]:
             if unknown(name, c.scales) is None:
                 by.setdefault(name, []).append(c.joint)
     return [f"{name} is unknown on {', '.join(joints)} and cannot be fitted to these recordings by itself: it is taken as absent" for name, joints in by.items()]
-
-
-__all__ = ["not_fitted", "reasons", "why"]

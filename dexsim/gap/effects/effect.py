@@ -1,0 +1,149 @@
+"""What an entry of the catalogue holds: everything that the diagnosis needs to know of one effect on a joint.
+
+To add an effect: a file here with a class of its own, its line in `catalogue.CATALOGUE`, its column
+(`dexsim.actuator.columns`, or `dexsim.gap.plant.columns` where training has no use for it), its law and a test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.scales import Scales
+
+if TYPE_CHECKING:
+    from dexsim.actuator.table import ServoTable
+    from dexsim.gap.plant.case import Case
+
+SLOW = 0.02  # of a joint's large speed: slower than this it stands
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way an effect may be there: its parameters, starts [n][P], and constants set on the plant."""
+
+    params: tuple[Param, ...]
+    starts: tuple[tuple[float, ...], ...]
+    label: str = ""
+    fixed: tuple[tuple[str, float], ...] = ()
+    note: dict = field(default_factory=dict)
+    refines: bool = False  # adds parameters to the first variant: tried only where that one was found
+    dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
+
+
+@dataclass(frozen=True)
+class FittedEffect:
+    """What a fit says of one effect on one joint: values and 90 % intervals by `Param.key`."""
+
+    variant: Variant
+    value: dict[str, float]
+    interval: dict[str, tuple[float, float]]
+    case: Case
+    table: ServoTable
+
+    @property
+    def force(self) -> str:
+        """Unit of a torque on this joint; a slide has a force."""
+        return "N" if self.case.scales.slide else "N.m"
+
+    @property
+    def length(self) -> str:
+        """Unit of the joint's position."""
+        return "m" if self.case.scales.slide else "rad"
+
+    def entry(self, key: str, unit: str, add: float = 0.0, times: float = 1.0) -> dict[str, Any]:
+        """A parameter as `diagnosis.json` has it, (x + add) * times."""
+        return entry(*((x + add) * times for x in (self.value[key], *self.interval[key])), unit)
+
+
+def entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
+    """A number with its interval as `diagnosis.json` has it."""
+    low, high = min(low, high), max(low, high)
+    return {"value": float(value), "low": float(low), "high": float(high), "unit": unit}
+
+
+def word(value: str) -> dict[str, Any]:
+    """A parameter that is a word."""
+    return {"value": value, "low": None, "high": None, "unit": ""}
+
+
+def param(
+    key: str,
+    column: str | tuple[str, ...],
+    mode: str,
+    low: float,
+    high: float,
+    start: float = 0.0,
+    unit: str = "1",
+) -> Param:
+    """A `Param` of one column or several."""
+    columns = (column,) if isinstance(column, str) else tuple(column)
+    return Param(key, columns, mode, float(low), float(high), float(start), unit)
+
+
+class Effect:
+    """An entry of the catalogue.
+
+    id: as `diagnosis.json` has it; words: a phrase after "joint X ..."; shows: the regime in which it leaves its trace;
+    experiment: what shows it best; classes: those of `confusion.CLASSES` that it belongs to.
+    """
+
+    id: ClassVar[str]
+    words: ClassVar[str]
+    shows: ClassVar[str]
+    experiment: ClassVar[str]
+    classes: ClassVar[tuple[str, ...]] = ()
+    motions: ClassVar[tuple[str, ...]] = ("steps", "chirp", "triangles")  # kinds of `recording.excitation` that show it
+    model_columns: ClassVar[tuple[str, ...]] = ()  # columns of the plant that are fields of the model
+    kinds: ClassVar[int] = 1  # variants that one short list may hold
+    fitted_anyway: ClassVar[dict[str, str]] = {}  # servo column that may be unknown -> the parameter that it is
+    demo: ClassVar[dict[str, float]] = {}  # servo columns of a drive that hides it, for `demo=`
+    demo_on_motor: ClassVar[bool] = False  # hidden behind a loop whose encoder sits on the motor
+    misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
+    parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
+    from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
+    slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
+    effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
+    couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
+    jitters: ClassVar[bool] = False  # its size may vary from command to command
+
+    def variants(self, s: Scales) -> list[Variant]:
+        """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
+        raise NotImplementedError
+
+    def unseen(self, s: Scales) -> str:
+        """Why a joint's motion cannot show it; empty where it can."""
+        return "" if self.variants(s) else "these recordings cannot show it"
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        """[n] how strongly it acts at each measured sample: its own torque, or the signal that it changes."""
+        return np.ones_like(case.regimes["speed"])
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        """Parameters by the keys of `diagnosis.json`, with 90 % intervals."""
+        raise NotImplementedError
+
+    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+        """What it does, in words, with its direction where its size tells that. believed: columns of the joint,
+        its model's friction included."""
+        return self.words
+
+    def of_pose(self, values: dict[str, float], case: Case) -> bool:
+        """Whether it is a torque that follows the pose and changes slowly along it."""
+        return False
+
+    def doubts(self, case: Case, runs: Sequence[int]) -> list[str]:
+        """Reasons of its own to doubt it, from the recordings that were used."""
+        return []
+
+    def excludes(self, mine: Variant, other: Effect, theirs: Variant) -> bool:
+        """Whether it and another effect replace one another: both at once mean nothing."""
+        return False
+
+    def to_model(self, spec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+        """Writes what is a field of the model into its spec; returns what was changed, in words."""
+        return []
