@@ -94,7 +94,7 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
         return {"effect": "joint_coupling", "confidence": sure, "where": {"joints": [joint], "taxels": [], "topics": []}, "parameters": {"from_joint": {"value": other}}}
 
     def answer(joint: str, column: str):
-        member = SimpleNamespace(id="joint_coupling", variant=SimpleNamespace(params=[SimpleNamespace(columns=(column,))]))
+        member = SimpleNamespace(effect=EFFECTS["joint_coupling"], variant=SimpleNamespace(params=[SimpleNamespace(columns=(column,))]))
         return SimpleNamespace(case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member])))
 
     lag = {"effect": "lag", "confidence": 0.9, "where": {"joints": ["b"], "taxels": [], "topics": []}, "parameters": {}}
