@@ -24,4 +24,4 @@ def on_page_markdown(markdown: str, **_: object) -> str:
     """A page's Markdown before it is rendered. Raises KeyError for a generated table that does not exist."""
     markdown = GENERATED.sub(lambda m: reference.PAGES[m[1]](), markdown)
     markdown = BLOCK.sub(lambda m: "".join(f"<p>{convert(line, display='block')}</p>\n" for line in m[1].split("\\\\\n")), markdown)
-    return INLINE.sub(lambda m: convert(m[1]), markdown)
+    return INLINE.sub(lambda m: f"<span>{convert(m[1])}</span>", markdown)  # a line that begins with <math> would be a block

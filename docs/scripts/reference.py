@@ -1,12 +1,14 @@
 """Reference pages written from the code and the config files, so that they cannot go stale.
 
-    python docs/scripts/reference.py settings | columns | effects | audit | metadata
+    python docs/scripts/reference.py settings | columns | effects | audit | metadata | commands
 
 prints one as Markdown; `hooks.py` puts them into the site where a page says `<!-- GENERATED: name -->`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -152,7 +154,19 @@ def metadata() -> str:
     return f"### Topics\n\n{topics}\n### Metadata\n\n{keys}\nFor recordings in other units:\n\n{units}"
 
 
-PAGES = {"settings": settings, "columns": columns, "effects": effects, "audit": audit, "metadata": metadata}
+def commands() -> str:
+    """What `dexsim COMMAND --help` prints, for every command."""
+    from dexsim.cli.main import COMMANDS, dispatch
+
+    out = []
+    for name, command in COMMANDS.items():
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            dispatch([name, "--help"])
+        out.append(f"## dexsim {name}\n\n{command.about[0].upper()}{command.about[1:]}.\n\n```text\n{printed.getvalue().strip()}\n```\n")
+    return "\n".join(out)
+
+
+PAGES = {"settings": settings, "columns": columns, "effects": effects, "audit": audit, "metadata": metadata, "commands": commands}
 
 
 def main(argv: Sequence[str]) -> int:
