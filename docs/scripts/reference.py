@@ -11,7 +11,7 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,18 +123,17 @@ def columns() -> str:
 
 def effects() -> str:
     """The catalogue of the diagnosis: effects of joints, then of touch and contact."""
-    from dexsim.gap.effects.catalogue import CATALOGUE, CONFUSED
-    from dexsim.gap.effects.touch import CONFUSED as TOUCH_CONFUSED
-    from dexsim.gap.effects.touch import TOUCH
+    from dexsim.gap.effects import catalogue, touch
 
-    def others(name: str, classes: Sequence[frozenset[str]]) -> str:
-        return ", ".join(f"`{x}`" for x in sorted({x for c in classes if name in c for x in c} - {name})) or "-"
+    head = ("effect", "what it means", "where it shows", "what shows it best", "may be confused with")
 
-    joint = [(f"`{e.id}`", f"the joint {e.words}", e.shows, e.experiment, others(e.id, CONFUSED), ", ".join(f"`{c}`" for c in e.columns) or "-")
-             for e in CATALOGUE]
-    touch = [(f"`{e.id}`", f"the fingertip {e.words}", e.shows, e.experiment, others(e.id, TOUCH_CONFUSED)) for e in TOUCH]
-    head = ("effect", "what it means", "where it shows", "motion that shows it", "may be confused with")
-    return f"## Joints\n\n{table((*head, 'servo columns'), joint)}\n## Touch and contact\n\n{table(head, touch)}"
+    def rows(what: str, entries: Sequence, confusable: Callable[[str, str], bool]) -> list[tuple[str, ...]]:
+        like = {e.id: [f"`{x.id}`" for x in entries if x.id != e.id and confusable(e.id, x.id)] for e in entries}
+        return [(f"`{e.id}`", f"the {what} {e.words}", e.shows, e.experiment, ", ".join(like[e.id]) or "-") for e in entries]
+
+    joints = table(head, rows("joint", catalogue.CATALOGUE, catalogue.confusable))
+    touches = table(head, rows("fingertip", touch.TOUCH, touch.confusable))
+    return f"## Joints\n\n{joints}\n## Touch and contact\n\n{touches}"
 
 
 def audit() -> str:
