@@ -1,4 +1,4 @@
-"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage DATA_DIR [out=DIR] [jobs=1] [figure=FILE.png]. One JSON line at the end."""
+"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage|panda|ergocub data=PATH [out=DIR] [jobs=1]. One JSON line at the end."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from benchmarks.real.fold import brief, fold, joint
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m benchmarks.real bam|emps|sage DATA_DIR [out=out/real] [jobs=1] [fit=20] [figure=FILE.png]
+USAGE = """usage: python -m benchmarks.real bam|emps|sage|panda|ergocub [data=PATH] [out=out/real/NAME] [jobs=1] [fit=20] [figure=FILE.png]
 
-DATA_DIR is where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml).
-jobs: of BAM's four gains left out in turn, or of SAGE's six joints, how many at a time, each in a process of its own; fit: of SAGE's
-twenty motions, how many to fit. Each part's result is written to out/ as it is done; the whole to out/NAME.json.
+data: where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml; the Panda's trajectory; the
+ergoCub fingers' runs), or the folder of all of them with one folder each; without it ../shared/realdata is looked for. Where the data is
+absent a line says so and nothing is run. jobs: of BAM's four gains left out in turn, SAGE's six joints or ergoCub's fingers, how many at a
+time, each in a process of its own; fit: of SAGE's twenty motions, how many to fit. Each part's result is written to out/ as it is done; the
+whole to out/NAME.json.
 """
+FOLDERS = {"bam": "bam_xl330", "emps": "emps", "sage": "sage_so101", "panda": "panda", "ergocub": "ergocub_fingers"}
 
 
 def bam(data: Path, out: Path, jobs: int) -> dict:
@@ -124,8 +127,29 @@ def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
+def panda(data: Path, out: Path, jobs: int) -> dict:
+    """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is kept out."""
+    from benchmarks.real.convert_panda import JOINTS, convert, plain
+    from dexsim.gap.diagnosis import KEEP_OUT, Settings, diagnose, save
+
+    made = convert(data, out / "recordings")
+    wall, cpu = time.perf_counter(), time.process_time()
+    d = diagnose(Settings([made.recording], out, None, str(made.model), str(made.servo), next_recording=False), say=print)
+    save(d, out)
+    cpu = time.process_time() - cpu
+    rows, plainly = {}, plain(data, 1 - KEEP_OUT)
+    for j in JOINTS:
+        v = d.servo.value(j, "coulomb_friction")
+        x = plainly[j]
+        rows[j] = {"handed_on": None if v.unknown else v.value, "low": v.low, "high": v.high, "plain": x,
+                   "inside": bool(not v.unknown and x["low"] <= v.value <= x["high"]), "sigma": d.joints.get(j)}  # fmt: skip
+    return {"benchmark": "panda", "inside": sum(r["inside"] for r in rows.values()), "of": len(JOINTS), "joints": rows, "stages": d.stages,
+            "verdict": d.data["verdict"], "findings": [brief(f) for f in d.data["findings"]], "sentence": d.sentence, "held_out": d.data["held_out"], "notes": d.notes,
+            "cpu_seconds": round(cpu, 1), "seconds": round(time.perf_counter() - wall, 1), "shares": d.shares}  # fmt: skip
+
+
 HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
-JOBS = {"bam": bam, "emps": emps, "sage": sage}
+JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda}
 
 
 def figure(result: dict, path: Path) -> None:
@@ -158,16 +182,29 @@ def figure(result: dict, path: Path) -> None:
     plt.close(fig)
 
 
+def folder(name: str, given: str | None) -> Path | None:
+    """The folder of a data set; None where none was given and none lies beside the project. UserError where the given one is not there."""
+    root = Path(given).expanduser() if given else Path("../shared/realdata")
+    inner = root / FOLDERS[name]
+    if inner.is_dir():
+        return inner
+    if given and not root.is_dir():
+        raise UserError(f"data={given} is not a folder; download the recordings first (benchmarks/real/convert_{name}.py says where from)")
+    return root if given else None
+
+
 def main(argv: list[str]) -> int:
     """Runs one benchmark; returns the exit status."""
     plain = [a for a in argv if "=" not in a]
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if len(plain) != 2 or plain[0] not in JOBS or set(given) - {"out", "jobs", "figure", "fit"} or not given.get("jobs", "1").isdigit():
+    if not plain or len(plain) > 2 or plain[0] not in JOBS or set(given) - {"data", "out", "jobs", "figure", "fit"} or not given.get("jobs", "1").isdigit():
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
-    data = Path(plain[1]).expanduser()
-    if not data.is_dir():
-        raise UserError(f"{data} is not a folder; download the recordings first (see benchmarks/real/convert_{plain[0]}.py for where from)")
+    data = folder(plain[0], plain[1] if len(plain) == 2 else given.get("data"))
+    if data is None:
+        print(json.dumps({"benchmark": plain[0], "skipped": f"../shared/realdata/{FOLDERS[plain[0]]} is absent; data=PATH names the recordings "
+                          f"(benchmarks/real/convert_{plain[0]}.py says where from)"}))  # fmt: skip
+        return 0
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")

@@ -189,7 +189,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     stages = stage_tests.tests(cases, runs, train, s.seed)
     for x in stages[:4]:
         say(f"  {x.text}")
-    by_torque = inverse_dynamics.found(cases, runs, train, test, s.seed)
+    by_torque = inverse_dynamics.found(cases, runs, train, test, s.seed, model, span_train, span_test)
     behind = inverse_dynamics.texts(by_torque)
     nothing_believed = [c.joint for c, _, _ in by_torque if "coulomb_friction" in c.unknown]
     notes += inverse_dynamics.believe(by_torque)
@@ -216,7 +216,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes)
     result.stages = [x.text for x in stages] + behind
     add_behind(result, inverse_dynamics.findings(by_torque, nothing_believed, runs, train), by_torque)
-    inverse_dynamics.write(by_torque, result.servo, nothing_believed)
+    inverse_dynamics.hand_on(by_torque, result, outcomes, test, span_test)
     result.data["unexplained"]["not_considered"] = left_out
     add_touch(result, felt)
     result.lengths = lengths

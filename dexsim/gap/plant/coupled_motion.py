@@ -68,7 +68,9 @@ def again(model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted:
     for j in misread:  # what a case holds of its own joint is what was measured
         out[j] = built(j)[j]
     for new, old in zip(out, cases, strict=True):
-        new.ranges, new.unknown, new.factors = old.ranges, old.unknown, old.factors
+        new.ranges, new.unknown, new.factors, new.told = old.ranges, old.unknown, old.factors, old.told
+        new.plant.nominal = old.plant.nominal  # with what the recorded torque told
+        new.scales.nominal.update(old.scales.nominal)
     return out
 
 

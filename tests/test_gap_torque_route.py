@@ -1,0 +1,104 @@
+"""The torque route through gravity and coupled joints, at 100 Hz: friction read off the recorded torque of a two-link arm."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.gap.search import inverse_dynamics
+from dexsim.gap.search.body_torque import body, motion
+
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" armature="0.02" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="2"/><body name="lower" pos="0 0 -0.4"><joint name="elbow" axis="0 1 0" armature="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/></body></body></worldbody></mujoco>"""
+JOINTS = ("shoulder", "elbow")
+COULOMB, VISCOUS, OFFSET = (0.5, 0.2), (0.3, 0.1), (0.05, -0.03)
+
+
+def arm() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+def run(model: mujoco.MjModel, seed: int, seconds: float = 20.0, rate: float = 100.0, friction=COULOMB, viscous=VISCOUS, pushed=None):
+    """A recording of the arm by exact inverse dynamics; pushed(t) [S]: what something outside adds to the elbow, N.m."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, seconds, 1 / rate)
+    w = 2 * np.pi * np.array([[0.21, 0.53, 0.83], [0.33, 0.47, 1.07]])
+    size, phase = np.array([[0.5, 0.3, 0.1], [0.6, 0.3, 0.1]]), rng.uniform(0, 6, (2, 3))
+    wave = lambda f: np.stack([(size[j] * f(j, w[j] * t[:, None] + phase[j])).sum(1) for j in (0, 1)], 1)  # noqa: E731
+    q, v, a = wave(lambda j, x: np.sin(x)), wave(lambda j, x: w[j] * np.cos(x)), wave(lambda j, x: -(w[j] ** 2) * np.sin(x))
+    data, torque = mujoco.MjData(model), np.empty_like(q)
+    for i in range(len(t)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[i], v[i], a[i]
+        mujoco.mj_inverse(model, data)
+        torque[i] = data.qfrc_inverse
+    torque += np.array(friction) * np.sign(v) + np.array(viscous) * v + np.array(OFFSET)
+    if pushed is not None:
+        torque[:, 1] -= pushed(t)  # the motor gives less of what the body needs
+    torque += 0.02 * rng.standard_normal(q.shape)
+    return SimpleNamespace(name=f"run{seed}.mcap", joints=JOINTS, t=t, q=q + 1e-5 * rng.standard_normal(q.shape), torque=torque, torque_unit="N.m",
+                           gravity=np.array([0, 0, -9.81]), duration=float(t[-1] - t[0]))  # fmt: skip
+
+
+def cases() -> list[SimpleNamespace]:
+    scales = lambda: SimpleNamespace(nominal={"efficiency": 1.0})  # noqa: E731
+    return [SimpleNamespace(joint=j, index=k, moved=True, scales=scales()) for k, j in enumerate(JOINTS)]
+
+
+def test_friction_of_coupled_joints_under_gravity_is_read_off_at_100_hz():
+    model = arm()
+    runs = [run(model, 0), run(model, 1)]
+    given = inverse_dynamics.found(cases(), runs, [0], [1], model=model)
+    assert [c.joint for c, *_ in given] == list(JOINTS) and given[0][2] == ["run1.mcap"]
+    for (_, x, _), coulomb, viscous in zip(given, COULOMB, VISCOUS, strict=True):
+        assert x.value["coulomb_friction"] == pytest.approx(coulomb, rel=0.05)
+        assert x.value["viscous_friction"] == pytest.approx(viscous, rel=0.1)  # beyond the model's own damping
+        assert x.residual < 0.05 and not x.refused
+        assert abs(x.value.get("gravity", 0.0)) < 0.02
+    assert given[0][1].value["inertia"] == pytest.approx(np.median(body(model, np.array([0, 0, -9.81]), JOINTS, moved(runs[0])).inertia[:, 0]), rel=0.05)
+
+
+def moved(r):
+    return motion(r.t, r.q, r.torque, 10.0)
+
+
+def test_a_heavier_arm_is_not_taken_for_friction():
+    model, heavy = arm(), arm()
+    heavy.body_mass[:] *= 1.1
+    heavy.body_inertia[:] *= 1.1
+    x = inverse_dynamics.found(cases(), [run(heavy, 0)], [0], [], model=model)[0][1]
+    assert x.value["gravity"] == pytest.approx(0.1, abs=0.02)
+    assert x.value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
+
+
+def test_what_is_kept_out_takes_no_part():
+    model = arm()
+    r = run(model, 0, 40.0)
+    r.torque[r.t > 30, 0] += 5.0
+    given = inverse_dynamics.found(cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)})
+    assert given[0][1].value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
+
+
+def test_a_negative_friction_is_a_refusal_with_a_reason():
+    model = arm()
+    r = run(model, 0, friction=(0.5, -0.2))
+    given = inverse_dynamics.found(cases(), [r], [0], [], model=model)
+    x = given[1][1]
+    assert x.value["coulomb_friction"] == 0.0 and "negative coulomb friction" in x.refused["coulomb_friction"]
+    assert "negative coulomb friction" in inverse_dynamics.texts(given)[1] and not given[0][1].refused
+    for c in cases():
+        c.unknown, c.told, c.ranges = ("coulomb_friction",), False, {}
+    given[1][0].unknown, given[1][0].told = ("coulomb_friction",), False
+    said = inverse_dynamics.believe(given[1:])
+    assert len(said) == 1 and "no coulomb friction is taken" in said[0] and not given[1][0].told
+
+
+def test_readings_too_slow_or_in_no_unit_of_torque_say_nothing():
+    model = arm()
+    slow, amperes = run(model, 0, rate=50.0), run(model, 0)
+    amperes.torque_unit = "A"
+    assert inverse_dynamics.found(cases(), [slow], [0], [], model=model) == []
+    assert inverse_dynamics.found(cases(), [amperes], [0], [], model=model) == []
