@@ -38,14 +38,14 @@ class Half:
 
 
 def files_of(where: str | Sequence[str], key: str) -> list[Path]:
-    """Recordings named by a folder (its *.mcap), a file, or several separated by commas. Raises UserError."""
+    """Recordings named by a folder (its *.mcap, else *.csv and *.npz), a file, or several separated by commas. Raises UserError."""
     parts = where.split(",") if isinstance(where, str) else list(where)
     out: list[Path] = []
     for part in parts:
         path = Path(part.strip()).expanduser()
-        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path] if path.is_file() else []
+        found = [path] if path.is_file() else sorted(path.glob("*.mcap")) or sorted([*path.glob("*.csv"), *path.glob("*.npz")])
         if not found:
-            raise UserError(f"{key}={part.strip()}: no recording there (a .mcap file, or a folder of them)")
+            raise UserError(f"{key}={part.strip()}: no recording there (a .mcap, .csv or .npz file, or a folder of them)")
         out += found
     return out
 

@@ -34,7 +34,7 @@ examples:
   python diagnose.py demo=true
 
 settings (key=default):
-  recordings=                 MCAP files (or bag folders): [a.mcap,b.mcap,...] or a pattern 'runs/*.mcap'
+  recordings=                 MCAP files, bag folders, or CSV and NPZ files with named columns: [a.mcap,b.csv,...] or a pattern 'runs/*.mcap'
   held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the time, is kept out
   model=                      MuJoCo or URDF file; the xHand by default
   servo=                      servo.yaml believed of its drives; the xHand's by default
@@ -48,7 +48,7 @@ settings (key=default):
                               compliance, coulomb_friction, deadband, load_friction, stribeck_friction
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
-  remap.OURS=                 their name of a topic or a joint, e.g. remap./joint_states=/xhand/state
+  remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state, remap.position.elbow=enc1
 """
 KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "replay", "demo", "columns")
 

@@ -66,7 +66,7 @@ def open_container(path: Path) -> Container:
         hint = (
             "; convert it with `ros2 bag convert`, or record with `ros2 bag record -s mcap`"
             if data[:6] == b"SQLite"
-            else ""
+            else "; numbers in named columns are read from .csv, .tsv and .npz"
         )
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
     out = Container(path)

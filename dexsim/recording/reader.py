@@ -13,7 +13,7 @@ from mcap.records import Schema as McapSchema
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.recording import decode, metadata, names, schema
+from dexsim.recording import columns, decode, metadata, names, schema
 from dexsim.recording.container import Container, open_container
 from dexsim.recording.schema import Finding, Recording, Series, States
 
@@ -28,12 +28,13 @@ def read(
     joints: Sequence[str] | None = None,
     audit: bool = True,
 ) -> Recording:
-    """The recording in an MCAP file, or in a folder that `ros2 bag record -s mcap` wrote.
+    """The recording in an MCAP file, in a folder that `ros2 bag record -s mcap` wrote, or in a CSV or NPZ file with named columns
+    (`columns.py`).
 
     Arguments:
         remap: our topic -> theirs ("/joint_states": "/xhand/state"), "#a.b" behind it for a sub-message; our joint name
             -> theirs ("index_joint1": "finger2_mcp"). A topic that differs only by a namespace, and joint names that
-            differ only by a prefix, are found without.
+            differ only by a prefix, are found without. Of a CSV or NPZ file: "position.elbow" (or "time") -> the column.
         meta: metadata values that win over what the recording says.
         joints: names of the model's joints: their order, and others are left out. None: the xHand's where the names
             fit, else those of the recording.
@@ -43,11 +44,15 @@ def read(
     a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
     """
     path = Path(path).expanduser()
-    containers = [open_container(p) for p in _files(path)]
-    reading = _Reading(path, containers, dict(remap or {}))
-    stated, findings = metadata.collect(
-        path, metadata.own_record([m for c in containers for m in c.metadata]), dict(meta or {})
-    )
+    remap, meta = dict(remap or {}), dict(meta or {})
+    if path.suffix.lower() in columns.SUFFIXES:
+        stated, findings = metadata.collect(path, {}, meta)
+        reading: _Reading = _TableReading(path, columns.read_table(path, remap, stated), remap)
+        stated = reading.stated(stated)
+    else:
+        containers = [open_container(p) for p in _files(path)]
+        reading = _Reading(path, containers, remap)
+        stated, findings = metadata.collect(path, metadata.own_record([m for c in containers for m in c.metadata]), meta)
     reading.findings += findings
     recording = reading.build(stated, joints)
     if audit:
@@ -230,7 +235,10 @@ class _Reading:
             )
             if not out and ours == schema.STATES:
                 raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
-        t = np.array(times)
+        return self._in_order(ours, np.array(times), out)
+
+    def _in_order(self, ours: str, t: np.ndarray, out: list[Any]) -> tuple[np.ndarray, list[Any]]:
+        """Samples in order of time."""
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
             self.findings.append(
@@ -473,6 +481,64 @@ class _Reading:
             None if np.isnan(stamp).all() else stamp,
             messages[0][2],
         )
+
+
+class _TableReading(_Reading):
+    """A file with named columns being turned into a Recording: its columns stand for the messages of a topic."""
+
+    def __init__(self, path: Path, table: columns.Table, remap: dict[str, str]):
+        self.path, self.table, self.findings = path, table, list(table.findings)
+        topics = [k for k in remap if _is_topic(k)]
+        if topics:
+            raise UserError(f"recording {path}: has columns, no topics (remap.{topics[0]}); say remap.QUANTITY.JOINT=COLUMN, quantities:"
+                            f" {', '.join(columns.QUANTITIES)}")  # fmt: skip
+        self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
+        self.start_ns, self.config, self.sources = table.start_ns, None, {}
+
+    def stated(self, stated: dict[str, str]) -> dict[str, str]:
+        """The metadata, with what the columns' names tell; the values are SI already."""
+        for key in schema.UNIT_KEYS:
+            if key in stated:
+                self.findings.append(Finding("unit", "", NAN, 1, f"{key}={stated[key]}: of columns without a unit, converted to SI", "info"))
+        return self.table.meta | {k: v for k, v in stated.items() if k not in schema.UNIT_KEYS}
+
+    def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, list[Any]]:
+        table, empty = self.table, np.zeros(0)
+        if ours == schema.STATES:
+            have = [q for q in ("position", "velocity", "effort") if q in table.value]
+            if "position" not in have:
+                return empty, []
+            t, rows = table.samples("position")
+            rest = {}
+            for q in have[1:]:
+                own, value = table.samples(q)
+                same = len(own) == len(t) and np.array_equal(own, t)
+                rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
+            out = [decode.JointSample(table.joints, x, *(rest[q][i] if q in rest else empty for q in ("velocity", "effort")), None) for i, x in enumerate(rows)]
+        elif ours == schema.COMMANDS:
+            if "command" not in table.value:
+                return empty, []
+            t, rows = table.samples("command")
+            out = [decode.JointSample(table.joints, x, empty, empty, None) for x in rows]
+        else:
+            quantity = {schema.TEMPERATURES: "temperature", schema.DUTY: "duty", schema.ENABLED: "enabled", schema.SUPPLY: "supply_voltage"}.get(ours)
+            if quantity not in table.value:
+                return empty, []
+            if quantity == "supply_voltage":
+                t, value = table.time[quantity], table.value[quantity][""]
+                rows = value[:, None]
+            else:
+                t, rows = table.samples(quantity)
+            out = [((len(x),), x) for x in rows]
+        return self._in_order(ours, t, out)
+
+    def _their_joints(self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None) -> list[str]:
+        return list(self.table.joints)
+
+
+def _line(t: np.ndarray, own: np.ndarray, x: np.ndarray) -> np.ndarray:
+    ok = np.isfinite(x) & np.isfinite(own)
+    return np.interp(t, own[ok], x[ok]) if ok.any() else np.full(len(t), np.nan)
 
 
 class _Placer:

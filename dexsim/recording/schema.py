@@ -54,8 +54,9 @@ DEFAULTS: dict[str, str] = {
 UNIT_KEYS: dict[str, dict[str, float]] = {
     "position_unit": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3},
     "effort_unit": {"A": 1.0, "mA": 1e-3, "N.m": 1.0, "N": 1.0, "mN.m": 1e-3},
+    "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }
-"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported."""
+"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported (time_unit: of a CSV or NPZ file)."""
 
 _HEADER = """std_msgs/Header header
 """

@@ -78,7 +78,7 @@ def grouped(notes: Sequence[str]) -> list[str]:
     out: dict[str, list[str]] = {}
     for note in notes:
         name, colon, text = note.partition(": ")
-        if colon and name.endswith((".mcap", ".bag")) and " " not in name:
+        if colon and name.endswith((".mcap", ".bag", ".csv", ".tsv", ".npz")) and " " not in name:
             out.setdefault(text, []).append(name)
         else:
             out.setdefault(note, [])
