@@ -1,0 +1,148 @@
+"""Imports run down the floors, and no files import each other in a circle. Read off the source with `ast`, nothing is imported.
+
+What stands under `if __name__ == "__main__":`, and a `__main__.py`, is a door: it runs only as a program and may lead to any floor.
+Imports inside functions count like those at the top; what stands under `if TYPE_CHECKING:` does not.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FLOORS: tuple[frozenset[str], ...] = tuple(
+    frozenset(names.split())
+    for names in (
+        "errors paths version rotation",
+        "console typed yaml_text",
+        "assets",
+        "sim",
+        "actuator tactile",
+        "recording view",
+        "calibration",
+        "deploy",
+        "tasks gap",  # neither knows of the other
+        "learning",
+        "cli excite export api",
+    )
+)
+"""Parts of dexsim from the ground up. A part imports itself and lower floors only."""
+NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
+"""What a part does not import though it stands lower."""
+CIRCLES: dict[frozenset[str], str] = {}
+"""Circles of files that are allowed, each with its reason. None is."""
+
+
+def door(node: ast.AST) -> bool:
+    """Whether a statement is `if __name__ == "__main__":` or `if TYPE_CHECKING:`."""
+    return isinstance(node, ast.If) and (
+        "TYPE_CHECKING" in ast.unparse(node.test) or ast.unparse(node.test).replace('"', "'") == "__name__ == '__main__'"
+    )
+
+
+def modules(root: Path, package: str = "dexsim") -> dict[str, Path]:
+    """Module name -> file of a package in the folder root."""
+    found = {}
+    for path in sorted((root / package).rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        if parts[-1] != "__main__":
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(path: Path, known: dict[str, Path], package: str = "dexsim") -> set[str]:
+    """Modules of the package that a file imports, wherever in it."""
+    out: set[str] = set()
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        node = waiting.pop()
+        if door(node):
+            waiting += node.orelse
+            continue
+        if isinstance(node, ast.Import):
+            names = [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute in dexsim"
+            names = [f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in known else node.module for a in node.names]
+        else:
+            names = []
+        for name in names:
+            if name.split(".")[0] == package:
+                assert name in known, f"{path}:{node.lineno}: {name} does not exist"
+                out.add(name)
+        waiting += ast.iter_child_nodes(node)
+    return out
+
+
+def part(module: str) -> str:
+    """"sim" of "dexsim.sim.engine"; "" of the package itself."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """One closed path, as short as there is, through each file that lies on one; every set of files once."""
+    found: dict[frozenset[str], list[str]] = {}
+    for start in graph:
+        before: dict[str, str] = {}
+        waiting = [start]
+        while waiting and start not in before:  # breadth first: the shortest way back
+            node = waiting.pop(0)
+            for follower in sorted(graph[node]):
+                if follower not in before and follower != node:
+                    before[follower] = node
+                    waiting.append(follower)
+        if start in before:
+            path = [start]
+            while (last := before[path[-1]]) != start:
+                path.append(last)
+            found.setdefault(frozenset(path), [start, *reversed(path)])
+    return list(found.values())
+
+
+@pytest.fixture(scope="module")
+def graph() -> dict[str, set[str]]:
+    known = modules(ROOT)
+    return {name: imported(path, known) - {name} for name, path in known.items()}
+
+
+def test_every_part_has_a_floor(graph):
+    homeless = {part(name) for name in graph} - {""} - frozenset().union(*FLOORS)
+    assert not homeless, f"say in FLOORS where these stand: {homeless}"
+
+
+def test_imports_run_down(graph):
+    level = {name: k for k, names in enumerate(FLOORS) for name in names}
+    wrong = []
+    for module, others in graph.items():
+        own = part(module)
+        for other in others:
+            if (theirs := part(other)) in (own, "") or own == "":
+                continue
+            if level[theirs] >= level[own] or theirs in NEVER.get(own, ()):
+                wrong.append(f"{module} imports {other}")
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_no_circles_of_files(graph):
+    found = [c for c in circles(graph) if frozenset(c) not in CIRCLES]
+    assert not found, "\n".join(" -> ".join(c) for c in found)
+
+
+def test_the_check_sees_what_it_must(tmp_path):
+    """A lazy import closes a circle; a door and a type-checking import do not; a wrong name is answered."""
+    house = tmp_path / "dexsim"
+    house.mkdir()
+    (house / "a.py").write_text("import dexsim.b\n")
+    (house / "b.py").write_text("def f():\n    from dexsim import c\n")
+    (house / "c.py").write_text("class C:\n    def g(self):\n        from dexsim.a import x\n")
+    (house / "d.py").write_text("from typing import TYPE_CHECKING\nimport dexsim.a\nif TYPE_CHECKING:\n    import dexsim.e\n")
+    (house / "e.py").write_text("import dexsim.d\nif __name__ == '__main__':\n    from dexsim.e import d\n")
+    known = modules(tmp_path)
+    graph = {name: imported(path, known) - {name} for name, path in known.items()}
+    assert graph["dexsim.b"] == {"dexsim.c"} and graph["dexsim.d"] == {"dexsim.a"}
+    assert [set(c) for c in circles(graph)] == [{"dexsim.a", "dexsim.b", "dexsim.c"}]
+    (house / "f.py").write_text("import dexsim.gone\n")
+    with pytest.raises(AssertionError, match="dexsim.gone does not exist"):
+        imported(house / "f.py", known)

@@ -1,0 +1,120 @@
+"""What a stranger installs: the wheel alone, in an environment of its own, from an empty folder outside the repository."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dexsim.cli.main import COMMANDS, dispatch, first_screen
+from dexsim.errors import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_every_command_is_there_and_on_the_first_screen():
+    for name, command in COMMANDS.items():
+        module, _, function = command.where.partition(":")
+        assert callable(getattr(importlib.import_module(module), function))
+        assert f"\n  {name:<15}{command.about}\n" in first_screen()
+    assert all(len(line) <= 120 for line in first_screen().splitlines())
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_help_of_each_command(name, capsys):
+    assert dispatch([name, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert f"dexsim {name}" in said, said.splitlines()[0]
+    assert dispatch(["help", name]) == 0 and capsys.readouterr().out == said
+
+
+def test_what_is_no_command(capsys):
+    with pytest.raises(UserError, match="unknown command 'trian': did you mean train"):
+        dispatch(["trian"])
+    assert dispatch([]) == 2 and capsys.readouterr().out == first_screen()
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The wheel, built from a copy so that nothing is left in the repository."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    shutil.copytree(ROOT / "dexsim", source / "dexsim", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--wheel-dir", out, source]
+    subprocess.run(command, check=True)
+    (made,) = out.glob("dexsim-*.whl")
+    return made
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """The `bin` folder of a fresh environment with this wheel, and the dependencies of the one that runs the tests."""
+    home = tmp_path_factory.mktemp("fresh")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True)
+    python = home / "bin" / "python"
+    subprocess.run([sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel], check=True)
+    ask = [python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"]
+    own = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
+    theirs = sorted({sysconfig.get_paths()[k] for k in ("purelib", "platlib")})
+    (own / "dependencies.pth").write_text("\n".join(theirs) + "\n")  # their .pth files, this checkout among them, are not read
+    return home / "bin"
+
+
+def call(installed: Path, folder: Path, *argv: str | Path) -> str:
+    """What a command of the fresh environment says, run in a folder."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    done = subprocess.run([installed / argv[0], *argv[1:]], cwd=folder, capture_output=True, text=True, timeout=600, env=clean)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_what_commands_read(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    for path in (ROOT / "dexsim").rglob("*"):
+        if path.is_file() and "__pycache__" not in path.parts:
+            assert path.relative_to(ROOT).as_posix() in names
+    assert {n.split("/")[0].partition("-")[0] for n in names} == {"dexsim"}
+
+
+@pytest.mark.slow
+def test_from_an_empty_folder(installed, tmp_path):
+    where = call(installed, tmp_path, "python", "-c", "import dexsim; print(dexsim.__file__)").strip()
+    assert Path(where).is_relative_to(installed.parent), f"{where}: not the wheel"
+    package = Path(where).parent
+    before = {p for p in package.rglob("*") if "__pycache__" not in p.parts}
+    assert call(installed, tmp_path, "dexsim", "--help") == first_screen()
+    assert "task=" in call(installed, tmp_path, "dexsim", "train", "--help")
+
+    said = call(installed, tmp_path, "dexsim", "diagnose", "demo=true")
+    assert "command_delay" in said and "What was hidden" in said
+    assert (tmp_path / "out/demo/report.html").is_file()
+    recording = min((tmp_path / "out/demo/recordings").glob("*.mcap"))
+    assert "states" in call(installed, tmp_path, "python", "-m", "dexsim", "audit", recording)
+
+    said = call(installed, tmp_path, "dexsim", "train", "task=grasp", "device=cpu", "worlds=4", "iterations=1", "final_episodes=0", "run=first")
+    assert "play it:  dexsim play checkpoint=runs/grasp/first/policy.pt" in said
+    assert yaml.safe_load((tmp_path / "runs/grasp/first/config.yaml").read_text())["worlds"] == 4
+    call(installed, tmp_path, "dexsim", "play", "checkpoint=runs/grasp/first/policy.pt", "device=cpu", "worlds=2", "episodes=2", "video=false")
+    assert (tmp_path / "runs/grasp/first/play/metrics.json").is_file()
+    assert {p.name for p in tmp_path.iterdir()} == {"out", "runs"}
+    assert {p for p in package.rglob("*") if "__pycache__" not in p.parts} == before, "a command wrote into the package"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("uvx") is None, reason="uv is not installed")
+def test_uvx_runs_the_wheel(wheel, tmp_path):
+    """No installation at all; uv takes the dependencies from its cache or the network, hence only where DEXSIM_UVX says so."""
+    if not os.environ.get("DEXSIM_UVX"):
+        pytest.skip("set DEXSIM_UVX=1: uv downloads the dependencies")
+    done = subprocess.run(["uvx", "--from", wheel, "dexsim", "diagnose", "demo=true"], cwd=tmp_path, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0 and "What was hidden" in done.stdout, done.stdout + done.stderr
