@@ -80,9 +80,9 @@ def of_contact(force: np.ndarray, local: np.ndarray, block: np.ndarray) -> list[
 
 def played(argv: list[str], worlds: int, seconds: float, seed: int) -> list[Contacts]:
     """Samples of a policy that plays (`of_contact`)."""
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.learning import checkpoint
     from dexsim.learning.ppo import load_policy
+    from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_env
 
     begun = start.for_play([*argv, f"episodes={worlds}", f"worlds={worlds}", f"seed={seed}"], tools.ROOT / "configs")

@@ -113,10 +113,10 @@ def main(argv: list[str]) -> int:
         print(__doc__)
         return 0
     s = settings(argv)
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap import demo
     from dexsim.gap.command import available
     from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.sim.quiet import quiet_warp
 
     asked = s["device"].split(",")
     quiet_warp("cpu" if asked == ["cpu"] else "cuda")

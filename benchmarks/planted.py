@@ -310,8 +310,8 @@ def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:
     """What is left of recordings q [n], simulated in the search's own plant, in times the noise, when all that the
     tool refits with every hypothesis is fitted to the first three: of those or of the last, whichever is less (what only the last shows could
     be known by nobody, what it does not show not be judged). Begun at the values under the effect; none [C]: without it."""
-    from dexsim.gap.search.fit import Fitter, Residuals, expand
     from dexsim.gap.plant.columns import INDEX
+    from dexsim.gap.search.fit import Fitter, Residuals, expand
     from dexsim.gap.search.search import JointSearch
 
     plant = case.plant
@@ -462,8 +462,8 @@ def _one(job: tuple) -> dict:
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    from dexsim.gap.plant import batch as plant
     from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.gap.plant import batch as plant
 
     if s["workers"] > 1:
         plant.THREADS = 1

@@ -47,10 +47,11 @@ def main(argv: list[str]) -> int:
         if not equals or key not in s:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
-    from dexsim.sim.quiet import quiet_warp
-    from dexsim.gap.touch import handed_on as touch_handed, press_rig, touch
+    from dexsim.gap.touch import handed_on as touch_handed
+    from dexsim.gap.touch import press_rig, touch
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     right: dict[str, list[bool]] = {}

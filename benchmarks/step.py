@@ -22,6 +22,7 @@ from benchmarks import tools
 from benchmarks.tape import Tape
 from dexsim.tasks import make_env
 
+
 def main(argv: list[str]) -> dict:
     own, rest = tools.split(argv, {"steps": "", "rounds": "3"})
     cfg = tools.config(rest)

@@ -2,7 +2,7 @@
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -41,7 +41,7 @@ class Tape:
         wp.launch(self._advance, dim=1, inputs=[self._at], device=e.device)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _kernels(real):
     """(record, play, advance) for the engine's scalar type."""
 

@@ -43,10 +43,10 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = _settings(argv)
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording.excitation import Limits, plan, write_plan
     from dexsim.recording.mechanism import mechanism
     from dexsim.recording.schema import numbers
+    from dexsim.sim.quiet import quiet_warp
 
     if not given.get("out"):
         raise UserError("say where to write: out=DIR")

@@ -60,10 +60,10 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
     """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
     from dexsim.calibration.file import Calibration
     from dexsim.console import folders
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.deploy import bundle
     from dexsim.learning import checkpoint as checkpoints
     from dexsim.learning.ppo import load_policy
+    from dexsim.sim.quiet import quiet_warp
 
     data = checkpoints.load(checkpoint)
     task = data["config"]["choices"]["task"]
@@ -110,7 +110,6 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
 def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
     """Inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets before and
     after they were built from and led to, and as many random observations."""
-    import numpy as np
     import torch
 
     from dexsim.deploy import bundle

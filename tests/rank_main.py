@@ -14,6 +14,7 @@ from pathlib import Path
 
 import dummy_task
 import torch
+
 from dexsim.cli import commands, train
 from dexsim.console.ending import guard
 from dexsim.errors import UserError

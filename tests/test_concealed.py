@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.concealed import baselines, effects, generate, page, plant, score, touch
 from benchmarks.concealed import __main__ as command
+from benchmarks.concealed import baselines, effects, generate, page, plant, score, touch
 from dexsim.recording import read
 
 SMOOTH = {"coulomb": 0.0, "viscous": 0.0, "kp": 0.0, "kd": 0.0}

@@ -13,19 +13,19 @@ from bundles import QUIET, make_checkpoint
 from dexsim import export
 from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
-from dexsim.deploy import bundle
 from dexsim.cli.deploy import main as command
+from dexsim.deploy import bundle
 from dexsim.deploy.driver import Clock, HandCommand, HandState, VirtualClock
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.recorder import Recorder
 from dexsim.deploy.replay import ReplayHand
 from dexsim.deploy.safety import Guard
-from dexsim.tasks.simulated_hand import SimulatedXHand, choose_gl
 from dexsim.deploy.timing import Timing
 from dexsim.deploy.vendor import VendorXHand
 from dexsim.deploy.vision import CameraPose, FixedPlace, Frame, Vision, centroid
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
+from dexsim.tasks.simulated_hand import SimulatedXHand, choose_gl
 
 torch.set_num_threads(1)
 

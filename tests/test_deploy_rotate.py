@@ -10,21 +10,20 @@ import torch
 import yaml
 from bundles import QUIET_TURN, make_checkpoint
 
-from dexsim import export
+from dexsim import export, rotation
 from dexsim.calibration.file import Calibration
+from dexsim.cli.deploy import main as command
 from dexsim.deploy import bundle
 from dexsim.deploy import observations_rotate as observations
-from dexsim.cli.deploy import main as command
 from dexsim.deploy.driver import HandState, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.measure import TurnMeasure, for_bundle
 from dexsim.deploy.recorder import GOAL, TURNED
 from dexsim.deploy.replay import ReplayHand
-from dexsim.tasks.simulated_hand import SimulatedXHand
 from dexsim.errors import UserError
 from dexsim.recording.reader import read
-from dexsim import rotation
+from dexsim.tasks.simulated_hand import SimulatedXHand
 
 torch.set_num_threads(1)
 SETTINGS = {

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dexsim.cli import start
-from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.make_grasps import FINGER_OF
+from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
 
 CONFIGS = Path(__file__).parents[1] / "configs"

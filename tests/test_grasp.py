@@ -127,7 +127,7 @@ def test_noise_is_the_actors_alone_and_as_large_as_stated():
     d = []
     for _ in range(6):
         obs, *_ = env.step(torch.zeros(64, 12))
-        d.append((obs["actor"][:, SLICES["joint_angle"]] - obs["critic"][:, SLICES["joint_angle"]]))
+        d.append(obs["actor"][:, SLICES["joint_angle"]] - obs["critic"][:, SLICES["joint_angle"]])
     d = torch.stack(d)
     assert float(d.std()) == pytest.approx(0.003, rel=0.05) and abs(float(d.mean())) < 3e-4
     assert float(torch.corrcoef(torch.stack([d[0].ravel(), d[1].ravel()]))[0, 1]) < 0.15, "fresh each step"

@@ -20,7 +20,7 @@ import torch
 import yaml
 from bundles import make_checkpoint
 from shell import call, configs
-from test_learning import config, runner
+from test_learning import runner
 
 from dexsim import export, yaml_text
 from dexsim.errors import UserError
@@ -375,7 +375,7 @@ def test_a_part_of_the_wrong_kind_is_named(payload, tmp_path, part, value):
 
 def edits():
     nan, inf = float("nan"), float("inf")
-    for key, value in (
+    yield from (
         ("policy", None), ("policy", "x"), ("policy.sha256", 1), ("policy.observation_size", "66"), ("policy.observation_size", 67), ("policy.action_size", 5),
         ("policy.input", "other"), ("policy.output", None), ("observation", {}), ("observation", []), ("observation.0.start", 3), ("observation.0", None),
         ("joints", None), ("joints", ["a"]), ("fingers", "thumb"), ("action", []), ("action.mode", "fast"), ("action.scale", nan), ("action.scale", "0.1"),
@@ -385,8 +385,7 @@ def edits():
         ("normalization.force_max_N", None), ("normalization.force_max_N", 0), ("initial_pose.4", 9.0), ("initial_pose", "open"), ("golden.tolerance", "x"),
         ("golden", None), ("task", "walk"), ("task", ["grasp"]), ("calibration", 3), ("calibration.touch", "x"), ("versions", 1),
         ("servo", []), ("task", "rotate"), ("version", "1"), ("format", None),
-    ):
-        yield key, value
+    )
 
 
 @pytest.mark.parametrize("key, value", list(edits()))

@@ -222,8 +222,8 @@ def test_a_fingertip_pressed_by_another_is_told(tmp_path):
 def test_presses_are_the_realitys_sensor(tmp_path):
     """A few presses: whole counts, later than the load cell by the reality's delay or a little more, no finger but the one pressed."""
     from benchmarks.loop import presses
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording import read
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     world = yaml.safe_load((ROOT / "configs" / "reality" / "late.yaml").read_text(encoding="utf-8"))

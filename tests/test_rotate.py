@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from dexsim import rotation
 from dexsim.cli import start
 from dexsim.errors import UserError
-from dexsim import rotation
 from dexsim.tasks import make_env
+from dexsim.tasks.make_grasps import DRIFT
 from dexsim.tasks.rotate import ACTOR_SIZE, CRITIC_SIZE
 from dexsim.tasks.rotate_eval import summary
-from dexsim.tasks.make_grasps import DRIFT
 from dexsim.tasks.stable_grasps import DEFAULT, GraspSet
 
 torch.set_num_threads(1)

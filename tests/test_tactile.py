@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from tactile_fixtures import SPRING, flat_layout, primitives, random_rotation, touch
 
 from dexsim.assets import xhand
 from dexsim.assets.objects import Grid, library
@@ -21,7 +22,6 @@ from dexsim.tactile.lanes import lane_ballot, lane_from, lanes_min, lanes_sum, l
 from dexsim.tactile.pressing import presses, skin_of
 from dexsim.tactile.sdf import Shapes, distance, normal
 from dexsim.tactile.shapes import TouchShape, bake_convex
-from tactile_fixtures import SPRING, flat_layout, primitives, random_rotation, touch
 
 SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0, 0), "capsule": (0.019, 0.011, 0), "cylinder": (0.02, 0.03, 0)}
 
@@ -409,8 +409,9 @@ def test_fingers_feel_each_other_apart_from_the_object():
 
 def test_several_objects_add_up():
     layout = flat_layout(n=21)
-    from dexsim.tactile import Tactile
     from tactile_fixtures import PosedEngine
+
+    from dexsim.tactile import Tactile
 
     engine = PosedEngine(1, ["pad", "a", "b"], ["pa", "pb"])
     for cfg, want in ((SPRING, None), ({"sum": "solver"}, 5.0)):

@@ -66,8 +66,8 @@ def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> 
 
 def record(given: dict[str, str]) -> None:
     """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are led by hand)."""
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.touch.press_rig import SERVO
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
@@ -214,9 +214,9 @@ def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target
 def pinch(given: dict[str, str]) -> None:
     """Writes a recording of the index's fingertip pressed by the thumb's: whether a fingertip feels another."""
     from dexsim.assets import xhand
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording import write
     from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, TACTILE, Recording, Series, States
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))

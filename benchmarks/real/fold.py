@@ -11,8 +11,8 @@ from typing import Any
 def fold(job: tuple[Path, Path, int]) -> dict:
     """One gain of BAM left out: fitted on the other three, judged on its four recordings."""
     from benchmarks.real.convert_bam import convert
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.sim.quiet import quiet_warp
 
     data, out, gain = job
     quiet_warp("cpu")
@@ -32,8 +32,8 @@ def fold(job: tuple[Path, Path, int]) -> dict:
 
 def joint(job: tuple[Any, Path, str]) -> dict:
     """One joint of SAGE: fitted on the motions to fit, judged on those held out."""
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.sim.quiet import quiet_warp
 
     made, out, name = job
     quiet_warp("cpu")

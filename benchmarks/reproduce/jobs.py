@@ -11,9 +11,9 @@ import json
 import math
 import os
 import queue
-import subprocess
 import shutil
 import statistics
+import subprocess
 import sys
 import threading
 import time

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-
 SPIN = "task.rewards.spin=0.01"
 """A term beyond the paper's reward that every row of the rotation but `paper_reward` was trained with: it was the default when the
 tables were made, and what has been trained goes on with the settings that it began with. A setting given to

@@ -87,10 +87,10 @@ def run(play: dict[str, Any]) -> int:
     video.mp4."""
     import yaml
 
-    from dexsim.sim.quiet import quiet_warp
     from dexsim.recording import audit, compare, led_object, mechanism
     from dexsim.recording.reader import read
     from dexsim.recording.writer import write
+    from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
     path = Path(play["replay"]).expanduser()

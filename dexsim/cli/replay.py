@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from dexsim.console.ticker import Ticker
 from dexsim.console.tables import table
+from dexsim.console.ticker import Ticker
 from dexsim.learning.ppo import Policy
 
 

@@ -13,9 +13,9 @@ from typing import Any
 from dexsim.cli import build, folder, machine
 from dexsim.cli.console import TrainingLines
 from dexsim.cli.replay import replay
+from dexsim.cli.start import Start
 from dexsim.console import program
 from dexsim.console.tables import count, duration
-from dexsim.cli.start import Start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ranks import Ranks

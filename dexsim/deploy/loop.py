@@ -21,11 +21,11 @@ from dexsim.calibration.file import Calibration
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState
+from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.measure import ORIENTATION, for_bundle
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
-from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.vision import HeightSource
 from dexsim.errors import UserError
 

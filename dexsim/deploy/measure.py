@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from dexsim import rotation
 from dexsim.calibration.file import Calibration
 from dexsim.deploy import observations, observations_rotate
 from dexsim.deploy.driver import HandState
 from dexsim.deploy.kinematics import HandKinematics
-from dexsim import rotation
 
 PLACE, ORIENTATION = "place", "orientation"
 """What a policy needs to know of the object, beside what the hand reads."""

@@ -4,7 +4,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from dexsim.sim.scene import OBJECT
 SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 
-@lru_cache(maxsize=None)
+@cache
 def copy_kernel(real):
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
     object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph."""

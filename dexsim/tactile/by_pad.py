@@ -17,7 +17,18 @@ import warp as wp
 
 from dexsim.errors import UserError
 from dexsim.tactile.config import TactileConfig
-from dexsim.tactile.kernel import LAWS, MAX_STRAIN, Law, Pads, pose_in, spread_level, spread_weight, taxel_force, turn_in, xyz
+from dexsim.tactile.kernel import (
+    LAWS,
+    MAX_STRAIN,
+    Law,
+    Pads,
+    pose_in,
+    spread_level,
+    spread_weight,
+    taxel_force,
+    turn_in,
+    xyz,
+)
 from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import NEVER, counts, relax, rubber_force
 from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from dexsim import rotation
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.deploy import observations
 from dexsim.deploy.observations import ACTOR_SIZE, OBSERVATION
 from dexsim.errors import UserError
 from dexsim.tactile.clearance import Clearance
-from dexsim import rotation
 from dexsim.tasks import terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press

@@ -14,12 +14,12 @@ import math
 
 import torch
 
+from dexsim import rotation
 from dexsim.assets import xhand
 from dexsim.deploy import observations_rotate as observations
 from dexsim.deploy.observations_rotate import ACTOR, ORIENTATION
 from dexsim.errors import UserError
 from dexsim.tactile.layout import xhand_layout
-from dexsim import rotation
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
 from dexsim.tasks.stable_grasps import GraspSet
