@@ -1,4 +1,4 @@
-"""Find what the simulator left out: python diagnose.py [key=value ...], the same as `dexsim diagnose`; --help lists the settings."""
+"""Find what the simulator leaves out: python diagnose.py [key=value ...], the same as `dexsim diagnose`; see --help."""
 
 import sys
 

@@ -30,7 +30,7 @@ settings (key=default):
   repeats=1         motions of each group of joints that come twice
   speed=0.6         largest joint speed, over the no-load speed
   torque=0.8        largest motor torque, over the stall torque
-  current=          A that no motor may draw, e.g. 0.3 for a firmware limit of 300 mA (by the servo's current_per_torque)
+  current=          A that no motor may draw, e.g. 0.3 for a firmware limit of 300 mA (by current_per_torque)
   margin=0.05       share of each joint's range kept free at both ends
   clearance=0.002   m between bodies that are not neighbours
   gravity=          in the model's frame, e.g. gravity="0 0 -9.81": how the hand is mounted (default: the model's)
@@ -53,7 +53,9 @@ def main(argv: Sequence[str]) -> int:
     quiet_warp("cpu")
     gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
     m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity)
-    limits = Limits(**{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)})
+    limits = Limits(
+        **{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
+    )
     start = time.perf_counter()
     p = plan(
         m,

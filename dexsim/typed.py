@@ -1,4 +1,5 @@
-"""Data of files against a declared type (msgspec): what does not fit is said in one line, with the place in the file."""
+"""Data of files against a declared type (msgspec): what does not fit is said in one line, with the place in the
+file."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
-    """`data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is there and what must be.
+    """`data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is there and
+    what must be.
 
     fix: what to do about it, appended. Instances of classes that `kind` names (tensors) pass as they are.
     """

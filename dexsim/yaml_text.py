@@ -1,4 +1,5 @@
-"""YAML that strangers wrote, read within limits: plain data only, and neither size, depth nor aliases can hang or fill the machine."""
+"""YAML that strangers wrote, read within limits: plain data only, and neither size, depth nor aliases can hang or fill
+the machine."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         self.depth += 1
         if self.depth > MOST_DEPTH:
-            raise yaml.MarkedYAMLError(problem=f"nested more than {MOST_DEPTH} deep", problem_mark=self.peek_event().start_mark)
+            raise yaml.MarkedYAMLError(
+                problem=f"nested more than {MOST_DEPTH} deep", problem_mark=self.peek_event().start_mark
+            )
         try:
             return super().compose_node(parent, index)
         finally:
@@ -30,8 +33,9 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse(text: str | bytes, source: object) -> Any:
-    """The plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the limit that was passed:
-    size, depth, number of values (aliases expanded), merge keys (<<), a node that holds itself, tags of Python objects."""
+    """The plain data of a YAML text. Raises UserError naming `source`, the line where there is one, and the limit that
+    was passed: size, depth, number of values (aliases expanded), merge keys (<<), a node that holds itself, tags of
+    Python objects."""
     if len(text) > MOST_BYTES:
         raise UserError(f"{source}: {len(text) / 2**20:.1f} MiB of YAML, allowed {MOST_BYTES >> 20} MiB")
     loader = None
@@ -56,14 +60,18 @@ def _count(node: yaml.Node, source: object, known: dict[int, int], open_: set[in
     if id(node) in known:
         return known[id(node)]
     if id(node) in open_:
-        raise UserError(f"{source}: line {node.start_mark.line + 1}: a value holds itself (an alias inside its own anchor)")
+        raise UserError(
+            f"{source}: line {node.start_mark.line + 1}: a value holds itself (an alias inside its own anchor)"
+        )
     total = 1
     if isinstance(node, (yaml.MappingNode, yaml.SequenceNode)):
         open_.add(id(node))
         for inner in node.value:
             for child in inner if isinstance(inner, tuple) else (inner,):
                 if child.tag == "tag:yaml.org,2002:merge":
-                    raise UserError(f"{source}: line {child.start_mark.line + 1}: merge keys (<<) are not read; write the values out")
+                    raise UserError(
+                        f"{source}: line {child.start_mark.line + 1}: merge keys (<<) are not read; write values out"
+                    )
                 total += _count(child, source, known, open_)
         open_.discard(id(node))
     if total > MOST_NODES:

@@ -25,9 +25,10 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
         from dexsim.tasks import make_env
     where = cfg["device"]
     print(versions_line())
-    facts = {"device": f"{machine.describe(where)}, memory {machine.memory(where)}",
-             "task": f"{cfg['choices']['task']}, {cfg['worlds']} worlds, engine {cfg['sim']['engine']},"
-                     f" seed {cfg['seed']}"} | facts
+    facts = {
+        "device": f"{machine.describe(where)}, memory {machine.memory(where)}",
+        "task": f"{cfg['choices']['task']}, {cfg['worlds']} worlds, engine {cfg['sim']['engine']}, seed {cfg['seed']}",
+    } | facts
     for name, value in facts.items():
         print(f"{name:<8} {value}")
     seed_all(cfg["seed"])

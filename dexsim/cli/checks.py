@@ -47,8 +47,10 @@ def check(cfg: dict[str, Any]) -> None:
             _number(key, value, low, high, whole)
     step, period = get(cfg, "sim.timestep"), get(cfg, "sim.control_period")
     if step and period and (period < step or abs(period / step - round(period / step)) > 1e-6):
-        raise UserError(f"sim.control_period={period}: must be a multiple of sim.timestep={step}, e.g."
-                        f" {max(round(period / step), 1) * step:g}")
+        raise UserError(
+            f"sim.control_period={period}: must be a multiple of sim.timestep={step}, e.g."
+            f" {max(round(period / step), 1) * step:g}"
+        )
     for key in ("agent.actor.hidden_dims", "agent.critic.hidden_dims"):
         sizes = get(cfg, key)
         if sizes is not None and (not isinstance(sizes, list) or not sizes or not all(_whole(s, 1) for s in sizes)):
@@ -56,8 +58,10 @@ def check(cfg: dict[str, Any]) -> None:
     worlds, steps = cfg.get("worlds"), get(cfg, "agent.num_steps_per_env")
     batches = get(cfg, "agent.algorithm.num_mini_batches")
     if worlds and steps and batches and worlds * steps < 2 * batches:
-        raise UserError(f"agent.algorithm.num_mini_batches={batches}: {worlds} worlds x {steps} steps are too few samples;"
-                        " raise worlds or agent.num_steps_per_env")
+        raise UserError(
+            f"agent.algorithm.num_mini_batches={batches}: {worlds} worlds x {steps} steps are too few samples;"
+            " raise worlds or agent.num_steps_per_env"
+        )
 
 
 def _number(key: str, value: Any, low: float, high: float, whole: bool) -> None:

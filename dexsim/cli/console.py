@@ -31,9 +31,14 @@ class TrainingLines:
         if now - self._printed < 1.0 and it not in (self._first + 1, self._total):
             return
         self._printed = now
-        parts = [f"{it:>{len(str(self._total))}}/{self._total}", f"{count(row['steps']):>5} steps",
-                 f"{count(row['rate']):>5}/s", f"reward {cell(self._seen.get('reward')):>6}",
-                 f"length {cell(self._seen.get('length')):>5}"]
-        parts += [f"{name.rpartition('/')[2]} {cell(self._seen.get(name))}" for name in self._headline
-                  if name in self._seen]
+        parts = [
+            f"{it:>{len(str(self._total))}}/{self._total}",
+            f"{count(row['steps']):>5} steps",
+            f"{count(row['rate']):>5}/s",
+            f"reward {cell(self._seen.get('reward')):>6}",
+            f"length {cell(self._seen.get('length')):>5}",
+        ]
+        parts += [
+            f"{name.rpartition('/')[2]} {cell(self._seen.get(name))}" for name in self._headline if name in self._seen
+        ]
         print("  ".join([*parts, f"{duration(self._each * (self._total - it))} left"]), flush=True)

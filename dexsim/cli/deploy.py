@@ -64,12 +64,16 @@ def main(argv: Sequence[str]) -> int:
                    else Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base))  # fmt: skip
     settings = LoopSettings(**changes)
     if "command" in changes and b.manifest["task"] != "grasp":
-        raise UserError(f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force")
+        raise UserError(
+            f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force"
+        )
     driver, eye = _hand(given, b, calibration)
     for text in calibration.assumed:
         print(f"note     {text}")
     recorder = _recorder(given, b, settings, calibration)
-    print(f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g} Hz")
+    print(
+        f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g} Hz"
+    )
     print(f"driver   {driver.name}; starting ...", flush=True)
     loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
 
@@ -95,6 +99,7 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
     import numpy as np
 
     from dexsim.deploy.vision import FixedPlace
+
     kind, task = given.get("driver", "sim"), b.manifest["task"]
     for key in ("vision", "place", "shape") if task == "rotate" else ("imu",):
         if key in given:
@@ -133,8 +138,10 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
         if task == "rotate":
             return VendorXHand(given["port"]), _imu(given, b)
         if place is None:
-            raise UserError("driver=xhand: nothing sees the object; state place=\"x y z\" [m, palm frame], or run the Loop with your own"
-                            " HeightSource (dexsim.deploy.vision)")
+            raise UserError(
+                'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your own'
+                " HeightSource (dexsim.deploy.vision)"
+            )
         return VendorXHand(given["port"]), place
     raise UserError(f"driver={kind}: must be sim or xhand")
 
@@ -147,11 +154,15 @@ def _imu(given: dict[str, str], b: Any) -> Any:
         return None
     how, _, port = given.get("imu", "").partition(":")
     if how != "udp" or not port.isdigit():
-        raise UserError(f"imu={given.get('imu', '')}: nothing says how the object is turned; say imu=udp:PORT and send lines \"w x y z\" there, or run"
-                        " the Loop with your own OrientationSource (dexsim.deploy.imu)")
+        raise UserError(
+            f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y z" there, or run'
+            " the Loop with your own OrientationSource (dexsim.deploy.imu)"
+        )
     imu = UdpImu(int(port))
     if not imu.wait(5.0):
-        raise UserError(f"imu=udp:{port}: no orientation came within 5 s; send lines of text \"w x y z\" to 127.0.0.1:{port}")
+        raise UserError(
+            f'imu=udp:{port}: no orientation came within 5 s; send lines of text "w x y z" to 127.0.0.1:{port}'
+        )
     return imu
 
 
@@ -198,5 +209,7 @@ def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
                 if not 0 <= changes[key] < float("inf"):
                     raise ValueError
         except (ValueError, KeyError):
-            raise UserError(f"{key}={value}: must be {'true or false' if 'bool' in fields[key] else 'a number of at least 0'}") from None
+            raise UserError(
+                f"{key}={value}: must be {'true or false' if 'bool' in fields[key] else 'a number of at least 0'}"
+            ) from None
     return given, changes

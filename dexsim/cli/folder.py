@@ -43,8 +43,11 @@ class ProgressFile:
         self._names: list[str] = []
         if earlier is not None and earlier.is_file():  # a resumed run's past
             with open(earlier, newline="") as file:
-                rows = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)
-                        if int(row["iteration"]) <= until]
+                rows = [
+                    {k: v for k, v in row.items() if v}
+                    for row in csv.DictReader(file)
+                    if int(row["iteration"]) <= until
+                ]
             self._names = list(dict.fromkeys(k for row in rows for k in row))
             self._write(rows)
 

@@ -18,7 +18,7 @@ examples:
   dexsim train servo=ideal agent.algorithm.learning_rate=5e-4
   dexsim train resume=runs/grasp/<run>/last.pt iterations=2000
   dexsim train --multirun seed=1,2,3 servo=xhand,ideal   every combination, one run each (docs/howto/gpus.md)
-  torchrun --nproc_per_node=8 -m dexsim train task=grasp    one run on eight GPUs, worlds= for each of them (docs/howto/gpus.md)
+  torchrun --nproc_per_node=8 -m dexsim train task=grasp    eight GPUs, worlds= for each (docs/howto/gpus.md)
 """
 PLAY = """usage: dexsim play checkpoint=PATH [key=value ...]
        dexsim play policy=random|zero|scripted task=grasp [key=value ...]

@@ -33,7 +33,11 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     view = LiveView(env, policy, name, choices, load, host, port)
     print(f"view     http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{view.port}   (Ctrl-C ends)")
     if host == "127.0.0.1":
-        print(f"         from another machine: ssh -L {view.port}:localhost:{view.port} THIS_MACHINE, then the same address there", flush=True)
+        print(
+            f"         from another machine: ssh -L {view.port}:localhost:{view.port} THIS_MACHINE,"
+            " then the same address there",
+            flush=True,
+        )
     try:
         view.run()
     except KeyboardInterrupt:

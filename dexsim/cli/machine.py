@@ -24,8 +24,10 @@ def device(asked: str | None) -> str:
         return "cpu"
     if name == "cuda" and (not index or index.isdigit()):
         if not count:
-            raise UserError(f"device={asked}: torch {torch.__version__} sees no CUDA device here; use device=cpu"
-                            " (or check nvidia-smi and that torch is a CUDA build)")
+            raise UserError(
+                f"device={asked}: torch {torch.__version__} sees no CUDA device here; use device=cpu"
+                " (or check nvidia-smi and that torch is a CUDA build)"
+            )
         if int(index or 0) >= count:
             raise UserError(f"device={asked}: this machine has {count} CUDA device(s), cuda:0 to cuda:{count - 1}")
         return f"cuda:{int(index or 0)}"
@@ -38,9 +40,9 @@ def cuda_devices() -> int:
 
 
 def set_threads(where: str) -> None:
-    """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread pool
-    of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds took
-    150 to 480 ms with two, 37 to 75 with one: docs/results/speed.md)."""
+    """One torch thread on the CPU, unless OMP_NUM_THREADS says otherwise: batches are small and C MuJoCo has a thread
+    pool of its own, so torch's threads would mostly wait for each other (on two busy cores a control step of 256 worlds
+    took 150 to 480 ms with two, 37 to 75 with one: docs/results/speed.md)."""
     if where == "cpu" and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
 

@@ -22,7 +22,9 @@ class Command:
 
 COMMANDS: dict[str, Command] = {
     "train": Command("dexsim.cli.commands:train", "train a policy in many simulated worlds at once"),
-    "play": Command("dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"),
+    "play": Command(
+        "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
+    ),
     "diagnose": Command("dexsim.gap.command:main", "find the physics that the simulator leaves out of your recordings"),
     "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),

@@ -25,8 +25,13 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if start.data is not None:
         checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))
         policy = load_policy(start.data, env, str(start.source), start.typed)
-        about = {"checkpoint": str(start.source), "iteration": start.data["iteration"], "git": start.data["git"],
-                 "trained_with": start.data["versions"], "versions": machine.versions()}
+        about = {
+            "checkpoint": str(start.source),
+            "iteration": start.data["iteration"],
+            "git": start.data["git"],
+            "trained_with": start.data["versions"],
+            "versions": machine.versions(),
+        }
     else:
         policy = plain_policy(str(play["policy"]), env, cfg["seed"])
         about = {"policy": play["policy"], "versions": machine.versions()}

@@ -10,13 +10,25 @@ from dexsim.cli import folder
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
-KEYS = ("replay", "model", "servo", "servo_file", "out", "video", "timestep", "object", "object_size", "object_mass", "object_friction")
+KEYS = (
+    "replay",
+    "model",
+    "servo",
+    "servo_file",
+    "out",
+    "video",
+    "timestep",
+    "object",
+    "object_size",
+    "object_mass",
+    "object_friction",
+)
 USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
-    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "object": a
-    `led_object.Stated` or None, "remap", "meta"}."""
+    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "object":
+    a `led_object.Stated` or None, "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments
 
     own: dict[str, str] = {}
@@ -75,7 +87,10 @@ def _object(own: dict[str, str]) -> Any:
             numbers = ()
         low, high = {"object_size": (1e-3, 1.0), "object_mass": (1e-4, 10.0), "object_friction": (0.01, 5.0)}[key]
         if not numbers or not all(low <= x <= high for x in numbers) or (key != "object_size" and len(numbers) > 1):
-            raise UserError(f"{key}={own[key]}: must be {'numbers' if key == 'object_size' else 'a number'} from {low:g} to {high:g}")
+            raise UserError(
+                f"{key}={own[key]}: must be {'numbers' if key == 'object_size' else 'a number'}"
+                f" from {low:g} to {high:g}"
+            )
         values[key.removeprefix("object_")] = numbers if key == "object_size" else numbers[0]
     stated = Stated(own["object"], **values)
     stated.about()  # answers what is impossible
@@ -106,12 +121,19 @@ def run(play: dict[str, Any]) -> int:
     placed = led_object.add_object(m, recording, play["object"])
     led = placed == "led"
     if play["object"] is not None and not led:
-        raise UserError(f"object={play['object'].shape}: recording {path} has no /object_pose in the palm frame for it, or model= is not the xHand")
+        raise UserError(
+            f"object={play['object'].shape}: recording {path} has no /object_pose in the palm frame"
+            " for it, or model= is not the xHand"
+        )
     out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
     print(
         f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
-        + {"led": ", the object led along its recorded path", "none": "",
-           "marked": ", the object marked by a ball that nothing feels: say its shape with object=box object_size=0.05,0.05,0.05"}[placed],  # fmt: skip
+        + {
+            "led": ", the object led along its recorded path",
+            "none": "",
+            "marked": ", the object marked by a ball that nothing feels: say its shape with"
+            " object=box object_size=0.05,0.05,0.05",
+        }[placed],  # fmt: skip
         flush=True,
     )
     result = mechanism.replay(

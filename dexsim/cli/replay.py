@@ -14,8 +14,9 @@ from dexsim.console.ticker import Ticker
 from dexsim.learning.ppo import Policy
 
 
-def replay(env: Any, policy: Policy, out: Path, episodes: int, seed: int, video: bool,
-           about: dict[str, Any]) -> dict[str, Any]:
+def replay(
+    env: Any, policy: Policy, out: Path, episodes: int, seed: int, video: bool, about: dict[str, Any]
+) -> dict[str, Any]:
     """Play and write ``metrics.json``, PNG plots and ``video.mp4`` into ``out``; returns the metrics.
 
     Args:
@@ -45,8 +46,15 @@ def _video(env: Any, frames: dict[str, Any], path: Path) -> None:
     from dexsim.view.video import NoRenderer, clips_of, render
 
     try:
-        render(clips_of(frames), path, float(frames.get("dt", env.dt)), frames.get("names", ()),
-               float(frames.get("full", 10.0)), camera=frames.get("camera"), progress=Ticker("frames"))
+        render(
+            clips_of(frames),
+            path,
+            float(frames.get("dt", env.dt)),
+            frames.get("names", ()),
+            float(frames.get("full", 10.0)),
+            camera=frames.get("camera"),
+            progress=Ticker("frames"),
+        )
         print(f"video    {path}")
     except NoRenderer as error:  # the metrics stand without it
         print(error)

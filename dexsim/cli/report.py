@@ -15,7 +15,8 @@ def versions_line() -> str:
 
 
 def describe_env(tables: dict[str, Any]) -> str:
-    """The tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization; then its notes."""
+    """The tables of ``env.describe()``: observations by group, action, rewards, terminations, randomization; then its
+    notes."""
     parts = []
     for group, rows in tables.get("observations", {}).items():
         total = sum(int(row[1]) for row in rows)

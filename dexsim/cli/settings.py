@@ -54,10 +54,13 @@ def parse(argv: list[str], config_dir: Path) -> Request:
             item = parser.parse_override(text)
         except HydraException:
             key, _, value = text.partition("=")
-            raise UserError(f"cannot read {text!r}: a value with special characters needs quotes, {key}='\"{value}\"'"
-                            " in a shell") from None
+            raise UserError(
+                f"cannot read {text!r}: a value with special characters needs quotes, {key}='\"{value}\"' in a shell"
+            ) from None
         if item.is_sweep_override():
-            raise UserError(f"{text!r} gives several values: one run takes one value for each setting (--multirun runs them all)")
+            raise UserError(
+                f"{text!r} gives several values: one run takes one value for each setting (--multirun runs them all)"
+            )
         if item.key_or_group in known and item.type == OverrideType.CHANGE:
             request.choices[item.key_or_group] = _option(item, known[item.key_or_group])
         else:
@@ -176,16 +179,23 @@ def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
         inside = isinstance(node, ListConfig) and part.isdigit() and int(part) < len(node)
         if not inside and not (isinstance(node, DictConfig) and part in node):
             where = ".".join(parts[:depth])
-            names = [f"{where}.{k}" if where else str(k) for k in node if k != "choices"] if isinstance(node, DictConfig) else []
-            valid = f"{where or 'the settings'} {'has' if where else 'are'}: {', '.join(names)}" if names else \
-                f"{where} is a single value"
+            names = (
+                [f"{where}.{k}" if where else str(k) for k in node if k != "choices"]
+                if isinstance(node, DictConfig)
+                else []
+            )
+            valid = (
+                f"{where or 'the settings'} {'has' if where else 'are'}: {', '.join(names)}"
+                if names
+                else f"{where} is a single value"
+            )
             everything = _every_key(cfg)
             raise UserError(f"unknown setting {key!r}{_guess(key, everything)}; {valid}")
         if depth == len(parts) - 1:
             return node
         node = node[int(part) if isinstance(node, ListConfig) else part]
         if not isinstance(node, (DictConfig, ListConfig)):
-            raise UserError(f"unknown setting {key!r}: {'.'.join(parts[:depth + 1])} is a single value")
+            raise UserError(f"unknown setting {key!r}: {'.'.join(parts[: depth + 1])} is a single value")
     raise AssertionError("unreachable")
 
 

@@ -14,8 +14,8 @@ from dexsim.paths import CONFIGS
 
 USAGE = """usage: dexsim stable-grasps [key=value ...]
 
-Let cubes fall into half-open hands, close the fingers, and keep the poses that hold in worlds with other mass, friction and
-drives. Rotation episodes start from them: dexsim train task=rotate task.initial.poses=FILE
+Let cubes fall into half-open hands, close the fingers, and keep the poses that hold in worlds with other mass,
+friction and drives. Rotation episodes start from them: dexsim train task=rotate task.initial.poses=FILE
 
 settings (key=default):
   out=out/stable_grasps.npz   file to write
@@ -32,7 +32,13 @@ def main(argv: list[str]) -> int:
     if any(a in ("-h", "--help", "help") for a in argv):
         print(USAGE, end="")
         return 0
-    own: dict[str, Any] = {"out": "out/stable_grasps.npz", "count": 2000, "worlds": 256, "seed": 0, "sizes": [0.045, 0.06]}
+    own: dict[str, Any] = {
+        "out": "out/stable_grasps.npz",
+        "count": 2000,
+        "worlds": 256,
+        "seed": 0,
+        "sizes": [0.045, 0.06],
+    }
     rest = []
     for text in argv:
         key, eq, value = text.partition("=")

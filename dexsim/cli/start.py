@@ -57,7 +57,9 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     plain = _finish(cfg, device)
     kind = device.partition(":")[0]
     if _another_world(plain):
-        raise UserError(f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py")
+        raise UserError(
+            f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py"
+        )
     plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
     plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
     checks.check(plain)
@@ -81,7 +83,9 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     request.values = [item for item in request.values if item.key_or_group not in own]
     play = settings.resolve(own)
     if (play["checkpoint"] is None) == (play["policy"] is None):
-        raise UserError("say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE")
+        raise UserError(
+            "say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE"
+        )
     if play["policy"] not in (None, "random", "zero", "scripted"):
         raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
@@ -103,7 +107,11 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
     plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
     checks.check(plain | {"agent": {}})
-    return None if only_show and _show(plain | play) else Start(plain, play, play["checkpoint"], data, settings.typed(request))
+    return (
+        None
+        if only_show and _show(plain | play)
+        else Start(plain, play, play["checkpoint"], data, settings.typed(request))
+    )
 
 
 def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | None, bool]:
@@ -112,7 +120,9 @@ def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | 
         print(help_page.text(script, config_dir), end="")
         return None, False
     if script == "play" and not argv:
-        raise UserError("say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE (--help)")
+        raise UserError(
+            "say what to play: checkpoint=PATH, policy=random|zero|scripted with task=<name>, or replay=FILE (--help)"
+        )
     return [a for a in argv if a != "--cfg"], "--cfg" in argv
 
 
@@ -137,8 +147,9 @@ def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
     return settings.override(_files(cfg, request), request.values)
 
 
-def _from_checkpoint(data: dict[str, Any], config_dir: Path, request: settings.Request,
-                     fresh: dict[str, Any]) -> DictConfig:
+def _from_checkpoint(
+    data: dict[str, Any], config_dir: Path, request: settings.Request, fresh: dict[str, Any]
+) -> DictConfig:
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
     own = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
     cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
@@ -179,7 +190,9 @@ def _another_world(plain: dict[str, Any]) -> bool:
 def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
     """The config of another world (`reality=`), on the CPU, all its trials at once: C MuJoCo has a thread pool."""
     if str(play["device"] or "cpu") != "cpu":
-        raise UserError(f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu")
+        raise UserError(
+            f"device={play['device']}: reality={plain['reality']['name']} is stepped by C MuJoCo; use device=cpu"
+        )
     play["device"] = plain["device"] = "cpu"
     if play["view"]:
         play["worlds"] = play["worlds"] or VIEW_WORLDS
@@ -191,8 +204,8 @@ def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
 
 
 def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
-    """Put the content of the user's files into ``servo``, ``tactile`` and ``randomize``, so that overrides reach it and a checkpoint
-    carries it."""
+    """Put the content of the user's files into ``servo``, ``tactile`` and ``randomize``, so that overrides reach it and
+    a checkpoint carries it."""
     servo, tactile = _last(request, "servo_file"), _last(request, "tactile_file")
     OmegaConf.set_struct(cfg, False)
     if servo is not None:

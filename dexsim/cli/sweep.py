@@ -1,7 +1,9 @@
-"""Several runs from one command, through Hydra's sweeper and launcher: dexsim train --multirun seed=1,2,3 servo=xhand,ideal.
+"""Several runs from one command, through Hydra's sweeper and launcher: dexsim train --multirun seed=1,2,3
+servo=xhand,ideal.
 
-Hydra expands the lists into jobs and hands them to its launcher; each job is `dexsim train` again, in a process of its own. The basic
-launcher runs them one after the other; a launcher plugin (hydra/launcher=joblib, submitit_slurm, ...) runs them as it does.
+Hydra expands the lists into jobs and hands them to its launcher; each job is `dexsim train` again, in a process of its
+own. The basic launcher runs them one after the other; a launcher plugin (hydra/launcher=joblib, submitit_slurm, ...)
+runs them as it does.
 """
 
 from __future__ import annotations
@@ -31,20 +33,33 @@ def wanted(argv: list[str]) -> bool:
 def run(argv: list[str], config_dir: Path, command: Sequence[str] = COMMAND) -> int:
     """Run all jobs; returns 0 when all ended with 0, else 1. Raises UserError for what Hydra refuses.
 
-    Each job's run folder is `<sweep>/<number>`; the sweep folder is runs/<task>/sweep_<date and time>, or `sweep=FOLDER`.
+    Each job's run folder is `<sweep>/<number>`; the sweep folder is runs/<task>/sweep_<date and time>, or
+    `sweep=FOLDER`.
     """
     argv = [a for a in argv if a not in FLAGS]
     for name in ("out", "run"):
         if any(a.startswith(f"{name}=") for a in argv):
-            raise UserError(f"{name}=: a sweep names its run folders itself, <sweep>/<number>; choose the place with sweep=FOLDER")
+            raise UserError(
+                f"{name}=: a sweep names its run folders itself, <sweep>/<number>; choose the place with sweep=FOLDER"
+            )
     given = [a.partition("=")[2] for a in argv if a.startswith("sweep=")]
     argv = [a for a in argv if not a.startswith("sweep=")]
     task = next((a.partition("=")[2] for a in reversed(argv) if a.startswith("task=")), "grasp").replace(",", "_")
-    folder = Path(given[-1] if given else Path("runs") / task / time.strftime("sweep_%Y-%m-%d_%H-%M-%S")).expanduser().resolve()
+    folder = (
+        Path(given[-1] if given else Path("runs") / task / time.strftime("sweep_%Y-%m-%d_%H-%M-%S"))
+        .expanduser()
+        .resolve()
+    )
     if folder.exists() and any(folder.iterdir()):
         raise UserError(f"{folder} already holds a sweep: choose another sweep=")
-    places = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${hydra.job.num}", "hydra.output_subdir=null", "hydra.job.chdir=false",
-              "hydra/job_logging=disabled", "hydra/hydra_logging=none"]
+    places = [
+        f"hydra.sweep.dir={folder}",
+        "hydra.sweep.subdir=${hydra.job.num}",
+        "hydra.output_subdir=null",
+        "hydra.job.chdir=false",
+        "hydra/job_logging=disabled",
+        "hydra/hydra_logging=none",
+    ]
     _hydra(argv, places, config_dir, Job(command))
     rows, failed = _collect(folder)
     print("\n" + table(f"sweep {folder}", ("run", "settings", "status", "iterations", "step reward", "seconds"), rows))
@@ -96,7 +111,13 @@ def _hydra(argv: list[str], places: list[str], config_dir: Path, job: Job) -> No
     args = parser.parse_args(["--multirun", *argv, *places])
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors as exceptions, to be said our way
     try:
-        _run_hydra(args=args, args_parser=parser, task_function=job, config_path=str(config_dir.resolve()), config_name="config")
+        _run_hydra(
+            args=args,
+            args_parser=parser,
+            task_function=job,
+            config_path=str(config_dir.resolve()),
+            config_name="config",
+        )
     except (HydraException, OmegaConfBaseException) as error:
         lines = [x.strip() for x in str(error).splitlines() if x.strip()]
         raise UserError(f"sweep: {' '.join(lines[:3])}") from None
@@ -115,7 +136,15 @@ def _collect(folder: Path) -> tuple[list[tuple], bool]:
                 progress = list(csv.DictReader(file))
         last = progress[-1] if progress else {}
         tail = [float(r["step_reward"]) for r in progress[-10:]]
-        rows.append((note.parent.name, " ".join(x for x in job["settings"] if x not in common), job["status"], int(last.get("iteration", 0)),
-                     sum(tail) / len(tail) if tail else float("nan"), job["seconds"]))
+        rows.append(
+            (
+                note.parent.name,
+                " ".join(x for x in job["settings"] if x not in common),
+                job["status"],
+                int(last.get("iteration", 0)),
+                sum(tail) / len(tail) if tail else float("nan"),
+                job["seconds"],
+            )
+        )
         failed |= job["status"] != 0
     return rows, failed

@@ -23,8 +23,14 @@ from dexsim.learning.runner import Runner
 
 SAVE_EVERY_S = 60.0  # last.pt and policy.pt, besides what save_interval keeps
 SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to every process already
-TAGS = {"reward": "Train/mean_reward", "length": "Train/mean_episode_length", "step_reward": "Train/step_reward",
-        "rate": "Perf/steps_per_second", "collect_s": "Perf/collection_time", "learn_s": "Perf/learning_time"}
+TAGS = {
+    "reward": "Train/mean_reward",
+    "length": "Train/mean_episode_length",
+    "step_reward": "Train/step_reward",
+    "rate": "Perf/steps_per_second",
+    "collect_s": "Perf/collection_time",
+    "learn_s": "Perf/learning_time",
+}
 
 
 def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
@@ -88,7 +94,9 @@ def _check_resume(start: Start) -> None:
         raise UserError(f"{start.source}: holds only a policy, nothing to resume; use the last.pt of its run folder")
     done = int(start.data["iteration"])
     if start.cfg["iterations"] <= done:
-        raise UserError(f"resume={start.source}: all {done} iterations are done; ask for more, e.g. iterations={2 * done}")
+        raise UserError(
+            f"resume={start.source}: all {done} iterations are done; ask for more, e.g. iterations={2 * done}"
+        )
 
 
 def _final_episodes(runner: Runner, cfg: dict[str, Any], where: Path) -> int:
@@ -151,11 +159,14 @@ class Log:
         for name in ("flush", "close", "stop"):
             getattr(self._writer, name, lambda: None)()
         seconds, steps = time.perf_counter() - self._began, self._runner.steps - self._first_step
-        print(f"\nlearned from {count(steps)} steps in {duration(seconds)} ({count(steps / max(seconds, 1e-9))} steps/s)")
+        print(
+            f"\nlearned from {count(steps)} steps in {duration(seconds)} ({count(steps / max(seconds, 1e-9))} steps/s)"
+        )
         if (self._where / "progress.csv").exists():
             from dexsim.view.plots import curves, read_progress
 
-            print(f"curves   {curves(read_progress(self._where / 'progress.csv'), self._where / 'curves.png', self._title)}")
+            drawn = curves(read_progress(self._where / "progress.csv"), self._where / "curves.png", self._title)
+            print(f"curves   {drawn}")
         print(f"run      {self._where}")
 
 

@@ -31,8 +31,11 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
     except (RuntimeError, MemoryError) as error:
         if not out_of_memory(error):
             raise
-        return _say(f"the memory of the device is full ({' '.join(str(error).split())[:120]}); use fewer worlds=, or more"
-                    " agent.algorithm.num_mini_batches= where only learning does not fit", 2)
+        return _say(
+            f"the memory of the device is full ({' '.join(str(error).split())[:120]}); use fewer worlds=, or more"
+            " agent.algorithm.num_mini_batches= where only learning does not fit",
+            2,
+        )
     except OSError as error:
         if error.errno not in FULL:
             raise
@@ -41,8 +44,8 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
 
 
 def _silent() -> bool:
-    """Whether another process says it: under torchrun every rank of a machine finds the same wrong setting, the first speaks.
-    What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
+    """Whether another process says it: under torchrun every rank of a machine finds the same wrong setting, the first
+    speaks. What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
     return os.environ.get("WORLD_SIZE", "1") != "1" and os.environ.get("LOCAL_RANK", "0") != "0"
 
 

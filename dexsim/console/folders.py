@@ -20,8 +20,10 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
         probe.write_bytes(b"x")
         probe.unlink()
         if empty and any(folder.iterdir()):
-            raise UserError(f"{folder} already holds a run: choose another {setting}, or continue it with"
-                            f" resume={folder / 'last.pt'}")
+            raise UserError(
+                f"{folder} already holds a run: choose another {setting}, or continue it with"
+                f" resume={folder / 'last.pt'}"
+            )
     except OSError as error:
         raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
     return folder

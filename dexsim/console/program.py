@@ -11,16 +11,21 @@ DOORS = ("train", "play", "diagnose", "calibrate")
 
 
 def name(job: str) -> str:
-    """The command of a job, called the way this process was: "dexsim play", "python -m dexsim play" or "python play.py"."""
+    """The command of a job, called the way this process was: "dexsim play", "python -m dexsim play" or "python
+    play.py"."""
     called = Path(sys.argv[0])
     if _by_door() and job in DOORS:
         return f"python {job}.py"
-    return f"python -m dexsim {job}" if (called.parent.name, called.name) == ("dexsim", "__main__.py") else f"dexsim {job}"
+    return (
+        f"python -m dexsim {job}" if (called.parent.name, called.name) == ("dexsim", "__main__.py") else f"dexsim {job}"
+    )
 
 
 def torchrun(job: str, processes: int) -> str:
     """The command that starts a job in this many processes of this machine at once."""
-    return f"torchrun --nproc_per_node={processes} " + (f"{job}.py" if _by_door() and job in DOORS else f"-m dexsim {job}")
+    return f"torchrun --nproc_per_node={processes} " + (
+        f"{job}.py" if _by_door() and job in DOORS else f"-m dexsim {job}"
+    )
 
 
 def words(text: str) -> str:

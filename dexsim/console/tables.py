@@ -10,12 +10,15 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> s
     """A table of aligned columns; numbers to the right, text to the left, the last column unpadded."""
     cells = [[cell(v) for v in row] for row in rows]
     number = [all(isinstance(row[i], (int, float)) for row in rows) and bool(rows) for i in range(len(header))]
-    widths = [max(len(str(h)), *(len(row[i]) for row in cells), 0) if cells else len(str(h))
-              for i, h in enumerate(header)]
+    widths = [
+        max(len(str(h)), *(len(row[i]) for row in cells), 0) if cells else len(str(h)) for i, h in enumerate(header)
+    ]
 
     def line(values: Sequence[str]) -> str:
-        return "  " + "  ".join(f"{v:>{w}}" if right else f"{v:<{w}}"
-                                for v, w, right in zip(values, widths, number)).rstrip()
+        return (
+            "  "
+            + "  ".join(f"{v:>{w}}" if right else f"{v:<{w}}" for v, w, right in zip(values, widths, number)).rstrip()
+        )
 
     return "\n".join([title, line([str(h) for h in header]), *(line(row) for row in cells)])
 
