@@ -5,11 +5,15 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import yaml
 
 from dexsim.console import program
 from dexsim.errors import UserError
+
+if TYPE_CHECKING:
+    from dexsim.gap.result import Settings
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
        python diagnose.py demo=true [out=DIR]
@@ -111,22 +115,10 @@ def main(argv: list[str]) -> int:
 
         print(describe())
         return 0
-    from dexsim.actuator.columns import did_you_mean
-    from dexsim.sim.quiet import quiet_warp
-    from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.gap.effects.catalogue import EFFECTS
-    from dexsim.gap.effects.touch import BY_ID
-    from dexsim.gap.judge.full_model import REPLAY
-    from dexsim.gap.read import inputs
+    from dexsim.gap.diagnosis import diagnose, save
 
     start = time.perf_counter()
-    device = given.get("device", "cpu")
-    if device != "cpu" and not device.startswith("cuda"):
-        raise UserError(f"device={device}: must be cpu or cuda")
-    quiet_warp(device)
-    device = available(device)
-    if given.get("replay", "mujoco") not in REPLAY:
-        raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
+    device = started(given.get("device", "cpu"))
     demo = None
     out = Path(given.get("out", "out/demo" if given.get("demo") else "out/diagnosis")).expanduser()
     if given.get("demo"):
@@ -137,18 +129,7 @@ def main(argv: list[str]) -> int:
         given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
-    allowed = None
-    if given.get("effects"):
-        known = (*EFFECTS, *(e for e in BY_ID if e not in EFFECTS))
-        for e in given["effects"]:
-            if e not in known:
-                raise UserError(f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}")
-        allowed = set(given["effects"])
-    settings = Settings(
-        inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
-        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "mujoco"), meta=given["meta"],
-        remap=given["remap"],
-    )  # fmt: skip
+    settings = settings_of(given, out, device)
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
     written = save(result, out)
     print(verdict(result))
@@ -156,6 +137,41 @@ def main(argv: list[str]) -> int:
         print(f"\nWhat was hidden: {', '.join(f'{k} {v:g}' for k, v in demo.items())}")
     print("\n" + "\n".join(str(p) for p in written) + f"\n{time.perf_counter() - start:.0f} s")
     return 0
+
+
+def settings_of(given: dict, out: Path, device: str) -> Settings:
+    """What `parse` took apart, as :func:`dexsim.gap.diagnosis.diagnose` takes it. Raises UserError."""
+    from dexsim.actuator.columns import did_you_mean
+    from dexsim.gap.effects.catalogue import EFFECTS
+    from dexsim.gap.effects.touch import BY_ID
+    from dexsim.gap.judge.full_model import REPLAY
+    from dexsim.gap.read import inputs
+    from dexsim.gap.result import Settings
+
+    if given.get("replay", "mujoco") not in REPLAY:
+        raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
+    allowed = None
+    if given.get("effects"):
+        known = (*EFFECTS, *(e for e in BY_ID if e not in EFFECTS))
+        for e in given["effects"]:
+            if e not in known:
+                raise UserError(f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}")
+        allowed = set(given["effects"])
+    return Settings(
+        inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
+        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "mujoco"), meta=given["meta"],
+        remap=given["remap"],
+    )  # fmt: skip
+
+
+def started(device: str) -> str:
+    """Start Warp without its banner; the device that is there. Raises UserError."""
+    from dexsim.sim.quiet import quiet_warp
+
+    if device != "cpu" and not device.startswith("cuda"):
+        raise UserError(f"device={device}: must be cpu or cuda")
+    quiet_warp(device)
+    return available(device)
 
 
 def available(device: str) -> str:
