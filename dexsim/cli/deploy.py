@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import signal
 import time
@@ -13,7 +14,7 @@ from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
 
-Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C relaxes at once. Stand clear of a real hand,
+Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C, SIGTERM and SIGHUP relax at once. Stand clear of a real hand,
 and try driver=sim first. On a machine that does other work too, run it with real-time priority (chrt -r 10 python -m ...).
 
 settings (key=default):
@@ -26,7 +27,8 @@ settings (key=default):
   record=             FILE.mcap of everything seen and sent (default: out/deploy_<date>.mcap; record=none: nothing)
   vision=truth        driver=sim: truth, or camera (a rendered depth image and mask); driver=xhand: place="x y z" [m]
   place=              the object's place in the palm frame where nothing sees it, e.g. place="0.055 0 0.04"
-  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours sends lines "w x y z"
+  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours sends lines "w x y z";
+                      udp:PORT:FROM takes them from that port alone (default: from whoever sends the first good one)
   shape=              driver=sim, grasp: the object's shape
   seed=0              driver=sim
 safety (key=default):
@@ -37,6 +39,7 @@ safety (key=default):
   home_speed=0.5      rad/s of the homing
   wait=3              rotate: s that the open hand then waits for the cube; grip=1: s its fingers take to close on it
   stale=0.1           s: a reading older than this relaxes the hand; late=0.1, hang=0.3, overruns=10 likewise
+  seen=               s: so does what was last seen of the object (default: 0.5 of a camera, 0.1 of an IMU)
   read_hz=100         readings a second
   recover=false       home again when readings are good again, instead of ending
 """
@@ -44,7 +47,7 @@ OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "
 
 
 def main(argv: Sequence[str]) -> int:
-    """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C. Raises UserError."""
+    """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP. Raises UserError."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
@@ -63,6 +66,7 @@ def main(argv: Sequence[str]) -> int:
     calibration = (Calibration.load(given["calibration"], base) if "calibration" in given
                    else Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base))  # fmt: skip
     settings = LoopSettings(**changes)
+    settings.check()
     if "command" in changes and b.manifest["task"] != "grasp":
         raise UserError(
             f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force"
@@ -77,22 +81,52 @@ def main(argv: Sequence[str]) -> int:
     print(f"driver   {driver.name}; starting ...", flush=True)
     loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
 
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
+    with _Stop() as stop:
+        try:
+            loop.run()
+        finally:
+            try:
+                driver.close()
+            finally:
+                with contextlib.suppress(OSError):  # the terminal may be gone
+                    _ending(loop.report, recorder)
+    return 0 if loop.report.ended == "done" else stop.status or 1
 
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        report = loop.run()
-    finally:
-        driver.close()
-        signal.signal(signal.SIGTERM, before)
-    print(f"\nended    {report.ended} after {report.acts} actions; the hand is relaxed")
+
+class _Stop:
+    """Ctrl-C, SIGTERM and SIGHUP: the first ends the run, which relaxes the hand; those after it change nothing."""
+
+    SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
+
+    def __init__(self) -> None:
+        self.status = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Stop:
+        self._before = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _frame: Any) -> None:
+        if not self.status:
+            self.status = 128 + number
+            raise KeyboardInterrupt(f"stopped by {self.SIGNALS[signal.Signals(number)]}")
+
+
+def _ending(report: Any, recorder: Any) -> None:
+    """What the run was, on standard output."""
+    if report.not_relaxed:
+        print(f"\nDANGER   the hand could not be relaxed ({report.not_relaxed}): cut its power", flush=True)
+    hand = "the hand may still drive" if report.not_relaxed else "the hand is relaxed"
+    print(f"\nended    {report.ended or 'failed'} after {report.acts} actions; {hand}")
     print(report.timing.table())
     print("counts   " + (", ".join(f"{k} {v}" for k, v in sorted(report.counts.items())) or "none"))
     if recorder is not None:
         lost = f"; {recorder.error}" if recorder.error else ""
-        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}")
-    return 0 if report.ended == "done" else 130 if "Ctrl-C" in report.ended else 1
+        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}", flush=True)
 
 
 def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
@@ -152,17 +186,19 @@ def _imu(given: dict[str, str], b: Any) -> Any:
 
     if b.manifest["task_settings"]["perception"] != "imu":
         return None
-    how, _, port = given.get("imu", "").partition(":")
-    if how != "udp" or not port.isdigit():
+    how, _, ports = given.get("imu", "").partition(":")
+    port, colon, sender = ports.partition(":")
+    if how != "udp" or not port.isdigit() or (colon and not sender.isdigit()):
         raise UserError(
             f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y z" there, or run'
             " the Loop with your own OrientationSource (dexsim.deploy.imu)"
         )
-    imu = UdpImu(int(port))
+    imu = UdpImu(int(port), sender_port=int(sender) if colon else None)
     if not imu.wait(5.0):
         raise UserError(
             f'imu=udp:{port}: no orientation came within 5 s; send lines of text "w x y z" to 127.0.0.1:{port}'
         )
+    print(f"imu      lines of {imu.sender[0]}:{imu.sender[1]}; those of others are not read")
     return imu
 
 
@@ -191,7 +227,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
 def _settings(argv: Sequence[str]) -> tuple[dict[str, str], dict[str, Any]]:
     from dexsim.deploy.loop import LoopSettings
 
-    fields = {f.name: f.type for f in dataclasses.fields(LoopSettings) if f.name != "home"}
+    fields = {f.name: str(f.type) for f in dataclasses.fields(LoopSettings) if f.name != "home"}
     given: dict[str, str] = {}
     changes: dict[str, Any] = {}
     for argument in argv:

@@ -20,9 +20,10 @@ from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
-from dexsim.deploy.driver import POSITION, Clock, HandCommand, HandDriver, HandState
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.imu import OrientationSource
 from dexsim.deploy.measure import ORIENTATION, for_bundle
+from dexsim.deploy.readings import bad_orientation, bad_place, bad_stamp, implausible
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
@@ -30,6 +31,18 @@ from dexsim.deploy.vision import HeightSource
 from dexsim.errors import UserError
 
 HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
+SEEN = {ORIENTATION: 0.1, "place": 0.5}
+"""s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second; a camera's
+thirty, and fingers hide an object for a moment."""
+RELAX_TRIES, RELAX_EVERY = 100, 0.01
+"""How often, and s apart, the hand is told to relax where its driver fails to."""
+LIMITS: dict[str, tuple[float, float, str]] = {
+    "seconds": (0, 1e7, "s"), "command": (0, 1, ""), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
+    "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"), "read_hz": (20, 1000, "Hz"),
+    "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "late": (0.005, 10, "s"), "overruns": (1, 1e6, ""), "hang": (0.02, 10, "s"),
+    "speed": (0.001, 100, ""), "margin": (0, 3.2, "rad"), "tor_max": (1, 32767, "mA"), "kp": (0, 32767, ""), "recover_s": (0, 3600, "s"),
+}  # fmt: skip
+"""Lowest and highest of each of `LoopSettings`, and its unit."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +51,9 @@ class LoopSettings:
 
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
     home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task starts with
-    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: a reading older than this relaxes; late
-    s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading period after
+    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: relaxes when the last good reading is older
+    than this (one that cannot be true is none), when every reading since has an error code, or the policy's actions since are not
+    finite; seen s: so does what was last seen of the object (default: `SEEN`); late s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading period after
     they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed: targets' largest, over
     the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one;
     kp: its gain.
@@ -57,6 +71,7 @@ class LoopSettings:
     grip: float = 1.0
     read_hz: float = 100.0
     stale: float = 0.1
+    seen: float | None = None
     late: float = 0.1
     overruns: int = 10
     hang: float = 0.3
@@ -67,13 +82,24 @@ class LoopSettings:
     recover: bool = False
     recover_s: float = 1.0
 
+    def check(self) -> None:
+        """Raise UserError for a setting outside `LIMITS`."""
+        for name, (low, high, unit) in LIMITS.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            numbers = np.atleast_1d(np.asarray(value, float))
+            if not ((numbers >= low) & (numbers <= high)).all() or (name == "tor_max" and numbers.size not in (1, 12)):
+                raise UserError(f"{name}={value}: must lie in [{low:g}, {high:g}]{' ' * bool(unit)}{unit}")
+
 
 @dataclass
 class Report:
     """What a run was: how it ended (`done`, or why the hand was relaxed), counts, timing; observations, actions and
-    targets of every act if kept."""
+    targets of every act if kept. not_relaxed: what the driver said when the hand could not be relaxed, else empty."""
 
     ended: str = ""
+    not_relaxed: str = ""
     acts: int = 0
     counts: Counter = field(default_factory=Counter)
     timing: Timing = field(default_factory=Timing)
@@ -92,10 +118,7 @@ class Loop:
         """eye: what sees the object, as `measure.needs` of the bundle's task has it (None: nothing has to). say: told what a
         person beside the hand has to do."""
         m, self.settings = bundle.manifest, settings
-        if not 0 <= settings.command <= 1:
-            raise UserError(f"command={settings.command}: must lie in [0, 1]")
-        if not 20 <= settings.read_hz <= 1000:
-            raise UserError(f"read_hz={settings.read_hz}: must lie in [20, 1000]")
+        settings.check()
         self.bundle, self.driver, self.eye, self.clock = bundle, driver, eye, clock or Clock()
         self.recorder, self.keep, self.report, self.say = recorder, keep, Report(), say or (lambda text: None)
         self.period, self.read_period = float(m["rates"]["policy_period_s"]), 1.0 / settings.read_hz
@@ -113,6 +136,7 @@ class Loop:
         self.guard = Guard(
             self.rule.low + settings.margin, self.rule.high - settings.margin, settings.speed * np.array(m["action"]["speed_limit_rad_s"]),
             self.tor_max, calibration.current_sign, tuple(m["joints"]))
+        self.home = np.clip(self.home, self.guard.low, self.guard.high)
         self.state: HandState | None = None
         self.target: np.ndarray | None = None
         self.phase = HOMING if settings.home else RUN
@@ -120,6 +144,11 @@ class Loop:
         self.stop = threading.Event()  # set it to end the run
         self._beat, self._lock = None, threading.Lock()
         self._tripped: str | None = None
+        self._sequence: int | None = None  # of the last reading that the driver gave, taken or not
+        self._wrong: str | None = None  # why readings since the last good one were not taken
+        self._coded_since: float | None = None  # since when every reading has an error code
+        self._nonsense_since: float | None = None  # since when no action was finite
+        self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs, 0.5)
 
     # -- the run -------------------------------------------------------------------------------------------------------------
     def run(self) -> Report:
@@ -140,9 +169,12 @@ class Loop:
             self._first_reading()
             self._turns()
             self.report.ended = self.report.ended or "done"
-        except KeyboardInterrupt:
-            self.report.ended = "stopped by Ctrl-C"
+        except KeyboardInterrupt as error:
+            self.report.ended = str(error) or "stopped by Ctrl-C"
             self.report.counts["interrupted"] += 1
+        except Exception as error:
+            self.report.ended = f"failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            raise
         finally:
             self._relax(self.report.ended or "the loop failed")
             self.stop.set()
@@ -152,22 +184,28 @@ class Loop:
             if watch is not None:
                 watch.join(1.0)
             if self.recorder is not None:
-                self.recorder.close()
+                self.recorder.close()  # says in its `error` what went wrong, and raises nothing
                 if self.recorder.dropped:
                     self.report.counts["not_recorded"] += self.recorder.dropped
-        self.report.counts.update(self.guard.counts)
+            self.report.counts.update(self.guard.counts)
         if getattr(self.measure, "goals", 0):
             self.report.counts["goals_reached"] += self.measure.goals
         return self.report
 
     def _first_reading(self) -> None:
         limit = self.clock.now() + 2.0
-        while (state := self.driver.read()) is None:
-            if self.clock.now() > limit:
-                raise UserError(f"{self.driver.name}: no reading of the hand within 2 s; check power, cable and bus")
-            self._beat = self.clock.now()
-            self.clock.sleep_until(self.clock.now() + self.read_period)
-        self.state, self._checked = state, state.time
+        while True:
+            state, now = self.driver.read(), self.clock.now()
+            wrong = "there is none" if state is None else implausible(state, now)
+            if wrong is None and now - state.time > self.settings.stale:
+                wrong = f"it is {1e3 * (now - state.time):.0f} ms old"
+            if wrong is None:
+                break
+            if now > limit:
+                raise UserError(f"{self.driver.name}: no good reading of the hand within 2 s ({wrong}); check power, cable and bus")
+            self._beat = now
+            self.clock.sleep_until(now + self.read_period)
+        self.state, self._sequence, self._good_at, self._checked = state, state.sequence, now, now
         self.target = np.asarray(state.position, float).copy()
         if self.settings.home:
             self._begin_homing(self.clock.now())
@@ -225,15 +263,29 @@ class Loop:
                     self._begin_homing(now)
 
     def _problem(self, now: float, late: float) -> str | None:
-        """What forbids going on: an old reading, a late turn, too much current or heat."""
+        """What forbids going on: an old reading, or none that can be true; error codes, actions that are no numbers; a late turn;
+        too much current or heat."""
         s = self.settings
-        age = now - self.state.time
+        age = now - min(self.state.time, self._good_at)  # a stamp may be wrong; when it came is known
         if age > s.stale:
-            return f"the hand's state is {1e3 * age:.0f} ms old, allowed {1e3 * s.stale:.0f}"
+            why = f": the readings since cannot be true, {self._wrong}" if self._wrong else ""
+            return f"the hand's state is {1e3 * age:.0f} ms old, allowed {1e3 * s.stale:.0f}{why}"
+        if self._coded_since is not None and now - self._coded_since > s.stale:
+            j = int(np.argmax(np.asarray(self.state.error) != 0))
+            return f"{xhand.JOINTS[j]} reports error code {self.state.error[j]} for {1e3 * (now - self._coded_since):.0f} ms"
+        if self._nonsense_since is not None and now - self._nonsense_since > s.stale:
+            return f"the policy's actions are not finite for {1e3 * (now - self._nonsense_since):.0f} ms"
+        if self.phase == RUN and self.measure.needs is not None:
+            seen_at = self._began if self._seen_at is None else self._seen_at
+            limit = s.stale if self._seen_at is None else self._seen_limit + self.period  # looked for once a period
+            if now - seen_at > limit:
+                why = f" ({self._unseen})" if self._unseen else ""
+                never = "was never seen" if self._seen_at is None else f"was seen {1e3 * (now - seen_at):.0f} ms ago, allowed {1e3 * limit:.0f}"
+                return f"the object {never}{why}"
         if late > s.late:
             return f"the loop woke {1e3 * late:.0f} ms late, allowed {1e3 * s.late:.0f}"
-        elapsed, self._checked = min(self.state.time - self._checked, s.stale), self.state.time
-        return self.guard.must_relax(self.state.current, self.state.temperature, elapsed) if elapsed > 0 else None
+        elapsed, self._checked = min(now - self._checked, s.stale), now
+        return self.guard.must_relax(self.state.current, self.state.temperature, elapsed)
 
     # -- parts of a turn -------------------------------------------------------------------------------------------------------
     def _read(self, now: float) -> None:
@@ -242,11 +294,16 @@ class Loop:
             self.report.counts["no_new_reading"] += 1
 
     def _take(self, now: float) -> bool:
-        """The newest state becomes ours; whether it is a new one. Recorded once."""
+        """The newest state becomes ours if it can be true; whether it is a new one. Recorded once."""
         state = self.driver.read()
-        if state is None or state.sequence == self.state.sequence:
+        if state is None or state.sequence == self._sequence:
             return False
-        self.state, self.fresh_for = state, self.fresh_for + 1
+        self._sequence = state.sequence
+        self._wrong = implausible(state, now)
+        if self._wrong is not None:
+            self.report.counts["bad_readings"] += 1
+            return False
+        self.state, self.fresh_for, self._good_at = state, self.fresh_for + 1, now
         if self.recorder is not None:
             r = self.recorder
             r.put("state", now, state.position, state.velocity, 1e-3 * np.asarray(state.current, float), state.time)
@@ -257,6 +314,9 @@ class Loop:
                 r.put(ERRORS, now, state.error)
         if np.any(state.error):
             self.report.counts["error_codes"] += 1
+            self._coded_since = now if self._coded_since is None else self._coded_since
+        else:
+            self._coded_since = None
         return True
 
     fresh_for = 0
@@ -301,26 +361,33 @@ class Loop:
             self._begin_run(now)
 
     def _look(self, now: float) -> bool:
-        """The newest of what is seen of the object; False where nothing was seen yet."""
+        """The newest of what is seen of the object, if it can be true; False where nothing was seen yet."""
         if self.measure.needs is None:
             self._seen, self._seen_at = None, now
             return True
-        seen = self.eye.orientation(now) if self.measure.needs == ORIENTATION else self.eye.place(now)
-        if seen is None:
+        turned = self.measure.needs == ORIENTATION
+        seen = self.eye.orientation(now) if turned else self.eye.place(now)
+        self._unseen = "there is no reading" if seen is None else bad_stamp(seen[1], now) or (bad_orientation if turned else bad_place)(seen[0])
+        if self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
-        self._seen, self._seen_at = seen
-        if now - self._seen_at > 0.5:
-            self.report.counts["object_seen_long_ago"] += 1
+        self._seen, self._seen_at = seen[0], min(float(seen[1]), now)
         return True
 
     def _policy(self, now: float) -> None:
         self._take(now)  # actions come between readings: act on what there is now
         if not self._look(now):
             return self._send(now, self.target, 1.0)
+        if now - self._seen_at > self._seen_limit:
+            return None  # the next turn lets go
         state, command = self.state, self.settings.command
         observation, touch = self.measure.observe(state, self._seen, command, self.target, self._action)
         action = self.bundle.act(observation)[0]
+        if np.isfinite(action).all():
+            self._nonsense_since = None
+        else:
+            self.report.counts["actions_not_finite"] += 1
+            self._nonsense_since = now if self._nonsense_since is None else self._nonsense_since
         target = self.rule.target(action, self.target, np.asarray(state.position, np.float32))
         self._send(now, target, 1.0)
         self._action = action
@@ -374,17 +441,38 @@ class Loop:
     def _begin_run(self, now: float) -> None:
         self.phase, self._began = RUN, now
         self.measure.reset()
+        self._unseen, self._nonsense_since = None, None
         self._seen, self._seen_at, self._action = None, None, np.zeros(len(self.rule.low), np.float32)
         started = getattr(self.driver, "started", None)
         if started is not None:
             started()
 
     def _relax(self, why: str) -> None:
-        with self._lock:
-            self.driver.relax()
         if self.phase != RELAXED:
             self.phase, self.why = RELAXED, why
             self.report.counts["relaxed"] += 1
+        self._let_go()
+
+    def _let_go(self, lock: bool = True) -> None:
+        """Tell the driver to relax until it does; an interrupt in the middle changes nothing. Between tries the passive mode is sent,
+        which a driver whose relaxing fails may still pass on."""
+        for _ in range(RELAX_TRIES):
+            held = lock and self._lock.acquire(timeout=0.02)  # whoever holds it longer hangs
+            try:
+                self.driver.relax()
+                self.report.not_relaxed = ""
+                return
+            except BaseException as error:  # Ctrl-C too: nothing comes before the hand
+                self.report.counts["relax_failed"] += 1
+                self.report.not_relaxed = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+            finally:
+                if held:
+                    self._lock.release()
+            try:
+                self.driver.send(HandCommand(np.zeros(12) if self.target is None else self.target, np.zeros(12), kp=0, mode=PASSIVE))
+                self.clock.sleep_until(self.clock.now() + RELAX_EVERY)
+            except BaseException:
+                continue
 
     def _watch(self) -> None:
         """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""
@@ -394,7 +482,7 @@ class Loop:
             if silent > limit and self._tripped is None and self.phase != RELAXED:
                 self._tripped = f"the loop did not turn for {1e3 * silent:.0f} ms, allowed {1e3 * limit:.0f}"
                 self.report.counts["watchdog"] += 1
-                self.driver.relax()  # without the lock: whoever holds it hangs
+                self._let_go(lock=False)  # whoever holds it hangs
 
 
 def _smooth(share: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -46,10 +47,18 @@ class Recorder:
             self._queue.put((kind, t - self.zero, values))
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and the index."""
+        """Write what waits, and the index. Raises nothing: what went wrong is said in `error`, and a run's report outlives its recording."""
         self._queue.put(None)
         self._thread.join(timeout)
-        self.writer.close()
+        if self._thread.is_alive():
+            self.error = self.error or f"{self.path}: the disk did not take the last samples within {timeout:g} s; the index is missing"
+            return
+        try:
+            self.writer.close()
+        except Exception as error:
+            self.error = self.error or f"{self.path}: {_reason(error)}; the index is missing, what was written before is there"
+            with contextlib.suppress(Exception):
+                self.writer._file.close()
 
     def _run(self) -> None:
         w = self.writer
@@ -65,8 +74,8 @@ class Recorder:
                 else:
                     self._array(kind, t, values[0])
                 self.written += 1
-            except OSError as error:  # a full disk must not stop the hand
-                self.error = f"{self.path}: {error.strerror}; nothing is recorded from {t:.1f} s on"
+            except Exception as error:  # a full disk must not stop the hand, and neither must what cannot be written
+                self.error = f"{self.path}: {_reason(error)}; nothing is recorded from {t:.1f} s on"
                 return
             if self._queue.empty():
                 time.sleep(0.002)  # a few samples at a time: fewer turns taken from the loop
@@ -80,3 +89,7 @@ class Recorder:
                 w._schemas[kind] = w._mcap.register_schema(kind, "ros2msg", schema.DEFINITIONS[kind].encode())
             w._channels[topic] = w._mcap.register_channel(topic, "cdr", w._schemas[kind])
         w._array(topic, t, np.atleast_1d(np.asarray(value, np.float32)), LABELS[topic])
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim.errors import UserError
+
 
 @dataclass
 class Guard:
@@ -28,18 +30,25 @@ class Guard:
     counts: Counter = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
+        if not (np.isfinite(self.low).all() and np.isfinite(self.high).all() and (self.low < self.high).all()):
+            j = int(np.argmax(~(self.low < self.high)))
+            raise UserError(f"limits of {self.names[j]}: {self.low[j]:.4g} to {self.high[j]:.4g} rad leave nothing between them; use a smaller margin=")
         self._over = np.zeros(len(self.low))
 
     def apply(self, target: np.ndarray, before: np.ndarray, q: np.ndarray, current: np.ndarray, period: float) -> np.ndarray:
-        """Safe targets [12] rad. before: the last ones sent; q rad and current mA: measured; period s since the last."""
+        """Safe targets [12] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and current mA:
+        measured; period s since the last."""
         t = np.asarray(target, float).copy()
+        middle = 0.5 * (self.low + self.high)
+        q = np.where(np.isfinite(q), q, middle)
+        before = np.where(np.isfinite(before), before, q)
+        current = np.nan_to_num(current, nan=0.0)
         bad = ~np.isfinite(t)
         self._count("not_finite", bad)
         t[bad] = before[bad]
         # where the motor draws too much, the target may lead the joint only by the share of its lead that draws the limit:
         # a position loop's current is proportional to it
-        with np.errstate(invalid="ignore"):
-            over = np.abs(current) > self.current
+        over = np.abs(current) > self.current
         if over.any():
             way = np.sign(self.current_sign * current)
             share = self.current / np.maximum(np.abs(current), 1e-9)

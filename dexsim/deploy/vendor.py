@@ -25,6 +25,7 @@ from dexsim.deploy.driver import PASSIVE, TAXELS, Clock, HandCommand, HandState
 from dexsim.errors import UserError
 
 BAUD = 3_000_000
+CLOSE = 1.0  # s that the bus has to carry the command to relax
 
 
 class VendorXHand:
@@ -38,8 +39,10 @@ class VendorXHand:
         self._state: HandState | None = None
         self._command: HandCommand | None = None
         self._lock = threading.Lock()
-        self._stop = threading.Event()
+        self._stop, self._passive = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
         self.bad_reads = 0
+        self.error = ""  # what the package said last when a bus cycle failed
 
     def open(self) -> dict[str, str]:
         sdk = self._package or self._import()
@@ -68,19 +71,27 @@ class VendorXHand:
 
     def send(self, command: HandCommand) -> None:
         with self._lock:
+            self._passive.clear()
             self._command = command
 
     def relax(self) -> None:
         self.send(HandCommand(np.zeros(12), np.zeros(12), kp=0, mode=PASSIVE))
 
     def close(self) -> None:
+        if self._device is None:
+            return
         self.relax()
-        if self._device is not None:
-            self._stop.wait(0.05)  # the bus thread still sends the relaxed command
-            self._stop.set()
-            self._thread.join(1.0)
+        self._passive.wait(CLOSE)  # until the bus has carried it
+        self._stop.set()
+        self._thread.join(1.0)
+        carried = self._passive.is_set()
+        try:
             self._device.close_device()
+        finally:
             self._device = None
+        if not carried:
+            raise UserError(f"xHand on {self.port}: the bus did not carry the command to relax within {CLOSE:g} s"
+                            f"{f' ({self.error})' if self.error else ''}; cut the hand's power")
 
     @staticmethod
     def _import() -> Any:
@@ -92,23 +103,34 @@ class VendorXHand:
         return xhand_control
 
     def _run(self) -> None:
-        """Bus cycles: send the last command, read the state that comes back."""
+        """Bus cycles until the end; one that fails is counted, shows as no new state to the loop, and is tried again."""
         while not self._stop.is_set():
+            try:
+                self._cycle()
+            except Exception as error:  # whatever the package raises; a thread that ended could relax no more
+                self.bad_reads, self.error = self.bad_reads + 1, f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+                self._stop.wait(0.002)
+
+    def _cycle(self) -> None:
+        """Send the last command, read the state that comes back."""
+        with self._lock:
+            command = self._command
+        if command is not None:
+            for i in range(12):
+                f = self._wire.finger_command[i]
+                f.id, f.kp, f.ki, f.kd = i, int(command.kp), int(command.ki), int(command.kd)
+                f.position, f.tor_max, f.mode = float(command.position[i]), int(command.tor_max[i]), int(command.mode)
+            self._device.send_command(self._id, self._wire)
             with self._lock:
-                command = self._command
-            if command is not None:
-                for i in range(12):
-                    f = self._wire.finger_command[i]
-                    f.id, f.kp, f.ki, f.kd = i, int(command.kp), int(command.ki), int(command.kd)
-                    f.position, f.tor_max, f.mode = float(command.position[i]), int(command.tor_max[i]), int(command.mode)
-                self._device.send_command(self._id, self._wire)
-            # True would send the last command again; False reads what the bus delivered
-            error, raw = self._device.read_state(self._id, command is not None)
-            if getattr(error, "error_code", 0) != 0:
-                self.bad_reads += 1  # an old state shows as stale to the loop
-                continue
-            self._sequence += 1
-            self._state = convert(raw, self.clock.now(), self._sequence)
+                if command.mode == PASSIVE and self._command is command:
+                    self._passive.set()
+        # True would send the last command again; False reads what the bus delivered
+        error, raw = self._device.read_state(self._id, command is not None)
+        if getattr(error, "error_code", 0) != 0:
+            self.bad_reads, self.error = self.bad_reads + 1, str(getattr(error, "error_message", error))[:160]
+            return
+        state = convert(raw, self.clock.now(), self._sequence + 1)
+        self._sequence, self._state = state.sequence, state
 
 
 def convert(raw: Any, now: float, sequence: int) -> HandState:

@@ -470,7 +470,8 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
 
     from dexsim.sim.quiet import quiet_warp
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's to handle: it relaxes first
+    for number in (signal.SIGINT, signal.SIGHUP):  # the loop's to handle: it relaxes first
+        signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)
     quiet_warp("cpu")
     v = _views(raw)

@@ -1,0 +1,100 @@
+"""Which readings the loop takes: a hand's state or an object's pose that cannot be true is left out, and said why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dexsim.assets import xhand
+from dexsim.deploy.driver import TAXELS, HandState
+
+AHEAD = 0.05
+"""s that a stamp may lie ahead of the loop's clock: a driver's thread stamps while a turn is under way."""
+BEYOND = 0.5
+"""rad that a joint may be read beyond its range: an encoder's zero is never quite right."""
+FASTEST = 100.0
+"""rad/s that a joint may be read to turn; the fastest of the hand's turns at about a tenth."""
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    name: str
+    unit: str
+    low: Any
+    high: Any
+
+
+_LOW, _HIGH = xhand.joint_limits().T
+_JOINT = (
+    _Bounds("position", "rad", _LOW - BEYOND, _HIGH + BEYOND),
+    _Bounds("current", "mA", -32768.0, 32767.0),
+    _Bounds("temperature", "degC", -60.0, 250.0),
+)
+_TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded or cut
+
+
+def implausible(state: HandState, now: float) -> str | None:
+    """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead, an array
+    of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged here."""
+    if (wrong := bad_stamp(state.time, now)) is not None:
+        return wrong
+    for b in _JOINT:
+        x = _array(getattr(state, b.name))
+        if x is None or x.shape != (12,):
+            return f"{b.name} is not 12 numbers"
+        bad = ~((x >= b.low) & (x <= b.high))  # NaN too
+        if bad.any():
+            j = int(np.argmax(bad))
+            return f"{b.name} of {xhand.JOINTS[j]} is {x[j]:.4g} {b.unit}"
+    error = _array(state.error)
+    if error is None or error.shape != (12,):
+        return "error is not 12 codes"
+    touch = _array(state.tactile)
+    if touch is None or touch.shape != TAXELS:
+        return f"tactile is not {' x '.join(map(str, TAXELS))} numbers"
+    top = float(np.abs(touch).max())
+    if not top <= _TOUCH:
+        return f"a taxel reads {top:.4g} counts"
+    if state.velocity is not None:
+        speed = _array(state.velocity)
+        if speed is None or speed.shape != (12,):
+            return "velocity is not 12 numbers"
+        if (np.abs(speed) > FASTEST).any():  # NaN: not said, as of older firmware
+            j = int(np.nanargmax(np.abs(speed)))
+            return f"velocity of {xhand.JOINTS[j]} is {speed[j]:.4g} rad/s"
+    return None
+
+
+def bad_stamp(stamp: Any, now: float) -> str | None:
+    """Why a stamp [s] cannot be a time of the loop's clock, or None."""
+    if not isinstance(stamp, (int, float, np.number)) or not np.isfinite(stamp):
+        return f"its stamp is {stamp}, no time"
+    if stamp > now + AHEAD:
+        return f"its stamp lies {stamp - now:.3g} s ahead"
+    return None
+
+
+def bad_place(place: Any) -> str | None:
+    """Why an object's place [3] m, palm frame, cannot be true, or None."""
+    x = _array(place)
+    if x is None or x.shape != (3,):
+        return "its place is not x y z"
+    return None if np.isfinite(x).all() and np.abs(x).max() < 2.0 else f"its place is {np.round(x, 3).tolist()} m"
+
+
+def bad_orientation(q: Any) -> str | None:
+    """Why an object's orientation [4], w x y z, cannot be true, or None."""
+    x = _array(q)
+    if x is None or x.shape != (4,):
+        return "its orientation is not w x y z"
+    return None if 0.5 < float(np.linalg.norm(x)) < 2.0 else f"its orientation is {np.round(x, 3).tolist()}"
+
+
+def _array(x: Any) -> np.ndarray | None:
+    """float64, None where it is not numbers."""
+    try:
+        return np.asarray(x, float)
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,439 @@
+"""The real-time loop lets go: whatever the hand, the object's eye, the disk, the settings or the terminal do, the hand is relaxed
+within 0.15 s, no target leaves that is not finite or lies outside the limits, and the recording and the report are there."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from bundles import make_checkpoint
+from test_deploy import FakeHand, FakePackage, recorder_at
+
+from dexsim import export
+from dexsim.assets import xhand
+from dexsim.calibration.file import Calibration
+from dexsim.deploy import bundle
+from dexsim.cli.deploy import _Stop
+from dexsim.deploy.driver import PASSIVE, HandCommand, VirtualClock
+from dexsim.deploy.imu import UdpImu
+from dexsim.deploy.loop import LIMITS, Loop, LoopSettings
+from dexsim.deploy.safety import Guard
+from dexsim.deploy.vendor import VendorXHand
+from dexsim.deploy.vision import FixedPlace
+from dexsim.errors import UserError
+from dexsim.recording.reader import read
+
+torch.set_num_threads(1)
+PLACE = np.array([0.055, 0.0, 0.04])
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.fixture(scope="module")
+def b(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults")
+    return bundle.load(export.export(str(make_checkpoint(folder / "policy.pt")), folder / "out", steps=2))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """One hand model for all loops here, and no collection of torch's whole heap before each: a run is then a tenth of a second."""
+    from dexsim.deploy import loop, measure
+
+    with pytest.MonkeyPatch.context() as patch:
+        model = measure.HandKinematics()
+        patch.setattr(measure, "HandKinematics", lambda: model)
+        patch.setattr(loop.gc, "collect", lambda: 0)
+        yield
+
+
+class Spoiled(FakeHand):
+    """A hand whose readings are changed by `spoil(state, now)` from `at` s after the policy's begin on (None: always)."""
+
+    def __init__(self, clock, spoil=None, at=0.3):
+        super().__init__(clock, start=0.05)
+        self.spoil, self.at, self.since, self.kept = spoil, at, None, []
+
+    def read(self):
+        state, now = super().read(), self.clock.now()
+        if self.spoil and (self.at is None or (self.begun and now >= self.begun + self.at)):
+            self.since = now if self.since is None else self.since
+            state = self.spoil(state, now, self.kept) or state
+        return state
+
+
+class Eye:
+    """Sees the object; its answers are changed by `spoil(now)` from `at` s after the policy's begin on."""
+
+    def __init__(self, hand, spoil, at):
+        self.hand, self.spoil, self.at, self.since = hand, spoil, at, None
+
+    def place(self, now):
+        if self.hand.begun and now >= self.hand.begun + self.at:
+            self.since = now if self.since is None else self.since
+            return self.spoil(now, self.since)
+        return PLACE, now
+
+
+def run(b, hand, eye=None, recorder=None, **changes):
+    loop = Loop(b, hand, eye or FixedPlace(PLACE), Calibration.default(), LoopSettings(**{"seconds": 1.0, "tor_max": 300.0, "home_speed": 3.0} | changes),
+                hand.clock, recorder)  # fmt: skip
+    try:
+        loop.run()
+    finally:
+        check_sent(hand, loop.guard)
+    return loop.report
+
+
+def check_sent(hand, guard):
+    """Nothing that is not finite or outside the limits has left, and nothing drives after the first letting go."""
+    driven = [(t, q) for t, q, _, mode in hand.sent if mode != PASSIVE]
+    for t, q in driven:
+        assert np.isfinite(q).all() and (q >= guard.low - 1e-6).all() and (q <= guard.high + 1e-6).all()
+    if hand.relaxed_at:
+        assert not [t for t, _ in driven if t > hand.relaxed_at[0]]
+
+
+def change(**fields):
+    """A spoiler that sets these fields of a reading; a function gets (old value, now)."""
+
+    def spoil(state, now, kept=None):
+        for name, value in fields.items():
+            setattr(state, name, value(getattr(state, name), now) if callable(value) else value)
+
+    return spoil
+
+
+def one(value, joint=4):
+    return lambda old, now: np.where(np.arange(12) == joint, value, np.asarray(old, float))
+
+
+def frozen(**fields):
+    """The same reading again and again, with these fields changed."""
+
+    def spoil(state, now, kept):
+        kept.append(dataclasses.replace(state))
+        again = dataclasses.replace(kept[0])
+        change(**fields)(again, now)
+        return again
+
+    return spoil
+
+
+def taxel(value):
+    def put(old, now):
+        new = np.asarray(old, float).copy()
+        new[2, 60, 2] = value
+        return new
+
+    return put
+
+
+HAND = {
+    "stamps an hour ahead, frozen": frozen(time=lambda old, now: now + 3600),
+    "stamps an hour ahead, frozen, counted on": frozen(time=lambda old, now: now + 3600, sequence=lambda old, now: int(1e6 * now)),
+    "stamps of NaN, frozen": frozen(time=NAN),
+    "stamps of now, frozen": frozen(time=lambda old, now: now),
+    "stamps ahead": change(time=lambda old, now: now + 1.0), "stamps of NaN": change(time=NAN), "stamps of inf": change(time=INF),
+    "stamps of None": change(time=None), "stamps an hour old": change(time=lambda old, now: now - 3600),
+    "stamps that run backwards": change(time=lambda old, now: 200 - now),
+    "no reading any more": frozen(), "a position of NaN": change(position=one(NAN)), "positions of NaN": change(position=np.full(12, NAN)),
+    "a position of 1e9": change(position=one(1e9)), "a position of -inf": change(position=one(-INF)), "11 positions": change(position=np.zeros(11)),
+    "positions of text": change(position=["x"] * 12), "a current of NaN": change(current=one(NAN)), "currents of NaN": change(current=np.full(12, NAN)),
+    "a current of 1e9": change(current=one(1e9)), "a temperature of NaN": change(temperature=one(NAN)), "a temperature of inf": change(temperature=one(INF)),
+    "90 degC": change(temperature=one(90.0)), "a taxel of NaN": change(tactile=taxel(NAN)), "a taxel of 1e9": change(tactile=taxel(1e9)),
+    "taxels of another shape": change(tactile=np.zeros((5, 12, 3))), "a velocity of 1e9": change(velocity=one(1e9)),
+    "error codes": change(error=one(7)), "an error of NaN": change(error=np.full(12, NAN)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", HAND)
+def test_a_fault_of_the_hands_readings_relaxes_it(b, fault):
+    hand = Spoiled(VirtualClock(100.0), HAND[fault])
+    report = run(b, hand)
+    assert report.ended not in ("done", "") and report.counts["relaxed"] == 1
+    assert hand.relaxed_at[0] - hand.since < 0.15, (hand.relaxed_at[0] - hand.since, report.ended)
+
+
+@pytest.mark.parametrize("fault", HAND)
+def test_a_fault_from_the_start_moves_nothing(b, fault):
+    hand = Spoiled(VirtualClock(100.0), HAND[fault], at=None)
+    begun = hand.clock.now()
+    try:
+        report = run(b, hand)
+        assert report.ended != "done" and hand.relaxed_at[0] - begun < 0.15, report.ended
+        moved = [0.05 - q for _, q, _, mode in hand.sent if mode != PASSIVE]
+        assert np.abs(moved or 0.0).max() < 0.35, "at 3 rad/s, it was homing for a tenth of a second"
+    except UserError as error:
+        assert "no good reading of the hand within 2 s" in str(error) and not [x for x in hand.sent if x[3] != PASSIVE]
+    assert hand.relaxed_at and hand.begun is None
+
+
+def test_one_bad_reading_in_ten_is_left_out_and_counted(b):
+    hand = Spoiled(VirtualClock(100.0), lambda state, now, kept: change(position=one(1e9))(state, now) if state.sequence % 10 == 0 else None, at=None)
+    report = run(b, hand)
+    assert report.ended == "done" and 10 < report.counts["bad_readings"] < 60
+
+
+EYE = {
+    "an hour old": lambda now, since: (PLACE, now - 3600), "never": lambda now, since: None, "a stamp of NaN": lambda now, since: (PLACE, NAN),
+    "an hour ahead": lambda now, since: (PLACE, now + 3600), "a place of NaN": lambda now, since: (PLACE * NAN, now),
+    "a place of 1e9": lambda now, since: (PLACE * 1e10, now), "two numbers": lambda now, since: (PLACE[:2], now), "frozen": lambda now, since: (PLACE, since),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("at", [0.0, 0.3])
+@pytest.mark.parametrize("fault", EYE)
+def test_an_object_that_is_not_seen_relaxes_the_hand(b, fault, at):
+    hand = Spoiled(VirtualClock(100.0))
+    eye = Eye(hand, EYE[fault], at)
+    report = run(b, hand, eye, seen=0.1, seconds=2.0)
+    assert "object" in report.ended, report.ended
+    assert hand.relaxed_at[0] - eye.since < 0.15, (hand.relaxed_at[0] - eye.since, report.ended)
+    if fault == "an hour old":  # without a setting too: its age is beyond any
+        hand = Spoiled(VirtualClock(100.0))
+        eye = Eye(hand, EYE[fault], at)
+        assert "object" in run(b, hand, eye).ended and hand.relaxed_at[0] - eye.since < 0.15
+
+
+# -- settings ---------------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", LIMITS)
+def test_settings_outside_their_range_are_refused_before_anything_moves(b, name):
+    low, high, _ = LIMITS[name]
+    for value in (NAN, INF, -INF, low - 1, high + 1, *([0.0] if low > 0 else [])):
+        hand = Spoiled(VirtualClock(100.0))
+        with pytest.raises(UserError, match=f"^{name}=.*must lie in") as error:
+            run(b, hand, **{name: value})
+        assert "\n" not in str(error.value) and not hand.sent
+
+
+@pytest.mark.parametrize("margin", [0.1, 0.3, 0.5, 0.6, 1.0])
+def test_a_margin_keeps_targets_inside_or_is_refused(b, margin):
+    hand = Spoiled(VirtualClock(100.0))
+    room = np.diff(xhand.joint_limits()).min()
+    if 2 * margin >= room:
+        with pytest.raises(UserError, match="smaller margin="):
+            run(b, hand, margin=margin)
+        assert not hand.sent
+    else:
+        assert run(b, hand, margin=margin, home_error=1.0).ended == "done"
+        low, high = xhand.joint_limits().T
+        q = np.stack([q for _, q, *_ in hand.sent])
+        assert (q >= low + margin - 1e-6).all() and (q <= high - margin + 1e-6).all()
+
+
+def test_the_guard_gives_finite_targets_inside_the_limits_whatever_comes_in():
+    rng = np.random.default_rng(0)
+    low, high = xhand.joint_limits().T
+    g = Guard(low, high, np.full(12, 2.0), np.full(12, 300.0), np.full(12, -1.0), xhand.JOINTS)
+    values = np.array([NAN, INF, -INF, 1e300, -1e300, 0.0, 0.3, -0.3])
+    for _ in range(2000):
+        target, before, q, current = rng.choice(values, (4, 12))
+        out = g.apply(target, before, q, current, 0.02)
+        assert np.isfinite(out).all() and (out >= low).all() and (out <= high).all()
+
+
+# -- relaxing that fails, disks, signals ----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("error", [RuntimeError("bus"), OSError(5, "I/O"), KeyboardInterrupt()])
+def test_relaxing_is_tried_again_until_it_works(b, error):
+    hand = Spoiled(VirtualClock(100.0), HAND["a position of 1e9"])
+    relax, tries = hand.relax, []
+
+    def failing():
+        tries.append(hand.clock.now())
+        if len(tries) <= 3:
+            raise error
+        relax()
+
+    hand.relax = failing
+    report = run(b, hand)
+    assert len(tries) >= 4 and report.counts["relax_failed"] == 3 and not report.not_relaxed
+    assert hand.relaxed_at[0] - hand.since < 0.15
+    assert [mode for t, _, _, mode in hand.sent if t >= tries[0]] == [PASSIVE] * 3, "and the passive mode is sent meanwhile"
+
+
+def test_a_hand_that_never_relaxes_is_said(b, capsys):
+    from dexsim.cli.deploy import _ending
+
+    hand = Spoiled(VirtualClock(100.0))
+
+    def failing():
+        raise OSError(5, "Input/output error")
+
+    hand.relax = failing
+    report = run(b, hand)
+    assert "Input/output" in report.not_relaxed and report.counts["relax_failed"] >= 50
+    _ending(report, None)
+    out = capsys.readouterr().out
+    assert "DANGER" in out and "cut its power" in out and "the hand is relaxed" not in out
+
+
+@pytest.mark.parametrize("at", ["write", "close", "thread"])
+def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_path, at):
+    hand = Spoiled(VirtualClock(100.0))
+    rec = recorder_at(tmp_path / "run.mcap")
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def odd(*_, **__):
+        raise ValueError("what nobody thought of")
+
+    setattr(rec.writer, {"write": "add_state", "close": "close", "thread": "_array"}[at], odd if at == "thread" else full)
+    report = run(b, hand, recorder=rec)
+    assert report.ended == "done" and report.acts == 48 and hand.relaxed_at
+    assert ("nobody thought" if at == "thread" else "No space left") in rec.error and rec.writer._file.closed
+    if at == "close":
+        assert len(read(tmp_path / "run.mcap", audit=False).commands) > 10, "what was written before is there"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_relaxes_and_those_after_it_change_nothing(b, number, tmp_path):
+    def hit(hand, now):
+        if hand.begun and now > hand.begun + 0.3:
+            hand.fault, hand.hit = None, now
+            os.kill(os.getpid(), number)
+
+    hand = Spoiled(VirtualClock(100.0))
+    hand.fault = hit
+    relax = hand.relax
+
+    def impatient():
+        relax()
+        for other in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            os.kill(os.getpid(), other)
+
+    hand.relax = impatient
+    rec = recorder_at(tmp_path / "run.mcap")
+    with _Stop() as stop:
+        report = run(b, hand, recorder=rec)
+    assert stop.status == 128 + number and report.ended == f"stopped by {_Stop.SIGNALS[number]}"
+    assert hand.relaxed_at[0] - hand.hit < 0.02 and report.acts > 10 and not rec.writer._open
+
+
+@pytest.mark.slow
+def test_a_terminal_that_goes_away_leaves_a_relaxed_hand_and_a_whole_recording(b, tmp_path):
+    path = tmp_path / "run.mcap"
+    p = subprocess.Popen([sys.executable, "-m", "dexsim.deploy", f"bundle={b.path}", "seconds=60", "home_speed=2", "late=2", "stale=2", "hang=3",
+                          "overruns=500", f"record={path}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
+    limit = time.monotonic() + 120
+    while not (path.exists() and path.stat().st_size > 40_000) and time.monotonic() < limit:
+        time.sleep(0.1)
+    os.kill(p.pid, signal.SIGHUP)
+    out, _ = p.communicate(timeout=60)
+    assert p.returncode == 129 and "stopped by SIGHUP" in out and "the hand is relaxed" in out
+    assert not [f for f in read(path, audit=False).findings if f.kind == "damage"]
+
+
+# -- the vendor's bus -------------------------------------------------------------------------------------------------------------
+def test_a_bus_that_fails_for_a_while_still_carries_the_command_to_relax():
+    package = FakePackage()
+    send, failing = package.send_command, threading.Event()
+
+    def broken(hand, command):
+        if failing.is_set():
+            raise OSError("bus")
+        send(hand, command)
+
+    package.send_command = broken
+    hand = VendorXHand("/dev/good", package=package)
+    hand.open()
+    hand.send(HandCommand(np.zeros(12), np.full(12, 300)))
+    time.sleep(0.05)
+    failing.set()
+    hand.relax()
+    time.sleep(0.05)
+    assert package.sent[-1][0]["mode"] == 3 and hand.bad_reads > 3
+    failing.clear()
+    hand.close()
+    assert package.sent[-1][0]["mode"] == 0 and package.closed
+
+
+def test_a_bus_that_never_carries_it_is_said(monkeypatch):
+    monkeypatch.setattr("dexsim.deploy.vendor.CLOSE", 0.1)
+    package = FakePackage()
+    hand = VendorXHand("/dev/good", package=package)
+
+    def broken(*_):
+        raise OSError("cable")
+
+    package.send_command = broken
+    hand.open()
+    with pytest.raises(UserError, match="did not carry the command to relax.*cable.*cut the hand's power"):
+        hand.close()
+    assert package.closed
+
+
+# -- the IMU's port ----------------------------------------------------------------------------------------------------------------
+def udp():
+    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+
+def test_the_first_sender_is_the_only_one():
+    imu = UdpImu(0)
+    with udp() as friend, udp() as stranger:
+        at = ("127.0.0.1", imu.port)
+        friend.sendto(b"1 0 0 0", at)
+        stranger.sendto(b"0 1 0 0", at)
+        assert imu.wait(2.0) and imu.sender[1] == friend.getsockname()[1] and imu.foreign == 1
+        for _ in range(50):
+            stranger.sendto(b"0 1 0 0", at)
+        assert imu.orientation(7.0)[1] < 7.0 or imu.orientation(7.0)[0].tolist() == [1, 0, 0, 0]
+        friend.sendto(b"0.6 0 0 0.8", at)
+        time.sleep(0.01)
+        q, seen = imu.orientation(8.0)
+        assert q.tolist() == [0.6, 0, 0, 0.8] and seen == 8.0
+    imu.close()
+
+
+def test_a_named_sender_is_the_only_one_from_the_start():
+    with udp() as friend, udp() as stranger:
+        friend.bind(("127.0.0.1", 0))
+        imu = UdpImu(0, sender_port=friend.getsockname()[1])
+        at = ("127.0.0.1", imu.port)
+        stranger.sendto(b"0 1 0 0", at)
+        time.sleep(0.01)
+        assert imu.orientation(1.0) is None
+        friend.sendto(b"1 0 0 0", at)
+        time.sleep(0.01)
+        assert imu.orientation(2.0)[0].tolist() == [1, 0, 0, 0]
+        imu.close()
+
+
+def test_a_flood_of_others_starves_nothing():
+    imu = UdpImu(0)
+    stop = threading.Event()
+    with udp() as friend:
+        at = ("127.0.0.1", imu.port)
+        friend.sendto(b"1 0 0 0", at)
+        assert imu.wait(2.0)
+
+        def flood():
+            with udp() as s:
+                while not stop.is_set():
+                    s.sendto(b"0 1 0 0", at)
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            came = 0
+            for k in range(40):
+                friend.sendto(f"{1 + k * 1e-3} 0 0 0.1".encode(), at)
+                time.sleep(0.005)
+                q, seen = imu.orientation(100.0 + k)
+                came += seen == 100.0 + k
+                assert q[1] == 0
+        finally:
+            stop.set()
+            thread.join()
+        assert came >= 38
+    imu.close()
