@@ -22,8 +22,8 @@ from test_deploy import FakeHand, FakePackage, recorder_at
 from dexsim import export
 from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
-from dexsim.deploy import bundle
 from dexsim.cli.deploy import _Stop
+from dexsim.deploy import bundle
 from dexsim.deploy.driver import PASSIVE, HandCommand, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import LIMITS, Loop, LoopSettings
@@ -97,7 +97,7 @@ def run(b, hand, eye=None, recorder=None, **changes):
 def check_sent(hand, guard):
     """Nothing that is not finite or outside the limits has left, and nothing drives after the first letting go."""
     driven = [(t, q) for t, q, _, mode in hand.sent if mode != PASSIVE]
-    for t, q in driven:
+    for _, q in driven:
         assert np.isfinite(q).all() and (q >= guard.low - 1e-6).all() and (q <= guard.high + 1e-6).all()
     if hand.relaxed_at:
         assert not [t for t, _ in driven if t > hand.relaxed_at[0]]
