@@ -14,7 +14,8 @@ import warp as wp
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
 from dexsim.actuator.columns import FEATURES, INDEX, column
 from dexsim.actuator.reference import servo as servo_reference
-from dexsim.actuator.reference import target_in_force
+from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS
+from dexsim.actuator.reference import target_in_force, target_rates
 from dexsim.errors import UserError
 from dexsim.sim import make_engine
 
@@ -92,7 +93,7 @@ def random_params(rng, shape) -> np.ndarray:
         "eccentric_sin": 0.05, "eccentric_cos": 0.05, "speed_lag": 0.02, "deadband_kind": 2.9,
         "backlash": 0.05, "rebound": 0.5, "softness": 0.2, "hardening": 0.5, "rotor": 3e-3,
         "thermal_torque": -0.01, "thermal_friction": 0.02, "thermal_resistance": 0.004, "warmth": 40.0,
-        "sag": 0.3, "braking_slope": 1.0, "coupling": 0.3, "coupling_from": 2.9,
+        "sag": 0.3, "braking_slope": 1.0, "speed_feedforward": 0.01, "acceleration_feedforward": 1e-5, "integral_gain": 20.0, "coupling": 0.3, "coupling_from": 2.9,
         "standin_constant": 0.05, "standin_position": -0.2, "standin_speed": -0.01, "standin_drag": -0.002,
     }  # fmt: skip
     around = ("efficiency", "supply", "position_scale")
@@ -112,7 +113,7 @@ def test_every_column_is_randomized_here():
 
 
 @pytest.mark.parametrize("voltage", [False, True])
-@pytest.mark.parametrize("features", [(), ("braking",), ("play",), tuple(FEATURES)])
+@pytest.mark.parametrize("features", [(), ("braking",), ("controller",), ("play",), tuple(FEATURES)])
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     """Also that a kernel built without a feature does not see its columns."""
@@ -132,15 +133,16 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     slots, queue = servo.slots, servo.queue
     state[..., slots["motor"]] = rng.normal(0, 0.3, (n, j))
     state[..., slots["enabled"]] = rng.random((n, j)) < 0.9
-    state[..., slots["stamp0"] : slots["stamp0"] + queue] = np.sort(rng.uniform(0.9, 1.0, (n, j, queue)))
+    state[..., slots["stamp0"] : slots["stamp0"] + queue] = 0.5 * np.sort(rng.uniform(0.9, 1.0, (n, j, queue))) + 0.5 * np.linspace(0.9, 1.0, queue)
     state[..., slots["target0"] : slots["target0"] + queue] = rng.normal(0, 0.3, (n, j, queue))
     servo.base_armature[:] = torch.as_tensor(rng.uniform(0, 2e-3, (n, j)))
     servo.home[:] = torch.as_tensor(rng.normal(0, 0.1, (n, j)))
-    extra = bool({"play", "rare"} & set(features))
+    extra = bool(EXTENDED & set(features))
     if extra:
         state[..., slots["fresh"]] = rng.random((n, j)) < 0.1
         state[..., slots["filtered"]], state[..., slots["line_a"]] = rng.normal(0, 6.0, (2, n, j))
         state[..., slots["line_b"]] = rng.uniform(-0.2, 0.9, (n, j))
+        state[..., slots["integral"]] = rng.normal(0, 0.3, (n, j))
     servo.set_state(torch.as_tensor(state, dtype=servo.state.dtype))
     q, v = rng.normal(0, 0.1, (n, j)), rng.normal(0, 6.0, (n, j)) * (rng.random((n, j)) < 0.8)
     if extra:
@@ -160,12 +162,12 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
 
     stamps, targets = np.split(state[..., slots["stamp0"] : slots["stamp0"] + 2 * queue], 2, axis=-1)
     target = target_in_force(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt)
-    known = {name: state[..., slots[name]] for name in ("filtered", "rotor", "line_a", "line_b", "fresh")} if extra else {}
+    known = {name: state[..., slots[name]] for name in EXTRA_SLOTS} if extra else {}
     source = np.clip(params[..., INDEX["coupling_from"]].astype(int), 0, j - 1)
     expected = servo_reference(
         params, target, q, v, dt=engine.dt, voltage=voltage, features=features, base_armature=armature, **known,
         dragging=np.take_along_axis(q - home, source, 1), others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
-        loop_motor=np.array([False, True, False]),
+        loop_motor=np.array([False, True, False]), rates=target_rates(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt),
         last=state[..., slots["motor"]], enabled=state[..., slots["enabled"]], inertia=servo.inertia.numpy(),
         base_damping=servo.base_damping.numpy(),
     )  # fmt: skip
@@ -177,6 +179,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     }
     if extra:
         got |= {name: servo.state[..., slots[name]].numpy() for name in ("line_a", "line_b") if "play" in features}
+        got |= {"integral": servo.state[..., slots["integral"]].numpy()} if "controller" in features else {}
         got |= {"filtered": servo.state[..., slots["filtered"]].numpy()} if "rare" in features else {}
     if "play" in features:
         got |= {"rotor": servo.state[..., slots["rotor"]].numpy(), "dof_armature": engine.field("dof_armature")[:, vi].numpy()}

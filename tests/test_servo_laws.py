@@ -13,7 +13,7 @@ from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants
 from dexsim.sim import make_engine
-from tests.test_servo import link_spec
+from tests.test_servo import STICKS, link_spec
 
 FREE = {"kp": 100.0, "kd": 0.0, "torque_limit": 0.4, "no_load_speed": 10.0}
 INERTIA = 1e-3
@@ -21,7 +21,7 @@ INERTIA = 1e-3
 
 def servo_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0, dt: float = 0.001) -> np.ndarray:
     """[steps, 3] q, v, motor torque at the begin of each step: a free link on the servo's kernel in C MuJoCo."""
-    engine = make_engine(link_spec(INERTIA, dt), 1, engine="mujoco", fields=FIELDS, threads=1)
+    engine = make_engine(link_spec(INERTIA, dt, friction=STICKS), 1, engine="mujoco", fields=FIELDS, threads=1)
     servo = Servo(engine, ["joint"], ServoTable.from_dict({"joints": {"joint": columns}}), control_period=0.005)
     engine.t.qvel[:] = v0
     out, k = [], 0
@@ -101,3 +101,87 @@ def test_braking_slope_round_trip_and_range(tmp_path):
     assert COLUMNS[INDEX["braking_slope"]].neutral == 1.0
     low, high = again.bounds(["b"])
     assert (low[0, INDEX["braking_slope"]], high[0, INDEX["braking_slope"]]) == (-1.0, 0.0)
+
+
+# -- the controller's other terms --------------------------------------------------------------------------------------------
+
+LOOP = {"kp": 2.0, "kd": 0.04, "viscous_friction": 0.01}
+TERMS = [
+    {"speed_feedforward": 0.05},
+    {"speed_feedforward": 0.05, "acceleration_feedforward": 1e-3},
+    {"integral_gain": 20.0},
+    {"integral_gain": 20.0, "torque_limit": 0.06, "no_load_speed": 40.0},  # winds up but for the limit
+]
+
+
+def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5) -> np.ndarray:
+    """[n] q at every `fine` s of the same link: explicit Euler of the controller's law as `laws.py` states it, written apart."""
+    c = {"speed_feedforward": 0.0, "acceleration_feedforward": 0.0, "integral_gain": 0.0, "torque_limit": np.inf, "no_load_speed": np.inf}
+    c |= columns
+    q = v = integral = 0.0
+    r, rate, bend, until = 0.0, 0.0, 0.0, np.inf
+    k, out = 0, []
+    for i in range(round(seconds / fine)):
+        now = i * fine
+        if k < len(times) and times[k] <= now + 1e-9:
+            if k:
+                span = times[k] - times[k - 1]
+                new = (targets[k] - r) / span
+                rate, bend, until = new, (new - rate) / span, now + 2 * span
+            r, k = targets[k], k + 1
+        if now >= until - 1e-9:
+            rate, bend = 0.0, 0.0
+        e = r - q
+        asked = c["kp"] * e - c["kd"] * v + c["speed_feedforward"] * rate + c["acceleration_feedforward"] * bend + integral
+        limit = c["torque_limit"] * max(0.0, 1.0 - abs(v) / c["no_load_speed"])
+        if abs(asked) <= limit or asked * e < 0:
+            integral += fine * c["integral_gain"] * e
+        out.append(q)
+        v += fine * (min(max(asked, -limit), limit) - c["viscous_friction"] * v) / INERTIA
+        q += fine * v
+    return np.array(out)
+
+
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+@pytest.mark.parametrize("terms", TERMS)
+def test_controller_terms_against_an_independent_integration(motion, terms):
+    """A stream of targets 100 times a second that stops half way: what is commanded is still, and the speed's term with it."""
+    times = np.arange(0.0, 0.3, 0.01)
+    targets = 0.4 * np.sin(9.0 * times) ** 2
+    steps = 50  # of the integration in a millisecond
+    expected = controller(LOOP | terms, times, targets, 0.5)[::steps]
+    plain = {k: v for k, v in terms.items() if k in ("torque_limit", "no_load_speed")}
+    without = controller(LOOP | plain, times, targets, 0.5)[::steps]
+    got = motion(LOOP | terms, times, targets, 0.5)[:, 0]
+    error = np.sqrt(np.mean((got - expected) ** 2))
+    assert error < 0.003, error
+    assert error < 0.15 * np.sqrt(np.mean((without - expected) ** 2))
+
+
+def test_a_speed_loop_inside_a_position_loop_is_these_columns():
+    """The cascade of `laws.py`: P position loop with full speed feed-forward around a PI speed loop, integrated by itself."""
+    k_pp, k_vp, k_vi, fine = 20.0, 0.05, 0.6, 2e-5
+    times = np.arange(0.0, 0.3, 0.01)
+    targets = 0.4 * np.sin(9.0 * times) ** 2
+    q = v = i_v = 0.0
+    expected, ramp = [], np.concatenate([[0.0], np.diff(targets) / 0.01])
+    for i in range(round(0.3 / fine)):
+        k = int((i + 0.5) * fine / 0.01)
+        u = k_pp * (targets[k] - q) + ramp[k]
+        # the integral of r' of held targets is r itself one interval late; the columns' kp acts on r: compare what both see
+        i_v += fine * (k_pp * (targets[k] - q) - v)
+        tau = k_vp * (u - v) + k_vi * (i_v + targets[k])
+        expected.append(q)
+        v += fine * tau / INERTIA
+        q += fine * v
+    columns = {"kp": k_vp * k_pp + k_vi, "kd": k_vp, "speed_feedforward": k_vp, "integral_gain": k_vi * k_pp}
+    got = servo_motion(columns, times, targets, 0.3, dt=0.0005)[:, 0]
+    assert np.sqrt(np.mean((got - np.array(expected)[::25]) ** 2)) < 0.002
+
+
+def test_an_integral_overcomes_dry_friction():
+    """A step whose proportional torque is less than the dry friction: without an integral the joint never moves."""
+    columns = {"kp": 2.0, "kd": 0.2, "integral_gain": 30.0, "coulomb_friction": 0.05}
+    for motion in (servo_motion, plant_motion):
+        with_, without = (motion(c, [0.0], [0.02], 1.0)[-1, 0] for c in (columns, columns | {"integral_gain": 0.0}))
+        assert abs(with_ - 0.02) < 0.006 and abs(without) < 0.001

@@ -33,6 +33,9 @@ COLUMNS: tuple[Column, ...] = (
     # The servo's loop (paper, "Actuator Model Randomization").
     Column("kp", "N.m/rad", 0.0, 0.0, 1e5, "proportional gain; duty per rad when drive is voltage"),
     Column("kd", "N.m.s/rad", 0.0, 0.0, 1e4, "gain on the measured velocity; duty per rad/s when drive is voltage"),
+    Column("speed_feedforward", "N.m.s/rad", 0.0, 0.0, 1e4, "gain on the target's speed, added to the PD; duty per rad/s when drive is voltage"),
+    Column("acceleration_feedforward", "N.m.s2/rad", 0.0, 0.0, 1e4, "gain on the target's acceleration, added to the PD; duty per rad/s2 when drive is voltage"),
+    Column("integral_gain", "N.m/(rad.s)", 0.0, 0.0, 1e6, "gain on the time integral of the position error, which waits at the torque limit; duty per rad.s when drive is voltage"),
     Column("deadband", "rad", 0.0, 0.0, 1.0, "no torque while |target - position| is less (the paper's epsilon)"),
     Column("torque_limit", "N.m", INF, 0.0, INF, "stall torque tau0: the clamp at zero speed"),
     Column("no_load_speed", "rad/s", INF, 1e-3, INF, "speed at which the torque-speed line reaches zero"),
@@ -92,6 +95,7 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "play": ("backlash", "softness"),
     "sag": ("sag",),
     "braking": ("braking_slope",),
+    "controller": ("speed_feedforward", "acceleration_feedforward", "integral_gain"),
     "rare": ("eccentric_sin", "eccentric_cos", "speed_lag", "deadband_kind", "thermal_torque", "thermal_friction", "thermal_resistance", "coupling"),
 }
 """What is compiled into a servo only where one of these columns differs from its neutral value."""

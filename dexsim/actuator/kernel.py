@@ -3,7 +3,7 @@
 The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is taken as zero: targets are held):
 
     e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder
-    tau_c  = kp * e - kd * qd_m
+    tau_c  = kp * e - kd * qd_m                                            (+ the controller's other terms, `laws.controller_terms`)
     tau_b  = 0 if |e| < deadband else tau_c
     limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b = 1 where motor * qd >= 0, braking_slope where it brakes
     motor  = clip(tau_b, -limit, +limit)                                   what the motor's current shows
@@ -39,18 +39,20 @@ the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 do
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
 from functools import lru_cache
+from typing import Any
 
 import warp as wp
 
 from dexsim.actuator.columns import INDEX
-from dexsim.actuator.laws import torque_limit
+from dexsim.actuator.laws import difference, hold, torque_limit, wind
 
 # Slots of state[world, joint, slot] before the queue: `queue` stamps [s], then `queue` targets [rad], oldest first.
 MOTOR, ENABLED, QUEUE = 0, 1, 2
 SLOTS = ("motor", "enabled")
 # After the queue, where a feature of `columns.FEATURES` needs it. line_a, line_b: see "Play and elasticity".
-EXTRA_SLOTS = ("filtered", "rotor", "line_a", "line_b", "fresh")
-FILTERED, ROTOR, LINE_A, LINE_B, FRESH = range(len(EXTRA_SLOTS))
+EXTRA_SLOTS = ("filtered", "rotor", "line_a", "line_b", "fresh", "integral")
+FILTERED, ROTOR, LINE_A, LINE_B, FRESH, INTEGRAL = range(len(EXTRA_SLOTS))
+EXTENDED = frozenset({"play", "rare", "controller"})  # the features that need them
 
 NEVER = -1.0e9  # the stamp of a target that has always been there
 SEED = 1.0e-6  # of the stall torque: braking from the no-load speed starts from no less
@@ -79,16 +81,38 @@ THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE, WARMTH = (
     INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance", "warmth")
 )
 BRAKING = INDEX["braking_slope"]
+FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain"))
 SAG, COUPLING, COUPLING_FROM = INDEX["sag"], INDEX["coupling"], INDEX["coupling_from"]
 REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
 REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
+@wp.func
+def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin: Any, dt: Any):
+    """(speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt] of what is in force
+    (`laws.difference`, `laws.hold`): begin is the step's, less the delay."""
+    speed = begin * type(begin)(0.0)
+    acceleration = begin * type(begin)(0.0)
+    rate = begin * type(begin)(0.0)
+    for k in range(1, queue):
+        stamp = state[w, j, QUEUE + k]
+        span = stamp - state[w, j, QUEUE + k - 1]
+        before = rate
+        rate = difference(state[w, j, QUEUE + queue + k], state[w, j, QUEUE + queue + k - 1], span, dt)
+        until = begin + dt
+        if k + 1 < queue:
+            until = wp.min(until, state[w, j, QUEUE + k + 1])
+        share = hold(stamp, span, until, begin, dt)
+        speed += share * rate
+        acceleration += share * difference(rate, before, span, dt)
+    return wp.vector(speed, acceleration)
+
+
 @lru_cache(maxsize=None)
 def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`."""
-    play, sag, rare, braking = (name in features for name in ("play", "sag", "rare", "braking"))
-    extended = play or rare
+    play, sag, rare, braking, controller = (name in features for name in ("play", "sag", "rare", "braking", "controller"))
+    extended = bool(features & EXTENDED)
 
     @wp.kernel(module="unique", enable_backward=False)
     def servo(
@@ -199,36 +223,7 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
                 other = wp.clamp(int(params[w, j, COUPLING_FROM]), 0, dof_q.shape[0] - 1)
                 target += dragged * (qpos[w, dof_q[other]] - home[w, other])
 
-        # PD: now (what the current shows) and as a line in the velocity at the end of the step.
-        e = target - q_m
-        kp = params[w, j, KP]
-        now = kp * e - params[w, j, KD] * v_d
-        pd = now - kp * dt * v_m
-        slope = scale * (kp * dt + params[w, j, KD])
-        kind = zero
-        if wp.static(rare):
-            pd = kp * e - params[w, j, KD] * v_next - kp * dt * v_m
-            slope = scale * (kp * dt + kd_blend * params[w, j, KD])
-            kind = params[w, j, DEADBAND_KIND]
-            if kind > real(1.5):
-                cut = kp * wp.clamp(e, -params[w, j, DEADBAND], params[w, j, DEADBAND])
-                now -= cut
-                pd -= cut
-        if wp.abs(e) < params[w, j, DEADBAND]:
-            if wp.static(rare):
-                if kind > real(0.5):
-                    now = -params[w, j, KD] * v_d
-                    pd = -params[w, j, KD] * v_next
-                    slope = scale * kd_blend * params[w, j, KD]
-                else:
-                    now = zero
-                    pd = zero
-                    slope = zero
-            else:
-                now = zero
-                pd = zero
-                slope = zero
-
+        # What the supply and the temperature leave of the motor, and its limits at this speed.
         tau0 = params[w, j, TORQUE_LIMIT]
         supply = params[w, j, SUPPLY]
         no_load = params[w, j, NO_LOAD_SPEED]
@@ -247,6 +242,72 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
         if wp.static(sag):
             others = given[w] - wp.abs(torque[w, j])
             supply = supply * wp.max(one - params[w, j, SAG] * others, wp.static(real(0.05)))
+        x = zero  # speed over no-load speed
+        upper = one  # limits of torque, or of duty
+        lower = one
+        steep = one  # how the limit falls with the speed while braking
+        if wp.static(not voltage):
+            x = wp.abs(v_drive) / (no_load * supply)
+            upper = torque_limit(tau0, x, one)
+            lower = upper
+            if wp.static(braking):
+                steep = params[w, j, BRAKING]
+                if v_drive > zero:
+                    lower = torque_limit(tau0, x, steep)
+                elif v_drive < zero:
+                    upper = torque_limit(tau0, x, steep)
+
+        # PD: now (what the current shows) and as a line in the velocity at the end of the step.
+        e = target - q_m
+        kp = params[w, j, KP]
+        now = kp * e - params[w, j, KD] * v_d
+        pd = now - kp * dt * v_m
+        slope = scale * (kp * dt + params[w, j, KD])
+        kind = zero
+        if wp.static(rare):
+            pd = kp * e - params[w, j, KD] * v_next - kp * dt * v_m
+            slope = scale * (kp * dt + kd_blend * params[w, j, KD])
+            kind = params[w, j, DEADBAND_KIND]
+            if kind > real(1.5):
+                cut = kp * wp.clamp(e, -params[w, j, DEADBAND], params[w, j, DEADBAND])
+                now -= cut
+                pd -= cut
+        dead = wp.abs(e) < params[w, j, DEADBAND]
+        if dead:
+            if wp.static(rare):
+                if kind > real(0.5):
+                    now = -params[w, j, KD] * v_d
+                    pd = -params[w, j, KD] * v_next
+                    slope = scale * kd_blend * params[w, j, KD]
+                else:
+                    now = zero
+                    pd = zero
+                    slope = zero
+            else:
+                now = zero
+                pd = zero
+                slope = zero
+
+        if wp.static(controller):
+            wish = target_rates(state, w, j, queue, end - dt, dt)
+            feed = params[w, j, FEED_SPEED] * wish[0] + params[w, j, FEED_ACCELERATION] * wish[1]
+            ki = params[w, j, INTEGRAL_GAIN]
+            e_i = e  # the error that is integrated: what the deadband leaves of it
+            if kind > real(1.5):
+                e_i = e - wp.clamp(e, -params[w, j, DEADBAND], params[w, j, DEADBAND])
+            if dead:
+                e_i = zero
+            wound = zero
+            if state[w, j, ENABLED] != zero:
+                wound = state[w, j, x0 + INTEGRAL]
+                wound = wind(wound, dt * ki * e_i, now + feed + wound, lower, upper)
+            state[w, j, x0 + INTEGRAL] = wound
+            if not dead or kind > real(0.5):
+                now += feed + wound
+                pd += feed + wound
+                if not dead:  # backward Euler of the integral, too
+                    pd += dt * ki * (e_i - dt * v_m)
+                    slope += scale * dt * dt * ki
         motor_now = zero
         motor = zero
         damping = zero
@@ -265,16 +326,6 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
                 damping = wp.max(ratio * damping, line)
                 on_drive = damping
         else:
-            x = wp.abs(v_drive) / (no_load * supply)  # speed over no-load speed
-            upper = torque_limit(tau0, x, one)
-            lower = upper
-            steep = one  # how the limit falls with the speed while braking
-            if wp.static(braking):
-                steep = params[w, j, BRAKING]
-                if v_drive > zero:
-                    lower = torque_limit(tau0, x, steep)
-                elif v_drive < zero:
-                    upper = torque_limit(tau0, x, steep)
             motor_now = wp.clamp(now, -lower, upper)
             motor = wp.clamp(pd, -lower, upper)
             limit = upper
@@ -471,6 +522,7 @@ def reset_kernel(real, extended: bool = False):
             return
         if wp.static(extended):
             state[w, j, QUEUE + 2 * queue + FRESH] = real(1.0)
+            state[w, j, QUEUE + 2 * queue + INTEGRAL] = real(0.0)
         state[w, j, MOTOR] = real(0.0)
         state[w, j, ENABLED] = real(1.0)
         for k in range(queue):

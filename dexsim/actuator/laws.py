@@ -21,3 +21,47 @@ def torque_limit(tau0: Any, x: Any, slope: Any):
     if slope * x < type(x)(1.0):
         limit = tau0 * (type(x)(1.0) - slope * x)
     return limit
+
+
+# -- the controller ------------------------------------------------------------------------------------------------------------
+#
+# tau_c = kp e - kd qd_m + speed_feedforward * r' + acceleration_feedforward * r'' + integral_gain * integral of e dt,
+# e = r - q_m, r the target in force. r' and r'' are taken from the targets as a drive takes them, by `difference`.
+#
+# A cascade of a proportional position loop and a PI speed loop,
+#     u = K_pp e + F r',    tau_c = K_vp (u - qd) + K_vi * integral of (u - qd) dt,
+# is the same law with
+#     kp = K_vp K_pp + K_vi F,  kd = K_vp,  speed_feedforward = K_vp F,  integral_gain = K_vi K_pp    where F = 1 or K_vi = 0
+# (from rest at e = 0: the integral of r' - qd is e). Without feed-forward (F = 0) its integral holds -K_vi q, a term in q alone:
+# kp = K_vp K_pp + K_vi then acts on -q, and only K_vp K_pp of it on r; that one is not expressed by these columns. A current loop
+# below is the column `lag`. (G. Ellis, Control System Design Guide, 4th ed. 2012, ch. 17.)
+
+HOLDS = wp.constant(2.0)  # intervals between targets for which their speed counts, if no other target comes: one may be late
+SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this are one
+
+
+@wp.func
+def difference(new: Any, old: Any, span: Any, dt: Any):
+    """Backward difference (new - old) / span of two targets, or of two of their speeds, span [s] apart; 0 for a jump in no time."""
+    rate = type(new)(0.0)
+    if span > type(dt)(SHORTEST) * dt:
+        rate = (new - old) / span
+    return rate
+
+
+@wp.func
+def hold(stamp: Any, span: Any, until: Any, begin: Any, dt: Any):
+    """Share of the step [begin, begin + dt] in which a target's speed is in force: from the target's time `stamp` to `until` (the
+    step's end, or the next target), for at most HOLDS times the interval `span` that it was taken over [s]."""
+    end = wp.min(until, stamp + type(span)(HOLDS) * span)
+    return wp.max(end - wp.max(stamp, begin), type(dt)(0.0)) / dt
+
+
+@wp.func
+def wind(integral: Any, step: Any, asked: Any, lower: Any, upper: Any):
+    """The integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for, with it, is beyond the
+    limits -lower .. upper and the step would take it further (conditional integration: K. Astrom, T. Hagglund, PID Controllers,
+    2nd ed. 1995, section 3.5)."""
+    if (asked > upper and step > type(step)(0.0)) or (asked < -lower and step < type(step)(0.0)):
+        return integral
+    return integral + step

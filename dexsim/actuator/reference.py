@@ -22,6 +22,24 @@ def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
     return target
 
 
+def target_rates(time, stamps, targets, delay, dt) -> tuple[np.ndarray, np.ndarray]:
+    """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step: arguments as for `target_in_force`.
+
+    Target k has speed (x_k - x_k-1) / span and acceleration (speed_k - speed_k-1) / span, span = t_k - t_k-1, from t_k to the
+    next target, for at most 2 span.
+    """
+    begin = np.asarray(time - delay, dtype=float)
+    spans = np.diff(stamps, axis=-1)
+    real = spans > SNAP * dt
+    per = 1.0 / np.where(real, spans, np.inf)
+    rates = np.diff(targets, axis=-1) * per
+    bends = np.diff(np.concatenate([np.zeros_like(rates[..., :1]), rates], -1), axis=-1) * per
+    ends = np.concatenate([stamps[..., 2:], np.full_like(stamps[..., :1], np.inf)], -1)
+    ends = np.minimum(np.minimum(ends, stamps[..., 1:] + 2.0 * spans), (begin + dt)[..., None])
+    share = np.maximum(ends - np.maximum(stamps[..., 1:], begin[..., None]), 0.0) / dt
+    return (share * rates).sum(-1), (share * bends).sum(-1)
+
+
 def servo(
     params,
     target,
@@ -47,6 +65,8 @@ def servo(
     line_b=0.0,
     fresh=1.0,
     loop_motor=False,
+    rates=(0.0, 0.0),
+    integral=0.0,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
@@ -54,9 +74,10 @@ def servo(
     (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint
     [kg.m2]; base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
     far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered, rotor, line_a,
-    line_b, fresh: the state's slots; loop_motor: the loop's encoder is on the rotor.
+    line_b, fresh, integral: the state's slots; loop_motor: the loop's encoder is on the rotor; rates: the target's speed and
+    acceleration (`target_rates`).
     Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as
-    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`.
+    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`, `integral`.
     """
     play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
@@ -104,6 +125,25 @@ def servo(
             efficiency = efficiency * torque_factor
     if "sag" in features:
         supply = supply * np.maximum(1.0 - p["sag"] * others, 0.05)
+    upper, lower = np.ones_like(v), np.ones_like(v)  # limits of the duty, or of the torque
+    if not voltage:
+        with np.errstate(invalid="ignore"):
+            x = np.abs(v_drive) / (no_load * supply)
+            steep = p["braking_slope"] if "braking" in features else np.ones_like(v)
+            drives, brakes = (np.where(k * x < 1.0, tau0 * (1.0 - k * x), 0.0) for k in (1.0, steep))
+            upper, lower = np.where(v_drive < 0.0, brakes, drives), np.where(v_drive > 0.0, brakes, drives)
+    if "controller" in features:
+        feed = p["speed_feedforward"] * rates[0] + p["acceleration_feedforward"] * rates[1]
+        counted = np.where(dead, 0.0, np.where(kind > 1.5, e - np.clip(e, -p["deadband"], p["deadband"]), e))
+        added = dt * p["integral_gain"] * counted
+        asked = now + feed + integral
+        waits = ((asked > upper) & (added > 0.0)) | ((asked < -lower) & (added < 0.0))
+        integral = np.where(np.asarray(enabled) == 0.0, 0.0, integral + np.where(waits, 0.0, added))
+        acts, off = ~dead | damped, ~dead
+        now = now + np.where(acts, feed + integral, 0.0)
+        pd = pd + np.where(acts, feed + integral, 0.0) + np.where(off, added - dt * dt * p["integral_gain"] * v_m, 0.0)
+        slope = slope + np.where(off, scale * dt * dt * p["integral_gain"], 0.0)
+
     inertia_drive = np.where(two, rotor_inertia, inertia)
     with np.errstate(divide="ignore", invalid="ignore"):  # np.where evaluates the branch not taken
         if voltage:
@@ -116,10 +156,6 @@ def servo(
             on_drive = np.where(np.abs(pd) > 1.0, np.maximum(ratio * damping, line), line)
             damping = np.where(np.abs(pd) > 1.0, on_drive, damping)
         else:
-            x = np.abs(v_drive) / (no_load * supply)
-            steep = p["braking_slope"] if "braking" in features else np.ones_like(v)
-            drives, brakes = (np.where(k * x < 1.0, tau0 * (1.0 - k * x), 0.0) for k in (1.0, steep))
-            upper, lower = np.where(v_drive < 0.0, brakes, drives), np.where(v_drive > 0.0, brakes, drives)
             motor_now = np.clip(now, -lower, upper)
             motor = np.clip(pd, -lower, upper)
             limit = np.where(pd < 0.0, lower, upper)
@@ -184,7 +220,7 @@ def servo(
         other["dof_frictionloss"] = np.broadcast_to(base_frictionloss, v.shape)
     out = {name: np.where(two, other[name], one[name]) for name in one}
     armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) + np.where(two, other.get("armature", 0.0), 0.0) if play else base_armature
-    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q}
+    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q, "integral": integral}
 
 
 def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:

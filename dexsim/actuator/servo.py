@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from dexsim.actuator.columns import COLUMNS, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
-from dexsim.actuator.kernel import EXTRA_SLOTS, QUEUE, SLOTS, given_kernel, reset_kernel, send_kernel, servo_kernel
+from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS, QUEUE, SLOTS, given_kernel, reset_kernel, send_kernel, servo_kernel
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 
@@ -73,19 +73,19 @@ class Servo:
 
         nominal = table.nominal(self.joints)
         _check_drags(table, self.joints, nominal)
+        named = {*_stated(table, self.joints), *varied}
+        self.features = frozenset(FEATURE_OF[name] for name in named if name in FEATURE_OF)
         self.queue, self.control_period = 8, control_period
-        if control_period:  # the newest entry, one a period through the longest delay, and one before
+        if control_period:  # the newest entry, one a period through the longest delay, and one before (three, where they have rates)
             longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
-            self.queue = max(8, math.ceil(longest / control_period) + 3)
+            self.queue = max(8, math.ceil(longest / control_period) + 3 + 2 * ("controller" in self.features))
         self.slots = {name: i for i, name in enumerate(SLOTS)}
         for k in range(self.queue):
             self.slots[f"stamp{k}"] = QUEUE + k
             self.slots[f"target{k}"] = QUEUE + self.queue + k
-        named = {*_stated(table, self.joints), *varied}
-        self.features = frozenset(FEATURE_OF[name] for name in named if name in FEATURE_OF)
         before_play = "play" in self.features and "motor" in table.encoder("position", self.joints)
         self.misread = before_play or bool(named & {"position_offset", "position_scale", "eccentric_sin", "eccentric_cos"})
-        extended = bool(self.features & {"play", "rare"})
+        extended = bool(self.features & EXTENDED)
         if extended:
             self.slots |= {name: QUEUE + 2 * self.queue + i for i, name in enumerate(EXTRA_SLOTS)}
 

@@ -240,6 +240,11 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
     now = np.stack([w.target for w in worlds])
     servo.reset(None, up(now))
+    if rows[:, :, SERVO_INDEX["integral_gain"]].any():  # a drive that has been on before: its integral holds the load, as in the plant
+        held = _gravity(engine.mjm, qpos, dofs) / np.maximum(rows[:, :, SERVO_INDEX["efficiency"]], 0.01)
+        if worlds[0].table.drive == "voltage":
+            held /= rows[:, :, SERVO_INDEX["torque_limit"]] * rows[:, :, SERVO_INDEX["supply"]]
+        servo.state[:, :, servo.slots["integral"]] = up(held)
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
     given = torch.zeros_like(seen) if torque else None
@@ -255,7 +260,7 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
                     row = w.targets[sent[i]]
                     new = np.where(np.isfinite(row), row, now[i])
                     sent[i] += 1
-                    if (new != now[i]).any():
+                    if (new != now[i]).any() or "controller" in servo.features:  # a target sent again has no speed
                         now[i], mask[i], stamp[i] = new, True, w.stamps[sent[i] - 1]
                         break
             if not mask.any():
@@ -277,6 +282,16 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
             given[k].copy_(servo.torque)
     q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
     return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+
+def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: Sequence[int]) -> np.ndarray:
+    """[N, J] torque [N.m] that holds the joints at rest at qpos [N, nq]: gravity less springs."""
+    data, out = mujoco.MjData(model), []
+    for q in qpos:
+        data.qpos[:], data.qvel[:] = q, 0.0
+        mujoco.mj_forward(model, data)
+        out.append((data.qfrc_bias - data.qfrc_passive)[dofs])
+    return np.array(out)
 
 
 def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,

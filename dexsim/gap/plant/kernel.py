@@ -16,10 +16,11 @@ from functools import lru_cache
 
 import warp as wp
 
-from dexsim.actuator.laws import torque_limit
+from dexsim.actuator.laws import difference, hold, torque_limit, wind
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
+vec5 = wp.types.vector(length=5, dtype=f64)
 ONE_BODY_STEPS = 1
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
@@ -67,6 +68,7 @@ P_FRESH = INDEX["effort_fresh"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
+P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
@@ -79,9 +81,11 @@ def plant_kernel():
     def law(
         e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
         dt: f64, voltage: f64, gain: f64, drift: f64, steep: f64, kind: f64, age: f64, v_lim: f64,
+        feed: f64, ki: f64, since: f64, wound: f64,
     ):  # fmt: skip
         """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
-        motor's speed). gain, drift: the change of speed in this step is gain * torque + drift.
+        motor's speed, the integral term). gain, drift: the change of speed in this step is gain * torque + drift. feed: torque of
+        the feed-forward; ki: integral_gain; wound: the integral term, `since` s before.
 
         At its limit the torque keeps to the limit for the whole step, unless the step's end is within the limits."""
         zero = f64(0.0)
@@ -94,7 +98,8 @@ def plant_kernel():
             cut = kp * wp.clamp(e, -deadband, deadband)
             now -= cut
             pd -= cut
-        if wp.abs(e) < deadband:
+        dead = wp.abs(e) < deadband
+        if dead:
             if kind < half:  # no torque at all
                 now = zero
                 pd = zero
@@ -103,6 +108,28 @@ def plant_kernel():
                 now = -kd * v_m
                 pd = now
                 slope = scale * kd
+        upper = one  # limits of the duty, or of the torque
+        lower = one
+        x = zero
+        if voltage <= zero:
+            x = wp.abs(v_lim) / (nls * supply)
+            upper = torque_limit(tau0, x, one)
+            lower = upper
+            if v_lim > zero:
+                lower = torque_limit(tau0, x, steep)
+            elif v_lim < zero:
+                upper = torque_limit(tau0, x, steep)
+        kept = wound
+        if not dead or kind > half:
+            if not dead:
+                e_i = e
+                if kind > f64(1.5):
+                    e_i = e - wp.clamp(e, -deadband, deadband)
+                kept = wind(wound, since * ki * e_i, now + feed + wound, lower, upper)
+                pd += ki * dt * (e_i - dt * v_m)
+                slope += scale * ki * dt * dt
+            now += feed + kept
+            pd += feed + kept
         motor_now = zero
         motor = zero
         line = zero
@@ -118,13 +145,6 @@ def plant_kernel():
                     slope = slope / wp.abs(pd)
             slope = tau0 * supply * slope
         else:
-            x = wp.abs(v_lim) / (nls * supply)
-            upper = torque_limit(tau0, x, one)
-            lower = upper
-            if v_lim > zero:
-                lower = torque_limit(tau0, x, steep)
-            elif v_lim < zero:
-                upper = torque_limit(tau0, x, steep)
             motor_now = wp.clamp(now, -lower, upper)
             motor = wp.clamp(pd, -lower, upper)
             limit = upper
@@ -141,7 +161,7 @@ def plant_kernel():
                         line = -wp.min(steep * tau0 / (nls * supply), half / wp.max(gain, f64(1.0e-12)))
                 else:
                     slope = slope * limit / wp.abs(pd)
-        return wp.vec4d(motor_now, motor, slope, line)
+        return vec5(motor_now, motor, slope, line, kept)
 
     @wp.func
     def measured(q: f64, scale: f64, offset: f64, esin: f64, ecos: f64, round_: bool):
@@ -165,6 +185,28 @@ def plant_kernel():
         if late != f64(0.0) and (i // group) % LATE_GROUPS == at:
             return t + late
         return t
+
+    @wp.func
+    def target_rates(cmd_t: wp.array(dtype=f64), cmd: wp.array(dtype=f64), first: int, k: int, last: int, begin: f64, dt: f64,
+                     late: f64, at: int, group: int):  # fmt: skip
+        """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step (see `actuator.laws.difference`): commands
+        k .. last of the run, which begins with command `first`, are in force in it."""
+        speed = f64(0.0)
+        acceleration = f64(0.0)
+        for m in range(wp.max(k, first + 1), last + 1):
+            stamp = acts_at(cmd_t[m], m, late, at, group)
+            before = acts_at(cmd_t[m - 1], m - 1, late, at, group)
+            rate = difference(cmd[m], cmd[m - 1], stamp - before, dt)
+            earlier = f64(0.0)
+            if m > first + 1:
+                earlier = difference(cmd[m - 1], cmd[m - 2], before - acts_at(cmd_t[m - 2], m - 2, late, at, group), dt)
+            until = begin + dt
+            if m < last:
+                until = wp.min(until, acts_at(cmd_t[m + 1], m + 1, late, at, group))
+            share = hold(stamp, stamp - before, until, begin, dt)
+            speed += share * rate
+            acceleration += share * difference(rate, earlier, stamp - before, dt)
+        return wp.vec2d(speed, acceleration)
 
     @wp.func
     def giving(free: f64, a: f64, level: f64, z: f64, w: f64):
@@ -263,6 +305,11 @@ def plant_kernel():
         preslide = params[h, P_PRESLIDE]
         age = params[h, P_AGE]
         z = zero  # share of the friction that is taken up
+        feed_v = params[h, P_FEEDV]
+        feed_a = params[h, P_FEEDA]
+        ki = params[h, P_KI]
+        wound = zero  # the controller's integral term
+        since = zero
 
         for i in range(steps):
             g = g0 + i
@@ -293,6 +340,10 @@ def plant_kernel():
                 part = wp.clamp((end - acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group)) / dt, zero, one)
                 target += part * (cmd[kk + 1] - cmd[kk])
                 kk += 1
+            feed = zero
+            if feed_v != zero or feed_a != zero:
+                wish = target_rates(cmd_t, cmd, window[w, 5], k, kk, end - dt, dt, late, late_at, late_group)
+                feed = feed_v * wish[0] + feed_a * wish[1]
             dragger = int(params[h, P_FROM])
             target += params[h, P_COUPLING] * series[g, XDRAG + dragger]
             carried = params[h, P_LINKAGE] * series[g, XDV + dragger]  # speed at which a linkage turns the motor, the joint at rest
@@ -381,14 +432,20 @@ def plant_kernel():
                 if two and wp.abs(qm - q) < gap2:
                     body = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
                 step = theta * dts
+                if fresh == 1 and ki != zero:  # a drive that has been on before: its integral holds the load
+                    wound = load / wp.max(eff, f64(0.01))
+                    if voltage > zero:
+                        wound = wound / (tau0 * supply)
                 torque = law(
                     e, shows * v_f, v_drive, kp, kd, shows, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
                     eff * step / body, -load * step / body, params[h, P_BRAKING], params[h, P_DEADKIND], age,
-                    v_drive + params[h, P_LIMITSPEED] * (shows * v_f - v_drive),
+                    v_drive + params[h, P_LIMITSPEED] * (shows * v_f - v_drive), feed, ki, since, wound,
                 )
                 now = torque[0]
                 motor = torque[1]
                 damping = torque[2]
+                wound = torque[4]
+                since = dts
                 older = zero  # what the age of its position makes of the torque that the loop asks for
                 if damping != zero:
                     older = kp * age * shows * v_l
@@ -408,6 +465,7 @@ def plant_kernel():
                         motor = now
                         slope_m = line
                 if series[g, XON] < half:
+                    wound = zero
                     now = zero
                     motor = zero
                     damping = zero
