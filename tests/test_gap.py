@@ -103,7 +103,8 @@ def test_a_stuck_drive_rests_where_the_servo_law_balances_gravity():
     assert law == pytest.approx(0.15 * 9.81 * 0.1 * np.sin(rest), rel=2e-3)
 
 
-@pytest.mark.parametrize("change", [{}, {"deadband": 0.03}, {"load_friction": 0.2, "load_friction_backdriven": 0.3}, {"delay": 0.02}])
+@pytest.mark.parametrize("change", [{}, {"deadband": 0.03}, {"load_friction": 0.2, "load_friction_backdriven": 0.3}, {"delay": 0.02},
+                                    {"speed_feedforward": 0.04, "acceleration_feedforward": 1e-3, "braking_slope": 0.0}])
 def test_plant_follows_the_full_simulation(change):
     """C MuJoCo with the servo kernel and the gap's own one-joint plant, the same columns: the same motion."""
     t_cmd, cmd = motion(0, 3.0)
@@ -120,7 +121,7 @@ def test_plant_follows_the_full_simulation(change):
     assert np.sqrt(np.mean((q[0] - plant.q) ** 2)) < 2e-3
     if change:
         plain = plant.base()[None].copy()
-        plain[0, 0, :21] = nominal_row(ServoTable.from_dict({"joints": {"*": SERVO}}).nominal(["joint"])[0], 0.0)[:21]
+        plain[0, 0, : len(SERVO_INDEX)] = nominal_row(ServoTable.from_dict({"joints": {"*": SERVO}}).nominal(["joint"])[0], 0.0)[: len(SERVO_INDEX)]
         other, _ = plant.simulate(plain, plant.windows(None))
         assert np.sqrt(np.mean((other[0] - plant.q) ** 2)) > 4e-3  # the column matters
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -9,6 +10,8 @@ import torch
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.reference import servo as servo_reference
+from dexsim.gap import demo
+from dexsim.gap.judge.full_model import World, free_runs
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants
@@ -185,3 +188,15 @@ def test_an_integral_overcomes_dry_friction():
     for motion in (servo_motion, plant_motion):
         with_, without = (motion(c, [0.0], [0.02], 1.0)[-1, 0] for c in (columns, columns | {"integral_gain": 0.0}))
         assert abs(with_ - 0.02) < 0.006 and abs(without) < 0.001
+
+
+def test_a_replay_begins_with_the_load_in_the_integral():
+    """A joint held against gravity by its integral since long stays where it is; one without sags by load / kp."""
+    sags = []
+    for gain in (10.0, 0.0):
+        table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "kd": 0.04, "integral_gain": gain}}})
+        q, at, none = np.array([0.5]), np.array([0.0]), np.zeros((0, 1))
+        world = World(table.nominal(["joint"]), table, np.array([0, 0, -9.81]), 0.3, q, 0 * at, q, np.zeros(0), none)
+        moved = free_runs(mujoco.MjSpec.from_string(demo.MODEL), ["joint"], [world], engine="mujoco")[0]
+        sags.append(np.abs(moved[:, 0] - 0.5).max())
+    assert sags[0] < 1e-4 < 0.01 < sags[1]
