@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.effects.touch import TOUCH, confusable
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
 from dexsim.gap.judge import confidence
 from dexsim.gap.read import inputs
 from dexsim.gap.read.runs import Run
@@ -40,10 +40,10 @@ def found(folder, seconds=7.0, **planted):
 
 
 def test_catalogue_of_touch_is_that_of_the_specification():
-    assert {e.id for e in TOUCH} == {"tactile_gain", "tactile_stiffening", "tactile_hysteresis", "tactile_crosstalk", "tactile_delay", "contact_friction",
+    assert {e.id for e in TOUCH_CATALOGUE} == {"tactile_gain", "tactile_stiffening", "tactile_hysteresis", "tactile_crosstalk", "tactile_delay", "contact_friction",
                                      "contact_stiffness", "thermal"}  # fmt: skip
-    assert confusable("tactile_gain", "contact_stiffness") and confusable("thermal", "tactile_hysteresis") and not confusable("tactile_gain", "tactile_delay")
-    for e in TOUCH:
+    assert touch_confusable("tactile_gain", "contact_stiffness") and touch_confusable("thermal", "tactile_hysteresis") and not touch_confusable("tactile_gain", "tactile_delay")
+    for e in TOUCH_CATALOGUE:
         assert all(len(s) == len(e.fits) for s in e.starts) and {k for k, _ in e.report} <= set(e.fits)
 
 

@@ -16,10 +16,11 @@ from dexsim.cli import help as help_page
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.effects.touch import TOUCH
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
 from dexsim.gap.touch import press_rig
-from dexsim.gap.touch.handed_on import HEAD, PadFacts, chord, handed
+from dexsim.gap.touch.handed_on import HEAD, chord, handed
 from dexsim.gap.touch.handed_on import save as write
+from dexsim.gap.touch.settings import PadFacts
 from dexsim.recording import read
 from dexsim.tactile.file import load
 
@@ -163,7 +164,7 @@ def ranges(settings: dict) -> dict:
 
 
 def test_every_effect_of_touch_has_a_place():
-    assert set(EVERY) == {e.id for e in TOUCH}
+    assert set(EVERY) == {e.id for e in TOUCH_CATALOGUE}
 
 
 @pytest.mark.parametrize("effect", list(EVERY))

@@ -142,8 +142,7 @@ def main(argv: list[str]) -> int:
 def settings_of(given: dict, out: Path, device: str) -> Settings:
     """What `parse` took apart, as :func:`dexsim.gap.diagnosis.diagnose` takes it. Raises UserError."""
     from dexsim.actuator.columns import did_you_mean
-    from dexsim.gap.effects.catalogue import EFFECTS
-    from dexsim.gap.effects.touch import BY_ID
+    from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
     from dexsim.gap.judge.full_model import REPLAY
     from dexsim.gap.read import inputs
     from dexsim.gap.result import Settings
@@ -152,7 +151,7 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
         raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")
     allowed = None
     if given.get("effects"):
-        known = (*EFFECTS, *(e for e in BY_ID if e not in EFFECTS))
+        known = (*EFFECTS, *(e for e in TOUCH_EFFECTS if e not in EFFECTS))
         for e in given["effects"]:
             if e not in known:
                 raise UserError(f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}")

@@ -343,10 +343,10 @@ def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
 
 def _cannot(s: Settings, left_out: dict[str, str]) -> list[str]:
     """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
-    from dexsim.gap.effects.touch import BY_ID
+    from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 
     asked = [e for e in sorted(s.allowed or ()) if e in left_out]
-    return [f"{e} cannot be seen here: {left_out[e]}; to see it: {(EFFECTS.get(e) or BY_ID[e]).experiment}" for e in asked]
+    return [f"{e} cannot be seen here: {left_out[e]}; to see it: {(EFFECTS.get(e) or TOUCH_EFFECTS[e]).experiment}" for e in asked]
 
 
 def _still(s: Settings) -> str:

@@ -8,6 +8,8 @@ from dexsim.gap.effects.backlash import Backlash
 from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.effects.compliance import Compliance
 from dexsim.gap.effects.confusion import CLASSES
+from dexsim.gap.effects.contact_friction import ContactFriction
+from dexsim.gap.effects.contact_stiffness import ContactStiffness
 from dexsim.gap.effects.coulomb_friction import CoulombFriction
 from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.effects.deadband import Deadband
@@ -22,11 +24,17 @@ from dexsim.gap.effects.position_offset import PositionOffset
 from dexsim.gap.effects.position_scale import PositionScale
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.gap.effects.supply_sag import SupplySag
+from dexsim.gap.effects.tactile_crosstalk import TactileCrosstalk
+from dexsim.gap.effects.tactile_delay import TactileDelay
+from dexsim.gap.effects.tactile_drift import TactileDrift
+from dexsim.gap.effects.tactile_gain import TactileGain
+from dexsim.gap.effects.tactile_hysteresis import TactileHysteresis
+from dexsim.gap.effects.tactile_stiffening import TactileStiffening
 from dexsim.gap.effects.thermal import Thermal
 from dexsim.gap.effects.torque_limit import TorqueLimit
 from dexsim.gap.effects.torque_ripple import TorqueRipple
 from dexsim.gap.effects.torque_speed_limit import TorqueSpeedLimit
-from dexsim.gap.effects.touch import BY_ID
+from dexsim.gap.effects.touch_effect import TouchEffect
 from dexsim.gap.effects.viscous_friction import ViscousFriction
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -54,6 +62,18 @@ CATALOGUE: tuple[Effect, ...] = (
 )
 """Effects of a joint and its drive."""
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}
+TOUCH_CATALOGUE: tuple[TouchEffect, ...] = (
+    TactileGain(),
+    TactileStiffening(),
+    TactileHysteresis(),
+    TactileCrosstalk(),
+    TactileDelay(),
+    TactileDrift(),
+    ContactFriction(),
+    ContactStiffness(),
+)
+"""Effects of touch and contact."""
+TOUCH_EFFECTS: dict[str, TouchEffect] = {e.id: e for e in TOUCH_CATALOGUE}
 
 
 def members(name: str) -> frozenset[str]:
@@ -74,6 +94,16 @@ def confusable(a: str, b: str) -> bool:
     return bool({*EFFECTS[a].classes} & {*EFFECTS[b].classes}) if a in EFFECTS and b in EFFECTS else False
 
 
+def touch_confusable(a: str, b: str) -> bool:
+    """Whether two effects of touch are of one class that some recordings cannot separate."""
+    return bool({*TOUCH_EFFECTS[a].classes} & {*TOUCH_EFFECTS[b].classes})
+
+
+def touch_compatible(effect: TouchEffect, ids: Sequence[str]) -> bool:
+    """Whether an effect of touch may be there beside others: none replaces another."""
+    return not any(e in effect.excludes or effect.id in TOUCH_EFFECTS[e].excludes for e in ids)
+
+
 def compatible(a: Effect, mine: Variant, b: Effect, theirs: Variant) -> bool:
     """Whether two effects may be there at once: they act on columns of their own, and neither replaces the other."""
     if a.excludes(mine, b, theirs) or b.excludes(theirs, a, mine):
@@ -90,4 +120,4 @@ def entry(finding: dict):
     """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
     if finding["where"]["joints"]:
         return EFFECTS.get(finding["effect"])
-    return BY_ID.get(finding["effect"])
+    return TOUCH_EFFECTS.get(finding["effect"])

@@ -28,7 +28,7 @@ class JointCoupling(Effect):
         out = []
         for k, other in enumerate(s.others[:4]):
             fixed, note = (("coupling_from", float(k)),), {"from_joint": other}
-            # its target is dragged along; a linkage between motor, joint and the other; that linkage's pull at its other end
+            # its target is dragged along; a linkage between motor, joint and the other; the pull at its other end
             for column, label, starts in (
                 ("coupling", other, (0.02, 0.15)),
                 ("linkage", f"linkage with {other}", (0.05, 0.4)),

@@ -128,8 +128,8 @@ def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[fl
 
 
 def add_mass(spec, joint: str, mass: float, place: np.ndarray | None, own: bool = False) -> str:
-    """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint (own: of the
-    joint's own), by default at that link's centre of mass; returns what was done, in words."""
+    """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint (own: of
+    the joint's own), by default at that link's centre of mass; returns what was done, in words."""
     import mujoco
 
     from dexsim.gap.plant.mechanics import leaf_of

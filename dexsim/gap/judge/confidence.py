@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 
@@ -21,7 +21,6 @@ SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say
 CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
 NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
-SPREAD = 0.15  # share that neighbours may take over because pressure spreads by another law (foundation or half-space) than the plant's
 
 
 @dataclass
@@ -146,8 +145,7 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
     for f in findings:
         h = f["held_out"]
         reason = too_small(before, h["before"], h["after"], noise, len(findings) == 1) if h else ""
-        if not reason and f["effect"] == "tactile_crosstalk" and f.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < SPREAD:
-            reason = "a contact's force may spread over the taxels as much wider than its law says"
+        reason = reason or TOUCH_EFFECTS[f["effect"]].doubt(f)
         if reason:
             f["confidence"] = min(f["confidence"], DOUBTED)
             said.append(f"{f['effect']} is not sure: {reason}")

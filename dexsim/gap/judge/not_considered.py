@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.effects.touch import BY_ID
+from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.search.search import unknown
 from dexsim.gap.touch.touch import TouchResult
 
@@ -34,7 +33,7 @@ def reasons(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None)
         else:
             out[e] = "; ".join(f"on {j}: {r}" for j, r in lacking.items())
     touch = "no /tactile is recorded" if not felt.tactile else "nothing is touched" if not felt.contact else "no force could be predicted" if felt.before is None else ""
-    for e in BY_ID:
+    for e in TOUCH_EFFECTS:
         if e in EFFECTS:
             continue
         if allowed is not None and e not in allowed:

@@ -110,7 +110,7 @@ def _bars(d: Diagnosis) -> str:
 
 def _where(d: Diagnosis) -> str:
     named = {j for f in d.data["findings"] for j in f["where"]["joints"]}
-    marked = {t for f in d.data["findings"] if f["effect"] == "tactile_gain" and "taxels" in f["parameters"] for t in f["where"]["taxels"]
+    marked = {t for f in d.data["findings"] if "taxels" in f["parameters"] for t in f["where"]["taxels"]
               if len(f["where"]["taxels"]) <= 40}
     taxels = d.touch.error if d.touch is not None else None
     unit = "mm" if d.data["held_out"]["error"].endswith("_m") else "mrad"

@@ -92,7 +92,7 @@ def place(f: dict) -> str:
         pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
         count = len(f["where"]["taxels"])
         fingers = " and ".join(xhand.FINGERS[p] for p in pads)
-        return f"the {fingers}'s pad" if count > 12 or f["effect"] != "tactile_gain" else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+        return f"the {fingers}'s pad" if count > 12 or "taxels" not in f["parameters"] else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
     return ", ".join(f["where"]["topics"])
 
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
+from dexsim.gap.effects.command_delay import CommandDelay
+from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import EDGE, Body, Motion
 
@@ -35,7 +37,7 @@ QUARTERS = 4
 LEAST = 0.12  # of the squared residual on the quarters left out: what a further effect must remove
 MOST = 4
 LATE = 0.02  # s: a torque that acts later than this is no drive's lag
-BY_DIRECTION, SQUARE, LAG, STRIBECK = "viscous friction that differs by direction", "friction with the square of the speed", "lag", "stribeck_friction"
+BY_DIRECTION, SQUARE, LAG, STRIBECK = "viscous friction that differs by direction", "friction with the square of the speed", "lag", StribeckFriction.id
 LOAD = "load_friction"
 GIVES = "dry friction that gives way before it slides"
 DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # of the whole motion: over which it may give way (P. Dahl 1968)
@@ -407,7 +409,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[i
                 f = x.full["viscous_friction"]
                 parameters = {"coefficient": entry(f, f * 0.95, f * 1.05, f"{force}.s/{length}"),
                               "asymmetry": entry(2 * n.value / f, 2 * n.low / f, 2 * n.high / f, "1")}  # fmt: skip
-            same = [LAG, "command_delay"] if n.effect == LAG else []
+            same = [LAG, CommandDelay.id] if n.effect == LAG else []
             signal = EFFECTS[n.effect].signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2

@@ -8,7 +8,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from dexsim.calibration.taxels import neighbours
-from dexsim.gap.effects.touch import BY_ID, EXCLUDES, TOUCH, TouchEffect, confusable
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
+from dexsim.gap.effects.tactile_gain import TactileGain
+from dexsim.gap.effects.touch_effect import TouchEffect
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
@@ -23,7 +25,6 @@ TIMING = 3e-3  # s by which a reading's time is uncertain: between two positions
 PRIOR = 0.3  # standard deviation of a taxel's gain, before anything is seen
 PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
 GAIN_OFF = 0.08  # a taxel whose gain is less than this off is not listed
-ALIKE = frozenset(("tactile_gain", "tactile_crosstalk"))  # with a wider contact beside it one follows much of the other: where one is tried, both are
 CLOSE = 0.03  # of the loss on presses left out: nearer than this the one that follows the presses themselves better is taken
 
 
@@ -176,10 +177,11 @@ class PadSearch:
 
     # -- fits ------------------------------------------------------------------------------------------------------------------------
     def _keys(self, ids: tuple[str, ...], mapped: bool = False) -> tuple[str, ...]:
-        keys = [k for e in ids for k in BY_ID[e].fits if not (e == "tactile_gain" and mapped)]
+        effects = [TOUCH_EFFECTS[e] for e in ids]
+        keys = [k for e in effects for k in e.fits if not (e.by_taxel and mapped)]
         # single taxels' gains leave nothing to a common one
         keys += ([] if mapped and self.scale_known else ["scale"]) + ["zero", "along", "across", "spread"] + (["skin"] if self.shear else [])
-        if "tactile_delay" not in ids:
+        if not any("clock" in e.replaces for e in effects):
             keys.append("clock")
         return tuple(dict.fromkeys(keys))
 
@@ -278,9 +280,10 @@ class PadSearch:
             if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < 1.2**2:
                 break
             listed = self.scan(current)
-            listed += [e for e in TOUCH if e.id in ALIKE and e not in listed and ALIKE & {x.id for x in listed} and self._possible(current, e)]
+            if any(x.widens for x in listed):
+                listed += [e for e in TOUCH_CATALOGUE if e.widens and e not in listed and self._possible(current, e)]
             options = [t for e in listed if (t := self._try(current, e)) is not None]
-            if self.scale_known and any(e.id == "tactile_gain" for e in listed):  # one number for the pad, beside one for each taxel
+            if self.scale_known and any(e.by_taxel for e in listed):  # one number for the pad, beside one for each taxel
                 options.append(self._common(current, 120))
             for t in options:
                 trials[frozenset(t.ids)] = t
@@ -308,11 +311,9 @@ class PadSearch:
         e = effect.id
         if e in current.ids or (self.allowed is not None and e not in self.allowed):
             return False
-        if any(e in x and set(current.ids) & x for x in EXCLUDES):
+        if not touch_compatible(effect, current.ids) or (effect.stage == "shear" and not self.shear):
             return False
-        if effect.stage == "shear" and not self.shear:
-            return False
-        return not (e == "thermal" and not self.thermometer and len(self.runs) < 2 and self.warm < 20)
+        return effect.possible(self)
 
     def scan(self, current: TouchTrial, most: int = 4) -> list[TouchEffect]:
         """The effects that would remove most of what `current` leaves, by a linear score at their starts with the refitted
@@ -327,24 +328,19 @@ class PadSearch:
         clean = project(r0 * weight)
         total = float(clean @ clean)
         found = []
-        for effect in TOUCH:
+        for effect in TOUCH_CATALOGUE:
             if not self._possible(current, effect):
                 continue
             best = 0.0
-            for s in self._starts(effect):
+            for s in effect.begin(self):
                 d = project((current.res - self.residual(current.values | s, current.gains, current.order))[self.train] * weight)
                 dd = float(d @ d)
                 if dd > 1e-9 * total:
                     c = np.clip(float(d @ clean) / dd, 0.0, 3.0)
                     best = max(best, (2 * c * float(d @ clean) - c * c * dd) / max(total, 1e-12))
-            found.append((1.0 if effect.id == "tactile_gain" else best, effect))
+            found.append((1.0 if effect.by_taxel else best, effect))
         found.sort(key=lambda f: -f[0])
         return [e for g, e in found[:most] if g > 0.25 * LEAST]
-
-    def _starts(self, effect: TouchEffect) -> list[dict[str, float]]:
-        if effect.id == "thermal":
-            return [{"drift": x / self.warm} for x in (0.15, -0.15)]
-        return [dict(zip(effect.fits, s, strict=True)) for s in effect.starts]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """The hypothesis with one effect more; None where it cannot be there."""
@@ -353,7 +349,7 @@ class PadSearch:
             return None
         ids = (*current.ids, e)
         tries = []
-        if e == "tactile_gain":
+        if effect.by_taxel:
             # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against the believed geometry
             believed = {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
             order = self._swaps(current.values | believed)
@@ -373,7 +369,7 @@ class PadSearch:
             if len(tries) == 2 and self._size(tries[0].res) > 0.7 * self._size(tries[1].res):
                 tries = tries[1:]
             return tries[0]
-        starts = sorted(self._starts(effect), key=lambda s: self._size(self.residual(current.values | s, current.gains, current.order)))
+        starts = sorted(effect.begin(self), key=lambda s: self._size(self.residual(current.values | s, current.gains, current.order)))
         tries = [self.fit(ids, current.values | s, None, current.gains, current.order, 50) for s in starts[:2]]
         best = min(tries, key=lambda t: self._size(t.res))
         if best.gains is not None:
@@ -388,7 +384,7 @@ class PadSearch:
     def _common(self, current: TouchTrial, evaluations: int) -> TouchTrial:
         """The hypothesis with one gain for all of the pad."""
         ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
-        return self.fit((*current.ids, "tactile_gain"), current.values | {"gain": ratio}, None, current.gains, current.order, evaluations)
+        return self.fit((*current.ids, TactileGain.id), current.values | {"gain": ratio}, None, current.gains, current.order, evaluations)
 
     def _swaps(self, values: dict[str, float]) -> np.ndarray | None:
         """Order of the taxels [K] in which exchanged pairs are put right, by what `values` predict; None where there are none."""
@@ -441,8 +437,8 @@ class PadSearch:
 
     def _without(self, current: TouchTrial, e: str) -> TouchTrial:
         rest = tuple(x for x in current.ids if x != e)
-        start = {k: v for k, v in current.values.items() if k not in BY_ID[e].fits}
-        keep = e != "tactile_gain"
+        start = {k: v for k, v in current.values.items() if k not in TOUCH_EFFECTS[e].fits}
+        keep = not TOUCH_EFFECTS[e].by_taxel
         less = self.fit(rest, start, None, current.gains if keep else None, current.order if keep else None, 40)
         if less.gains is not None:
             less.gains = self.gain_map(less, self.train)
@@ -454,20 +450,22 @@ class PadSearch:
         base = self._without(current, e)
         others = []
         tried = self.scan(base, 3)
-        for x in TOUCH:
-            if x.id in current.ids or not (x in tried or confusable(x.id, e) or {x.id, e} == ALIKE):
+        for x in TOUCH_CATALOGUE:
+            alike = touch_confusable(x.id, e)
+            if x.id in current.ids or not (x in tried or alike or (x.widens and TOUCH_EFFECTS[e].widens)):
                 continue
             t = trials.get(frozenset((*base.ids, x.id))) or self._try(base, x)
-            if confusable(x.id, e) and t is not None:  # what is said to be no rival must have been fitted to its end
+            if alike and t is not None:  # what is said to be no rival must have been fitted to its end
                 start = t.values
-                if x.id == "tactile_gain" and t.gains is not None and self.scale_known:
-                    start, t = base.values, self._common(base, 120)
-                elif x.id == "contact_stiffness" and current.gains is None:
-                    start = base.values | {"stiffness": current.values["gain"]}
+                if x.by_taxel and t.gains is not None and self.scale_known:
+                    t = self._common(base, 120)
+                    start = t.values
+                elif current.gains is None:
+                    start = x.in_place(t.values, base, current)
                 if t.gains is None:
-                    again = self.fit(t.ids, start if x.id == "contact_stiffness" else t.values, None, t.gains, t.order, 160)
+                    again = self.fit(t.ids, start, None, t.gains, t.order, 160)
                     t = again if self._size(again.res) < self._size(t.res) else t
-            if t is not None and (self._size(t.res) < 2.5 * self._size(current.res) or confusable(x.id, e)):
+            if t is not None and (self._size(t.res) < 2.5 * self._size(current.res) or alike):
                 self.cross(t)
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[t.left_out for _, t in others], self.cross(base)])

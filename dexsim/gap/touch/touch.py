@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 
 from dexsim.assets import xhand
-from dexsim.gap.effects.touch import BY_ID, confusable
+from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
+from dexsim.gap.effects.effect import word
+from dexsim.gap.effects.tactile_gain import TactileGain
 from dexsim.gap.judge.errors import rms_interval
-from dexsim.gap.touch.handed_on import Fit, PadFacts, chord
-from dexsim.gap.touch.plant import contact, readings, shear
+from dexsim.gap.touch.handed_on import chord
+from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.read import TouchData, collect, newtons
 from dexsim.gap.touch.search import GAIN_OFF, PadOutcome, PadSearch, TouchTrial, held_out_rms
+from dexsim.gap.touch.settings import Fit, PadFacts
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 
@@ -134,12 +137,12 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
         dead["held_out"] = {"before": out.pads[name]["before"], "after": rms(np.concatenate([e0, silent[1]]))}
     fresh: list[dict[str, Any]] = []
     for e in best.ids:
-        effect = BY_ID[e]
+        effect = TOUCH_EFFECTS[e]
         stage = _stage(search, e)
         less = search._without(best, e) if len(best.ids) > 1 else none
         b, a = held_out_rms(search, less, stage)[0], held_out_rms(search, best, stage)[0]
         rivals, share = o.rivals[e], o.confidence[e]
-        same = [r for r in rivals if confusable(r[0], e) and r[1] >= SET_SHARE][:2]
+        same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= SET_SHARE][:2]
         earned = float(np.clip((b - a) / (0.1 * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
         if earned <= 0.2:
             out.notes.append(f"{e} on the {name}'s pad earned its place in training but not on what was kept out; not claimed")
@@ -155,7 +158,7 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
             "held_out": {"before": b, "after": a},
         })  # fmt: skip
     if dead is not None:  # one finding per effect and pad: broken taxels are gains of 0
-        gain = next((f for f in fresh if f["effect"] == "tactile_gain"), None)
+        gain = next((f for f in fresh if TOUCH_EFFECTS[f["effect"]].by_taxel), None)
         if gain is None:
             fresh.append(dead)
         else:
@@ -208,7 +211,7 @@ def _quantiles(x: np.ndarray, weight: np.ndarray, at: tuple[float, ...]) -> list
 
 def _chord(search: PadSearch, t: TouchTrial, bounds: dict[str, tuple[float, float]]) -> Fit | None:
     """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known; None without one."""
-    if "tactile_stiffening" not in t.ids:
+    if not any("c10" in TOUCH_EFFECTS[e].fits for e in t.ids):
         return None
     fits = []
     for k in (None, 0, 1):
@@ -232,7 +235,7 @@ def _readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, fl
 
 def _stage(search: PadSearch, effect: str) -> int:
     """Which signal judges an effect: 0 the taxels, 1 the load cell (where there is one), 2 shear."""
-    return {"cell": 1 if search.load else 0, "shear": 2}.get(BY_ID[effect].stage, 0)
+    return {"cell": 1 if search.load else 0, "shear": 2}.get(TOUCH_EFFECTS[effect].stage, 0)
 
 
 def _floor(search: PadSearch, stages: list[int]) -> float:
@@ -272,7 +275,7 @@ def _broken(search: PadSearch, pad: int) -> dict[str, Any] | None:
 
 def _taxel_finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
     return {
-        "effect": "tactile_gain", "confidence": confidence, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
+        "effect": TactileGain.id, "confidence": confidence, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
         "where": {"joints": [], "taxels": names, "topics": ["/tactile"]}, "regime": regime, "when": [],
         "parameters": {"gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"}, "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""}},
         "held_out": None,
@@ -299,9 +302,9 @@ def _group(search: PadSearch, pad: int) -> list[str]:
 
 def _parameters(e: str, t: TouchTrial, bounds, search: PadSearch, pad: int) -> tuple[list[str], dict[str, Any]]:
     """(taxels concerned, parameters with intervals by the catalogue's keys)."""
-    effect = BY_ID[e]
+    effect = TOUCH_EFFECTS[e]
     taxels, out = _group(search, pad), {}
-    if e == "tactile_gain" and t.gains is not None:
+    if effect.by_taxel and t.gains is not None:
         g = t.gains
         moved = [] if t.order is None else [int(k) for k in np.flatnonzero(t.order != np.arange(len(g)))]
         half = _gain_width(search, t)
@@ -325,11 +328,7 @@ def _parameters(e: str, t: TouchTrial, bounds, search: PadSearch, pad: int) -> t
         low, high = bounds.get(key, (t.values[key], t.values[key]))
         unit = "1/degC" if key == "drift" and search.thermometer else "1/s" if key == "drift" else _unit(key)
         out[name] = {"value": float(f * t.values[key]), "low": float(f * low), "high": float(f * high), "unit": unit}
-    if e == "tactile_gain":
-        out["taxels"] = {"value": "all of the pad", "low": None, "high": None, "unit": ""}
-    if e == "thermal":
-        out["of"] = {"value": "taxels", "low": None, "high": None, "unit": ""}
-    return taxels, out
+    return taxels, out | {k: word(v) for k, v in effect.words_beside.items()}
 
 
 def _unit(key: str) -> str:
@@ -352,16 +351,7 @@ def _when(e: str, search: PadSearch, t: TouchTrial) -> list[dict]:
     """Stretches in which the effect changes the readings by more than a quarter of its most."""
     out = []
     for r in search.runs:
-        if e == "contact_friction":
-            off = np.linalg.norm(shear(r, t.values) - shear(r, t.values | {"mu": 1.0}), axis=1)
-        elif e == "tactile_gain" and t.gains is not None:
-            off = np.abs(readings(r, t.values, t.gains, t.order) - readings(r, t.values)).max(1)
-        elif BY_ID[e].stage == "cell" and r.load is not None:
-            neutral = {k: search.base[k] for k in BY_ID[e].fits}
-            off = np.interp(r.t, r.grid, np.abs(contact(r, t.values)[0] - contact(r, t.values | neutral)[0]))
-        else:
-            neutral = {k: search.base[k] for k in BY_ID[e].fits}
-            off = np.abs(readings(r, t.values, t.gains, t.order) - readings(r, t.values | neutral, t.gains, t.order)).max(1)
+        off = TOUCH_EFFECTS[e].changes(r, t, search.base)
         on = off > 0.25 * max(float(np.percentile(off, 99.5)), 1e-9)
         if not on.any():
             continue
@@ -391,11 +381,11 @@ def _depends(search: PadSearch, t: TouchTrial, name: str) -> list[str]:
     if len(y) < 20 or y.std() == 0:
         return []
     said = []
-    for word, x in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
+    for what, x in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
         x = np.concatenate(x)
         c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
         if abs(c) > 0.4:
-            said.append((abs(c), f"{word} (touch of the {name}, rank correlation {c:.2f})"))
+            said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
     return [x for _, x in sorted(said, reverse=True)[:2]]
 
 

@@ -1,0 +1,50 @@
+"""An effect is one entry: everything that the diagnosis knows of it stands in its class."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import dexsim.gap
+from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TOUCH_EFFECTS
+from dexsim.gap.plant.columns import NAMES, SERIES
+
+ROOM = Path(dexsim.gap.__file__).parent
+IDS = {*EFFECTS, *TOUCH_EFFECTS}
+COLUMNS = {*NAMES, *SERIES}  # some effects are called as the column that they write
+
+
+def asked_by_name(source: str) -> list[str]:
+    """Ids of effects that a source names: any that is no column's name, and those in comparisons with a finding's or a member's effect."""
+    out = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in IDS - COLUMNS:
+            out.append(f"{node.lineno}: {node.value}")
+        if isinstance(node, ast.Compare) and re.search(r"\.ids?\b|\beffects?\b", ast.unparse(node)):
+            named = {x.value for x in ast.walk(node) if isinstance(x, ast.Constant) and isinstance(x.value, str)} & IDS & COLUMNS
+            out += [f"{node.lineno}: {x}" for x in sorted(named)]
+    return out
+
+
+@pytest.mark.parametrize(("source", "found"), [
+    ('f["effect"] == "supply_sag"', 1), ('m.id in ("payload", "lag")', 2), ('FAST = ("command_delay", "lag")', 1), ('row[INDEX["payload"]]', 0),
+    ('name in ("kp", "torque_limit")', 0)])  # fmt: skip
+def test_the_search_for_names_finds_them(source, found):
+    assert len(asked_by_name(source)) == found
+
+
+def test_no_effect_is_asked_for_by_name_outside_its_class():
+    files = [p for p in ROOM.rglob("*.py") if p.parent.name != "effects"]
+    assert len(files) > 20
+    assert {str(p.relative_to(ROOM)): said for p in files if (said := asked_by_name(p.read_text(encoding="utf-8")))} == {}
+
+
+def test_every_effect_has_a_file_of_its_own_and_says_what_it_is():
+    for e in (*CATALOGUE, *TOUCH_CATALOGUE):
+        text = (ROOM / "effects" / f"{type(e).__module__.rpartition('.')[2]}.py").read_text(encoding="utf-8")
+        assert len(re.findall(r"^class \w+\((?:Touch)?Effect\)", text, re.M)) == 1, e.id
+        assert e.words and e.shows and e.experiment and type(e).__doc__
+    assert len(EFFECTS) == len(CATALOGUE) and len(TOUCH_EFFECTS) == len(TOUCH_CATALOGUE)
