@@ -123,7 +123,7 @@ def columns() -> str:
 
 def effects() -> str:
     """The catalogue of the diagnosis: effects of joints, then of touch and contact."""
-    from dexsim.gap.effects import catalogue, touch
+    from dexsim.gap.effects import catalogue
 
     head = ("effect", "what it means", "where it shows", "what shows it best", "may be confused with")
 
@@ -132,7 +132,7 @@ def effects() -> str:
         return [(f"`{e.id}`", f"the {what} {e.words}", e.shows, e.experiment, ", ".join(like[e.id]) or "-") for e in entries]
 
     joints = table(head, rows("joint", catalogue.CATALOGUE, catalogue.confusable))
-    touches = table(head, rows("fingertip", touch.TOUCH, touch.confusable))
+    touches = table(head, rows("fingertip", catalogue.TOUCH_CATALOGUE, catalogue.touch_confusable))
     return f"## Joints\n\n{joints}\n## Touch and contact\n\n{touches}"
 
 
