@@ -82,7 +82,8 @@ def dispatch(argv: list[str]) -> int:
         hint = f"did you mean {near[0]}? " if near else f"there are {', '.join(COMMANDS)} "
         raise UserError(f"unknown command '{name}': {hint}(dexsim --help)")
     module, _, function = COMMANDS[name].where.partition(":")
-    return getattr(importlib.import_module(module), function)(argv[1:])
+    status: int = getattr(importlib.import_module(module), function)(argv[1:])
+    return status
 
 
 def main(argv: list[str] | None = None) -> int:

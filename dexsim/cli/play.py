@@ -18,7 +18,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         from dexsim.cli import recorded
 
         return recorded.run(play)
-    out = folder.make(_out(start), "out=")
+    out = folder.make(results(start), "out=")
     what = start.source or f"policy {play['policy']}"
     env = build.build_env(cfg, make_env, {"policy": what, "results": out})
     env.dump_folder = out  # for worlds that were not finite
@@ -55,7 +55,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     return 0
 
 
-def _out(start: Start) -> Path:
+def results(start: Start) -> Path:
     """``out``; else play/ beside a run's checkpoint, else out/<checkpoint> or out/<task>_<policy>."""
     if start.play["out"] is not None:
         return Path(str(start.play["out"])).expanduser()
