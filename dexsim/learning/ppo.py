@@ -69,7 +69,12 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
     except (RuntimeError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: its policy does not fit this environment ({reason})") from None
-    return actor.eval()
+    actor.eval()
+    with torch.no_grad():
+        if not bool(actor(env.get_observations()).isfinite().all()):
+            raise UserError(f"{path}: its policy's actions are not finite in this environment; its weights are out of range, use an"
+                            " earlier checkpoint of its run folder")
+    return actor
 
 
 def plain_policy(name: str, env: Any, seed: int) -> Policy:

@@ -124,7 +124,10 @@ class Runner(OnPolicyRunner):
         actions = self.alg.act(obs)
         obs, rewards, dones, extras = self.env.step(actions)
         if self.cfg["check_for_nan"]:
-            check_nan(obs, rewards, dones)
+            try:
+                check_nan(obs, rewards, dones)
+            except ValueError as error:  # of an environment that does not see to it itself, as HandEnv does
+                raise UserError(f"iteration {self.iteration + 1}: {str(error).splitlines()[0]}") from None
         obs = obs.clone()
         self.alg.process_env_step(obs, rewards, dones, extras)
         self._meter.add(rewards, dones, extras.get("log"))
@@ -140,15 +143,23 @@ class Runner(OnPolicyRunner):
             losses = {}  # a later mini-batch stumbled over the weights
         bad = [f"{k} loss {v}" for k, v in losses.items() if not math.isfinite(v)]
         if not bad and not self._finite():
-            bad = ["weights not finite"]
+            bad = [f"{self._first_not_finite()}: weights not finite"]
         if bad:
             raise UserError(f"learning diverged at iteration {self.iteration + 1} ({', '.join(bad)}); continue from the"
                             " last checkpoint with a lower agent.algorithm.learning_rate or desired_kl")
         return losses
 
     def _finite(self) -> bool:
+        """Whether the weights and the observations' running normalization are finite."""
         weights = [p for group in self.alg.optimizer.param_groups for p in group["params"]]
+        weights += [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers() if b.is_floating_point()]
         return bool(torch.stack([w.isfinite().all() for w in weights]).all())
+
+    def _first_not_finite(self) -> str:
+        """Name of the first weights that are not finite."""
+        state = self.alg.save()
+        return next((f"{part}.{name}" for part in ("actor", "critic") for name, w in state[f"{part}_state_dict"].items()
+                     if not bool(w.isfinite().all())), "the optimizer's")
 
     def payload(self) -> dict[str, Any]:
         """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""

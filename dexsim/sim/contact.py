@@ -128,9 +128,9 @@ def check_worlds(
         if not wp.isfinite(qvel[w, i]) or wp.abs(qvel[w, i]) > 1.0e4:
             bad = 1
     f = solver_overflow[w]
-    overflow[w] = overflow[w] | f
     if bad == 1:
-        f = f | nan_bit
+        f = nan_bit  # what a world that is not finite lost does not matter: it begins anew
+    overflow[w] = overflow[w] | (f & ~nan_bit)
     flags[w] = f
     solver_overflow[w] = 0
     if w == 0:

@@ -103,9 +103,9 @@ class MujocoEngine(Engine):
                     self._disabled[:] = self._flags if k == substeps - 1 else self._flags | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
                     before_each()
                     b.step()
+            self._check()
             self._contacts()
             self._kinematics()
-            self._check()
             if after is not None:
                 after()
 
@@ -144,10 +144,11 @@ class MujocoEngine(Engine):
     def _contacts(self) -> None:
         if not self.pairs:
             return
-        args = [*self._contact_args, _SLOTS, _LOST, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
+        args = [*self._contact_args, _SLOTS, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
         wp.launch(kernels.read_contacts, dim=(self.n, len(self.pairs)), inputs=args, device="cpu")
-        self._peak[0] = max(self._peak[0], self._ncon.max())
-        self._peak[1] = max(self._peak[1], self._nefc.max())
+        sound = self.t.flags.numpy() == 0
+        self._peak[0] = max(self._peak[0], self._ncon.reshape(-1).max(initial=0, where=sound))
+        self._peak[1] = max(self._peak[1], self._nefc.reshape(-1).max(initial=0, where=sound))
 
     def _check(self) -> None:
         args = [self.wp.qpos, self.wp.qvel, FLAG_NAN, self.wp.flags]

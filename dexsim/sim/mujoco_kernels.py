@@ -136,6 +136,8 @@ def read_contacts(
     first: wp.array(dtype=int),  # [P] column of each pair's sensor
     slots: int,
     lost: int,
+    flags: wp.array(dtype=int),
+    nan_bit: int,
     # out
     normal_sum: wp.array2d(dtype=float),
     force_sum: wp.array2d(dtype=wp.vec3),
@@ -143,8 +145,13 @@ def read_contacts(
     most: wp.array(dtype=int),
 ):
     """Sums of each pair's contact forces. A slot holds what the first member exerts on the second, in the frame (normal,
-    tangent, their cross product); the sum is of what acts on the first: minus."""
+    tangent, their cross product); the sum is of what acts on the first: minus. A world whose state is not finite has none:
+    what the sensors say of it is nonsense."""
     w, p = wp.tid()
+    if (flags[w] & nan_bit) != 0:
+        normal_sum[w, p] = float(0.0)
+        force_sum[w, p] = wp.vec3()
+        return
     a = first[p]
     found = int(sensors[w, a])
     total = wp.vec3d()

@@ -34,6 +34,8 @@ from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.reality import Reality, present
 
+MOST_NAN = 0.2
+"""Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
 FINGER_ROOTS = ("right_hand_thumb_bend_link", "right_hand_index_bend_link", "right_hand_mid_link1", "right_hand_ring_link1",
                 "right_hand_pinky_link1")
 PAIRS = (
@@ -166,13 +168,14 @@ class HandEnv(VecEnv):
         """One control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are reset, and
         their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds), and with
         `keep_final_obs` also "final_obs", the observations before the reset."""
+        self._steps_since += 1
         self._action_in.copy_(actions)
         self._replay("before", self._before)
         substeps = self.decimation if self.reality is None else self.reality.substeps(self.decimation)
         self.engine.step(substeps, self.servo.before_each, self.feel)
         self._replay("after", self._after)
         if self.keep_final_obs:
-            final = {k: v.clone() for k, v in self.observe(advance=False).items()}
+            final = {k: torch.nan_to_num(v, 0.0, 0.0, 0.0) for k, v in self.observe(advance=False).items()}
         self._replay("reset", self._reset_done)
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         extras = {"time_outs": self.time_out.clone(), "log": log}
@@ -188,17 +191,29 @@ class HandEnv(VecEnv):
     def _after(self) -> None:
         self.episode_length_buf += 1
         self.read_state()
-        self._nan_dump.after(self.nan)
         ends = self.terminated()
+        terms = self.rewards()
+        reward = torch.stack(list(terms.values()))
+        self._judge(terms, reward)
+        self._nan_dump.after(self.nan)
         ends["nan"] = self.nan
         dead = torch.stack(list(ends.values())).any(0)
         self.time_out.copy_((self.episode_length_buf >= self._length_limit) & ~dead)
-        terms = self.rewards()
-        reward = torch.stack(list(terms.values()))
         reward = torch.where(self.nan, torch.zeros_like(reward), reward)
         self.reward.copy_(reward.sum(0))
         self.done.copy_(dead | self.time_out)
         self._log(terms, ends, reward)
+
+    def _judge(self, terms: dict[str, torch.Tensor], reward: torch.Tensor) -> None:
+        """A world of which a reward [T, N] or the last observation is not finite begins anew as one whose state is not; counts
+        by state, term and group for `check`."""
+        wrong = ~reward.isfinite() & ~self.nan
+        if self._wrong is None:
+            self._sources = ("state", *(f"reward {k}" for k in terms), "observations")
+            with torch.inference_mode(False):  # it outlives the rollout that happens to come first
+                self._wrong = torch.zeros(len(self._sources), dtype=torch.long, device=self.device)
+        self._wrong += torch.cat([self.nan[None], wrong, self._blind[None]]).sum(1)
+        self.nan |= wrong.any(0) | self._blind
 
     def _reset_done(self) -> None:
         if self.skip_idle_resets and not bool(self.done.any()):
@@ -263,10 +278,13 @@ class HandEnv(VecEnv):
         self._observe_all()
 
     def _observe_all(self) -> None:
+        self._blind.zero_()
         for group, value in self.observe(advance=True).items():
             if group not in self.obs:
                 self.obs[group] = torch.zeros_like(value)
-            self.obs[group].copy_(value)
+            good = value.isfinite().all(1)
+            self._blind |= ~good
+            self.obs[group].copy_(torch.where(good[:, None], value, torch.zeros_like(value)))
 
     def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor,
               target: torch.Tensor | None = None) -> None:
@@ -358,6 +376,10 @@ class HandEnv(VecEnv):
         self.tips = zeros(5, 3)
         self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.reward = zeros()
+        self._blind = zeros(dtype=torch.bool)  # worlds of which an observation was not finite
+        self._wrong: torch.Tensor | None = None  # world-steps that were not finite since the last `check`, by source
+        self._sources: tuple[str, ...] = ()
+        self._steps_since = 0
         self._action_in = zeros(J)
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
@@ -401,13 +423,26 @@ class HandEnv(VecEnv):
         return model
 
     def check(self) -> None:
-        """Raise UserError if contacts were lost since the last call; write a world that was not finite to `dump_folder`
+        """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not finite; write a world that was not finite to `dump_folder`
         (a file nan_<k>.npz). Reads from the device: once an iteration."""
         path = self._nan_dump.write(Path(self.dump_folder))
         if path is not None:
             print(f"a world was not finite and began anew ({int(self.nan_count)} so far); one is kept in {path}: "
                   f"dexsim nan-dump {path} repeats the step", flush=True)
+        self._check_share()
         self.engine.check_overflow()
+
+    def _check_share(self) -> None:
+        """A few worlds that diverge cost their episodes only; many mean that a setting makes them."""
+        if self._wrong is None:
+            return
+        counts, steps = self._wrong.tolist(), self._steps_since * self.num_envs
+        self._wrong.zero_()
+        self._steps_since = 0
+        if sum(counts) > MOST_NAN * steps and sum(counts) > 20:
+            where = ", ".join(f"{k} {100 * n / steps:.0f} %" for k, n in zip(self._sources, counts, strict=True) if n)
+            raise UserError(f"not finite in so many of the last {steps} world-steps that nothing is learned from them: {where}; allowed"
+                            f" {100 * MOST_NAN:.0f} % in all. Look at what this task's settings of that name are, or lower sim.timestep")
 
     @property
     def action_names(self) -> tuple[str, ...]:
