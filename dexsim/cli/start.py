@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from dexsim.cli import checks, settings
 from dexsim.cli import help as help_page
 from dexsim.errors import UserError
+from dexsim.learning import weights_and_biases
 
 WORLDS = {"cpu": 64, "cuda": 8192}  # where neither the user nor the task's preset says
 ITERATIONS = {"cpu": 200, "cuda": 1000}
@@ -63,6 +64,8 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
     plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
     checks.check(plain)
+    if checks.get(plain, "agent.logger") == "wandb":
+        weights_and_biases.check_installed()  # before anything is built
     return None if only_show and _show(plain) else Start(plain, {}, source, data, settings.typed(request))
 
 

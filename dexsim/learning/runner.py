@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dexsim.learning import checkpoint, names
+from dexsim.learning import checkpoint, names, weights_and_biases
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import agent_config, agent_errors
 from dexsim.learning.ranks import Ranks, seed_all
@@ -63,8 +63,11 @@ class Runner(OnPolicyRunner):
         """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
         known = self._git["commit"] != "unknown"
         self.logger.log_dir, self.logger.git_status_repos = str(folder), [__file__] if known else []
-        with agent_errors():
-            self.logger.init_logging_writer()  # writes git/<repository>.diff as well
+        with agent_errors():  # rsl-rl writes git/<repository>.diff as well
+            if self.cfg.get("logger") == "wandb":
+                weights_and_biases.open_writer(self.logger, folder, self.cfg.get("wandb_project") or "dexsim", self.full_cfg)
+            else:
+                self.logger.init_logging_writer()
         if not known:
             (folder / "git").rmdir()
         return self.logger.writer
@@ -161,11 +164,16 @@ class Runner(OnPolicyRunner):
         return next((f"{part}.{name}" for part in ("actor", "critic") for name, w in state[f"{part}_state_dict"].items()
                      if not bool(w.isfinite().all())), "the optimizer's")
 
+    def _config(self) -> dict[str, Any]:
+        """The config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked again."""
+        agent = self.full_cfg["agent"]
+        return self.full_cfg | {"agent": agent | {"logger": "tensorboard"}} if agent.get("logger") == "wandb" else self.full_cfg
+
     def payload(self) -> dict[str, Any]:
         """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         learned = self.alg.save()
         return {
-            "kind": "train", "config": self.full_cfg, "versions": self._versions, "git": self._git,
+            "kind": "train", "config": self._config(), "versions": self._versions, "git": self._git,
             "layout": self._layout, "iteration": self.iteration, "steps": self.steps,
             "actor": learned["actor_state_dict"], "critic": learned["critic_state_dict"],
             "optimizer": learned["optimizer_state_dict"], "env": self.env.state_dict(), "rng": checkpoint.rng_state(),
