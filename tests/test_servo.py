@@ -13,8 +13,8 @@ import warp as wp
 
 from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
 from dexsim.actuator.columns import FEATURES, INDEX, column
-from dexsim.actuator.reference import servo as servo_reference
 from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS
+from dexsim.actuator.reference import servo as servo_reference
 from dexsim.actuator.reference import target_in_force, target_rates
 from dexsim.errors import UserError
 from dexsim.sim import make_engine

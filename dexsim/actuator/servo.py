@@ -10,7 +10,16 @@ import torch
 import warp as wp
 
 from dexsim.actuator.columns import COLUMNS, FEATURE_OF, FEATURES, INDEX, NAMES, column, did_you_mean
-from dexsim.actuator.kernel import EXTENDED, EXTRA_SLOTS, QUEUE, SLOTS, given_kernel, reset_kernel, send_kernel, servo_kernel
+from dexsim.actuator.kernel import (
+    EXTENDED,
+    EXTRA_SLOTS,
+    QUEUE,
+    SLOTS,
+    given_kernel,
+    reset_kernel,
+    send_kernel,
+    servo_kernel,
+)
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 
