@@ -87,7 +87,7 @@ def random_params(rng, shape) -> np.ndarray:
     scale = {
         "kp": 4.0, "kd": 0.1, "deadband": 0.05, "torque_limit": 1.0, "no_load_speed": 10.0, "efficiency": 0.5,
         "delay": 0.02, "lag": 0.02, "supply": 0.3, "coulomb_friction": 0.02, "friction_asymmetry": 0.4,
-        "stribeck_peak": 0.02, "stribeck_speed": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
+        "stribeck_peak": 0.02, "stribeck_speed": 1.0, "stribeck_exponent": 3.0, "presliding": 0.02, "ripple_shape": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
         "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0,
         "position_offset": 0.05, "position_scale": 0.1,
         "eccentric_sin": 0.05, "eccentric_cos": 0.05, "speed_lag": 0.02, "deadband_kind": 2.9,
@@ -103,7 +103,7 @@ def random_params(rng, shape) -> np.ndarray:
         out[..., i] = np.where(rng.random(shape) < (0.4 if c.name in ("backlash", "softness") else 0.15), c.neutral, u)
         if c.name in ("deadband_kind", "coupling_from"):
             out[..., i] = np.floor(out[..., i])
-        if c.name == "braking_slope":
+        if c.name in ("braking_slope", "ripple_shape"):
             out[..., i] = np.where(out[..., i] == c.neutral, c.neutral, rng.uniform(-1.0, 1.0, shape))
     return out
 
@@ -113,7 +113,7 @@ def test_every_column_is_randomized_here():
 
 
 @pytest.mark.parametrize("voltage", [False, True])
-@pytest.mark.parametrize("features", [(), ("braking",), ("controller",), ("play",), tuple(FEATURES)])
+@pytest.mark.parametrize("features", [(), ("braking",), ("controller",), ("presliding", "shape"), ("play",), ("play", "presliding"), tuple(FEATURES)])
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     """Also that a kernel built without a feature does not see its columns."""
@@ -142,6 +142,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         state[..., slots["fresh"]] = rng.random((n, j)) < 0.1
         state[..., slots["filtered"]], state[..., slots["line_a"]] = rng.normal(0, 6.0, (2, n, j))
         state[..., slots["line_b"]] = rng.uniform(-0.2, 0.9, (n, j))
+        state[..., slots["taken"]] = rng.uniform(-1.0, 1.0, (n, j))
         state[..., slots["integral"]] = rng.normal(0, 0.3, (n, j))
     servo.set_state(torch.as_tensor(state, dtype=servo.state.dtype))
     q, v = rng.normal(0, 0.1, (n, j)), rng.normal(0, 6.0, (n, j)) * (rng.random((n, j)) < 0.8)
@@ -179,6 +180,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     }
     if extra:
         got |= {name: servo.state[..., slots[name]].numpy() for name in ("line_a", "line_b") if "play" in features}
+        got |= {"taken": servo.state[..., slots["taken"]].numpy()} if "presliding" in features else {}
         got |= {"integral": servo.state[..., slots["integral"]].numpy()} if "controller" in features else {}
         got |= {"filtered": servo.state[..., slots["filtered"]].numpy()} if "rare" in features else {}
     if "play" in features:

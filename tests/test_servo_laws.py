@@ -16,7 +16,7 @@ from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants
 from dexsim.sim import make_engine
-from tests.test_servo import STICKS, link_spec
+from tests.test_servo import STICKS, drive, link_spec, run
 
 FREE = {"kp": 100.0, "kd": 0.0, "torque_limit": 0.4, "no_load_speed": 10.0}
 INERTIA = 1e-3
@@ -45,7 +45,7 @@ def plant_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0,
     constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, INERTIA, 0.0)
     plant = JointPlant("joint", constants, dt, False, "joint", "joint")
     series = np.zeros((2, len(SERIES)))
-    for name, value in (("inertia", INERTIA), ("supply", 1.0), ("enabled", 1.0)):
+    for name, value in (("inertia", INERTIA), ("supply", 1.0), ("enabled", 1.0), ("warmth", columns.get("warmth", 0.0))):
         series[:, SERIES_INDEX[name]] = value
     row = nominal_row(ServoTable.from_dict({"joints": {"joint": columns}}).nominal(["joint"])[0], 0.0)
     early = [-2.0, *times], [0.0, *targets]
@@ -200,3 +200,110 @@ def test_a_replay_begins_with_the_load_in_the_integral():
         moved = free_runs(mujoco.MjSpec.from_string(demo.MODEL), ["joint"], [world], engine="mujoco")[0]
         sags.append(np.abs(moved[:, 0] - 0.5).max())
     assert sags[0] < 1e-4 < 0.01 < sags[1]
+
+
+# -- friction and ripple -----------------------------------------------------------------------------------------------------
+
+COAST = {"kp": 0.0}
+
+
+def coast(torque, v0: float, seconds: float, fine: float = 1e-5) -> np.ndarray:
+    """[ms] q of the link under torque(q, v), by the midpoint rule in steps of 10 us; it stands once its speed turns."""
+    q, v, out = 0.0, v0, []
+    for i in range(round(seconds / fine)):
+        if i % round(1e-3 / fine) == 0:
+            out.append(q)
+        if v > 0.0:
+            a = torque(q, v) / INERTIA
+            a = torque(q + 0.5 * fine * v, v + 0.5 * fine * a) / INERTIA
+            q, v = q + fine * (v + 0.5 * fine * a), max(v + fine * a, 0.0)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+@pytest.mark.parametrize("exponent", [2.0, 1.0, 0.5])
+def test_stribeck_exponent(motion, exponent):
+    """A link that coasts to its stop: I v' = -(c + peak exp(-(v / v_s)^n))."""
+    columns = COAST | {"coulomb_friction": 0.02, "stribeck_peak": 0.03, "stribeck_speed": 1.5, "stribeck_exponent": exponent}
+    q = motion(columns, [0.0], [0.0], 0.25, v0=6.0)[:, 0]
+    ends = {n: coast(lambda _, v, n=n: -0.02 - 0.03 * np.exp(-((v / 1.5) ** n)), 6.0, 0.25)[-1] for n in (2.0, 1.0, 0.5)}
+    assert abs(q[-1] - ends[exponent]) < 0.012
+    assert min(abs(a - ends[exponent]) for n, a in ends.items() if n != exponent) > 0.03  # a law of its own each
+
+
+def sawtooth(angle):
+    """By its Fourier series: rises through 0 at angle 0, drops at pi."""
+    k = np.arange(1, 400)[:, None]
+    return (2 / np.pi * (-1.0) ** (k + 1) / k * np.sin(k * angle)).sum(0)
+
+
+@pytest.mark.parametrize("shape", [0.0, 1.0, -1.0, 0.4])
+def test_ripple_shape(shape):
+    """Kernel and reference against the sawtooth's Fourier series; the plant against an integration of the kernel's wave."""
+    q = np.linspace(-1.0, 1.0, 57)
+    angle = 9.0 * q + 0.3
+    saw = sawtooth(angle) if shape >= 0 else -sawtooth(angle - np.pi)
+    expected = 0.02 * ((1 - abs(shape)) * np.sin(angle) + abs(shape) * saw)
+    columns = COAST | {"torque_ripple": 0.02, "ripple_per_turn": 9.0, "ripple_phase": 0.3, "ripple_shape": shape}
+    engine = make_engine(link_spec(1.0, 1e-4), len(q), engine="mujoco", fields=FIELDS, threads=1)
+    table = ServoTable.from_dict({"joints": {"joint": columns}})
+    servo = Servo(engine, ["joint"], table)
+    engine.t.qpos[:, 0] = torch.as_tensor(q)
+    servo.before_each()
+    away = np.abs(np.mod(angle - (np.pi if shape > 0 else 0.0) + np.pi, 2 * np.pi) - np.pi) > 0.1  # of the jump, where the series rings
+    np.testing.assert_allclose(engine.t.qfrc_applied[:, 0].numpy()[away], expected[away], atol=3e-4)
+    params = np.tile(table.nominal(["joint"]), (len(q), 1))
+    law = servo_reference(params, 0.0, q, 0.0 * q, dt=1e-4, features=("shape",))["qfrc_applied"]
+    np.testing.assert_allclose(law[away], expected[away], atol=3e-4)
+    fine = np.linspace(-10.0, 10.0, 200001)
+    table_of = servo_reference(np.tile(params[:1], (len(fine), 1)), 0.0, fine, 0.0 * fine, dt=1e-9, features=("shape",))["qfrc_applied"]
+    moved = coast(lambda q, v: np.interp(q, fine, table_of), 3.0, 0.2, fine=1e-4)
+    assert np.abs(plant_motion(columns, [0.0], [0.0], 0.2, v0=3.0)[:, 0] - moved).max() < 0.004
+    assert np.abs(moved - 3e-3 * np.arange(200)).max() > 0.01
+
+
+def dahl(amount: float, level: float, times, targets, seconds: float, fine: float = 1e-5) -> np.ndarray:
+    """[ms] q of the link on a PD (2, 0.02) with Dahl's friction level z, dz = (1 - z sign(v)) v dt / amount, by explicit Euler."""
+    q = v = z = 0.0
+    out = []
+    for i in range(round(seconds / fine)):
+        if i % round(1e-3 / fine) == 0:
+            out.append(q)
+        r = targets[min(int((i + 0.5) * fine / 0.01), len(targets) - 1)]
+        v += fine * (2.0 * (r - q) - 0.02 * v - level * z) / INERTIA
+        z += fine * v / amount * (1.0 - z * np.sign(v))
+        q += fine * v
+    return np.array(out)
+
+
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+def test_presliding_is_dahls_law(motion):
+    """Small motions inside the dry friction, then one out of it: with a stiff friction the small ones would not be there."""
+    times = np.arange(0.0, 0.8, 0.01)
+    targets = np.where(times < 0.5, 0.02 * np.sin(15.0 * times), 0.2)
+    columns = {"kp": 2.0, "kd": 0.02, "coulomb_friction": 0.08, "presliding": 0.01}
+    expected = dahl(0.01, 0.08, times, targets, 0.8)
+    q = motion(columns, times, targets, 0.8)[:, 0]
+    stiff = motion(columns | {"presliding": 0.0}, times, targets, 0.8)[:, 0]
+    small = slice(0, 500)
+    assert np.abs(stiff[small]).max() < 5e-4 < 2e-3 < np.abs(expected[small]).max()
+    assert np.abs(q - expected)[small].max() < 4e-4, np.abs(q - expected)[small].max()
+    assert np.abs(q - expected).max() < 0.01, np.abs(q - expected).max()
+
+
+def test_presliding_is_stable_at_any_step_and_inertia():
+    """A finger's last link of 1e-5 kg.m2 at 5 ms, friction of a twentieth of the stall torque: it holds still, off its target."""
+    columns = {"kp": 1.5, "kd": 0.03, "torque_limit": 0.4, "no_load_speed": 14.38, "coulomb_friction": 0.02, "presliding": 0.002}
+    for extra, dt in (({}, 0.005), ({"softness": 0.3, "rotor": 1e-5}, 0.001)):
+        engine, servo = drive(columns | extra, inertia=1e-5, dt=dt)
+        servo.send(torch.full((1, 1), 0.5))
+        out = run(engine, servo, 1.0)
+        assert np.isfinite(out).all() and abs(out[-1, 0] - 0.5) < 0.03 and np.abs(out[-40:, 1]).max() < 0.02, (extra, out[-1])
+
+
+@pytest.mark.parametrize("motion", [servo_motion, plant_motion])
+def test_warmth_acts_on_friction_that_grows_with_load(motion):
+    """Constant motor torque T against load friction f T: I v' = T (1 - f (1 + k warmth)), 40 degrees warm."""
+    columns = {"kp": 100.0, "torque_limit": 0.05, "load_friction": 0.5, "thermal_friction": -0.01, "warmth": 40.0}
+    q = motion(columns, [0.0], [1e4], 0.2)[:, 0]
+    assert q[-1] == pytest.approx(0.5 * 0.05 * (1 - 0.5 * 0.6) / INERTIA * 0.199**2, rel=0.02)

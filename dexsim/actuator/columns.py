@@ -50,6 +50,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("friction_asymmetry", "1", 0.0, -2.0, 2.0, "(level moving positive - level moving negative) / mean"),
     Column("stribeck_peak", "N.m", 0.0, 0.0, 1e3, "breakaway friction in excess of the sliding level"),
     Column("stribeck_speed", "rad/s", 1.0, 1e-4, 1e3, "speed at which that excess is down to 1/e (if stribeck_peak)"),
+    Column("stribeck_exponent", "1", 2.0, 0.2, 6.0, "how it falls with speed: exp(-(|speed| / stribeck_speed)^exponent)"),
+    Column("presliding", "rad", 0.0, 0.0, 1.0, "how far the joint gives way elastically before its dry friction slides (Dahl's law)"),
     Column("viscous_friction", "N.m.s/rad", 0.0, 0.0, 1e4, "friction proportional to speed"),
     Column("load_friction", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the motor drives the load"),
     Column("load_friction_backdriven", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the load drives it"),
@@ -57,6 +59,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("torque_ripple", "N.m", 0.0, 0.0, 1e3, "amplitude of a torque periodic in the position (cogging, gear)"),
     Column("ripple_per_turn", "1", 1.0, 0.0, 1e4, "periods in one turn of the joint (if torque_ripple)"),
     Column("ripple_phase", "rad", 0.0, -6.3, 6.3, "phase of the ripple at position zero"),
+    Column("ripple_shape", "1", 0.0, -1.0, 1.0, "0 sinusoid, 1 sawtooth that rises and drops, -1 one that falls and jumps up; between: a mixture"),
     # Encoder of the loop and of the reported position: measured = scale * position + offset.
     Column("position_offset", "rad", 0.0, -7.0, 7.0, "encoder zero error, added to the measured position"),
     Column("position_scale", "1", 1.0, 0.5, 2.0, "encoder scale: measured over true position"),
@@ -74,7 +77,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("rotor", "kg.m2", 0.0, 0.0, 1e3, "reflected inertia of the rotor (if play or elasticity); 0: the model's armature"),
     # Temperature: relative changes per degree of `warmth`.
     Column("thermal_torque", "1/degC", 0.0, -0.2, 0.2, "change of the torque constant"),
-    Column("thermal_friction", "1/degC", 0.0, -0.5, 0.5, "change of dry and viscous friction"),
+    Column("thermal_friction", "1/degC", 0.0, -0.5, 0.5, "change of all friction: dry, of the load, viscous"),
     Column("thermal_resistance", "1/degC", 0.0, -0.2, 0.2, "change of the winding's resistance (drive: voltage)"),
     Column("warmth", "degC", 0.0, -100.0, 200.0, "temperature above that at which the other figures hold"),
     # Other joints.
@@ -95,6 +98,8 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "play": ("backlash", "softness"),
     "sag": ("sag",),
     "braking": ("braking_slope",),
+    "presliding": ("presliding",),
+    "shape": ("stribeck_exponent", "ripple_shape"),
     "controller": ("speed_feedforward", "acceleration_feedforward", "integral_gain"),
     "rare": ("eccentric_sin", "eccentric_cos", "speed_lag", "deadband_kind", "thermal_torque", "thermal_friction", "thermal_resistance", "coupling"),
 }

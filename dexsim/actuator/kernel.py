@@ -32,7 +32,8 @@ feels tau' = T - D v'. D dt goes to dof_armature and T - D v to qfrc_applied, so
 contacts know the inertia, not the damping). The rotor's step is completed with the v' it
 found when the next begins: what the rotor loses the link receives. With K -> inf, D dt -> J_r: the armature again.
 Rotors carry the motor's friction and turn the torque-speed line; the model's own friction stays on the link.
-Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking. How hard it sticks is
+Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking; one that is elastic before it
+slides (`presliding`) is a spring there and goes to qfrc_applied and dof_damping. How hard it sticks is
 the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 does not.
 """
 
@@ -44,15 +45,15 @@ from typing import Any
 import warp as wp
 
 from dexsim.actuator.columns import INDEX
-from dexsim.actuator.laws import difference, hold, torque_limit, wind
+from dexsim.actuator.laws import difference, hold, preslide, preslide_slope, ripple_wave, stribeck_power, torque_limit, wind
 
 # Slots of state[world, joint, slot] before the queue: `queue` stamps [s], then `queue` targets [rad], oldest first.
 MOTOR, ENABLED, QUEUE = 0, 1, 2
 SLOTS = ("motor", "enabled")
 # After the queue, where a feature of `columns.FEATURES` needs it. line_a, line_b: see "Play and elasticity".
-EXTRA_SLOTS = ("filtered", "rotor", "line_a", "line_b", "fresh", "integral")
-FILTERED, ROTOR, LINE_A, LINE_B, FRESH, INTEGRAL = range(len(EXTRA_SLOTS))
-EXTENDED = frozenset({"play", "rare", "controller"})  # the features that need them
+EXTRA_SLOTS = ("filtered", "rotor", "line_a", "line_b", "fresh", "integral", "taken")
+FILTERED, ROTOR, LINE_A, LINE_B, FRESH, INTEGRAL, TAKEN = range(len(EXTRA_SLOTS))
+EXTENDED = frozenset({"play", "rare", "controller", "presliding"})  # the features that need them
 
 NEVER = -1.0e9  # the stamp of a target that has always been there
 SEED = 1.0e-6  # of the stall torque: braking from the no-load speed starts from no less
@@ -81,6 +82,7 @@ THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE, WARMTH = (
     INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance", "warmth")
 )
 BRAKING = INDEX["braking_slope"]
+STRIBECK_EXPONENT, PRESLIDING, RIPPLE_SHAPE = (INDEX[n] for n in ("stribeck_exponent", "presliding", "ripple_shape"))
 FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain"))
 SAG, COUPLING, COUPLING_FROM = INDEX["sag"], INDEX["coupling"], INDEX["coupling_from"]
 REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
@@ -111,7 +113,9 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
 @lru_cache(maxsize=None)
 def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`."""
-    play, sag, rare, braking, controller = (name in features for name in ("play", "sag", "rare", "braking", "controller"))
+    play, sag, rare, braking, controller, presliding, shape = (
+        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape")
+    )
     extended = bool(features & EXTENDED)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -370,8 +374,12 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
         # Ripple; where its slope is that of a spring, it too is taken at the end of the step.
         turn = params[w, j, RIPPLE_PER_TURN]
         angle = turn * qpos[w, dof_q[j]] + params[w, j, RIPPLE_PHASE]
-        applied += params[w, j, RIPPLE] * wp.sin(angle)
-        stiffness = wp.max(zero, -params[w, j, RIPPLE] * turn * wp.cos(angle))
+        form = zero
+        if wp.static(shape):
+            form = params[w, j, RIPPLE_SHAPE]
+        wave = ripple_wave(angle, form)
+        applied += params[w, j, RIPPLE] * wave[0]
+        stiffness = wp.max(zero, -params[w, j, RIPPLE] * turn * wave[1])
         applied -= stiffness * dt * v
         damping += stiffness * dt
 
@@ -397,16 +405,39 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
         if wp.static(rare):
             viscous = viscous * friction_factor
             level = base_frictionloss[w, j] + friction_factor * params[w, j, COULOMB]
+            fraction = fraction * friction_factor
         peak = params[w, j, STRIBECK_PEAK]
         if wp.static(rare):
             peak = peak * friction_factor
-        level += peak * wp.exp(-ratio_v * ratio_v) + fraction * wp.abs(last)
+        exponent = real(2.0)
+        if wp.static(shape):
+            exponent = params[w, j, STRIBECK_EXPONENT]
+        level += peak * wp.exp(-stribeck_power(ratio_v, exponent)) + fraction * wp.abs(last)
+
+        # Elastic before it slides: a torque, taken up at the step's begin, and its line in the speed at the step's end.
+        bristle = zero
+        if wp.static(presliding):
+            give = params[w, j, PRESLIDING]
+            if give > zero:
+                taken = zero
+                if not fresh:
+                    taken = preslide(state[w, j, x0 + TAKEN], v_drive * dt / give)
+                state[w, j, x0 + TAKEN] = taken
+                sliding = level
+                if two:
+                    sliding = level - base_frictionloss[w, j]
+                bristle = sliding * taken
+                viscous += sliding * dt / give * preslide_slope(taken, v_drive * dt / give)
 
         if wp.static(play):
             if two:
                 drawn = of_motor
                 own = level - base_frictionloss[w, j]  # the rotor's; the model's own stays on the link
                 of_motor -= real(0.5) * params[w, j, ASYMMETRY] * own
+                if wp.static(presliding):
+                    if params[w, j, PRESLIDING] > zero:
+                        of_motor -= bristle
+                        own = zero
                 on_loop = zero  # the slope in the link's speed
                 if loop_on_rotor:
                     on_drive = slope_motor
@@ -469,6 +500,10 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
             state[w, j, x0 + LINE_B] = one
 
         applied -= real(0.5) * params[w, j, ASYMMETRY] * level
+        if wp.static(presliding):
+            if params[w, j, PRESLIDING] > zero:
+                applied -= bristle
+                level = zero
         damping += brake
         qfrc_applied[w, d] = applied + damping * v
         dof_damping[w, d] = base_damping[w, j] + viscous + damping

@@ -23,6 +23,83 @@ def torque_limit(tau0: Any, x: Any, slope: Any):
     return limit
 
 
+# -- friction ------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def stribeck_power(ratio: Any, exponent: Any):
+    """p of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed / stribeck_speed.
+
+    2: Gaussian (Armstrong-Helouvry 1994, Tustin's exponential is 1); see B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit,
+    A survey of models ... for the control of machines with friction, Automatica 30 (1994), eq. 5.
+    """
+    power = ratio * ratio
+    if exponent != type(ratio)(2.0):
+        power = wp.pow(wp.abs(ratio), exponent)
+    return power
+
+
+@wp.func
+def preslide(taken: Any, turned: Any):
+    """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn / presliding.
+
+    Dahl's law dz/dy = 1 - z sign(y) (P. Dahl, A solid friction model, 1968), taken implicitly over the turn."""
+    return (taken + turned) / (type(taken)(1.0) + wp.abs(turned))
+
+
+@wp.func
+def preslide_slope(taken: Any, turned: Any):
+    """Slope of `preslide` from no turn to this one, (z' - z) / y >= 0: of a line in the turn that is right at both ends."""
+    ahead = taken  # what of it lies in the direction of the turn; from rest either way
+    if turned < type(turned)(0.0):
+        ahead = -taken
+    elif turned == type(turned)(0.0):
+        ahead = type(taken)(0.0)
+    return (type(taken)(1.0) - ahead) / (type(taken)(1.0) + wp.abs(turned))
+
+
+@wp.func
+def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
+    """Speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) + level z' = 0.
+
+    a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction; level [N.m];
+    w = presliding / step: the speed that takes up all of the friction in one step."""
+    one = type(a)(1.0)
+    turn = wp.sign(a * free - level * taken)
+    f = turn * free
+    y = turn * taken
+    A = a * w
+    B = A - a * f + level
+    C = level * y - a * f
+    root = wp.sqrt(wp.max(B * B - type(a)(4.0) * A * C, type(a)(0.0)))
+    u = (root - B) / (type(a)(2.0) * A)
+    if B > type(a)(0.0):
+        u = -type(a)(2.0) * C / (B + root)
+    return turn * w * wp.max(u, type(a)(0.0))
+
+
+# -- ripple --------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def ripple_wave(angle: Any, shape: Any):
+    """(value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0 sin(angle), 1 a sawtooth
+    that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and jumps up at 0; mixtures between."""
+    value = wp.sin(angle)
+    slope = wp.cos(angle)
+    if shape != type(angle)(0.0):
+        share = wp.abs(shape)
+        half = type(angle)(3.141592653589793)
+        turned = angle  # within -pi .. pi of where the sawtooth passes zero
+        if shape < type(angle)(0.0):
+            turned = angle - half
+        turned = turned - type(angle)(2.0) * half * wp.floor((turned + half) / (type(angle)(2.0) * half))
+        tooth = turned / half * wp.sign(shape)
+        value = value + share * (tooth - value)
+        slope = slope + share * (wp.sign(shape) / half - slope)
+    return wp.vector(value, slope)
+
+
 # -- the controller ------------------------------------------------------------------------------------------------------------
 #
 # tau_c = kp e - kd qd_m + speed_feedforward * r' + acceleration_feedforward * r'' + integral_gain * integral of e dt,

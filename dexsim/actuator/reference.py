@@ -67,6 +67,7 @@ def servo(
     loop_motor=False,
     rates=(0.0, 0.0),
     integral=0.0,
+    taken=0.0,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
@@ -74,10 +75,10 @@ def servo(
     (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint
     [kg.m2]; base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
     far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered, rotor, line_a,
-    line_b, fresh, integral: the state's slots; loop_motor: the loop's encoder is on the rotor; rates: the target's speed and
+    line_b, fresh, integral, taken: the state's slots; loop_motor: the loop's encoder is on the rotor; rates: the target's speed and
     acceleration (`target_rates`).
     Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as
-    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`, `integral`.
+    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`, `integral`, `taken`.
     """
     play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
@@ -185,12 +186,19 @@ def servo(
     on_drive = efficiency * blend * on_drive
 
     angle = p["ripple_per_turn"] * q + p["ripple_phase"]
-    applied = applied + p["torque_ripple"] * np.sin(angle)
-    stiffness = np.maximum(0.0, -p["torque_ripple"] * p["ripple_per_turn"] * np.cos(angle))
+    wave, tilt = np.sin(angle), np.cos(angle)
+    if "shape" in features:
+        form = p["ripple_shape"]
+        centre = np.where(form < 0.0, np.pi, 0.0)
+        tooth = np.sign(form) * (np.mod(angle - centre + np.pi, 2 * np.pi) / np.pi - 1.0)
+        wave = (1.0 - np.abs(form)) * wave + np.abs(form) * tooth
+        tilt = (1.0 - np.abs(form)) * tilt + form / np.pi
+    applied = applied + p["torque_ripple"] * wave
+    stiffness = np.maximum(0.0, -p["torque_ripple"] * p["ripple_per_turn"] * tilt)
     applied = applied - stiffness * dt * v
     damping = damping + stiffness * dt
 
-    of_motor, slope_motor = applied, damping
+    of_motor, slope_motor, drawn = applied, damping, applied
     pull = p["standin_position"]
     brake = p["standin_speed"] + p["standin_drag"] * np.abs(v)
     spring = np.maximum(0.0, -pull)
@@ -198,29 +206,37 @@ def servo(
     damping = damping + spring * dt + np.maximum(0.0, -brake)
 
     fraction = np.where(last * v_drive < 0.0, p["load_friction_backdriven"], p["load_friction"])
-    own = friction_factor * (p["coulomb_friction"] + p["stribeck_peak"] * np.exp(-((v_drive / p["stribeck_speed"]) ** 2)))
-    own = own + fraction * np.abs(last)
+    exponent = p["stribeck_exponent"] if "shape" in features else 2.0
+    own = p["coulomb_friction"] + p["stribeck_peak"] * np.exp(-(np.abs(v_drive / p["stribeck_speed"]) ** exponent))
+    own = friction_factor * (own + fraction * np.abs(last))
     level = base_frictionloss + own
     viscous = friction_factor * p["viscous_friction"]
 
+    gives = ("presliding" in features) & (p["presliding"] > 0.0)
+    y = v_drive * dt / np.where(gives, p["presliding"], 1.0)
+    taken = np.where(gives & ~fresh, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
+    sliding = np.where(gives, np.where(two, own, level), 0.0)
+    viscous = viscous + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (1.0 + np.abs(y))
+    of_motor = of_motor - sliding * taken
+
     one = {
-        "qfrc_applied": applied - 0.5 * p["friction_asymmetry"] * level + damping * v,
+        "qfrc_applied": applied - 0.5 * p["friction_asymmetry"] * level - sliding * taken + damping * v,
         "dof_damping": base_damping + viscous + damping,
-        "dof_frictionloss": level,
+        "dof_frictionloss": np.where(gives, 0.0, level),
         "line_a": np.zeros_like(v), "line_b": np.ones_like(v),
     }  # fmt: skip
     other = one
     if play:
         with np.errstate(divide="ignore", invalid="ignore"):
-            other = _rotor(p, of_motor - 0.5 * p["friction_asymmetry"] * own, slope_motor, on_drive, on_rotor, own, viscous, rotor_q, v_drive,
+            other = _rotor(p, of_motor - 0.5 * p["friction_asymmetry"] * own, slope_motor, on_drive, on_rotor, np.where(gives, 0.0, own), viscous, rotor_q, v_drive,
                            rotor_inertia, inertia, q, v, dt, p["kp"] * tau0 if voltage else p["kp"])  # fmt: skip
-        rest, rest_slope = applied - of_motor, damping - slope_motor  # of the stand-in: on the link itself
+        rest, rest_slope = applied - drawn, damping - slope_motor  # of the stand-in: on the link itself
         other["qfrc_applied"] = other["qfrc_applied"] + rest + rest_slope * v
         other["dof_damping"] = base_damping + rest_slope
         other["dof_frictionloss"] = np.broadcast_to(base_frictionloss, v.shape)
     out = {name: np.where(two, other[name], one[name]) for name in one}
     armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) + np.where(two, other.get("armature", 0.0), 0.0) if play else base_armature
-    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q, "integral": integral}
+    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q, "integral": integral, "taken": taken}
 
 
 def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ from dexsim.gap.plant.param import Param
 
 def handed(p: Param, case: Case) -> bool:
     """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
-    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "effort_gain") and p.key not in case.ranges and p.key not in case.unknown)
+    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "presliding", "effort_gain") and p.key not in case.ranges and p.key not in case.unknown)
 
 
 def undamped(trial, kp: float) -> float:

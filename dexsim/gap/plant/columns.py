@@ -23,7 +23,6 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("reaction", 0.0, "1", "the other end of a linkage: share of another joint's load that pulls on this one"),
     ("feedback_delay", 0.0, "s", "age of the position that the loop acts on: it is sampled, and its torque holds until the next sample"),
     ("limit_speed", 0.5, "1", "speed that the torque limit falls with: 0 the motor's, 1 what the loop takes for it (they part with play, elasticity, scale, filter)"),
-    ("presliding", 0.0, "rad", "how far the joint gives way elastically before its dry friction slides"),
     ("bias", 0.0, "N.m", "constant torque on the joint"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import warp as wp
 
-from dexsim.actuator.laws import difference, hold, torque_limit, wind
+from dexsim.actuator.laws import difference, hold, preslide, preslide_speed, ripple_wave, stribeck_power, torque_limit, wind
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
@@ -68,6 +68,7 @@ P_FRESH = INDEX["effort_fresh"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
+P_EXPONENT, P_SHAPE = INDEX["stribeck_exponent"], INDEX["ripple_shape"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
@@ -208,24 +209,6 @@ def plant_kernel():
             acceleration += share * difference(rate, earlier, stamp - before, dt)
         return wp.vec2d(speed, acceleration)
 
-    @wp.func
-    def giving(free: f64, a: f64, level: f64, z: f64, w: f64):
-        """Speed v at the end of a step under Dahl's friction level * z', z' = (z + v / w) / (1 + |v| / w), which gives way
-        elastically before it slides (P. Dahl 1968, taken implicitly): a (v - free) + level z' = 0. z: share of the level
-        that is taken up, w: the speed that takes it all up in one step."""
-        one = f64(1.0)
-        turn = wp.sign(a * free - level * z)
-        f = turn * free
-        y = turn * z
-        A = a * w
-        B = A - a * f + level
-        C = level * y - a * f
-        root = wp.sqrt(wp.max(B * B - f64(4.0) * A * C, f64(0.0)))
-        u = (root - B) / (f64(2.0) * A)
-        if B > f64(0.0):
-            u = -f64(2.0) * C / (B + root)
-        return turn * w * wp.max(u, f64(0.0))
-
     @wp.kernel(module="unique", enable_backward=False)
     def plant(
         first: int,  # first guess of this launch
@@ -302,7 +285,7 @@ def plant_kernel():
         v_f = v
         fresh = int(1)
         prev_tau = zero
-        preslide = params[h, P_PRESLIDE]
+        give = params[h, P_PRESLIDE]
         age = params[h, P_AGE]
         z = zero  # share of the friction that is taken up
         feed_v = params[h, P_FEEDV]
@@ -486,7 +469,8 @@ def plant_kernel():
                 begun_m = vm
                 applied = eff * motor
                 if ripple != zero:
-                    applied += ripple * wp.sin(turn * q + params[h, P_PHASE])
+                    wave = ripple_wave(turn * q + params[h, P_PHASE], params[h, P_SHAPE])
+                    applied += ripple * wave[0]
                 applied += params[h, P_BIAS]
 
                 v_fric = v - carried
@@ -498,9 +482,10 @@ def plant_kernel():
                 level = params[h, P_COULOMB]
                 if peak > zero:
                     ratio_v = v_fric / params[h, P_VS]
-                    if wp.abs(ratio_v) < f64(5.0):
-                        level += peak * wp.exp(-ratio_v * ratio_v)
-                level = level * friction_factor + fraction * wp.abs(before)
+                    power = stribeck_power(ratio_v, params[h, P_EXPONENT])
+                    if power < f64(25.0):
+                        level += peak * wp.exp(-power)
+                level = (level + fraction * wp.abs(before)) * friction_factor
                 applied -= half * params[h, P_ASYM] * level
 
                 stop_d = zero
@@ -518,14 +503,14 @@ def plant_kernel():
                     free = (inertia / (theta * dts) * v + applied + damping * v - load + params[h, P_VISC] * friction_factor * carried) / a
                     free -= carried  # dry friction acts where the motor turns
                     if i < warm:
-                        if preslide > zero:
-                            z = (z + v_fric * dts / preslide) / (one + wp.abs(v_fric) * dts / preslide)
+                        if give > zero:
+                            z = preslide(z, v_fric * dts / give)
                     else:
                         went = carried  # speed in the middle of the step, or at its end
-                        if preslide > zero:
-                            free = giving(free, a, level, z, preslide / dts)
+                        if give > zero:
+                            free = preslide_speed(free, a, level, z, give / dts)
                             went = free + carried
-                            z = (z + free * dts / preslide) / (one + wp.abs(free) * dts / preslide)
+                            z = preslide(z, free * dts / give)
                             q += dts * (free + carried)
                             v = v + (free + carried - v) / theta
                             if (v - carried) * free < zero:
@@ -582,9 +567,9 @@ def plant_kernel():
                     det = a11 * a22 - a12 * a21
                     x1 = (b1 * a22 - a12 * b2) / det
                     gain = a22 / det
-                    if preslide > zero:
-                        x1 = giving(x1, one / gain, level, z, preslide / dts)
-                        z = (z + x1 * dts / preslide) / (one + wp.abs(x1) * dts / preslide)
+                    if give > zero:
+                        x1 = preslide_speed(x1, one / gain, level, z, give / dts)
+                        z = preslide(z, x1 * dts / give)
                         x2 = (b2 - a21 * x1) / a22
                     elif wp.abs(x1) <= gain * level:
                         x1 = zero
