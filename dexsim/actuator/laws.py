@@ -64,7 +64,6 @@ def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
 
     a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction; level [N.m];
     w = presliding / step: the speed that takes up all of the friction in one step."""
-    one = type(a)(1.0)
     turn = wp.sign(a * free - level * taken)
     f = turn * free
     y = turn * taken
