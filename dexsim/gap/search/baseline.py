@@ -1,0 +1,170 @@
+"""The plain model that an engineer fits first, of every joint: PD gains, torque limit, Coulomb and viscous friction, delay.
+
+A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the bounds. Whatever else a
+diagnosis finds has to follow what was kept out better than this, or this is what is handed on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from dexsim.actuator.columns import INDEX as SERVO
+from dexsim.actuator.table import ServoTable
+from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.search.fit import Fitter, Residuals
+from dexsim.gap.search.recorded_motion import forbids, room_for_friction
+
+WINDOW, WINDOWS = 2.0, 24  # s of a window, and how many: more would say little more
+GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted
+ITERATIONS = 8
+GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
+LATEST = 0.08  # s
+WORSE = 1.02  # x the plain model's error on what was kept out: beyond it an answer is worse
+AT_NOISE = 1.1  # x the noise: what is followed to it is as good as anything
+UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
+
+
+@dataclass
+class Baseline:
+    """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over what was kept out
+    [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples; at_bound: columns that stopped there."""
+
+    joint: str
+    value: dict[str, float]
+    error_before: float
+    error: float
+    squares_before: np.ndarray = field(repr=False)
+    squares: np.ndarray = field(repr=False)
+    slide: bool = False
+    at_bound: tuple[str, ...] = ()
+
+    def entry(self) -> dict[str, Any]:
+        """As `diagnosis.json` has it."""
+        unit = lambda n: UNITS.get(n, "1").replace("N.m", "N").replace("rad", "m") if self.slide else UNITS.get(n, "1")  # noqa: E731
+        return {"error_before": self.error_before, "error": self.error, "parameters": {n: {"value": x, "unit": unit(n)} for n, x in self.value.items()}}
+
+
+def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
+    """What is fitted of a joint: around its belief, within its stated range where it has one; friction from none to what drives it."""
+    s, out = case.scales, []
+
+    def factor(name: str, wide: tuple[float, float]) -> None:
+        value = s.nominal[name]
+        if 0 < value < 1e8:
+            low, high = case.ranges.get(name, (wide[0] * value, wide[1] * value))
+            out.append(Param(name, (name,), "factor", min(low / value, 1.0), max(high / value, 1.0), 1.0))
+
+    factor("kp", GAIN)
+    if s.nominal["kd"] > 0:
+        factor("kd", (0.0, GAIN[1]))
+    elif s.nominal["kp"] > 0:  # a loop that is said not to damp: up to critical damping
+        stiffness = s.nominal["kp"] * (s.nominal["torque_limit"] if s.voltage else 1.0)
+        out.append(Param("kd", ("kd",), "set", 0.0, 2.0 * s.nominal["kp"] * float(np.sqrt(s.inertia / max(stiffness, 1e-12))), 0.0))
+    factor("torque_limit", LIMIT)
+    if not case.told:  # what the recorded torque has told is known
+        room = min(min(room_for_friction(case, train).values()) - case.constants.friction, s.tau)
+        low, high = case.ranges.get("coulomb_friction", (0.0, np.inf))
+        room = min(room, high) if high > low else room
+        if room > 0:
+            out.append(Param("coulomb_friction", ("coulomb_friction",), "set", 0.0, room, min(s.nominal["coulomb_friction"], room), UNITS["coulomb_friction"]))
+        most = max(s.tau / s.speed, 2 * s.nominal["viscous_friction"])
+        out.append(Param("viscous_friction", ("viscous_friction",), "set", 0.0, most, s.nominal["viscous_friction"], UNITS["viscous_friction"]))
+    out.append(Param("delay", ("delay",), "set", 0.0, max(LATEST, 2 * s.nominal["delay"]), s.nominal["delay"], "s"))
+    return out
+
+
+def fit(case: Case, train: Sequence[int], test: Sequence[int], span_train: dict | None = None, span_test: dict | None = None, seed: int = 0,
+        whole: Any = None) -> Baseline | None:
+    """The plain model of a joint, fitted on runs `train` and judged on `test` (span_*: part of each run, s). whole: the plant on which free runs are
+    judged (None: the case's own). None where there is nothing to fit or to judge."""
+    from dexsim.gap.judge.errors import free_run
+    from dexsim.gap.search.search import subset
+
+    windows = case.plant.windows(WINDOW, list(train), span=span_train)
+    judged = replace(case, plant=whole or case.plant)
+    kept = judged.plant.windows(None, list(test), span=span_test)
+    if not len(windows.window) or not len(kept.window):
+        return None
+    pick = np.zeros(len(windows.window), bool)
+    pick[np.unique(np.linspace(0, len(pick) - 1, WINDOWS).astype(int))] = True
+    params = plain_model(case, train)
+    fitter = Fitter(case.plant, subset(windows, pick), Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)))
+    x = _fitted(fitter, params, np.random.default_rng(seed))
+    measured = judged.plant.q[kept.sample_row]
+    before = (measured - free_run(judged, [], np.zeros(0), kept, underway=True)[0]) ** 2
+    after = (measured - free_run(judged, params, x, kept, underway=True)[0]) ** 2
+    row = expand(case.plant, params, x[None])[0, 0]
+    value = {p.key: float(row[INDEX[p.key]]) for p in params}
+    stopped = tuple(p.key for p, v in zip(params, x, strict=True) if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0))
+    rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
+    return Baseline(case.joint, value, rms(before), rms(after), before, after, case.scales.slide, stopped)
+
+
+def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np.ndarray:
+    """[P] least squares from the best of guesses all over the bounds, and from what is believed."""
+    low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+    start = np.clip([p.start for p in params], low, high)
+    cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))  # a Latin square
+    share = cells / GUESSES
+    spread = np.array([p.mode == "factor" and p.low > 0 for p in params])  # factors evenly in their logarithm; the rest denser near none
+    safe = np.where(spread, low, 1.0)
+    guesses = np.where(spread, safe * (np.where(spread, high, 2.0) / safe) ** share, low + (high - low) * share**2)
+    guesses = np.concatenate([start[None], guesses])
+    loss = fitter.loss(fitter.residuals(params, guesses))
+    order = np.argsort(loss)[:BEST]
+    fits = [fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3) for k in dict.fromkeys([0, *order.tolist()])]
+    return min(fits, key=lambda f: f.loss).x
+
+
+def overall(given: Sequence[Baseline]) -> dict[str, Any]:
+    """All joints together as `diagnosis.json` has them; empty where there is none."""
+    if not given:
+        return {}
+    rms = lambda parts: float(np.sqrt(np.mean(np.concatenate(parts))))  # noqa: E731
+    return {"error_before": rms([b.squares_before for b in given]), "error": rms([b.squares for b in given]),
+            "parameters": sorted({n for b in given for n in b.value}), "joints": {b.joint: b.entry() for b in given}, "handed_on": []}  # fmt: skip
+
+
+def refused(given: Sequence[Baseline], joints: dict[str, dict[str, float]], answers: Sequence[Any], train: Sequence[int]) -> dict[str, str]:
+    """Joints of which what was found is not handed on, with the reason: it follows what was kept out worse than the plain model, or its friction
+    forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); answers: with `case` and the fit `best` of each."""
+    out = {}
+    by = {b.joint: b for b in given}
+    for a in answers:
+        joint, case, trial = a.case.joint, a.case, a.best
+        row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
+        reason = forbids(case, train, float(row[INDEX["coulomb_friction"]]), float(row[INDEX["friction_asymmetry"]]))
+        plain, after = by.get(joint), joints[joint]["after"]
+        if reason:
+            out[joint] = reason
+        elif plain is not None and after > max(WORSE * plain.error, AT_NOISE * joints[joint]["sigma"]):
+            k, unit = 1e3, "mm" if case.scales.slide else "mrad"
+            out[joint] = (f"a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was kept out to {k * plain.error:.3g} {unit}, "
+                          f"what was found to {k * after:.3g}")  # fmt: skip
+    return out
+
+
+def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str]) -> list[str]:
+    """Writes the plain model of `joints` into the servo table that is handed on; returns those that have one."""
+    done = []
+    for b in given:
+        if b.joint in joints and b.error < b.error_before:
+            for name, x in b.value.items():
+                if name in SERVO:
+                    servo.set(b.joint, name, round(x, 9))
+            done.append(b.joint)
+    return done
+
+
+def text(data: dict[str, Any], unit: str) -> str:
+    """One line for a person."""
+    if not data:
+        return ""
+    said = f"A plain least squares (gains, limit, Coulomb, viscous, delay) leaves {1e3 * data['error']:.3g} {unit} of {1e3 * data['error_before']:.3g} on what was kept out"
+    return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
