@@ -327,7 +327,7 @@ def answer(rig):
     return d, folder / "out"
 
 
-KEYS = {"schema", "verdict", "noise_floor", "nuisance", "held_out", "findings", "unexplained", "next_recording"}
+KEYS = {"schema", "verdict", "noise_floor", "nuisance", "baseline", "held_out", "findings", "unexplained", "next_recording"}
 FINDING = {"effect", "confidence", "alternatives", "indistinguishable", "separating_experiment", "where", "regime", "when", "parameters", "held_out"}
 
 
@@ -338,6 +338,9 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     assert data["verdict"] in ("explained", "partly_explained")
     assert set(data["noise_floor"]) == {"position_rad", "how"} and data["noise_floor"]["how"] in ("repeats", "split", "quantum")
     assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"}
+    plain = data["baseline"]
+    assert set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"} and plain["error"] < 0.1 * plain["error_before"]
+    assert set(plain["joints"]["joint"]) == {"error_before", "error", "parameters"} and plain["handed_on"] == []
     f = data["findings"][0]
     assert set(f) == FINDING and set(f["where"]) == {"joints", "taxels", "topics"}
     assert f["effect"] == "command_delay" and f["where"]["joints"] == ["joint"]

@@ -215,10 +215,13 @@ def verdict(d) -> str:
     """The verdict in at most ten lines."""
     from dexsim.gap.report.charts import number
     from dexsim.gap.report.sentence import place
+    from dexsim.gap.search import baseline
 
     data = d.data
     lines = ["", f"{data['verdict'].replace('_', ' ').upper()}: {d.sentence}"]
-    for f in data["findings"][:4]:
+    if plain := baseline.text(data["baseline"], "mm" if data["held_out"]["error"].endswith("_m") else "mrad"):
+        lines.append(f"  {plain}")
+    for f in data["findings"][: 4 - bool(plain)]:
         where = place(f)
         sizes = ", ".join(
             f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)

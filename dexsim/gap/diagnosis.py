@@ -23,7 +23,7 @@ from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_experiment import rival_of
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Clock, Diagnosis, Settings, empty
-from dexsim.gap.search import inverse_dynamics
+from dexsim.gap.search import baseline, inverse_dynamics
 from dexsim.gap.search.parallel import together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch import handed_on as touch_handed
@@ -213,7 +213,9 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         else:
             outcomes.append((case, search, found))
     clock.lap("search")
-    result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes)
+    plains = [b for case, search, _ in outcomes if case.moved and (b := baseline.fit(case, train, test, span_train, span_test, s.seed, search.whole))]
+    clock.lap("plain model")
+    result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes, plains)
     result.stages = [x.text for x in stages] + behind
     add_behind(result, inverse_dynamics.findings(by_torque, nothing_believed, runs, train), by_torque)
     inverse_dynamics.hand_on(by_torque, result, outcomes, test, span_test)

@@ -80,7 +80,7 @@ def empty(verdict: str = "unusable") -> dict[str, Any]:
     """diagnosis.json with nothing in it."""
     zero = {"recordings": [], "error": "position_rmse_rad"}
     zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
-    return {"schema": 1, "verdict": verdict, "noise_floor": {"position_rad": None, "how": "quantum"}, "nuisance": {}, "held_out": zero,
+    return {"schema": 1, "verdict": verdict, "noise_floor": {"position_rad": None, "how": "quantum"}, "nuisance": {}, "baseline": {}, "held_out": zero,
             "findings": [], "unexplained": {"fraction_of_gap": None, "depends_on": [], "not_considered": {}}, "next_recording": None}
 
 

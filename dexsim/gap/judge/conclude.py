@@ -16,21 +16,23 @@ from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings, empty
+from dexsim.gap.search import baseline
 from dexsim.gap.search.search import ENOUGH, JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/results/concealed.md)
 NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
 SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
+HINTED = 0.45  # confidence of what a plain model does better without
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 
 
 def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]], kept: Kept, floor: tuple[float, str], how: str,
-             channel: list[dict[str, Any]], notes: list[str]) -> Diagnosis:
+             channel: list[dict[str, Any]], notes: list[str], plains: Sequence[baseline.Baseline] = ()) -> Diagnosis:
     """The diagnosis of the joints.
 
     outcomes: what the search answered of each; floor: of the noise [rad or m], and where it comes from; how: what was kept out, in words;
-    channel: findings about signals, of all joints; notes: what the page says beside the findings, added to."""
+    channel: findings about signals, of all joints; notes: what the page says beside the findings, added to; plains: the plain model of each joint."""
     data = empty("none")
     data["noise_floor"] = {"position_rad": float(floor[0]), "how": floor[1]}
     out = Diagnosis(data, "", notes, mechanism=m)
@@ -59,14 +61,30 @@ def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSear
         v = out.joints[joint]
         notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
                      "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
+    fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
+    worse = baseline.refused(plains, out.joints, fits, kept.train, floor[0])
+    _not_better(out, worse)
     findings.sort(key=lambda f: -_weight(f))
     _doubts(out, findings, [f for f in channel if not _elsewhere(f, kept)])
-    _hand_on(out, m, [a for a in answers if a.case.joint not in refuted], findings)
+    _hand_on(out, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
+    data["baseline"] = baseline.overall(plains)
+    if worse:
+        data["baseline"]["handed_on"] = baseline.hand_on(plains, out.servo, list(worse))
     findings = _linkages(findings, answers)
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed)
     out.sentence = sentence(data, out, floor[0])
     return out
+
+
+def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
+    """Doubts what was found on joints that a plain model follows better, or of which a recorded motion says that it cannot be."""
+    for joint, reason in worse.items():
+        d.notes.append(f"{joint}: {reason}; what was fitted is not handed on")
+        for e in d.evidence:
+            if e.joint == joint and not EFFECTS[e.effect].effort_only:
+                e.reasons.append(reason)
+                e.confidence = min(e.confidence, HINTED)
 
 
 def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:

@@ -11,6 +11,7 @@ from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.judge.full_model import TASKS
 from dexsim.gap.report import charts
 from dexsim.gap.report.picture import mechanism, pad, scale
+from dexsim.gap.search import baseline
 
 if TYPE_CHECKING:
     from dexsim.gap.result import Diagnosis
@@ -96,6 +97,9 @@ def _bars(d: Diagnosis) -> str:
     rows = [("before", *scaled(h["before"], h["before_low"], h["before_high"]), charts.BEFORE)]
     if found:
         rows.append(("after", *scaled(h["after"], h["after_low"], h["after_high"]), charts.AFTER))
+    plain = d.data["baseline"]
+    if plain and h["error"].startswith("position"):
+        rows.append(("plain model", k * plain["error"], None, None, charts.FLOOR))
     floor = d.data["noise_floor"]
     touched = h["error"].startswith("tactile")
     value = floor.get("tactile_N") if touched else floor["position_rad"] if unit in ("mrad", "mm") else None
@@ -103,9 +107,10 @@ def _bars(d: Diagnosis) -> str:
         rows.append(("noise floor", k * value, None, None, charts.FLOOR))
     how = {"repeats": "repeats of the same commands", "split": "the scatter of single samples", "quantum": "the encoder's step"}[floor["how"]]
     note = "the counts of the taxels" if touched else how
+    said = f" Plain model: {_t(baseline.text(plain, unit))}." if plain and h["error"].startswith("position") else ""
     over = f", all {len(d.joints)} joints" if len(d.joints) > 1 and unit in ("mrad", "mm") else ""
     return (f'<h2>Error on held-out data{over}</h2>{charts.bars(rows, unit)}<p class="soft small">Root mean square, 90 % intervals. Before: the machine as it is believed, its '
-            f"figures refitted within 5 %. Floor: from {note}.</p>")  # fmt: skip
+            f"figures refitted within 5 %.{said} Floor: from {note}.</p>")  # fmt: skip
 
 
 def _where(d: Diagnosis) -> str:
@@ -153,21 +158,21 @@ def _table(d: Diagnosis, unit: str) -> str:
 
 
 def _rows(d: Diagnosis, unit: str, most: int | None = None) -> str:
-    rows = []
+    rows, plain = [], d.data["baseline"].get("joints", {})
     order = sorted(d.joints.items(), key=lambda x: -x[1]["before"])
     for j, v in order[:most]:
         effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
         rows.append(f'<tr><td>{_t(j)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
-                    f'<td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
+                    f'<td class="n">{charts.number(1e3 * plain[j]["error"]) if j in plain else ""}</td><td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
     from dexsim.assets import xhand
 
     for finger, v in (d.touch.pads if d.touch else {}).items():
         f_ = xhand.FINGERS.index(finger)
         effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if any(t.startswith(f"{f_}:") for t in f["where"]["taxels"])) or "&#8211;"
         rows.append(f'<tr><td>pad of the {_t(finger)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
-                    f'<td class="n">{1e3 * v["noise"]:.2g} mN</td></tr>')  # fmt: skip
+                    f'<td class="n"></td><td class="n">{1e3 * v["noise"]:.2g} mN</td></tr>')  # fmt: skip
     more = f'<p class="soft small">and {len(order) - most} more joints with less, in the details</p>' if most is not None and len(order) > most else ""
-    return f'<table><tr><th>where</th><th>found</th><th class="n">before</th><th class="n">after</th><th class="n">noise</th></tr>{"".join(rows)}</table>{more}'
+    return f'<table><tr><th>where</th><th>found</th><th class="n">before</th><th class="n">after</th><th class="n">plain model</th><th class="n">noise</th></tr>{"".join(rows)}</table>{more}'
 
 
 def _parameters(f: dict) -> str:

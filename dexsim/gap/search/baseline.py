@@ -25,15 +25,17 @@ GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted
 ITERATIONS = 8
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
-WORSE = 1.02  # x the plain model's error on what was kept out: beyond it an answer is worse
-AT_NOISE = 1.1  # x the noise: what is followed to it is as good as anything
+WORSE = 1.05  # x the plain model's error on what was kept out: beyond it an answer is worse
+AT_NOISE = 1.3  # x the noise: what is followed to it is as good as anything
+BLOCK, DRAWS, SURE = 0.5, 400, 0.95  # s, and in how many of the bootstraps it has to be worse
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
 
 
 @dataclass
 class Baseline:
     """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over what was kept out
-    [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples; at_bound: columns that stopped there."""
+    [rad or m] with what is believed and with them; squares [n]: those errors squared, at its
+    samples, of half a second a block [n]; at_bound: columns that stopped there."""
 
     joint: str
     value: dict[str, float]
@@ -41,6 +43,7 @@ class Baseline:
     error: float
     squares_before: np.ndarray = field(repr=False)
     squares: np.ndarray = field(repr=False)
+    block: np.ndarray = field(repr=False)
     slide: bool = False
     at_bound: tuple[str, ...] = ()
 
@@ -99,11 +102,11 @@ def fit(case: Case, train: Sequence[int], test: Sequence[int], span_train: dict 
     measured = judged.plant.q[kept.sample_row]
     before = (measured - free_run(judged, [], np.zeros(0), kept, underway=True)[0]) ** 2
     after = (measured - free_run(judged, params, x, kept, underway=True)[0]) ** 2
-    row = expand(case.plant, params, x[None])[0, 0]
-    value = {p.key: float(row[INDEX[p.key]]) for p in params}
+    value = {p.key: float(v * case.scales.nominal[p.key] if p.mode == "factor" else v) for p, v in zip(params, x, strict=True)}
     stopped = tuple(p.key for p, v in zip(params, x, strict=True) if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0))
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
-    return Baseline(case.joint, value, rms(before), rms(after), before, after, case.scales.slide, stopped)
+    block = (judged.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * judged.plant.run_of[kept.sample_row]
+    return Baseline(case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped)
 
 
 def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np.ndarray:
@@ -131,23 +134,35 @@ def overall(given: Sequence[Baseline]) -> dict[str, Any]:
             "parameters": sorted({n for b in given for n in b.value}), "joints": {b.joint: b.entry() for b in given}, "handed_on": []}  # fmt: skip
 
 
-def refused(given: Sequence[Baseline], joints: dict[str, dict[str, float]], answers: Sequence[Any], train: Sequence[int]) -> dict[str, str]:
-    """Joints of which what was found is not handed on, with the reason: it follows what was kept out worse than the plain model, or its friction
-    forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); answers: with `case` and the fit `best` of each."""
+def refused(given: Sequence[Baseline], joints: dict[str, dict[str, float]], fits: Sequence[tuple[Case, Any, np.ndarray]], train: Sequence[int],
+            floor: float) -> dict[str, str]:
+    """Joints of which what was fitted is not handed on, with the reason: it follows what was kept out worse than the plain model, or its friction
+    forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); fits: each joint's case, the trial that it would hand on and its squared errors on what was kept
+    out, at the plain model's samples; floor: of the noise, as `joints`."""
     out = {}
     by = {b.joint: b for b in given}
-    for a in answers:
-        joint, case, trial = a.case.joint, a.case, a.best
+    for case, trial, squares in fits:
+        joint = case.joint
         row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
         reason = forbids(case, train, float(row[INDEX["coulomb_friction"]]), float(row[INDEX["friction_asymmetry"]]))
         plain, after = by.get(joint), joints[joint]["after"]
         if reason:
             out[joint] = reason
-        elif plain is not None and after > max(WORSE * plain.error, AT_NOISE * joints[joint]["sigma"]):
+        elif plain is not None and after > max(WORSE * plain.error, AT_NOISE * max(joints[joint]["sigma"], floor)) and _surely(squares, plain):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"
             out[joint] = (f"a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was kept out to {k * plain.error:.3g} {unit}, "
                           f"what was found to {k * after:.3g}")  # fmt: skip
     return out
+
+
+def _surely(squares: np.ndarray, plain: Baseline) -> bool:
+    """Whether squared errors [n] are larger than the plain model's, whichever stretches had been recorded."""
+    if len(squares) != len(plain.squares):
+        return False
+    _, block = np.unique(plain.block, return_inverse=True)
+    more = np.bincount(block, squares - plain.squares)
+    draws = more[np.random.default_rng(0).integers(0, len(more), (DRAWS, len(more)))].sum(1)
+    return float(np.mean(draws > 0)) >= SURE
 
 
 def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str]) -> list[str]:

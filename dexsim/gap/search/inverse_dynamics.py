@@ -368,6 +368,8 @@ def hand_on(given: Sequence[tuple], d, outcomes: Sequence[tuple], test: Sequence
             continue
         for name in told:
             d.servo.set(case.joint, name, round(case.scales.nominal[name], 9), *(round(v, 9) for v in case.ranges[name]))
+            if f"{name}@{case.joint}" in d.data["nuisance"]:
+                d.data["nuisance"][f"{name}@{case.joint}"] = round(case.scales.nominal[name], 6)
         if "inertia" in ours:
             d.data["nuisance"][f"inertia_factor@{case.joint}"] = round(ours["inertia"], 6)
         d.notes.append(f"{case.joint}: friction is handed on as the recorded torque tells it; its closed loop does not tell it better")

@@ -1,0 +1,114 @@
+"""The plain model beside every diagnosis, and motions that were recorded against frictions that forbid them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from dexsim.actuator.table import ServoTable
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.read.runs import Run
+from dexsim.gap.search import baseline
+from dexsim.gap.search.recorded_motion import forbids, room_for_friction
+
+PENDULUM = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="joint" axis="0 1 0" armature="0.001"/>
+<geom type="sphere" size="0.01" pos="0 0 -0.1" mass="0.5"/></body></worldbody></mujoco>"""
+HANGS = 0.5 * 9.81 * 0.1  # N.m at a right angle
+BELIEVED = {"drive": "torque", "loop_rate": 1000, "joints": {"*": {"kp": 3.0, "kd": 0.1, "torque_limit": 2.0}}}
+
+
+def run(name: str, t, q, cmd, enabled=None, torque=None) -> Run:
+    column = lambda x: None if x is None else np.asarray(x, float)[:, None]  # noqa: E731
+    return Run(name, ("joint",), t, column(cmd), t, column(q), ServoTable.from_dict(BELIEVED), np.array([0, 0, -9.81]), enabled=column(enabled), torque=column(torque))
+
+
+def case_of(*runs: Run):
+    for r in runs:
+        r.smooth()
+    return build(mujoco.MjModel.from_xml_string(PENDULUM), list(runs))[0]
+
+
+def falls(friction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and angles of the pendulum let go at 1.2 rad without power; it comes to rest by its dry friction [N.m]."""
+    t, dt, inertia = np.arange(0, 3, 5e-3), 2.5e-4, 0.001 + 0.5 * 0.1**2
+    q, v, out = 1.2, 0.0, []
+    for i in range(len(t) * 20):
+        if i % 20 == 0:
+            out.append(q)
+        free = v - dt * HANGS * np.sin(q) / inertia if t[i // 20] > 0.5 else 0.0  # held until then
+        stop = dt * friction / inertia
+        v = np.sign(free) * max(abs(free) - stop, 0.0)
+        q += dt * v
+    return t, np.array(out)
+
+
+def test_a_friction_that_forbids_a_fall_that_was_recorded_is_refused_with_the_reason():
+    t, q = falls(0.05)
+    case = case_of(run("fall.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))))
+    room = room_for_friction(case, [0])
+    assert 0.05 < room[-1] < 0.5 * HANGS  # it swings, and each swing begins with less of gravity
+    assert forbids(case, [0], 0.05) == ""
+    assert "would hold the joint, but it was recorded setting itself in motion" in forbids(case, [0], 1.4 * HANGS)
+    assert "in motion backwards" in forbids(case, [0], 0.4 * HANGS, asymmetry=-1.9)  # of which more backwards
+    powered = case_of(run("fall.mcap", t, q, np.full(len(t), 1.2), enabled=np.ones(len(t))))
+    assert forbids(powered, [0], 1.4 * HANGS) == ""  # the drive may have pushed it
+
+
+def moved(case, seconds: float = 6.0, seed: int = 0, **true: float) -> Run:
+    """A recording of steps and a wave by the plant itself, with columns at their true values."""
+    rng, t = np.random.default_rng(seed), np.arange(0, seconds, 5e-3)
+    cmd = 0.4 * np.sin(2 * np.pi * (0.4 + 0.1 * seed) * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.55 * t + seed))
+    blank = case_of(run(f"m{seed}.mcap", t, np.zeros(len(t)), cmd))
+    params = blank.plant.base()[None].copy()
+    for name, value in true.items():
+        params[:, :, INDEX[name]] = value
+    q = blank.plant.simulate(params, blank.plant.windows(None))[0][0]
+    return run(f"m{seed}.mcap", t, q + 3e-4 * rng.standard_normal(len(t)), cmd)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    true = {"kp": 3.9, "kd": 0.16, "coulomb_friction": 0.08, "viscous_friction": 0.0, "delay": 0.02}
+    case = case_of(*(moved(None, seed=k, **true) for k in (0, 1)))
+    return case, true, baseline.fit(case, [0], [1])
+
+
+def test_the_plain_model_follows_what_it_can_state(fitted):
+    case, true, plain = fitted
+    assert plain.error < 1e-3 < 0.05 * plain.error_before
+    for name, tolerance in (("kp", 0.1), ("coulomb_friction", 0.1), ("delay", 0.15)):
+        assert plain.value[name] == pytest.approx(true[name], rel=tolerance), name
+    entry = plain.entry()
+    assert entry["parameters"]["delay"]["unit"] == "s" and entry["error"] == plain.error
+    data = baseline.overall([plain])
+    assert data["error"] == pytest.approx(plain.error) and data["joints"]["joint"] == entry
+    assert "plain least squares" in baseline.text(data, "mrad") and baseline.text({}, "mrad") == ""
+
+
+def test_what_follows_worse_than_the_plain_model_is_not_handed_on(fitted):
+    case, true, plain = fitted
+    trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
+    given = lambda squares: baseline.refused([plain], {"joint": {"after": float(np.sqrt(squares.mean())), "sigma": 3e-4}}, [(case, trial, squares)], [0], 3e-4)  # noqa: E731
+    assert given(1.05 * plain.squares) == {}  # as good, to the noise
+    worse = plain.squares + (2e-3) ** 2
+    assert "plain least squares" in given(worse)["joint"]
+    lucky = plain.squares.copy()
+    lucky[:20] += 1e-2  # one moment is no evidence
+    assert given(lucky) == {}
+    servo = ServoTable.from_dict(BELIEVED)
+    assert baseline.hand_on([plain], servo, ["joint"]) == ["joint"]
+    assert servo.value("joint", "delay").value == pytest.approx(plain.value["delay"], abs=1e-8)
+    assert servo.value("joint", "kp").value == pytest.approx(plain.value["kp"], abs=1e-8)
+
+
+def test_the_plain_model_fits_no_friction_that_a_fall_forbids():
+    t, q = falls(0.05)
+    case = case_of(run("fall.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))), run("again.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))))
+    friction = next(p for p in baseline.plain_model(case, [0]) if p.key == "coulomb_friction")
+    assert friction.high <= room_for_friction(case, [0])[-1]
+    refused = baseline.refused([], {"joint": {"after": 1.0, "sigma": 1e-3}}, [(case, SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS]))), np.ones(3))], [0], 1e-3)
+    assert "would hold the joint" in refused["joint"]
