@@ -1,5 +1,7 @@
 # make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
 # make test    the tests
+# make lint    ruff over everything, mypy over the public functions
+# make wheel   what `pip install` takes, in dist/
 # make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
 # make docs    this documentation as a site, in out/site/
 # Another Python: make train PYTHON=python3.12
@@ -10,10 +12,10 @@ VENV ?= .venv
 PY := $(VENV)/bin/python
 ARGS ?=
 
-.PHONY: help train test play docs
+.PHONY: help train test lint wheel play docs
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
 
 train: $(VENV)/.installed
 	$(PY) train.py $(or $(filter task=%,$(ARGS)),task=grasp) $(filter-out task=%,$(ARGS))
@@ -23,6 +25,13 @@ play: $(VENV)/.installed
 
 test: $(VENV)/.installed-test
 	$(PY) -m pytest -q -m "not slow" $(ARGS)
+
+lint: $(VENV)/.installed-test
+	$(PY) -m ruff check .
+	$(PY) -m mypy
+
+wheel: $(VENV)/.installed
+	$(PY) -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict

@@ -390,7 +390,7 @@ def edits():
 
 @pytest.mark.parametrize("key, value", list(edits()))
 def test_a_manifest_of_the_wrong_kind_is_named(b, tmp_path, key, value):
-    from dexsim.deploy.__main__ import main
+    from dexsim.cli.deploy import main
 
     m = yaml.safe_load((b / "manifest.yaml").read_text())
     node, (*path, last) = m, key.split(".")
