@@ -90,7 +90,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     runs = channels.drop(runs, out, notes, m.spec.compile(), held)
     held = [k for k, r in enumerate(runs) if before[id(r)] in held]
     if blind:
-        runs, held = inputs.free_air(runs, held, inputs.merged_spans(blind), notes, "readings are old ones, sent again", "in which they are not", (0.0, 0.0), inputs.SHORTEST)
+        runs, held = inputs.free_air(runs, held, inputs.merged_spans(blind), notes, "part of it tells nothing (old readings, a pause, or a clock that was set)", "that does", (0.0, 0.0), inputs.SHORTEST)
     notes += failures
     failures += [f"{name}: {joint}: {why}" for (name, joint), why in out.items()] if not runs else []
     if failures and runs and len(held) < len(runs):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dexsim.recording import timeline
 from dexsim.recording.schema import COMMANDS, Finding, Recording, Series
 
 GAP = 3.5  # periods without a sample
@@ -207,7 +208,8 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
     state, leads = r.states.position, []
     if len(r.commands) < 20:
         return None
-    start, end = max(state.t[0], r.commands.t[0]), min(state.t[-1], r.commands.t[-1])
+    first, last = timeline.stretch(state.t)
+    start, end = max(first, r.commands.t[0]), min(last, r.commands.t[-1])
     if end - start < 4 * reach:
         return None
     grid = np.arange(start, end, step)

@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.assets import xhand
 from dexsim.recording.schema import STATES, TACTILE, Finding, Recording, Series
+from dexsim.recording.spikes import of_effort, spiked
 
 NAN = float("nan")
 MODULI = (2 * np.pi, 360.0, 256.0, 4096.0, 65536.0, 65.536, 2.0**32)  # angles, 8, 12, 16 (also in thousandths), 32 bit
@@ -160,30 +161,23 @@ def wrapped(x: np.ndarray) -> tuple[float, np.ndarray] | None:
 
 
 def spikes(r: Recording) -> Iterator[Finding]:
-    """Single position samples far from both neighbours."""
-    s = r.states.position
-    if len(s) < 10:
-        return
-    for j, joint in enumerate(r.joints):
-        x = s.value[:, j]
-        if not np.isfinite(x).all() or wrapped(x) is not None:
-            continue
-        away = np.minimum(np.abs(x[1:-1] - x[:-2]), np.abs(x[1:-1] - x[2:]))
-        there = np.sign(x[1:-1] - x[:-2]) == np.sign(x[1:-1] - x[2:])
-        typical = np.percentile(np.abs(np.diff(x)), 99)
-        at = np.flatnonzero(there & (away > 0.1) & (away > 5 * typical) & (np.abs(x[2:] - x[:-2]) < 0.5 * away)) + 1
-        if len(at):
-            yield Finding(
-                "spike",
-                s.topic,
-                float(s.t[at[0]]),
-                len(at),
-                f"position of {joint}: {len(at)} single samples far from both neighbours"
-                f" (by up to {away[at - 1].max():.3g})",
-                "warning",
-                joint,
-                float(s.t[at[-1]]),
-            )
+    """Single samples of position, command and effort far from their neighbours."""
+    s = r.states
+    for series, name in ((s.position, "position"), (r.commands, "command"), (s.effort, "effort")):
+        for j, joint in enumerate(r.joints if series is not None and len(series) else ()):
+            x = series.value[:, j]
+            at = np.flatnonzero(of_effort(r, j) if name == "effort" else spiked(x, name))
+            if len(at) and wrapped(x) is None:
+                yield Finding(
+                    "spike",
+                    series.topic,
+                    float(series.t[at[0]]),
+                    len(at),
+                    f"{name} of {joint}: {len(at)} single samples ({100 * len(at) / len(x):.2g} %) far from their neighbours",
+                    "warning",
+                    joint,
+                    float(series.t[at[-1]]),
+                )
 
 
 def held(r: Recording) -> Iterator[Finding]:

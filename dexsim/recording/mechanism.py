@@ -21,9 +21,11 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
+from dexsim.recording import files
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
+MAX_MODEL = 64 << 20  # bytes of a model file
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
 
@@ -79,13 +81,13 @@ def mechanism(
         table = _table(servo if servo is not None else xhand_servo_dict())
     else:
         path = Path(model).expanduser()
-        if not path.is_file():
-            raise UserError(f"model={model}: no such file")
+        files.check(path, MAX_MODEL, f"model={model}:")
         try:
             spec = mujoco.MjSpec.from_file(str(path))
             spec.compile()
         except (ValueError, RuntimeError) as error:
             raise UserError(f"model={model}: {' '.join(str(error).split())}") from None
+        _physical(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:
             raise UserError(f"model={model}: say which servo drives it with servo=FILE (a servo.yaml)")
@@ -102,6 +104,30 @@ def mechanism(
     if not chosen:
         raise UserError(f"model={model}: has no named hinge or slide joint to drive")
     return Mechanism(spec, chosen, table, robot)
+
+
+def _physical(model: mujoco.MjModel, where: str) -> None:
+    """UserError for figures that no body has: they would be fitted around in silence."""
+    checks = (
+        ("gravity", model.opt.gravity[None], -100.0, "a number from -100 to 100 m/s2", lambda k: "option"),
+        ("mass", model.body_mass, 0.0, "a number >= 0 [kg]", lambda k: f"body '{model.body(k).name}'"),
+        ("inertia", model.body_inertia, 0.0, "numbers >= 0 [kg m2]", lambda k: f"body '{model.body(k).name}'"),
+        ("armature", model.dof_armature, 0.0, "a number >= 0 [kg m2]", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
+        ("damping", model.dof_damping, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
+        ("frictionloss", model.dof_frictionloss, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
+        ("stiffness", model.jnt_stiffness, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(k).name}'"),
+        ("range", model.jnt_range, -1e6, "two finite numbers", lambda k: f"joint '{model.joint(k).name}'"),
+        ("position", model.body_pos, -1e4, "three finite numbers [m]", lambda k: f"body '{model.body(k).name}'"),
+    )
+    for name, values, low, must, whose in checks:
+        rows = np.asarray(values, float).reshape(len(values), -1)
+        bad = ~(np.isfinite(rows) & (rows >= low) & (rows <= max(1e6, -low))).all(1)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise UserError(f"{where}: {whose(k)}: {name} is {' '.join(f'{x:g}' for x in rows[k])}; it must be {must}")
+    for k in range(model.njnt):
+        if not model.dof_M0[model.jnt_dofadr[k]] > 0:
+            raise UserError(f"{where}: joint '{model.joint(k).name}' moves nothing that has mass or inertia; give its body a mass, or the joint an armature")
 
 
 def for_recording(

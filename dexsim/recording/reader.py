@@ -13,7 +13,7 @@ from mcap.records import Schema as McapSchema
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.recording import columns, decode, metadata, names, schema
+from dexsim.recording import columns, decode, metadata, names, schema, timeline
 from dexsim.recording.container import Container, open_container
 from dexsim.recording.schema import Finding, Recording, Series, States
 
@@ -85,7 +85,7 @@ class _Reading:
     """One file (or bag folder) being turned into a Recording."""
 
     def __init__(self, path: Path, containers: list[Container], remap: dict[str, str]):
-        self.path, self.findings = path, []
+        self.path, self.findings, self.breaks = path, [], []
         self.streams: dict[str, list[_Stream]] = {}
         for c in containers:
             self._damage(c)
@@ -110,7 +110,7 @@ class _Reading:
             raise UserError(
                 f"recording {path}: no message that can be read; topics: {self._describe_topics()}" + self._losses()
             )
-        self.start_ns = min(used)
+        self.start_ns = min(self._first(s.messages) for theirs, _ in self.sources.values() for s in self.streams[theirs] if s.messages)
 
     def _damage(self, c: Container) -> None:
         where = f"{c.path.name}: " if c.path != self.path else ""
@@ -131,6 +131,12 @@ class _Reading:
                     "error",
                 )
             )
+
+    def _first(self, messages: list[Message]) -> int:
+        """The earliest host time [ns] of those that can be true."""
+        base = sorted(m.log_time for m in messages)[len(messages) // 2]
+        keep = timeline.kept(np.array([(m.log_time - base) * 1e-9 for m in messages]))
+        return min((m.log_time for m, on in zip(messages, keep, strict=True) if on), default=base)
 
     def _losses(self) -> str:
         return "".join(f"; {f.text}" for f in self.findings[:3] if f.kind == "damage")
@@ -209,7 +215,7 @@ class _Reading:
         if ours not in self.sources:
             return np.zeros(0), []
         theirs, part = self.sources[ours]
-        times, out, bad, why, when = [], [], 0, "", NAN
+        times, out, bad, why, when, written = [], [], 0, "", NAN, []
         for stream in self.streams[theirs]:
             try:
                 reader = make(stream.channel, stream.schema, part)
@@ -220,39 +226,50 @@ class _Reading:
                     Finding("unreadable", ours, NAN, len(stream.messages), f"{theirs}: {error}", "error")
                 )
                 continue
+            first = len(times)
             for m in stream.messages:
                 t = (m.log_time - self.start_ns) * 1e-9
                 try:
                     value = reader(m.data)
                 except Exception as error:  # a damaged message may fail anywhere in a decoder
-                    bad, why, when = bad + 1, why or str(error) or type(error).__name__, min(when, t) if bad else t
+                    bad, why, when = bad + 1, why or " ".join(str(error).split())[:200] or type(error).__name__, min(when, t) if bad else t
                     continue
                 times.append(t)
                 out.append(value)
+            written.append(slice(first, len(times)))
         if bad:
             self.findings.append(
                 Finding("unreadable", ours, when, bad, f"{bad} messages cannot be decoded: {why}", "error")
             )
             if not out and ours == schema.STATES:
                 raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
-        return self._in_order(ours, np.array(times), out)
+        return self._in_order(ours, np.array(times), out, written)
 
-    def _in_order(self, ours: str, t: np.ndarray, out: list[Any]) -> tuple[np.ndarray, list[Any]]:
-        """Samples in order of time."""
+    def _in_order(self, ours: str, t: np.ndarray, out: list[Any], written: Sequence[slice] | None = None) -> tuple[np.ndarray, list[Any]]:
+        """Samples in order of time, without those whose time cannot be theirs; `written`: which were written one after another."""
+        keep = np.zeros(len(t), bool)
+        for part in written if written is not None else [slice(0, len(t))]:
+            keep[part] = timeline.kept(t[part])
+            self.breaks += timeline.gaps(t[part], keep[part])
+        lost = np.flatnonzero(~keep)
+        if len(lost):
+            back = np.diff(t[np.isfinite(t)]).min() if np.isfinite(t).sum() > 1 else 0.0
+            what = f"goes back by up to {-back:.3g} s" if back < -timeline.REORDERED else "jumps"
+            around = t[keep] if keep.any() else np.zeros(1)
+            near = np.clip(np.searchsorted(np.flatnonzero(keep), lost[[0, -1]]), 0, len(around) - 1)
+            self.findings.append(
+                Finding("time_not_monotonic", ours, float(around[near[0]]), len(lost),
+                        f"host time {what}: {len(lost)} of {len(t)} samples, whose time cannot be theirs, are left out", "error", end=float(around[near[1]]))
+            )  # fmt: skip
+            t, out = t[keep], [out[i] for i in np.flatnonzero(keep)]
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
-            self.findings.append(
-                Finding(
-                    "time_not_monotonic",
-                    ours,
-                    float(t[back[0] + 1]),
-                    len(back),
-                    f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
-                    " samples are returned in order of time",
-                    "error",
-                    end=float(t[back[-1] + 1]),
-                )
-            )
+            if not len(lost) and (written is None or len(written) == 1):
+                self.findings.append(
+                    Finding("time_not_monotonic", ours, float(t[back[0] + 1]), len(back),
+                            f"host time goes backwards {len(back)} times, by up to {-np.diff(t).min() * 1e3:.3g} ms;"
+                            " samples are returned in order of time", "error", end=float(t[back[-1] + 1]))
+                )  # fmt: skip
             order = np.argsort(t, kind="stable")
             t, out = t[order], [out[i] for i in order]
         return t, out
@@ -266,9 +283,11 @@ class _Reading:
         mapping = self._match(theirs, joints)
         ours = tuple(dict.fromkeys(mapping[n] for n in theirs if n in mapping))
         order = joints if joints is not None else xhand.JOINTS if set(ours) <= set(xhand.JOINTS) else ours
-        ours = tuple(j for j in order if j in ours)
+        there = set(ours)
+        ours = tuple(j for j in order if j in there)
         # where each of their unnamed columns goes
-        column = np.array([ours.index(mapping[n]) if n in mapping else -1 for n in theirs])
+        place_of = {j: k for k, j in enumerate(ours)}
+        column = np.array([place_of[mapping[n]] if n in mapping else -1 for n in theirs])
         scale = self._units(stated)
         has_effort = any(len(s.effort) for s in states)
         has_tactile = schema.TACTILE in self.sources
@@ -285,7 +304,8 @@ class _Reading:
                 )
             )
         sign = schema.per_joint_sign(stated["effort_sign"], tuple(theirs), str(self.path))
-        stated["effort_sign"] = ",".join(f"{int(sign[list(column).index(k)]):+d}" for k in range(len(ours)))
+        source = {int(c): i for i, c in reversed(list(enumerate(column)))}
+        stated["effort_sign"] = ",".join(f"{int(sign[source[k]]):+d}" for k in range(len(ours)))
         stated["joint_names"] = ",".join(ours)
 
         place = _Placer(theirs, column, len(ours))
@@ -315,6 +335,7 @@ class _Reading:
         ):
             setattr(out, name, self._vectors(topic))
         out.findings = self.findings
+        out.breaks = sorted(self.breaks)
         return out
 
     def _their_joints(
@@ -455,7 +476,7 @@ class _Reading:
                 rows.append(row)
                 keep.append(i)
         if len(keep) < len(messages):
-            first = next(i for i in range(len(messages)) if i not in set(keep))
+            first = next((k for k, i in enumerate(keep) if k != i), len(keep))
             self.findings.append(
                 Finding(
                     "malformed",
@@ -487,7 +508,7 @@ class _TableReading(_Reading):
     """A file with named columns being turned into a Recording: its columns stand for the messages of a topic."""
 
     def __init__(self, path: Path, table: columns.Table, remap: dict[str, str]):
-        self.path, self.table, self.findings = path, table, list(table.findings)
+        self.path, self.table, self.findings, self.breaks = path, table, list(table.findings), []
         topics = [k for k in remap if _is_topic(k)]
         if topics:
             raise UserError(f"recording {path}: has columns, no topics (remap.{topics[0]}); say remap.QUANTITY.JOINT=COLUMN, quantities:"
@@ -546,13 +567,14 @@ class _Placer:
 
     def __init__(self, theirs: Sequence[str], column: np.ndarray, count: int):
         self.theirs, self.column, self.count = list(theirs), column, count
+        self._at = {name: i for i, name in reversed(list(enumerate(self.theirs)))}
         self._known: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
 
     def __call__(self, names_: Sequence[str], size: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(which values to take, their columns), or None where names and values do not fit."""
         key = tuple(names_)
         if key not in self._known:
-            index = np.array([self.theirs.index(n) for n in key], int) if key else np.arange(len(self.theirs))
+            index = np.array([self._at[n] for n in key], int) if key else np.arange(len(self.theirs))
             columns = self.column[index]
             keep = np.flatnonzero(columns >= 0)
             self._known[key] = keep, columns[keep]

@@ -133,6 +133,8 @@ float64[9] linear_acceleration_covariance"""
 }
 """ROS 2 type -> message definition, as rosbag2 stores it."""
 
+ALLOWED: dict[str, tuple[float, float]] = {"gravity": (-100.0, 100.0), "tactile_axis_sign": (-1.0, 1.0), "tactile_lsb": (1e-9, 1e3)}
+"""What the numbers of a key may be: m/s2, sign, N a count. Gravity may be zero: of a joint that it does not load."""
 SEVERITIES = ("info", "warning", "error")
 
 
@@ -202,6 +204,7 @@ class Recording:
     (`tactile_unit`, vendor axes); external_force [T, 6] N and N.m in `external_force.frame`; object_pose [T, 7] x y z,
     w x y z, palm frame; imu [T, 10] orientation w x y z, angular velocity, linear acceleration.
     Effort is as recorded: `effort_sign` is not applied (`signed_effort` does).
+    breaks: stretches [s] over which host time cannot be trusted: what came after is of another time.
     meta: every key of `KEYS`, defaults filled in. start_ns: host time of t = 0. findings: of reading and audit.
     """
 
@@ -221,6 +224,7 @@ class Recording:
     start_ns: int = 0
     findings: list[Finding] = field(default_factory=list)
     config: str | None = None  # the resolved config attached to it, YAML
+    breaks: list[tuple[float, float]] = field(default_factory=list)
 
     @property
     def duration(self) -> float:
@@ -280,11 +284,14 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
         values = np.array([float(x) for x in text.replace(",", " ").split()])
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count:
+    if len(values) != count or not np.isfinite(values).all():
         raise UserError(
-            f"{where}: metadata {key}='{text}' must be {count} number{'s' * (count > 1)};"
+            f"{where}: metadata {key}='{text[:80]}' must be {count} finite number{'s' * (count > 1)};"
             f" correct it with meta.{key}=..."
         )
+    low, high = ALLOWED.get(key, (-np.inf, np.inf))
+    if ((values < low) | (values > high)).any():
+        raise UserError(f"{where}: metadata {key}='{text[:80]}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=...")
     return values
 
 

@@ -70,6 +70,8 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             out[run.name, joint] = f"{kind}: {text}"
 
     for i, run in enumerate(runs):
+        if (spans := _pauses(run)):
+            blind[run.name] = spans
         stale = np.zeros(len(run.t), bool)
         for j, joint in enumerate(run.joints):
             if (run.name, joint) in out:
@@ -143,6 +145,15 @@ def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], mod
                 setattr(run, name, None if x is None else x[:, k])
         kept.append(run)
     return kept
+
+
+def _pauses(run: Run) -> list[tuple[float, float]]:
+    """Stretches [s] without samples, and those over which the clock was set anew: a joint is judged before and after them."""
+    step = np.diff(run.t)
+    long = np.flatnonzero(step > max(BLIND, 8 * float(np.median(step))))
+    out = [(float(run.t[k]), float(run.t[k + 1])) for k in long]
+    # the first sample after a break is of the other time already
+    return sorted({*out, *((a, b) for a, b in run.breaks if run.t[0] <= a and b <= run.t[-1])})
 
 
 def _assume(run: Run, j: int, follows: bool, model: mujoco.MjModel) -> None:

@@ -8,10 +8,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.read.runs import Run
+from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import Recording, Series
 
@@ -39,6 +41,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     if not len(recording.commands):
         raise Unusable(f"{name}: states without commands: no /joint_commands, so what the servo was asked is unknown")
     column = [recording.joints.index(j) for j in joints]
+    _without_spikes(recording, notes)
     p = recording.states.position
     t, q = np.asarray(p.t, float), p.value[:, column]
     keep = np.r_[True, np.diff(t) > 1e-6] & np.isfinite(q).any(1)
@@ -54,7 +57,8 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
             continue
         if not finite.all():
             notes.append(f"{name}: {joints[j]}: {int((~finite).sum())} missing positions are interpolated")
-            q[:, j] = np.interp(t, t[finite], q[finite, j])
+            q[:, j] = PchipInterpolator(t[finite], q[finite, j], extrapolate=False)(t)
+            q[:, j] = np.where(np.isfinite(q[:, j]), q[:, j], np.interp(t, t[finite], q[finite, j]))
         good.append(j)
     ct, c = np.asarray(recording.commands.t, float), recording.commands.value[:, column].copy()
     kept = []
@@ -90,6 +94,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
 
         table = ServoTable.from_dict(merged(table.to_dict(), yaml.safe_load(recording.meta["servo"])), source=f"servo of {name}")
     run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
+    run.breaks = tuple(recording.breaks)
     run.v = _at(recording.states.velocity, t, column)
     effort = recording.signed_effort()
     if effort is not None and recording.effort_is != "none" and not _bad(recording, "/joint_states", "effort"):
@@ -113,6 +118,22 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         if finite.any():
             run.supply = np.interp(t, s.t[finite], s.value[finite])
     return run
+
+
+def _without_spikes(recording: Recording, notes: list[str]) -> None:
+    """Spikes of position, command and effort that the audit has found are missing values from here on."""
+    done: set[tuple[str, str]] = set()
+    s = recording.states
+    for f in recording.findings:
+        quantity = f.text.split(" ")[0]
+        if f.kind != "spike" or (quantity, f.joint) in done or f.joint not in recording.joints:
+            continue
+        done.add((quantity, f.joint))
+        series, j = {"position": s.position, "command": recording.commands, "effort": s.effort}[quantity], recording.joints.index(f.joint)
+        on = spikes.of_effort(recording, j) if quantity == "effort" else spikes.spiked(series.value[:, j], quantity)
+        series.value = series.value.copy()
+        series.value[on, j] = np.nan
+        notes.append(f"{recording.path.name}: {f.text}; left out")
 
 
 def _bad(recording: Recording, topic: str, word: str) -> bool:

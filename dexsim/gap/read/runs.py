@@ -18,6 +18,7 @@ class Run:
     the plain current in A where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V.
     gravity: the world's, m/s2, [3]. servo: the table believed for this recording; counted: the mechanism's joints, by whose number its
     `coupling_from` counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of them.
+    breaks: stretches [s] over which its clock cannot be trusted.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Run:
     notes: list[str] = field(default_factory=list)
     counted: tuple[str, ...] = ()
     left_out: frozenset[str] = frozenset()
+    breaks: tuple[tuple[float, float], ...] = ()
     # filled by `smooth`
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None
