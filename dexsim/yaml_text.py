@@ -3,10 +3,12 @@ the machine."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import yaml
 
+from dexsim import files
 from dexsim.errors import UserError
 
 MOST_BYTES = 8 << 20
@@ -53,6 +55,11 @@ def parse(text: str | bytes, source: object) -> Any:
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def load(path: Path, what: str) -> Any:
+    """The plain data of a YAML file of people (at most `files.MAX_YAML` bytes); `what` it is, for the message. Raises UserError."""
+    return parse(files.text(path, files.MAX_YAML, what), f"{what} '{path}'")
 
 
 def _count(node: yaml.Node, source: object, known: dict[int, int], open_: set[int]) -> int:

@@ -267,8 +267,8 @@ def test_metadata_beside_the_file_and_by_hand(tmp_path):
     for bad, text in (
         ({"effort_is": "mA"}, "must be one of current_A"),
         ({"effort": "x"}, "does not exist"),
-        ({"effort_sign": "+1,-1,+1"}, "must be 2 numbers"),
-        ({"servo": "a: [1"}, "is not YAML"),
+        ({"effort_sign": "+1,-1,+1"}, "must be 2 finite numbers"),
+        ({"servo": "a: [1"}, "cannot be read as YAML"),
     ):
         with pytest.raises(UserError, match=text):
             read(path, meta=bad)

@@ -25,6 +25,7 @@ from typing import Any, Iterable, Sequence
 import numpy as np
 import yaml
 
+from dexsim import yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES, Column, did_you_mean
 from dexsim.errors import UserError
 
@@ -126,16 +127,9 @@ class ServoTable:
     def load(cls, path: str | Path) -> ServoTable:
         """The table in a YAML file; UserError if it is missing, not YAML, or states something impossible."""
         path = Path(path)
-        try:
-            raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UserError(f"servo file '{path}' does not exist; servo_file=PATH must name a servo.yaml.") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"servo file '{path}' cannot be read: {error}.") from None
-        except yaml.YAMLError as error:
-            text = " ".join(str(error).split())
-            raise UserError(f"servo file '{path}' is not valid YAML: {text}.") from None
-        return cls.from_dict(raw, source=str(path))
+        if not path.exists():
+            raise UserError(f"servo file '{path}' does not exist; servo_file=PATH must name a servo.yaml.")
+        return cls.from_dict(yaml_text.load(path, "servo file"), source=str(path))
 
     @classmethod
     def from_dict(cls, raw: Any, source: str = "servo") -> ServoTable:

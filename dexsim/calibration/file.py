@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from dexsim import yaml_text
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 
@@ -87,12 +88,9 @@ class Calibration:
     def load(cls, path: str | Path, torque_max: np.ndarray | None = None) -> Calibration:
         """Raises UserError for a file that is missing, not YAML or impossible."""
         path = Path(path).expanduser()
-        try:
-            raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UserError(f"calibration {path}: no such file (dexsim calibrate writes one)") from None
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise UserError(f"calibration {path}: cannot be read: {' '.join(str(error).split())}") from None
+        if not path.exists():
+            raise UserError(f"calibration {path}: no such file (dexsim calibrate writes one)")
+        raw = yaml_text.load(path, "calibration")
         return cls.from_dict(raw, str(path), torque_max)
 
     @classmethod

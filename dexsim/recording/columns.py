@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import files
 from dexsim.errors import UserError
-from dexsim.recording import files, schema
+from dexsim.recording import schema
 from dexsim.recording.schema import Finding
 
 SUFFIXES = (".csv", ".tsv", ".npz")

@@ -10,16 +10,26 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.stream_reader import CRCValidationError
 
+from dexsim import files
 from dexsim.errors import UserError
 
+MAX_FILE = 64 << 30
+"""Bytes of a file; only what its records need is read of it."""
+MAX_CHUNK = 256 << 20
+"""Bytes of a chunk, unpacked."""
+MAX_UNPACKED = 4 << 30
+"""Bytes of all messages of a file, unpacked; and MAX_PACKED times the file's own size, beyond a chunk's."""
+MAX_PACKED = 200
+MAX_MESSAGES = 5_000_000
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = 9  # opcode and length
 _BROKEN = (
@@ -34,6 +44,10 @@ _BROKEN = (
 )
 
 
+class TooMuch(UserError):
+    """A file beyond a limit: refused, not damaged."""
+
+
 @dataclass
 class Container:
     """What one MCAP file holds. damage: (ns or None, number of messages or 0 where unknown, text) of what is lost."""
@@ -45,6 +59,8 @@ class Container:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: dict[str, bytes] = field(default_factory=dict)
     damage: list[tuple[int | None, int, str]] = field(default_factory=list)
+    most: int = MAX_UNPACKED  # bytes that its messages may come to
+    unpacked: int = 0
 
     def channel(self, message: Message) -> Channel | None:
         """The channel of a message; None where its record is lost."""
@@ -53,12 +69,10 @@ class Container:
 
 def open_container(path: Path) -> Container:
     """Read every record that can be read. Raises UserError for what is not an MCAP file at all."""
+    size = files.check(path, MAX_FILE, "recording")
     try:
         with open(path, "rb") as file:
-            size = path.stat().st_size
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
-    except FileNotFoundError:
-        raise UserError(f"recording {path} does not exist") from None
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
     if data[: len(MAGIC)] != MAGIC:
@@ -71,6 +85,7 @@ def open_container(path: Path) -> Container:
         raise UserError(f"recording {path} is {what} (it must start with the MCAP magic){hint}")
     out = Container(path)
     finished = False
+    out.most = min(MAX_UNPACKED, MAX_CHUNK + MAX_PACKED * size)
     for opcode, at, length in _records(data, out):
         body = data[at : at + length]
         if opcode == Opcode.FOOTER:
@@ -143,6 +158,7 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
             out.channels.setdefault(record.id, record)
         elif opcode == Opcode.MESSAGE:
             out.messages.append(Message.read(stream, length))
+            out.unpacked += length
         elif opcode == Opcode.METADATA:
             out.metadata.append(Metadata.read(stream))
         elif opcode == Opcode.ATTACHMENT:
@@ -150,6 +166,23 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
             out.attachments[record.name] = record.data
     except _BROKEN as error:
         out.damage.append((None, 1, f"a record (opcode {opcode}) cannot be read: {error or type(error).__name__}"))
+    if out.unpacked > out.most or len(out.messages) > MAX_MESSAGES:
+        raise TooMuch(f"recording {out.path}: its messages come to more than {out.most / 2**20:.0f} MiB or {MAX_MESSAGES} of them;"
+                      " cut it into several files, or leave cameras out")  # fmt: skip
+
+
+def _unzip(packed: bytes) -> bytes:
+    """What zstd packed, as far as it is there. Raises ValueError beyond MAX_CHUNK."""
+    if not packed:
+        return b""
+    parts, size = [], 0
+    with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
+        while part := reader.read(1 << 20):
+            size += len(part)
+            if size > MAX_CHUNK:
+                raise ValueError(f"it unpacks to more than {MAX_CHUNK >> 20} MiB")
+            parts.append(part)
+    return b"".join(parts)
 
 
 def _chunk(body: bytes, cut: bool, out: Container) -> None:
@@ -164,11 +197,20 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
             kind, packed = bytes(body[32 : 32 + name]), body[40 + name :]
             if kind not in (b"zstd", b""):
                 raise ValueError(f"a truncated {kind.decode('ascii', 'replace')} chunk cannot be unpacked")
-            data = zstandard.ZstdDecompressor().decompressobj().decompress(packed) if kind == b"zstd" else packed
+            data = _unzip(packed) if kind == b"zstd" else packed
         else:
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
             span = chunk.message_start_time
-            data = get_chunk_data_stream(chunk)[0].read(max(chunk.uncompressed_size, 1)) if chunk.data else b""
+            if chunk.uncompressed_size > MAX_CHUNK:
+                raise ValueError(f"it unpacks to {chunk.uncompressed_size / 2**20:.0f} MiB; at most {MAX_CHUNK >> 20} are read")
+            if chunk.compression == "zstd":
+                data = _unzip(chunk.data)
+            elif chunk.compression == "lz4":
+                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, MAX_CHUNK) if chunk.data else b""
+            elif chunk.compression == "":
+                data = chunk.data
+            else:
+                raise ValueError(f"its compression '{chunk.compression[:20]}' is not read; zstd, lz4 and none are")
             if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
                 raise ValueError("its checksum does not fit")
         at = 0
@@ -178,6 +220,8 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
                 break
             _plain(opcode, data[at + _HEAD : at + _HEAD + length], length, out)
             at += _HEAD + length
+    except TooMuch:
+        raise
     except _BROKEN as error:
         text = " ".join(str(error).split()) or type(error).__name__
         out.damage.append((span, 0, f"a chunk of {len(body)} bytes is lost: {text}"))

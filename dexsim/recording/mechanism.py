@@ -16,12 +16,12 @@ import numpy as np
 import torch
 import yaml
 
+from dexsim import files, yaml_text
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
-from dexsim.recording import files
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
@@ -143,7 +143,7 @@ def for_recording(
             f" its joints: {', '.join(out.joints)}"
         )
     if recording.meta.get("servo"):
-        over = yaml.safe_load(recording.meta["servo"])
+        over = yaml_text.parse(recording.meta["servo"], f"servo of {recording.path}")
         out.table = ServoTable.from_dict(merged(out.table.to_dict(), over), source=f"servo of {recording.path}")
     return out
 

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from dexsim.actuator.columns import did_you_mean
+from dexsim import files, yaml_text
 from dexsim.errors import UserError
 from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers
 
@@ -90,10 +91,7 @@ def own_record(records: list[Any]) -> dict[str, str]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+    raw = yaml_text.parse(files.text(path, files.MAX_YAML, "metadata"), path)
     if raw is None:
         return {}
     if not isinstance(raw, dict):
@@ -122,9 +120,5 @@ def _check(path: Path, stated: Mapping[str, str]) -> None:
         if key in stated and stated[key] != "unknown":
             numbers(stated[key], count, key, str(path))
     if stated.get("servo"):
-        try:
-            raw = yaml.safe_load(stated["servo"])
-        except yaml.YAMLError as error:
-            raise UserError(f"{path}: metadata servo is not YAML: {' '.join(str(error).split())}") from None
-        if not isinstance(raw, dict):
+        if not isinstance(yaml_text.parse(stated["servo"], f"{path}: metadata servo"), dict):
             raise UserError(f"{path}: metadata servo must map keys of servo.yaml to values")

@@ -17,8 +17,7 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from dexsim import yaml_text
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.tactile.config import COLUMNS
@@ -34,12 +33,9 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
     Raises UserError in one line naming the file, the field, its value and what is allowed."""
     path = Path(path).expanduser()
     where = f"tactile file '{path}'"
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (diagnose.py writes one)") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{where}: cannot be read: {' '.join(str(error).split())}") from None
+    if not path.exists():
+        raise UserError(f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (dexsim diagnose writes one)")
+    raw = yaml_text.load(path, "tactile file")
     try:
         return _checked(raw)
     except UserError as error:

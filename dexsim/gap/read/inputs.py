@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.read.runs import Run
@@ -42,6 +43,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         raise Unusable(f"{name}: states without commands: no /joint_commands, so what the servo was asked is unknown")
     column = [recording.joints.index(j) for j in joints]
     _without_spikes(recording, notes)
+    notes += [f"{name}: {f.topic}: {f.text}" for f in recording.findings if f.kind == "time_not_monotonic"]
     p = recording.states.position
     t, q = np.asarray(p.t, float), p.value[:, column]
     keep = np.r_[True, np.diff(t) > 1e-6] & np.isfinite(q).any(1)
@@ -90,9 +92,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         t, q = t[start:], q[start:]
     table = m.table
     if recording.meta.get("servo"):
-        import yaml
-
-        table = ServoTable.from_dict(merged(table.to_dict(), yaml.safe_load(recording.meta["servo"])), source=f"servo of {name}")
+        table = ServoTable.from_dict(merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")), source=f"servo of {name}")
     run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
     run.breaks = tuple(recording.breaks)
     run.v = _at(recording.states.velocity, t, column)
