@@ -119,7 +119,7 @@ def test_shipped_servos(name):
         ("loop_encoder: rotor", ["loop_encoder", "joint, motor"]),
         ("loop_encoder: {j: moto}", ["loop_encoder", "Did you mean 'motor'"]),
         ("[1, 2]", ["expected a mapping", "drive"]),
-        ("joints: {j: {kp: 1", ["not valid YAML"]),
+        ("joints: {j: {kp: 1", ["cannot be read as YAML"]),
         ("", ["expected a mapping"]),
     ],
 )

@@ -10,13 +10,18 @@ build up again within some updates), its progress.csv and config.yaml, and what 
 from __future__ import annotations
 
 import io
+import itertools
 import json
+import os
 import sys
 import tarfile
+import tempfile
+import zlib
 from pathlib import Path
 
 from benchmarks import tools
 from benchmarks.reproduce.jobs import done
+from dexsim import outputs
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -39,9 +44,18 @@ def pack(out: Path, into: Path, part: float) -> list[Path]:
     jobs = sorted(p for p in out.glob("*/seed*") if p.is_dir() and any(p.glob("train_*/last.pt")))
     if not jobs:
         raise UserError(f"out={out}: holds no training (ROW/seedN/train_*/last.pt)")
-    into.parent.mkdir(parents=True, exist_ok=True)
-    for old in into.parent.glob(f"{into.name}_*.tgz"):
+    outputs.claim(into.parent, "into=", [p.name for p in into.parent.glob(f"{into.name}_*.tgz")])
+    with outputs.staged(into.parent, "into=") as stage:
+        names = [p.name for p in _archives(jobs, out, stage / into.name, part)]
+    for k in itertools.count(len(names)):  # parts of a longer one, written here before
+        old = into.with_name(f"{into.name}_{k}.tgz")
+        if not old.exists():
+            break
         old.unlink()
+    return [into.with_name(name) for name in names]
+
+
+def _archives(jobs: list[Path], out: Path, into: Path, part: float) -> list[Path]:
     written: list[Path] = []
     archive, size = None, 0
     for folder in jobs:
@@ -69,13 +83,25 @@ def unpack(prefix: Path, out: Path) -> int:
     parts = sorted(prefix.parent.glob(f"{prefix.name}_*.tgz"))
     if not parts:
         raise UserError(f"unpack={prefix}: no file {prefix.name}_0.tgz")
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        return sum(_unpacked(part, out) for part in parts)
+    except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
+        raise UserError(f"unpack={prefix}: an archive is cut off or damaged ({error}); what was whole is in {out}") from None
+
+
+def _unpacked(part: Path, out: Path) -> int:
+    """Files of one archive that were put into `out`."""
     count = 0
-    for part in parts:
-        with tarfile.open(part) as archive:
-            for entry in archive:
-                if entry.isfile() and not (out / entry.name).exists():
-                    archive.extract(entry, out, filter="data")
-                    count += 1
+    with tarfile.open(part) as archive:
+        for entry in archive:
+            if not entry.isfile() or (out / entry.name).exists():
+                continue
+            with tempfile.TemporaryDirectory(prefix=".unpack-", dir=out) as beside:  # a cut archive leaves no half of a file
+                archive.extract(entry, beside, filter="data")
+                (out / entry.name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(Path(beside) / entry.name, out / entry.name)
+            count += 1
     return count
 
 

@@ -13,6 +13,9 @@ import yaml
 from dexsim.errors import UserError
 
 LINEAR_R2 = 0.97  # a press curve under this is not called linear
+RESULTS = ("calibration.yaml", "real.png", "sim.png", "taxels.png", "press.png", "rubber.png")
+PRESSES = {"real": "presses_realistic", "sim": "presses_sim", "touch": "pads"}
+"""Folders of simulated recordings, by what they stand for."""
 CHOICES = {"normalization": ("matched", "paper")}
 
 
@@ -30,14 +33,15 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
 
 def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     """Everything that the settings ask for."""
-    from dexsim.calibration import charts, current, simulate
-    from dexsim.calibration.file import Calibration, save
-    from dexsim.console import folders
+    from dexsim import outputs
+    from dexsim.calibration import simulate
     from dexsim.sim.quiet import quiet_warp
 
-    out = folders.make(Path(str(s["out"])).expanduser(), "out=")
+    out = Path(str(s["out"])).expanduser()
+    given = [Path(p.strip()) for k in ("real", "sim", "touch", "curve") if s[k] for p in str(s[k]).split(",")]
+    made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES["real" if s["realistic"] else "sim"]] * s["simulate"]
+    outputs.claim(out, "out=", (*RESULTS, *made_here), given)
     report: dict[str, Any] = {"schema": 1, "robot": "xhand_right", "normalization": s["normalization"], "source": {}}
-    real = sim = None
     if s["simulate"]:
         quiet_warp("cpu")
         joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else list(simulate.xhand.JOINTS)
@@ -50,6 +54,21 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
         quiet_warp("cpu")
         made = simulate.make_rolled(out / "pads", True, int(s["seed"]), s["faults"])
         s["touch"] = s["touch"] or str(made)
+    outputs.note_paths(out, [out / name for name in made_here])
+    with outputs.staged(out) as stage:
+        assumed = _fits(s, meta, stage, report)
+    for text in assumed:
+        print(f"note     {text}")
+    print(f"yaml     {out / 'calibration.yaml'}")
+    return 0
+
+
+def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any]) -> list[str]:
+    """All fits and their plots, calibration.yaml; returns what is assumed in it."""
+    from dexsim.calibration import charts, current
+    from dexsim.calibration.file import Calibration, save
+
+    real = sim = None
     for key, effort_is, symbol in (("real", "current_A", "alpha"), ("sim", "torque_Nm", "beta")):
         if not s[key]:
             continue
@@ -57,7 +76,7 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
         report["source"][key] = s[key] if len(s[key]) < 200 else str(Path(s[key].split(",")[0]).parent)
         _print_half(half, key, symbol)
         title = f"{key}: fingertip force over {'motor current' if key == 'real' else 'joint torque'}"
-        print(f"plot     {charts.lines(half, out / f'{key}.png', title)}\n")
+        print(f"plot     {_moved(charts.lines(half, out / f'{key}.png', title))}\n")
         real, sim = (half, sim) if key == "real" else (real, half)
     if real or sim:
         report["joints"] = current.combine(real, sim)
@@ -74,12 +93,13 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
         touch |= _curve(s, out)
     if touch:
         report["touch"] = touch
-    path = out / "calibration.yaml"
-    save(path, report)
-    for text in Calibration.from_dict(report).assumed:
-        print(f"note     {text}")
-    print(f"yaml     {path}")
-    return 0
+    save(out / "calibration.yaml", report)
+    return Calibration.from_dict(report).assumed
+
+
+def _moved(path: Path) -> Path:
+    """Where a staged file is once all is done."""
+    return path.parent.parent / path.name
 
 
 def _print_half(half: Any, key: str, symbol: str) -> None:
@@ -166,7 +186,7 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
     result["threshold"] = float(f"{max(p.threshold for p in found.values()) * scale:.4g}")
     if not measured:
         print("note     no /external_force: gains and N a count are not known")
-    print(f"plot     {charts.pads(found, out / 'taxels.png')}\n")
+    print(f"plot     {_moved(charts.pads(found, out / 'taxels.png'))}\n")
     return {k: v for k, v in result.items() if v not in ({}, None)}
 
 
@@ -180,7 +200,7 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
         k = rubber.fit_linear(a, b)
         loop = f", hysteresis {100 * k.hysteresis:.1f} %" if np.isfinite(k.hysteresis) else ""
         print(f"curve    linear stiffness {k.value:.4g} [{k.low:.4g}, {k.high:.4g}] N/m, R2 {k.r2:.4f}, held out {k.held_out:.3g} N{loop}")
-        print(f"plot     {charts.press(a, b, k, out / 'press.png')}")
+        print(f"plot     {_moved(charts.press(a, b, k, out / 'press.png'))}")
         result["stiffness"] = {"value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out, "linear": k.r2 >= LINEAR_R2}
         if k.r2 < LINEAR_R2:
             print(f"note     R2 under {LINEAR_R2}: the force does not grow in proportion to depth; the Mooney-Rivlin fit (area=) may hold")
@@ -193,7 +213,7 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
     print(f"curve    Mooney-Rivlin c10 {fit.c10:.4g} [{fit.c10_range[0]:.4g}, {fit.c10_range[1]:.4g}] Pa, c01 {fit.c01:.4g}"
           f" [{fit.c01_range[0]:.4g}, {fit.c01_range[1]:.4g}] Pa, R2 {fit.r2:.4f}, held out {fit.held_out:.3g} Pa, stretch"
           f" {fit.stretch[0]:.2f} to {fit.stretch[1]:.2f}")  # fmt: skip
-    print(f"plot     {charts.rubber(a[keep], b[keep], fit, out / 'rubber.png')}\n")
+    print(f"plot     {_moved(charts.rubber(a[keep], b[keep], fit, out / 'rubber.png'))}\n")
     result["rubber"] = {"c10": fit.c10, "c01": fit.c01, "c10_range": list(fit.c10_range), "c01_range": list(fit.c01_range), "r2": fit.r2,
                         "held_out_Pa": fit.held_out, "thickness": float(s["thickness"]), "shear_modulus": fit.shear_modulus}  # fmt: skip
     return result

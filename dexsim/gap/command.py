@@ -115,7 +115,9 @@ def main(argv: list[str]) -> int:
 
         print(describe())
         return 0
+    from dexsim import outputs
     from dexsim.gap.diagnosis import diagnose, save
+    from dexsim.gap.report.files import RESULTS
 
     start = time.perf_counter()
     device = started(given.get("device", "cpu"))
@@ -124,12 +126,17 @@ def main(argv: list[str]) -> int:
     if given.get("demo"):
         from dexsim.gap import demo as maker
 
+        outputs.claim(out, "out=", (*RESULTS, "recordings"))
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
         paths, model, servo, demo = maker.make(out / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle")
         given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
     settings = settings_of(given, out, device)
+    read = [*settings.recordings, *(settings.held_out or []), *(Path(p) for p in (settings.model, settings.servo) if p)]
+    outputs.claim(out, "out=", RESULTS, read)
+    if given.get("demo"):
+        outputs.note_paths(out, [out / "recordings"])
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
     written = save(result, out)
     print(verdict(result))

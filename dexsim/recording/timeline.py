@@ -64,12 +64,20 @@ def _longest(t: np.ndarray) -> np.ndarray:
 
 
 def gaps(t: np.ndarray, on: np.ndarray) -> list[tuple[float, float]]:
-    """Stretches [s] between samples that stay (on [T]) in which at least LOST s and three samples in a row were left out: what came
-    after is of another time."""
+    """Stretches [s] in which times of samples that stay (on [T]) may be of either of two clocks: where at least LOST s and three samples in a
+    row were left out, from the earliest to the latest of them. Another topic may have kept those that this one left out."""
     index = np.flatnonzero(on)
-    many = np.flatnonzero(np.diff(index) > 3)
-    period = float(np.median(np.diff(t[index]))) if len(index) > 1 else 0.0
-    return [(float(t[index[k]]), float(t[index[k + 1]])) for k in many if (index[k + 1] - index[k] - 1) * period >= LOST]
+    if len(index) < 2:
+        return []
+    period, low, high = float(np.median(np.diff(t[index]))), t[index[0]], t[index[-1]]
+    out = []
+    for k in np.flatnonzero(np.diff(index) > 3):
+        a, b = index[k], index[k + 1]
+        if (b - a - 1) * period >= LOST:
+            lost = t[a + 1 : b]
+            around = np.r_[t[a], t[b], lost[(lost >= low) & (lost <= high)]]
+            out.append((float(around.min()), float(around.max())))
+    return out
 
 
 def stretch(t: np.ndarray, pause: float = 1.0) -> tuple[float, float]:

@@ -114,16 +114,28 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
     return [x for e in CATALOGUE if e.id in by_member for x in e.to_model(spec, case, by_member[e.id], notes.get(e.id, {}))]
 
 
+MODEL_FILES = "model_files"  # folder beside model.xml
+
+
 def save_model(spec, path: Path) -> None:
-    """The model as `path`, with the mesh files that it names by relative paths copied beside it, so that it loads from there."""
+    """The model as `path`, with the mesh, height field and texture files that it names by relative paths copied into `model_files` beside
+    it, so that it loads from there; nothing is written anywhere else, whatever those paths say."""
     import shutil
 
-    folder = Path(spec.modelfiledir or ".")
-    for mesh in spec.meshes:
-        if mesh.file and not Path(mesh.file).is_absolute():
-            name = Path(spec.meshdir or ".") / mesh.file
-            target = path.parent / name
-            if (folder / name).is_file() and (folder / name).resolve() != target.resolve():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(folder / name, target)
+    spec, folder, places = spec.copy(), Path(spec.modelfiledir or "."), {}
+    for things, where in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir), (spec.textures, spec.texturedir)):
+        for thing in things:
+            source = folder / (where or ".") / thing.file
+            if not thing.file or Path(thing.file).is_absolute() or Path(where or ".").is_absolute() or not source.is_file():
+                continue
+            source = source.resolve()
+            if source not in places:
+                places[source] = f"{len(places)}_{source.name}"
+                (path.parent / MODEL_FILES).mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, path.parent / MODEL_FILES / places[source])
+            thing.file = places[source]
+    if places:
+        spec.meshdir = spec.texturedir = MODEL_FILES
+        spec.modelfiledir = str(path.parent)
+        spec.compile()
     path.write_text(spec.to_xml(), encoding="utf-8")

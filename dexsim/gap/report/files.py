@@ -11,55 +11,52 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dexsim import outputs
 from dexsim.gap.judge import residual_fit
-from dexsim.gap.judge.findings import save_model
+from dexsim.gap.judge.findings import MODEL_FILES, save_model
 from dexsim.gap.result import Diagnosis
 from dexsim.gap.touch import handed_on as touch_handed
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
-    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and tactile.yaml; returns
-    what was written."""
+    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and tactile.yaml, all of
+    them or none; returns what was written. Raises UserError where one would go over a file that is not ours."""
     from dexsim.gap.report.page import page
 
-    out.mkdir(parents=True, exist_ok=True)
-    written = []
     d.notes = grouped(d.notes)
-    path = out / "diagnosis.json"
-    asked, more = specified(d.data)
-    path.write_text(json.dumps(plain(asked), indent=1, allow_nan=False), encoding="utf-8")
-    written.append(path)
-    more |= {"notes": d.notes, "seconds": d.shares}
-    path = out / "details.json"
-    path.write_text(json.dumps(plain(more), indent=1, allow_nan=False), encoding="utf-8")
-    written.append(path)
-    if d.evidence:
-        path = out / "evidence.json"
-        path.write_text(json.dumps(plain([e.plain() for e in d.evidence]), indent=1, allow_nan=False), encoding="utf-8")
-        written.append(path)
-    if d.servo is not None:
-        d.servo.save(out / "servo.yaml")
-        written.append(out / "servo.yaml")
-    if d.touch is not None and touch_handed.save(touch_handed.handed(d.touch.findings, d.touch.facts), out / "tactile.yaml"):
-        written.append(out / "tactile.yaml")
-    if d.standins:
-        residual_fit.write(d.servo, d.standins, out / "servo_standin.yaml")
-        written.append(out / "servo_standin.yaml")
-    if d.model_spec is not None:
-        try:
-            d.model_spec.compile()
-            save_model(d.model_spec, out / "model.xml")
-            written.append(out / "model.xml")
-        except (ValueError, OSError, mujoco.FatalError) as error:
-            d.notes.append(f"model.xml could not be written: {error}")
+    names = []
+    with outputs.staged(out) as stage:
+        if d.servo is not None:
+            d.servo.save(stage / "servo.yaml")
+            names.append("servo.yaml")
+        if d.touch is not None and touch_handed.save(touch_handed.handed(d.touch.findings, d.touch.facts), stage / "tactile.yaml"):
+            names.append("tactile.yaml")
+        if d.standins:
+            residual_fit.write(d.servo, d.standins, stage / "servo_standin.yaml")
+            names.append("servo_standin.yaml")
+        if d.model_spec is not None:
+            try:
+                d.model_spec.compile()
+                save_model(d.model_spec, stage / "model.xml")
+                names.append("model.xml")
+            except (ValueError, mujoco.FatalError) as error:
+                d.notes.append(f"model.xml could not be written: {error}")
+        asked, more = specified(d.data)
+        more |= {"notes": d.notes, "seconds": d.shares}
+        data = {"diagnosis.json": asked, "details.json": more} | ({"evidence.json": [e.plain() for e in d.evidence]} if d.evidence else {})
+        for name, value in data.items():
+            (stage / name).write_text(json.dumps(plain(value), indent=1, allow_nan=False), encoding="utf-8")
+        (stage / "report.html").write_text(page(d), encoding="utf-8")
+        names = [*data, *names]
     if (d.data["next_recording"] or {}).get("commands"):
-        written.append(out / d.data["next_recording"]["commands"])
-    path = out / "report.html"
-    path.write_text(page(d), encoding="utf-8")
-    written.append(path)
-    return written
+        names.append(d.data["next_recording"]["commands"])
+        outputs.note_paths(out, [out / names[-1]])
+    return [out / name for name in (*names, "report.html")]
 
 
+RESULTS = ("diagnosis.json", "details.json", "evidence.json", "servo.yaml", "tactile.yaml", "servo_standin.yaml", "model.xml", MODEL_FILES,
+           "next_recording.mcap", "report.html")  # fmt: skip
+"""Everything that `save` and the plan of the next recording may write."""
 BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexplained", "not_considered"))
 
 

@@ -1,0 +1,125 @@
+"""Results: nothing that is not ours is overwritten, nothing outside the folder is written, and what is there is whole."""
+
+from __future__ import annotations
+
+import mujoco
+import pytest
+
+from dexsim import outputs
+from dexsim.errors import UserError
+from dexsim.gap.judge.findings import save_model
+from dexsim.gap.report.files import save
+from dexsim.gap.result import Diagnosis, empty
+
+CUBE = "v -.1 -.1 -.1\nv .1 -.1 -.1\nv 0 .1 -.1\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+def result():
+    return Diagnosis(empty("unusable"), "so", [])
+
+
+def test_a_second_diagnosis_replaces_the_first_and_nothing_else(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    written = save(result(), tmp_path)
+    assert all(p.is_file() for p in written)
+    outputs.claim(tmp_path, "out=", [p.name for p in written])
+    save(result(), tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine" and not list(tmp_path.glob(".writing*"))
+
+
+@pytest.mark.parametrize("name", ["report.html", "diagnosis.json"])
+def test_a_file_of_the_users_is_not_overwritten(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UserError, match=f"{name} is not a result written here before"):
+        outputs.claim(tmp_path, "out=", [name])
+    with pytest.raises(UserError, match=name):
+        save(result(), tmp_path)
+    assert (tmp_path / name).read_text() == "mine" and sorted(p.name for p in tmp_path.iterdir()) == [name]
+
+
+def test_a_result_that_was_edited_is_the_users(tmp_path):
+    save(result(), tmp_path)
+    (tmp_path / "report.html").write_text("edited")
+    with pytest.raises(UserError, match="was changed since"):
+        save(result(), tmp_path)
+    assert (tmp_path / "report.html").read_text() == "edited"
+
+
+def test_what_is_read_is_not_written(tmp_path):
+    save(result(), tmp_path)
+    with pytest.raises(UserError, match="is read and would be written"):
+        outputs.claim(tmp_path, "out=", ["report.html"], [tmp_path / "report.html"])
+
+
+def test_links_lead_nowhere(tmp_path):
+    out, other = tmp_path / "out", tmp_path / "other"
+    out.mkdir()
+    other.mkdir()
+    (other / "a").write_text("mine")
+    (out / "a").symlink_to(other / "a")
+    (out / "sub").symlink_to(other)
+    for name in ("a", "sub/a"):
+        with pytest.raises(UserError, match="overwritten"), outputs.staged(out) as stage:
+            (stage / name).parent.mkdir(exist_ok=True)
+            (stage / name).write_text("new")
+    assert (other / "a").read_text() == "mine"
+
+
+def test_what_fails_half_way_leaves_what_was(tmp_path):
+    save(result(), tmp_path)
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    with pytest.raises(UserError, match="No space left"), outputs.staged(tmp_path) as stage:
+        (stage / "diagnosis.json").write_text("new")
+        raise OSError(28, "No space left on device")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_an_unwritable_folder_is_told_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="out="):
+        outputs.claim(tmp_path / "file" / "out", "out=", [])
+
+
+@pytest.mark.parametrize("where", ["meshes", "../../up", ".."])
+def test_a_models_meshes_stay_in_its_folder(tmp_path, where):
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    (folder / where).mkdir(exist_ok=True, parents=True)
+    mesh = folder / where / "cube.obj"
+    mesh.write_text(CUBE)
+    (folder / "m.xml").write_text(f'<mujoco><asset><mesh name="c" file="{where}/cube.obj"/></asset><worldbody><body><joint/>'
+                                  '<geom type="mesh" mesh="c"/></body></worldbody></mujoco>')  # fmt: skip
+    spec = mujoco.MjSpec.from_file(str(folder / "m.xml"))
+    spec.compile()
+    out = tmp_path / "x" / "y" / "out"
+    out.mkdir(parents=True)
+    there = {p for p in tmp_path.rglob("*")}
+    save_model(spec, out / "model.xml")
+    assert all(p.is_relative_to(out) for p in set(tmp_path.rglob("*")) - there) and mesh.read_text() == CUBE
+    mujoco.MjModel.from_xml_path(str(out / "model.xml"))
+
+
+def test_archives_of_others_stay_and_a_cut_one_leaves_no_half(tmp_path):
+    import io
+    import os
+    import tarfile
+
+    from benchmarks.reproduce import pack
+
+    (tmp_path / "state_0.tgz").write_text("mine")
+    job = tmp_path / "out" / "row" / "seed0" / "train_1"
+    job.mkdir(parents=True)
+    (job / "last.pt").write_bytes(b"x")
+    with pytest.raises(UserError, match="state_0.tgz is not a result"):
+        pack.pack(tmp_path / "out", tmp_path / "state", 1e6)
+    assert (tmp_path / "state_0.tgz").read_text() == "mine"
+    with tarfile.open(tmp_path / "cut_0.tgz", "w:gz") as archive:
+        for name in ("a", "b"):
+            entry = tarfile.TarInfo(f"row/{name}")
+            entry.size = 300_000
+            archive.addfile(entry, io.BytesIO(os.urandom(300_000)))
+    data = (tmp_path / "cut_0.tgz").read_bytes()
+    (tmp_path / "cut_0.tgz").write_bytes(data[: int(0.75 * len(data))])
+    with pytest.raises(UserError, match="cut off"):
+        pack.unpack(tmp_path / "cut", tmp_path / "there")
+    assert [(p.name, p.stat().st_size) for p in (tmp_path / "there").rglob("*") if p.is_file()] == [("a", 300_000)]
