@@ -262,3 +262,214 @@ def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
     assert process.poll() is None, (tmp_path / "log").read_text()[-2000:]  # it steps and draws
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 0, (tmp_path / "log").read_text()[-2000:]
+
+
+# --- strangers
+
+
+def pack(kind: str, **fields) -> bytes:
+    import msgspec
+
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+def camera() -> bytes:
+    return pack("ViewerCameraMessage", wxyz=[1, 0, 0, 0], position=[0, 0, 1], fov=1.0, image_height=10, image_width=10, near=0.01, far=10.0,
+                look_at=[0, 0, 0], up_direction=[0, 0, 1])  # fmt: skip
+
+
+def open_socket(port: int, origin: str | None = "same", host: str | None = None, path: str = "", headers=()):
+    import viser
+    from websockets.sync.client import connect
+
+    extra = dict(headers) | ({"Host": host} if host else {})
+    return connect(f"ws://127.0.0.1:{port}{path}", origin=f"http://127.0.0.1:{port}" if origin == "same" else origin,
+                   subprotocols=[f"viser-v{viser.__version__}"], additional_headers=extra, open_timeout=20, max_size=2**26)  # fmt: skip
+
+
+def status(port: int, **how) -> int:
+    from websockets.exceptions import InvalidStatus
+
+    try:
+        open_socket(port, **how).close()
+    except InvalidStatus as error:
+        return error.response.status_code
+    return 101
+
+
+def fetch(port: int, path: str = "/", host: str | None = None, address: str = "127.0.0.1", **headers) -> tuple[int, dict]:
+    import http.client
+
+    connection = http.client.HTTPConnection(address, port, timeout=20)
+    connection.request("GET", path, headers={"Host": host or f"{address}:{port}"} | {k.replace("_", "-"): v for k, v in headers.items()})
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status, dict(answer.getheaders())
+
+
+def test_only_the_page_that_is_served_may_connect(view):
+    port = view.port
+    assert status(port) == 101 and fetch(port)[0] == 200
+    for origin in ("http://evil.example", "null", None, f"http://localhost:{port}", f"http://127.0.0.1:{port + 1}", "http://127.0.0.1",
+                   f"http://127.0.0.1:{port}.evil.example", f"http://evil@127.0.0.1:{port}", f"file://127.0.0.1:{port}", "http://["):  # fmt: skip
+        assert status(port, origin=origin) == 403, origin
+    for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "169.254.169.254", f"localhost.evil:{port}"):
+        assert fetch(port, host=host)[0] == 403, host
+    assert fetch(port, host=f"localhost:{port}")[0] == 200 and fetch(port, host=f"LOCALHOST:{port + 5}")[0] == 200, "through ssh -L too"
+    assert fetch(port, "/../../etc/passwd")[0] == 404 and fetch(port, "/%2e%2e/%2e%2e/etc/passwd")[0] == 404
+
+
+def hostile(ids: dict[str, str]):
+    """1,000 messages that no page of ours sends."""
+    values = [-1000, 10**9, "abc", "0/1", "1/0", "", None, [], {}, [1] * 1000, float("nan"), float("inf"), True, 2.5, "x" * 10_000, b"\0" * 100, {"a": {"b": []}},
+              "../../etc/passwd", "<script>alert(1)</script>", -1]  # fmt: skip
+    for value in values:
+        for uuid in ids.values():
+            yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+    for uuid in ids.values():
+        for prop in ("update_cb", "sync_cb", "removed", "uuid", "props", "is_button", "__class__", "update_timestamp", "nothing"):
+            yield pack("GuiUpdateMessage", uuid=uuid, updates={prop: 5})
+            yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": "1", prop: [5]})
+        yield pack("GuiUpdateMessage", uuid=uuid, updates=[])
+        yield pack("GuiButtonHoldMessage", uuid=uuid, frequency=10.0)
+        yield pack("FileTransferStartUpload", source_component_uuid=uuid, transfer_uuid="x", filename="../x", mime_type="a", part_count=10**9, size_bytes=10**12)
+    others = ["ViewerCameraMessage", "ResetSceneMessage", "RemoveSceneNodeMessage", "SceneNodeClickMessage", "TransformControlsUpdateMessage", "Nothing",
+              "RunJavascriptMessage", "SetPositionMessage", "ShareUrlRequest", "GuiCloseModalMessage", "FileTransferPart", "CommandTriggerMessage"]  # fmt: skip
+    for kind in others:
+        yield pack(kind)
+        yield pack(kind, name="/bodies", uuid="x", wxyz=[1], position="abc", updates={})
+    raw = [b"", b"\xc1", b"\x81", b"\xdd\xff\xff\xff\xff", bytes(1000), b"\xff" * 500, pack("GuiUpdateMessage")[:-3]]
+    yield from raw
+    while True:
+        for uuid in ids.values():
+            yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": -1000})
+
+
+def test_a_thousand_hostile_messages_end_nothing(view, env):
+    from websockets.exceptions import ConnectionClosed
+
+    ids = {name: h._impl.uuid for h in view.server.gui._gui_input_handle_from_uuid.values() for name in [h._impl.uuid]}
+    assert len(ids) == 7
+    loop = threading.Thread(target=view.run, daemon=True)
+    loop.start()
+    view.wishes.speed = "1/4"
+    messages, sent = hostile(ids), 0
+    socket_ = open_socket(view.port)
+    socket_.send(camera())
+    while sent < 1000:
+        try:
+            socket_.send(next(messages))
+            sent += 1
+            if sent % 50 == 0:
+                socket_.ping().wait(5)
+        except ConnectionClosed:  # what cannot be read ends its own connection
+            socket_ = open_socket(view.port)
+            socket_.send(camera())
+    socket_.close()
+    time.sleep(0.3)
+    assert loop.is_alive() and view.wishes.world in (0, 1) and view.wishes.speed in ("1/10", "1/4", "1/2", "1", "fastest")
+    with open_socket(view.port) as ours:  # and the controls still work
+        ours.send(camera())
+        world = next(u for u, h in view.server.gui._gui_input_handle_from_uuid.items() if getattr(h, "label", "") == "world")
+        ours.send(pack("GuiUpdateMessage", uuid=world, updates={"value": 1 - view.wishes.world}))
+        before, limit = view.wishes.world, time.monotonic() + 10
+        while view.wishes.world == before and time.monotonic() < limit:
+            time.sleep(0.02)
+        assert view.wishes.world == 1 - before
+    steps = view.steps
+    time.sleep(1.0)
+    assert loop.is_alive() and (view.steps > steps or view.wishes.pause)
+    view._stopped.set()
+    loop.join(10)
+    assert not loop.is_alive()
+
+
+def test_three_hundred_sockets_end_nothing(view):
+    from websockets.exceptions import ConnectionClosed
+
+    loop = threading.Thread(target=view.run, daemon=True)
+    loop.start()
+    view.wishes.speed = "1/4"
+    raw = [socket.create_connection(("127.0.0.1", view.port), timeout=20) for _ in range(240)]
+    for k, s in enumerate(raw):
+        s.sendall((b"GET / HTTP/1.1\r\n", b"\x16\x03\x01" + bytes(50), b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n", b"")[k % 4])
+    full = []
+    for _ in range(60):
+        full.append(open_socket(view.port))
+    told_to_wait = 0
+    for s in full:
+        try:
+            s.recv(timeout=5)
+        except ConnectionClosed as closed:
+            told_to_wait += closed.rcvd is not None and closed.rcvd.code == 1013
+    assert told_to_wait >= 60 - 24 and view.gate.clients <= 24
+    assert loop.is_alive()
+    for s in (*raw, *full):
+        s.close()
+    limit = time.monotonic() + 15
+    while status(view.port) != 101 or view.gate.clients > 5:
+        assert time.monotonic() < limit
+        time.sleep(0.1)
+    steps = view.steps
+    time.sleep(1.0)
+    assert loop.is_alive() and view.steps > steps
+    view._stopped.set()
+    loop.join(10)
+
+
+def test_a_picture_that_fails_costs_a_picture_and_a_fault_that_stays_is_told(view, monkeypatch):
+    draw, calls = view._draw, []
+
+    def failing(panels_too):
+        calls.append(1)
+        if len(calls) % 2:
+            raise RuntimeError("dictionary changed size during iteration")
+        draw(panels_too)
+
+    monkeypatch.setattr(view, "_draw", failing)
+    view.run(seconds=0.5)
+    assert len(calls) > 3
+    monkeypatch.setattr("dexsim.view.live.MOST_FAILED_DRAWS", 3)
+    monkeypatch.setattr(view, "_draw", lambda panels_too: (_ for _ in ()).throw(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
+        view.run(seconds=5)
+
+
+def test_beyond_loopback_a_token_is_asked_for(view, env):
+    from dexsim.view.live import LiveView
+
+    assert view.token == ""
+    wide = LiveView(env, view.policy, "close", ["close"], view._load, "0.0.0.0", free_port())
+    try:
+        port, token = wide.port, wide.token
+        assert len(token) >= 20
+        assert fetch(port)[0] == 401 and fetch(port, "/?token=wrong")[0] == 401 and fetch(port, "/index.html", Cookie="dexsim=x")[0] == 401
+        assert status(port) == 401 and status(port, path="/?token=no") == 401
+        code, headers = fetch(port, f"/?token={token}", host="any.name:1")
+        assert code == 200 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
+        cookie = headers["Set-Cookie"].split(";")[0]
+        assert fetch(port, Cookie=cookie)[0] == 200 and status(port, headers={"Cookie": cookie}) == 101
+        assert status(port, headers={"Cookie": cookie}, origin="http://evil.example") == 403, "a foreign page with the cookie"
+    finally:
+        wide.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (Debian, Ubuntu: apt-get install chromium)")
+def test_the_page_with_its_token_in_a_browser(view, env):
+    """The token of the address is a cookie from then on, which the page's WebSocket carries."""
+    from dexsim.view.live import LiveView
+
+    wide = LiveView(env, view.policy, "close", ["close"], view._load, "0.0.0.0", free_port())
+    loop = threading.Thread(target=wide.run, daemon=True)
+    loop.start()
+    page = Page(f"http://127.0.0.1:{wide.port}/?token={wide.token}")
+    try:
+        page.wait("document.querySelector('[data-fact=step]') !== null")
+        assert wide.gate.clients == 1
+    finally:
+        page.close()
+        wide._stopped.set()
+        loop.join(10)
+        wide.stop()

@@ -31,7 +31,9 @@ def run(start: Start, env: Any, policy: Policy) -> int:
     name = source.name if source is not None else str(play["policy"])
     host, port = str(play["view_host"]), int(play["view_port"])
     view = LiveView(env, policy, name, choices, load, host, port)
-    print(f"view     http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{view.port}   (Ctrl-C ends)")
+    name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
+    asked = f"/?token={view.token}" if view.token else ""
+    print(f"view     http://{name}:{view.port}{asked}   (Ctrl-C ends)", flush=True)
     if host == "127.0.0.1":
         print(
             f"         from another machine: ssh -L {view.port}:localhost:{view.port} THIS_MACHINE,"

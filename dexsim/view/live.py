@@ -23,12 +23,16 @@ import torch
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.sim.scene import OBJECT
+from dexsim.view import live_gate
 from dexsim.view import live_panels as panels
 from dexsim.view.live_meshes import body_meshes
 from dexsim.view.render import CAMERA, backdrop
 
 Policy = Callable[[Any], torch.Tensor]  # observations -> actions [N, A]
-SPEEDS = ("1/10", "1/4", "1/2", "1", "fastest")
+SPEEDS = {"1/10": 0.1, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "fastest": float("inf")}
+BUTTONS = {"step": 1, "10 steps": 10, "new episodes": 0}
+MOST_STEPS = 1000  # asked for and not yet taken
+MOST_FAILED_DRAWS = 100  # in a row, before the view gives up
 SCENE_HZ, PANEL_HZ = 30.0, 8.0
 LIFT = 4e-4  # m, taxels are drawn this much above the skin
 FULL_TAXEL = 0.25  # N, darkest colour until more was felt
@@ -74,7 +78,9 @@ class LiveView:
         self.steps, self.episodes, self.ended = 0, 0, "-"
         self._message, self._world, self._stopped = "", 0, threading.Event()
         self._command: float | None = None
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner; the address is ours to say
+        self.gate = live_gate.Gate(host)
+        self._failed_draws = 0
+        with contextlib.redirect_stdout(io.StringIO()), live_gate.gated(self.gate):  # its banner; the address is ours to say
             self.server = viser.ViserServer(host=host, port=port, label="dexsim", verbose=False)
         self._nodes: dict[int, Any] = {}
         self._object: list[Any] = []
@@ -86,6 +92,11 @@ class LiveView:
     def port(self) -> int:
         """Where it is served."""
         return self.server.get_port()
+
+    @property
+    def token(self) -> str:
+        """What the address must carry as ?token=..., '' where it is served on this machine only."""
+        return self.gate.token
 
     # -- the page --------------------------------------------------------------------------------------------------------------
     def _lay_out(self, choices: list[str]) -> None:
@@ -106,8 +117,8 @@ class LiveView:
         camera.look_at, camera.position, camera.near = tuple(look), tuple(look + 0.7 * CAMERA["distance"] * away), 0.005
         with gui.add_folder("Controls"):
             pause = gui.add_checkbox("pause", initial_value=False)
-            buttons = gui.add_button_group("", ("step", "10 steps", "new episodes"))
-            speed = gui.add_button_group("speed", SPEEDS)
+            buttons = gui.add_button_group("", tuple(BUTTONS))
+            speed = gui.add_button_group("speed", tuple(SPEEDS))
             world = gui.add_slider("world", min=0, max=max(self.env.num_envs - 1, 1), step=1, initial_value=0, disabled=self.env.num_envs == 1)
             policy = gui.add_dropdown("policy", choices, initial_value=self.name)
             own = gui.add_checkbox("own command", initial_value=False, visible=hasattr(self.env, "fixed_command"))
@@ -120,6 +131,9 @@ class LiveView:
         with gui.add_folder("Rewards"):
             self._reward_html = gui.add_html("")
         self._pause = pause
+        live_gate.only_known(server, {h._impl.uuid: check for h, check in (
+            (pause, live_gate.truth), (own, live_gate.truth), (buttons, live_gate.one_of(BUTTONS)), (speed, live_gate.one_of(SPEEDS)),
+            (world, live_gate.number(0, max(self.env.num_envs - 1, 1))), (policy, live_gate.one_of(choices)), (command, live_gate.number(0, 1)))})
 
         @pause.on_update
         def _(_: Any) -> None:
@@ -128,33 +142,34 @@ class LiveView:
 
         @buttons.on_click
         def _(_: Any) -> None:
-            if buttons.value == "new episodes":
+            steps = BUTTONS.get(buttons.value)
+            if steps == 0:
                 w.restart = True
-            else:
+            elif steps is not None:
                 w.pause = pause.value = True
-                w.steps += 10 if buttons.value == "10 steps" else 1
+                w.steps = min(w.steps + steps, MOST_STEPS)
             w.changed.set()
 
         @speed.on_click
         def _(_: Any) -> None:
-            w.speed = speed.value
+            w.speed = speed.value if speed.value in SPEEDS else w.speed
             w.changed.set()
 
         @world.on_update
         def _(_: Any) -> None:
-            w.world = min(int(world.value), self.env.num_envs - 1)
+            w.world = int(min(max(world.value, 0), self.env.num_envs - 1))
             w.changed.set()
 
         @policy.on_update
         def _(_: Any) -> None:
-            w.policy = policy.value
+            w.policy = policy.value if policy.value in choices else None
             w.changed.set()
 
         @own.on_update
         @command.on_update
         def _(_: Any) -> None:
             command.disabled = not own.value
-            w.command = float(command.value) if own.value else None
+            w.command = min(max(float(command.value), 0.0), 1.0) if own.value else None
             w.changed.set()
 
     def _show_world(self) -> None:
@@ -182,7 +197,17 @@ class LiveView:
                         for k, m in enumerate(meshes.get(thing, []))]
 
     def draw(self, panels_too: bool) -> None:
-        """Bring the page to the present state of the chosen world; reads from the device."""
+        """Bring the page to the present state of the chosen world; reads from the device. What fails between here and a page costs a
+        picture, not the run, unless it fails again and again."""
+        try:
+            self._draw(panels_too)
+            self._failed_draws = 0
+        except Exception:
+            self._failed_draws += 1
+            if self._failed_draws >= MOST_FAILED_DRAWS:
+                raise
+
+    def _draw(self, panels_too: bool) -> None:
         env, w = self.env, self.wishes.world
         self._data.qpos[:] = env.engine.t.qpos[w].cpu().numpy()
         mujoco.mj_kinematics(self._model, self._data)
@@ -254,8 +279,7 @@ class LiveView:
                     self.draw(panels_too)
                     drawn, shown = now, now if panels_too else shown
                 if w.speed != "fastest" and not w.pause:
-                    top, _, bottom = w.speed.partition("/")
-                    due = max(due + env.dt * int(bottom or 1) / int(top), time.perf_counter() - 0.2)  # too slow: do not catch up
+                    due = max(due + env.dt / SPEEDS[w.speed], time.perf_counter() - 0.2)  # too slow: do not catch up
                     time.sleep(max(due - time.perf_counter(), 0.0))
 
     def _step(self, obs: Any) -> Any:
