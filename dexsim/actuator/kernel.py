@@ -45,7 +45,28 @@ from typing import Any
 import warp as wp
 
 from dexsim.actuator.columns import INDEX
-from dexsim.actuator.laws import difference, hold, preslide, preslide_slope, ripple_wave, stribeck_power, torque_limit, wind
+from dexsim.actuator.laws import (
+    arrived,
+    difference,
+    eccentricity,
+    eccentricity_slope,
+    hold,
+    lag_share,
+    load_share,
+    other_terms,
+    pd,
+    preslide,
+    preslide_slope,
+    ripple_wave,
+    sagging,
+    stribeck_power,
+    torque_limits,
+    transmission,
+    transmission_damping,
+    voltage_torque,
+    warmed,
+    wind,
+)
 
 # Slots of state[world, joint, slot] before the queue: `queue` stamps [s], then `queue` targets [rad], oldest first.
 MOTOR, ENABLED, QUEUE = 0, 1, 2
@@ -89,6 +110,56 @@ REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
 REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
+@lru_cache(maxsize=None)
+def drives(real):
+    """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in `servo.Servo`."""
+
+    @wp.struct
+    class Drives:
+        # addresses, [J]
+        dof: wp.array(dtype=int)
+        dof_q: wp.array(dtype=int)
+        loop_q: wp.array(dtype=int)
+        loop_dof: wp.array(dtype=int)
+        loop_motor: wp.array(dtype=int)  # the loop's encoder is on the rotor
+        # what is believed, [N, J, C] and [N, J]
+        params: wp.array3d(dtype=real)
+        inertia: wp.array2d(dtype=real)
+        base_damping: wp.array2d(dtype=real)
+        base_frictionloss: wp.array2d(dtype=real)
+        base_armature: wp.array2d(dtype=real)
+        home: wp.array2d(dtype=real)
+        # what the engine says, [N], [N, nq], [N, nv]
+        time: wp.array(dtype=real)
+        qpos: wp.array2d(dtype=real)
+        qvel: wp.array2d(dtype=real)
+        given: wp.array(dtype=real)  # sum of the motors' |torque| in the last step, [N]
+        # in and out
+        state: wp.array3d(dtype=real)
+        torque: wp.array2d(dtype=real)
+        # out, [N, nv]
+        qfrc_applied: wp.array2d(dtype=real)
+        dof_damping: wp.array2d(dtype=real)
+        dof_frictionloss: wp.array2d(dtype=real)
+        dof_armature: wp.array2d(dtype=real)
+
+    return Drives
+
+
+@wp.func
+def target_in_force(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, end: Any, dt: Any):
+    """The target [rad], mean over the step of dt [s] that ends at `end`, less the delay (`laws.arrived`)."""
+    target = state[w, j, QUEUE + queue]
+    for k in range(1, queue):
+        part = arrived(end, state[w, j, QUEUE + k], dt)
+        new = state[w, j, QUEUE + queue + k]
+        if part > type(dt)(WHOLE):
+            target = new
+        elif part > type(dt)(SNAP):
+            target += part * (new - state[w, j, QUEUE + queue + k - 1])
+    return target
+
+
 @wp.func
 def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin: Any, dt: Any):
     """(speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt] of what is in force
@@ -112,402 +183,395 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
 
 @lru_cache(maxsize=None)
 def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
-    """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`."""
+    """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`.
+
+    Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop asks for;
+    `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two. Each has the law as
+    `laws.py` states it and takes it to the end of the step ("Integration")."""
     play, sag, rare, braking, controller, presliding, shape = (
         name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape")
     )
     extended = bool(features & EXTENDED)
+    Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
+
+    @wp.struct
+    class Rotor:  # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
+        q: real
+        v: real
+        inertia: real  # its own; 0 where the joint's armature stands for it
+        two: bool  # it is a body of its own
+        on_loop: bool  # the loop's encoder is on it
+
+    @wp.struct
+    class Sensed:  # what the loop's encoder shows
+        q: real
+        rate: real  # of it, now
+        v: real  # the speed that kd acts on: now, and
+        v_end: real  # at the end of the step at unchanged speed
+        scale: real  # shown over true speed
+        share: real  # of a change of speed, what the filter passes in a step
+
+    @wp.struct
+    class Motor:  # what the supply and the temperature leave of it
+        tau0: real
+        no_load: real
+        supply: real
+        efficiency: real
+        friction: real  # factor
+
+    @wp.struct
+    class Torque:  # as a line in the velocity at the end of the step
+        now: real  # what the current shows
+        end: real  # at the end of the step at unchanged speed
+        slope: real  # less per speed gained
+        on_drive: real  # of it, in the motor's own speed, not in that of the loop's encoder
+
+    @wp.struct
+    class Friction:
+        level: real  # dry
+        own: real  # the drive's part of it
+        viscous: real
+        taken: real  # torque of what gives way elastically; the level is 0 then
+
+    @wp.func
+    def locate(dt: real, x0: int, fresh: bool, d: Drives, w: int, j: int):
+        """The rotor where the last step's v' has left it; writes its slot and the armature of what stays with the joint."""
+        r = Rotor()
+        r.v = d.qvel[w, d.dof[j]]
+        if wp.static(play):
+            r.q = d.qpos[w, d.dof_q[j]]
+            r.two = d.params[w, j, BACKLASH] > real(0.0) or d.params[w, j, SOFTNESS] > real(0.0)
+            if r.two and not fresh:
+                r.v = d.state[w, j, x0 + LINE_A] + d.state[w, j, x0 + LINE_B] * r.v
+                r.q = d.state[w, j, x0 + ROTOR] + dt * r.v
+            if r.two:
+                r.inertia = d.params[w, j, ROTOR_INERTIA]
+                if r.inertia == real(0.0):
+                    r.inertia = d.base_armature[w, j]
+                r.inertia = wp.max(r.inertia, wp.static(real(LEAST_ROTOR)) * d.inertia[w, j])
+                r.on_loop = d.loop_motor[j] != 0
+            d.state[w, j, x0 + ROTOR] = r.q
+            left = wp.max(d.base_armature[w, j] - r.inertia, -real(BORROWED) * d.inertia[w, j])
+            d.dof_armature[w, d.dof[j]] = left
+        return r
+
+    @wp.func
+    def sense(dt: real, x0: int, fresh: bool, r: Rotor, d: Drives, w: int, j: int):
+        """What the loop's encoder shows; writes the slot of kd's filter."""
+        turned = d.qpos[w, d.loop_q[j]]
+        turning = d.qvel[w, d.loop_dof[j]]
+        if wp.static(play):
+            if r.on_loop:
+                turned = r.q
+                turning = r.v
+        s = Sensed()
+        s.scale = d.params[w, j, SCALE]
+        s.share = real(1.0)
+        s.q = s.scale * turned + d.params[w, j, OFFSET]
+        if wp.static(rare):
+            s.q += eccentricity(turned, d.params[w, j, ECC_SIN], d.params[w, j, ECC_COS])
+            s.scale += eccentricity_slope(turned, d.params[w, j, ECC_SIN], d.params[w, j, ECC_COS])
+        s.rate = s.scale * turning
+        s.v = s.rate
+        s.v_end = s.rate
+        if wp.static(rare):
+            s.share = lag_share(d.params[w, j, SPEED_LAG], dt)
+            filtered = turning
+            if not fresh:
+                filtered = d.state[w, j, x0 + FILTERED]
+                filtered += s.share * (turning - filtered)
+            d.state[w, j, x0 + FILTERED] = filtered
+            s.v = s.scale * filtered
+            s.v_end = s.scale * (filtered + s.share * (turning - filtered))
+        return s
+
+    @wp.func
+    def remaining(d: Drives, w: int, j: int):
+        """What the supply and the temperature leave of the motor."""
+        m = Motor()
+        m.tau0 = d.params[w, j, TORQUE_LIMIT]
+        m.supply = d.params[w, j, SUPPLY]
+        m.no_load = d.params[w, j, NO_LOAD_SPEED]
+        m.efficiency = d.params[w, j, EFFICIENCY]
+        m.friction = real(1.0)
+        if wp.static(rare):
+            warmth = d.params[w, j, WARMTH]
+            constant = warmed(d.params[w, j, THERMAL_TORQUE], warmth)
+            m.friction = wp.max(warmed(d.params[w, j, THERMAL_FRICTION], warmth), real(0.0))
+            m.tau0 = m.tau0 * constant
+            if wp.static(voltage):
+                m.tau0 = m.tau0 / wp.max(warmed(d.params[w, j, THERMAL_RESISTANCE], warmth), wp.static(real(0.1)))
+                m.no_load = m.no_load / constant
+            else:
+                m.efficiency = m.efficiency * constant
+        if wp.static(sag):
+            m.supply = sagging(m.supply, d.params[w, j, SAG], d.given[w] - wp.abs(d.torque[w, j]))
+        return m
+
+    @wp.func
+    def control(dt: real, queue: int, x0: int, s: Sensed, lower: real, upper: real, d: Drives, w: int, j: int):
+        """(now, end, slope) that the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at which its integral waits."""
+        end = d.time[w] - d.params[w, j, DELAY] + dt
+        target = target_in_force(d.state, w, j, queue, end, dt)
+        kind = real(0.0)
+        if wp.static(rare):
+            kind = d.params[w, j, DEADBAND_KIND]
+            dragged = d.params[w, j, COUPLING]
+            if dragged != real(0.0):
+                other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
+                target += dragged * (d.qpos[w, d.dof_q[other]] - d.home[w, other])
+        u = pd(target - s.q, s.v, s.v_end, s.rate, s.scale, d.params[w, j, KP], d.params[w, j, KD], d.params[w, j, DEADBAND],
+               kind, dt, real(0.0), s.share)  # fmt: skip
+        if wp.static(not controller):
+            return wp.vector(u[0], u[1], u[2])
+        wish = target_rates(d.state, w, j, queue, end - dt, dt)
+        feed = d.params[w, j, FEED_SPEED] * wish[0] + d.params[w, j, FEED_ACCELERATION] * wish[1]
+        gain = d.params[w, j, INTEGRAL_GAIN]
+        integral = real(0.0)
+        if d.state[w, j, ENABLED] != real(0.0):
+            integral = d.state[w, j, x0 + INTEGRAL]
+            integral = wind(integral, dt * gain * u[3], u[0] + feed + integral, lower, upper)
+        d.state[w, j, x0 + INTEGRAL] = integral
+        return other_terms(u, feed, integral, gain, s.rate, s.scale, dt)
+
+    @wp.func
+    def drive_voltage(u: vec3, v: real, m: Motor):
+        """What a voltage drive gives of a duty."""
+        line = m.tau0 / m.no_load
+        t = Torque()
+        t.now = voltage_torque(u[0], m.tau0, m.supply, line, v)
+        t.end = voltage_torque(u[1], m.tau0, m.supply, line, v)
+        t.slope = m.tau0 * m.supply * u[2] + line
+        t.on_drive = line
+        if wp.abs(u[1]) > real(1.0):
+            unlimited = m.tau0 * m.supply * u[1] - line * v
+            ratio = real(0.0)
+            if unlimited != real(0.0):
+                ratio = wp.clamp(t.end / unlimited, real(0.0), real(1.0))
+            t.slope = wp.max(ratio * t.slope, line)
+            t.on_drive = t.slope
+        return t
+
+    @wp.func
+    def drive_torque(dt: real, u: vec3, v: real, x: real, lower: real, upper: real, steep: real, inertia: real, m: Motor):
+        """What a torque drive gives of a torque; x: |v| over the no-load speed; steep: `braking_slope`."""
+        t = Torque()
+        t.now = wp.clamp(u[0], -lower, upper)
+        t.end = wp.clamp(u[1], -lower, upper)
+        t.slope = u[2]
+        limit = upper
+        if u[1] < real(0.0):
+            limit = lower
+        if wp.abs(u[1]) > limit:
+            line = m.tau0 / (m.no_load * m.supply)
+            size = limit
+            if u[1] * v < real(0.0):  # braking: the limit grows as the speed falls, by this factor within the step
+                growth = wp.min(steep * m.efficiency * line * dt / inertia, real(60.0))
+                if growth > real(SNAP) and steep * x < real(EDGE):
+                    size = wp.max(limit, real(SEED) * m.tau0) * (wp.exp(growth) - real(1.0)) / growth
+                    size = wp.min(size, wp.min(m.tau0, wp.abs(u[1])))
+                    t.end = wp.sign(u[1]) * size
+                line = size / (m.no_load * m.supply * (real(1.0) + x))
+            elif limit == real(0.0):
+                line = real(0.0)
+            # to the PD's zero, or to the no-load speed in the direction of the torque
+            t.slope = wp.max(u[2] * size / wp.abs(u[1]), line)
+            t.on_drive = t.slope
+        return t
+
+    @wp.func
+    def ask(dt: real, queue: int, x0: int, s: Sensed, r: Rotor, m: Motor, d: Drives, w: int, j: int):
+        """The motor's torque after its lag; writes what the current shows."""
+        t = Torque()
+        if wp.static(voltage):
+            t = drive_voltage(control(dt, queue, x0, s, real(1.0), real(1.0), d, w, j), r.v, m)
+        else:
+            x = wp.abs(r.v) / (m.no_load * m.supply)
+            steep = real(1.0)
+            if wp.static(braking):
+                steep = d.params[w, j, BRAKING]
+            limits = torque_limits(m.tau0, x, r.v, steep)
+            inertia = d.inertia[w, j]
+            if r.two:
+                inertia = r.inertia
+            u = control(dt, queue, x0, s, limits[0], limits[1], d, w, j)
+            t = drive_torque(dt, u, r.v, x, limits[0], limits[1], steep, inertia, m)
+        if d.state[w, j, ENABLED] == real(0.0):
+            t.now = real(0.0)
+            t.end = real(0.0)
+            t.slope = real(0.0)
+            t.on_drive = real(0.0)
+        share = lag_share(d.params[w, j, LAG_TIME], dt)
+        last = d.state[w, j, MOTOR]
+        t.now = last + share * (t.now - last)
+        t.end = last + share * (t.end - last)
+        d.state[w, j, MOTOR] = t.now
+        d.torque[w, j] = t.now
+        t.end = m.efficiency * t.end
+        t.slope = m.efficiency * (share * t.slope)
+        t.on_drive = m.efficiency * share * t.on_drive
+        return t
+
+    @wp.func
+    def resist(dt: real, x0: int, fresh: bool, last: real, r: Rotor, factor: real, d: Drives, w: int, j: int):
+        """Friction at the motor's speed; last: its torque of the step before."""
+        f = Friction()
+        f.viscous = d.params[w, j, VISCOUS]
+        peak = d.params[w, j, STRIBECK_PEAK]
+        share = load_share(last, r.v, d.params[w, j, LOAD], d.params[w, j, LOAD_BACK])
+        f.level = d.base_frictionloss[w, j] + d.params[w, j, COULOMB]
+        if wp.static(rare):
+            f.viscous = f.viscous * factor
+            peak = peak * factor
+            share = share * factor
+            f.level = d.base_frictionloss[w, j] + factor * d.params[w, j, COULOMB]
+        exponent = real(2.0)
+        if wp.static(shape):
+            exponent = d.params[w, j, STRIBECK_EXPONENT]
+        f.level += peak * wp.exp(-stribeck_power(r.v / d.params[w, j, STRIBECK_SPEED], exponent)) + share * wp.abs(last)
+        f.own = f.level - d.base_frictionloss[w, j]
+        if wp.static(presliding):  # a torque, taken up at the step's begin, and its line in the speed at the step's end
+            give = d.params[w, j, PRESLIDING]
+            if give > real(0.0):
+                turned = r.v * dt / give
+                taken = real(0.0)
+                if not fresh:
+                    taken = preslide(d.state[w, j, x0 + TAKEN], turned)
+                d.state[w, j, x0 + TAKEN] = taken
+                sliding = f.level
+                if r.two:
+                    sliding = f.own
+                f.taken = sliding * taken
+                f.viscous += sliding * dt / give * preslide_slope(taken, turned)
+        return f
+
+    @wp.func
+    def couple(dt: real, t: Torque, f: Friction, r: Rotor, stiffness: real, d: Drives, w: int, j: int):
+        """(torque on the link T, its slope D in the link's speed, A, B): the rotor's step as a line w' = A + B v', "Play and
+        elasticity". stiffness: of the loop [N.m/rad]."""
+        q = d.qpos[w, d.dof_q[j]]
+        v = d.qvel[w, d.dof[j]]
+        gap2 = real(0.5) * d.params[w, j, BACKLASH]
+        on_drive = t.on_drive
+        on_loop = real(0.0)  # the slope in the link's speed
+        if r.on_loop:
+            on_drive = t.slope
+        else:
+            on_loop = t.slope - on_drive
+        own = f.own
+        if wp.static(presliding):
+            if d.params[w, j, PRESLIDING] > real(0.0):
+                own = real(0.0)
+        soft = d.params[w, j, SOFTNESS]
+        link = wp.max(d.inertia[w, j] - r.inertia, wp.static(real(LEAST_ROTOR)) * d.inertia[w, j])
+        stiff = real(STOP_GAIN) * stiffness + wp.static(real(STOP_RATE * STOP_RATE)) * d.inertia[w, j]
+        hardening = real(0.0)
+        if soft > real(0.0):
+            stiff = real(1.0) / soft
+            hardening = d.params[w, j, HARDENING]
+        damp = transmission_damping(d.params[w, j, REBOUND], stiff, r.inertia, link, r.inertia + link)
+        # without the spring: inertia (w' - w) / dt = t.end - on_drive (w' - w) - on_loop (v' - v) - viscous w' -+ own
+        free_a = r.inertia / dt + f.viscous + on_drive
+        push = r.inertia / dt * r.v + t.end + on_drive * r.v
+        line_a = real(0.0)
+        line_b = real(0.0)
+        if wp.abs(push) > own:
+            line_a = (push - wp.sign(push) * own + on_loop * v) / free_a
+            line_b = -on_loop / free_a
+        twist = r.q + dt * (line_a + line_b * v) - q - dt * v
+        pulls = real(0.0)
+        slope = real(0.0)
+        if wp.abs(twist) >= gap2:
+            side = wp.sign(twist) * gap2
+            spring = transmission(r.q - q - side, stiff, hardening)
+            grip = spring[1] * dt + damp
+            all_a = free_a + grip
+            on_a = real(0.0)
+            on_b = real(0.0)
+            if wp.abs(push - spring[0] + grip * v) > own:
+                on_a = (push - spring[0] - wp.sign(push - spring[0] + grip * v) * own + on_loop * v) / all_a
+                on_b = (grip - on_loop) / all_a
+            pushed = spring[0] + grip * on_a
+            slope_pushed = grip * (real(1.0) - on_b)
+            # the ends of a play push and do not pull
+            if gap2 == real(0.0) or (pushed - slope_pushed * v) * side >= real(0.0):
+                line_a = on_a
+                line_b = on_b
+                pulls = pushed
+                slope = slope_pushed
+        return wp.vector(pulls, slope, line_a, line_b)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def servo(
-        # in
-        dt: real,
-        queue: int,
-        dof: wp.array(dtype=int),
-        dof_q: wp.array(dtype=int),
-        loop_q: wp.array(dtype=int),
-        loop_dof: wp.array(dtype=int),
-        params: wp.array3d(dtype=real),
-        inertia: wp.array2d(dtype=real),
-        base_damping: wp.array2d(dtype=real),
-        base_frictionloss: wp.array2d(dtype=real),
-        base_armature: wp.array2d(dtype=real),
-        home: wp.array2d(dtype=real),
-        loop_motor: wp.array(dtype=int),
-        time: wp.array(dtype=real),
-        qpos: wp.array2d(dtype=real),
-        qvel: wp.array2d(dtype=real),
-        given: wp.array(dtype=real),
-        # in and out
-        state: wp.array3d(dtype=real),
-        # out
-        qfrc_applied: wp.array2d(dtype=real),
-        dof_damping: wp.array2d(dtype=real),
-        dof_frictionloss: wp.array2d(dtype=real),
-        dof_armature: wp.array2d(dtype=real),
-        torque: wp.array2d(dtype=real),
-    ):
+    def servo(dt: real, queue: int, d: Drives):
         w, j = wp.tid()
-        zero = real(0.0)
-        one = real(1.0)
-        d = dof[j]
-        v = qvel[w, d]
-        scale = params[w, j, SCALE]
-        turned = qpos[w, loop_q[j]]  # what the loop's encoder turns with
-        turning = qvel[w, loop_dof[j]]
-        v_drive = v  # the motor's speed
-        inertia_drive = inertia[w, j]
-
+        i = d.dof[j]
+        q = d.qpos[w, d.dof_q[j]]
+        v = d.qvel[w, i]
         x0 = int(0)
         fresh = bool(False)
         if wp.static(extended):
             x0 = QUEUE + 2 * queue
-            fresh = state[w, j, x0 + FRESH] != zero
-            state[w, j, x0 + FRESH] = zero
-
-        # The rotor where the last step's v' has left it.
-        two = bool(False)
-        loop_on_rotor = bool(False)
-        rotor_q = zero
-        rotor_inertia = zero
-        gap2 = zero
-        armature = zero
-        if wp.static(play):
-            rotor_q = qpos[w, dof_q[j]]
-            gap2 = real(0.5) * params[w, j, BACKLASH]
-            two = gap2 > zero or params[w, j, SOFTNESS] > zero
-            if two and not fresh:
-                v_drive = state[w, j, x0 + LINE_A] + state[w, j, x0 + LINE_B] * v
-                rotor_q = state[w, j, x0 + ROTOR] + dt * v_drive
-            if two:
-                rotor_inertia = params[w, j, ROTOR_INERTIA]
-                if rotor_inertia == zero:
-                    rotor_inertia = base_armature[w, j]
-                rotor_inertia = wp.max(rotor_inertia, wp.static(real(LEAST_ROTOR)) * inertia[w, j])
-                inertia_drive = rotor_inertia
-                loop_on_rotor = loop_motor[j] != 0
-                if loop_on_rotor:
-                    turned = rotor_q
-                    turning = v_drive
-            state[w, j, x0 + ROTOR] = rotor_q
-            armature = wp.max(base_armature[w, j] - rotor_inertia, -real(BORROWED) * inertia[w, j])
-            dof_armature[w, d] = armature
-
-        q_m = scale * turned + params[w, j, OFFSET]
-        v_m = scale * turning
-        v_d = v_m  # the speed that kd acts on: now, and
-        v_next = v_m  # at the end of the step at unchanged speed
-        kd_blend = one
-        if wp.static(rare):
-            q_m += params[w, j, ECC_SIN] * wp.sin(turned) + params[w, j, ECC_COS] * (wp.cos(turned) - one)
-            scale += params[w, j, ECC_SIN] * wp.cos(turned) - params[w, j, ECC_COS] * wp.sin(turned)  # what it shows of a speed here
-            v_m = scale * turning
-            kd_blend = dt / (params[w, j, SPEED_LAG] + dt)
-            filtered = turning
-            if not fresh:
-                filtered = state[w, j, x0 + FILTERED]
-                filtered += kd_blend * (turning - filtered)
-            state[w, j, x0 + FILTERED] = filtered
-            v_d = scale * filtered
-            v_next = scale * (filtered + kd_blend * (turning - filtered))
-
-        # The target in force, averaged over this step: a delay that ends inside a step acts for the rest of it.
-        end = time[w] - params[w, j, DELAY] + dt
-        target = state[w, j, QUEUE + queue]
-        for k in range(1, queue):
-            part = wp.clamp((end - state[w, j, QUEUE + k]) / dt, zero, one)
-            new = state[w, j, QUEUE + queue + k]
-            if part > real(WHOLE):
-                target = new
-            elif part > real(SNAP):
-                target += part * (new - state[w, j, QUEUE + queue + k - 1])
-        if wp.static(rare):
-            dragged = params[w, j, COUPLING]
-            if dragged != zero:
-                other = wp.clamp(int(params[w, j, COUPLING_FROM]), 0, dof_q.shape[0] - 1)
-                target += dragged * (qpos[w, dof_q[other]] - home[w, other])
-
-        # What the supply and the temperature leave of the motor, and its limits at this speed.
-        tau0 = params[w, j, TORQUE_LIMIT]
-        supply = params[w, j, SUPPLY]
-        no_load = params[w, j, NO_LOAD_SPEED]
-        efficiency = params[w, j, EFFICIENCY]
-        friction_factor = one
-        if wp.static(rare):
-            warmth = params[w, j, WARMTH]
-            torque_factor = one + params[w, j, THERMAL_TORQUE] * warmth
-            friction_factor = wp.max(one + params[w, j, THERMAL_FRICTION] * warmth, zero)
-            tau0 = tau0 * torque_factor
-            if wp.static(voltage):
-                tau0 = tau0 / wp.max(one + params[w, j, THERMAL_RESISTANCE] * warmth, wp.static(real(0.1)))
-                no_load = no_load / torque_factor
-            else:
-                efficiency = efficiency * torque_factor
-        if wp.static(sag):
-            others = given[w] - wp.abs(torque[w, j])
-            supply = supply * wp.max(one - params[w, j, SAG] * others, wp.static(real(0.05)))
-        x = zero  # speed over no-load speed
-        upper = one  # limits of torque, or of duty
-        lower = one
-        steep = one  # how the limit falls with the speed while braking
-        if wp.static(not voltage):
-            x = wp.abs(v_drive) / (no_load * supply)
-            upper = torque_limit(tau0, x, one)
-            lower = upper
-            if wp.static(braking):
-                steep = params[w, j, BRAKING]
-                if v_drive > zero:
-                    lower = torque_limit(tau0, x, steep)
-                elif v_drive < zero:
-                    upper = torque_limit(tau0, x, steep)
-
-        # PD: now (what the current shows) and as a line in the velocity at the end of the step.
-        e = target - q_m
-        kp = params[w, j, KP]
-        now = kp * e - params[w, j, KD] * v_d
-        pd = now - kp * dt * v_m
-        slope = scale * (kp * dt + params[w, j, KD])
-        kind = zero
-        if wp.static(rare):
-            pd = kp * e - params[w, j, KD] * v_next - kp * dt * v_m
-            slope = scale * (kp * dt + kd_blend * params[w, j, KD])
-            kind = params[w, j, DEADBAND_KIND]
-            if kind > real(1.5):
-                cut = kp * wp.clamp(e, -params[w, j, DEADBAND], params[w, j, DEADBAND])
-                now -= cut
-                pd -= cut
-        dead = wp.abs(e) < params[w, j, DEADBAND]
-        if dead:
-            if wp.static(rare):
-                if kind > real(0.5):
-                    now = -params[w, j, KD] * v_d
-                    pd = -params[w, j, KD] * v_next
-                    slope = scale * kd_blend * params[w, j, KD]
-                else:
-                    now = zero
-                    pd = zero
-                    slope = zero
-            else:
-                now = zero
-                pd = zero
-                slope = zero
-
-        if wp.static(controller):
-            wish = target_rates(state, w, j, queue, end - dt, dt)
-            feed = params[w, j, FEED_SPEED] * wish[0] + params[w, j, FEED_ACCELERATION] * wish[1]
-            ki = params[w, j, INTEGRAL_GAIN]
-            e_i = e  # the error that is integrated: what the deadband leaves of it
-            if kind > real(1.5):
-                e_i = e - wp.clamp(e, -params[w, j, DEADBAND], params[w, j, DEADBAND])
-            if dead:
-                e_i = zero
-            wound = zero
-            if state[w, j, ENABLED] != zero:
-                wound = state[w, j, x0 + INTEGRAL]
-                wound = wind(wound, dt * ki * e_i, now + feed + wound, lower, upper)
-            state[w, j, x0 + INTEGRAL] = wound
-            if not dead or kind > real(0.5):
-                now += feed + wound
-                pd += feed + wound
-                if not dead:  # backward Euler of the integral, too
-                    pd += dt * ki * (e_i - dt * v_m)
-                    slope += scale * dt * dt * ki
-        motor_now = zero
-        motor = zero
-        damping = zero
-        on_drive = zero  # what of the slope below is in the motor's own speed, not in that of the loop's encoder
-        if wp.static(voltage):
-            line = tau0 / no_load
-            motor_now = tau0 * supply * wp.clamp(now, -one, one) - line * v_drive
-            motor = tau0 * supply * wp.clamp(pd, -one, one) - line * v_drive
-            damping = tau0 * supply * slope + line
-            on_drive = line
-            if wp.abs(pd) > one:
-                unlimited = tau0 * supply * pd - line * v_drive
-                ratio = zero
-                if unlimited != zero:
-                    ratio = wp.clamp(motor / unlimited, zero, one)
-                damping = wp.max(ratio * damping, line)
-                on_drive = damping
-        else:
-            motor_now = wp.clamp(now, -lower, upper)
-            motor = wp.clamp(pd, -lower, upper)
-            limit = upper
-            if pd < zero:
-                limit = lower
-            damping = slope
-            if wp.abs(pd) > limit:
-                line = tau0 / (no_load * supply)
-                size = limit
-                if pd * v_drive < zero:  # braking: the limit grows as the speed falls, by this factor within the step
-                    growth = wp.min(steep * efficiency * line * dt / inertia_drive, real(60.0))
-                    if growth > real(SNAP) and steep * x < real(EDGE):
-                        size = wp.max(limit, real(SEED) * tau0) * (wp.exp(growth) - one) / growth
-                        size = wp.min(size, wp.min(tau0, wp.abs(pd)))
-                        motor = wp.sign(pd) * size
-                    line = size / (no_load * supply * (one + x))
-                elif limit == zero:
-                    line = zero
-                # to the PD's zero, or to the no-load speed in the direction of the torque
-                damping = wp.max(slope * size / wp.abs(pd), line)
-                on_drive = damping
-
-        if state[w, j, ENABLED] == zero:
-            motor_now = zero
-            motor = zero
-            damping = zero
-            on_drive = zero
-
-        # First-order lag, backward Euler: y' = (1 - blend) y + blend * motor.
-        blend = dt / (params[w, j, LAG_TIME] + dt)
-        last = state[w, j, MOTOR]
-        motor_now = last + blend * (motor_now - last)
-        motor = last + blend * (motor - last)
-        damping = blend * damping
-        state[w, j, MOTOR] = motor_now
-        torque[w, j] = motor_now
-
-        applied = efficiency * motor
-        damping = efficiency * damping
-        on_drive = efficiency * blend * on_drive
+            fresh = d.state[w, j, x0 + FRESH] != real(0.0)
+            d.state[w, j, x0 + FRESH] = real(0.0)
+        last = d.state[w, j, MOTOR]
+        r = locate(dt, x0, fresh, d, w, j)
+        m = remaining(d, w, j)
+        t = ask(dt, queue, x0, sense(dt, x0, fresh, r, d, w, j), r, m, d, w, j)
 
         # Ripple; where its slope is that of a spring, it too is taken at the end of the step.
-        turn = params[w, j, RIPPLE_PER_TURN]
-        angle = turn * qpos[w, dof_q[j]] + params[w, j, RIPPLE_PHASE]
-        form = zero
+        turn = d.params[w, j, RIPPLE_PER_TURN]
+        form = real(0.0)
         if wp.static(shape):
-            form = params[w, j, RIPPLE_SHAPE]
-        wave = ripple_wave(angle, form)
-        applied += params[w, j, RIPPLE] * wave[0]
-        stiffness = wp.max(zero, -params[w, j, RIPPLE] * turn * wave[1])
-        applied -= stiffness * dt * v
-        damping += stiffness * dt
-
-        of_motor = applied  # on the rotor, where there is one
-        slope_motor = damping
+            form = d.params[w, j, RIPPLE_SHAPE]
+        wave = ripple_wave(turn * q + d.params[w, j, RIPPLE_PHASE], form)
+        t.end += d.params[w, j, RIPPLE] * wave[0]
+        stiffness = wp.max(real(0.0), -d.params[w, j, RIPPLE] * turn * wave[1])
+        t.end -= stiffness * dt * v
+        t.slope += stiffness * dt
 
         # The stand-in for what is not known; what of it brakes, or pulls like a spring, is taken at the end of the step.
-        pull = params[w, j, REST_POSITION]
-        brake = params[w, j, REST_SPEED] + params[w, j, REST_DRAG] * wp.abs(v)
-        applied += params[w, j, REST] + pull * qpos[w, dof_q[j]] + brake * v
-        spring = wp.max(zero, -pull)
+        applied = t.end
+        damping = t.slope
+        pull = d.params[w, j, REST_POSITION]
+        brake = d.params[w, j, REST_SPEED] + d.params[w, j, REST_DRAG] * wp.abs(v)
+        applied += d.params[w, j, REST] + pull * q + brake * v
+        spring = wp.max(real(0.0), -pull)
         applied -= spring * dt * v
-        brake = wp.max(zero, -brake)
         damping += spring * dt
 
         # Dry friction: an interval of torques [-level (1 + a/2), +level (1 - a/2)], as a symmetric one and a constant.
-        ratio_v = v_drive / params[w, j, STRIBECK_SPEED]
-        fraction = params[w, j, LOAD]
-        if last * v_drive < zero:
-            fraction = params[w, j, LOAD_BACK]
-        viscous = params[w, j, VISCOUS]
-        level = base_frictionloss[w, j] + params[w, j, COULOMB]
-        if wp.static(rare):
-            viscous = viscous * friction_factor
-            level = base_frictionloss[w, j] + friction_factor * params[w, j, COULOMB]
-            fraction = fraction * friction_factor
-        peak = params[w, j, STRIBECK_PEAK]
-        if wp.static(rare):
-            peak = peak * friction_factor
-        exponent = real(2.0)
-        if wp.static(shape):
-            exponent = params[w, j, STRIBECK_EXPONENT]
-        level += peak * wp.exp(-stribeck_power(ratio_v, exponent)) + fraction * wp.abs(last)
-
-        # Elastic before it slides: a torque, taken up at the step's begin, and its line in the speed at the step's end.
-        bristle = zero
-        if wp.static(presliding):
-            give = params[w, j, PRESLIDING]
-            if give > zero:
-                taken = zero
-                if not fresh:
-                    taken = preslide(state[w, j, x0 + TAKEN], v_drive * dt / give)
-                state[w, j, x0 + TAKEN] = taken
-                sliding = level
-                if two:
-                    sliding = level - base_frictionloss[w, j]
-                bristle = sliding * taken
-                viscous += sliding * dt / give * preslide_slope(taken, v_drive * dt / give)
-
+        f = resist(dt, x0, fresh, last, r, m.friction, d, w, j)
+        uneven = real(0.5) * d.params[w, j, ASYMMETRY]
         if wp.static(play):
-            if two:
-                drawn = of_motor
-                own = level - base_frictionloss[w, j]  # the rotor's; the model's own stays on the link
-                of_motor -= real(0.5) * params[w, j, ASYMMETRY] * own
+            d.state[w, j, x0 + LINE_A] = real(0.0)
+            d.state[w, j, x0 + LINE_B] = real(1.0)
+            if r.two:
+                applied = applied - t.end  # what acts on the link itself: the stand-in
+                damping = damping - t.slope + wp.max(real(0.0), -brake)
+                t.end -= uneven * f.own
                 if wp.static(presliding):
-                    if params[w, j, PRESLIDING] > zero:
-                        of_motor -= bristle
-                        own = zero
-                on_loop = zero  # the slope in the link's speed
-                if loop_on_rotor:
-                    on_drive = slope_motor
-                else:
-                    on_loop = slope_motor - on_drive
-                applied = applied - drawn  # what acts on the link itself: the stand-in
-                damping = damping - slope_motor
-                soft = params[w, j, SOFTNESS]
-                link = wp.max(inertia[w, j] - rotor_inertia, wp.static(real(LEAST_ROTOR)) * inertia[w, j])
-                stiff = kp
+                    t.end -= f.taken
+                loop = d.params[w, j, KP]
                 if wp.static(voltage):
-                    stiff = kp * tau0
-                stiff = real(STOP_GAIN) * stiff + wp.static(real(STOP_RATE * STOP_RATE)) * inertia[w, j]
-                if soft > zero:
-                    stiff = one / soft
-                damp = real(2.0) * params[w, j, REBOUND] * wp.sqrt(stiff * rotor_inertia * link / (rotor_inertia + link))
-                # without the spring: rotor_inertia (w' - w) / dt = of_motor - on_drive (w' - w) - on_loop (v' - v) - viscous w' -+ own
-                free_a = rotor_inertia / dt + viscous + on_drive
-                push = rotor_inertia / dt * v_drive + of_motor + on_drive * v_drive
-                line_a = zero
-                line_b = zero
-                if wp.abs(push) > own:
-                    line_a = (push - wp.sign(push) * own + on_loop * v) / free_a
-                    line_b = -on_loop / free_a
-                twist = rotor_q + dt * (line_a + line_b * v) - qpos[w, dof_q[j]] - dt * v
-                pulls = zero
-                spring_t = zero
-                if wp.abs(twist) >= gap2:
-                    side = wp.sign(twist) * gap2
-                    stretch = stiff * (rotor_q - qpos[w, dof_q[j]] - side)
-                    harder = one
-                    if soft > zero:
-                        harder = one + params[w, j, HARDENING] * stretch * stretch
-                    grip = (real(3.0) * harder - real(2.0)) * stiff * dt + damp
-                    pull = stretch * harder
-                    all_a = free_a + grip
-                    on_a = zero
-                    on_b = zero
-                    if wp.abs(push - pull + grip * v) > own:
-                        on_a = (push - pull - wp.sign(push - pull + grip * v) * own + on_loop * v) / all_a
-                        on_b = (grip - on_loop) / all_a
-                    pushed = pull + grip * on_a
-                    slope_pushed = grip * (one - on_b)
-                    # the ends of a play push and do not pull
-                    if gap2 == zero or (pushed - slope_pushed * v) * side >= zero:
-                        line_a = on_a
-                        line_b = on_b
-                        pulls = pushed
-                        spring_t = slope_pushed
-                state[w, j, x0 + LINE_A] = line_a
-                state[w, j, x0 + LINE_B] = line_b
-                damping += brake
+                    loop = loop * m.tau0
+                c = couple(dt, t, f, r, loop, d, w, j)
+                d.state[w, j, x0 + LINE_A] = c[2]
+                d.state[w, j, x0 + LINE_B] = c[3]
                 # D goes to the armature, D (v' - v) = D dt a: contacts are solved with the inertia, which a damping is no part of
-                qfrc_applied[w, d] = applied + damping * v + pulls - spring_t * v
-                dof_armature[w, d] = armature + spring_t * dt
-                dof_damping[w, d] = base_damping[w, j] + damping
-                dof_frictionloss[w, d] = base_frictionloss[w, j]
+                d.qfrc_applied[w, i] = applied + damping * v + c[0] - c[1] * v
+                d.dof_armature[w, i] = d.dof_armature[w, i] + c[1] * dt
+                d.dof_damping[w, i] = d.base_damping[w, j] + damping
+                d.dof_frictionloss[w, i] = d.base_frictionloss[w, j]
                 return
-            state[w, j, x0 + LINE_A] = zero
-            state[w, j, x0 + LINE_B] = one
-
-        applied -= real(0.5) * params[w, j, ASYMMETRY] * level
+        applied -= uneven * f.level
         if wp.static(presliding):
-            if params[w, j, PRESLIDING] > zero:
-                applied -= bristle
-                level = zero
-        damping += brake
-        qfrc_applied[w, d] = applied + damping * v
-        dof_damping[w, d] = base_damping[w, j] + viscous + damping
-        dof_frictionloss[w, d] = level
+            if d.params[w, j, PRESLIDING] > real(0.0):
+                applied -= f.taken
+                f.level = real(0.0)
+        damping += wp.max(real(0.0), -brake)
+        d.qfrc_applied[w, i] = applied + damping * v
+        d.dof_damping[w, i] = d.base_damping[w, j] + f.viscous + damping
+        d.dof_frictionloss[w, i] = f.level
 
     return servo
 

@@ -9,6 +9,61 @@ from typing import Any
 import warp as wp
 
 
+# -- encoder -------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def eccentricity(q: Any, sine: Any, cosine: Any):
+    """Error [rad] at position q [rad] of an encoder whose disk is off its axis: sine * sin q + cosine * (cos q - 1), zero at q = 0."""
+    return sine * wp.sin(q) + cosine * (wp.cos(q) - type(q)(1.0))
+
+
+@wp.func
+def eccentricity_slope(q: Any, sine: Any, cosine: Any):
+    """What that encoder shows beyond a speed at position q, over the speed: the derivative of `eccentricity`."""
+    return sine * wp.cos(q) - cosine * wp.sin(q)
+
+
+# -- delay and lag -------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def arrived(end: Any, stamp: Any, dt: Any):
+    """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in force: a delay
+    that ends inside a step acts for the rest of it."""
+    return wp.clamp((end - stamp) / dt, type(dt)(0.0), type(dt)(1.0))
+
+
+@wp.func
+def lag_share(time: Any, dt: Any):
+    """Share of the way that a first-order lag, time * y' = u - y, goes from y to u in a step of dt [s]: backward Euler."""
+    return dt / (time + dt)
+
+
+# -- the motor -----------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def warmed(per_degree: Any, warmth: Any):
+    """Factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree [1/degC] * warmth [degC].
+
+    Copper has +0.0039, the magnets' flux about -0.001 (NdFeB) per degree; grease gets thinner."""
+    return type(warmth)(1.0) + per_degree * warmth
+
+
+@wp.func
+def sagging(supply: Any, per_torque: Any, others: Any):
+    """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque| [N.m])."""
+    return supply * wp.max(type(supply)(1.0) - per_torque * others, type(supply)(0.05))
+
+
+@wp.func
+def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
+    """Torque [N.m] of a DC motor at a duty (clipped to -1 .. 1) of its supply: tau0 * supply * duty - line * v, line = stall torque over
+    no-load speed [N.m.s/rad] (R i = u - k v, torque = k i)."""
+    return tau0 * supply * wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)) - line * v
+
+
 @wp.func
 def torque_limit(tau0: Any, x: Any, slope: Any):
     """Largest torque [N.m] of a motor: tau0 * max(0, 1 - slope * x), x = |speed| / no-load speed at the supply's voltage.
@@ -21,6 +76,38 @@ def torque_limit(tau0: Any, x: Any, slope: Any):
     if slope * x < type(x)(1.0):
         limit = tau0 * (type(x)(1.0) - slope * x)
     return limit
+
+
+@wp.func
+def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
+    """(lower, upper) >= 0: the torque lies in -lower .. upper [N.m] at speed v [rad/s], x = |v| / no-load speed; `torque_limit` with
+    slope 1 in the direction of v, with `slope` against it."""
+    upper = torque_limit(tau0, x, type(x)(1.0))
+    lower = upper
+    if v > type(v)(0.0):
+        lower = torque_limit(tau0, x, slope)
+    elif v < type(v)(0.0):
+        upper = torque_limit(tau0, x, slope)
+    return wp.vector(lower, upper)
+
+
+# -- transmission --------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def transmission(turn: Any, stiff: Any, hardening: Any):
+    """(torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening t^2), t = stiff * turn;
+    its stiffness is 1 + 3 hardening t^2 times as large (a cubic hardening spring, as harmonic drives show)."""
+    stretch = stiff * turn
+    harder = type(turn)(1.0) + hardening * stretch * stretch
+    return wp.vector(stretch * harder, (type(turn)(3.0) * harder - type(turn)(2.0)) * stiff)
+
+
+@wp.func
+def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: Any):
+    """Damping [N.m.s/rad] of a spring [N.m/rad] between two inertias [kg.m2] at the damping ratio `rebound`:
+    2 rebound sqrt(stiff * rotor * link / both), both = rotor + link."""
+    return type(stiff)(2.0) * rebound * wp.sqrt(stiff * rotor * link / both)
 
 
 # -- friction ------------------------------------------------------------------------------------------------------------------
@@ -37,6 +124,16 @@ def stribeck_power(ratio: Any, exponent: Any):
     if exponent != type(ratio)(2.0):
         power = wp.pow(wp.abs(ratio), exponent)
     return power
+
+
+@wp.func
+def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
+    """Dry friction per motor torque of a gear: `driving` where the motor drives the load (torque and speed agree), `backdriven` where
+    the load drives the motor (they do not). The friction is this share of |torque|."""
+    share = driving
+    if torque * v < type(v)(0.0):
+        share = backdriven
+    return share
 
 
 @wp.func
@@ -111,6 +208,57 @@ def ripple_wave(angle: Any, shape: Any):
 # (from rest at e = 0: the integral of r' - qd is e). Without feed-forward (F = 0) its integral holds -K_vi q, a term in q alone:
 # kp = K_vp K_pp + K_vi then acts on -q, and only K_vp K_pp of it on r; that one is not expressed by these columns. A current loop
 # below is the column `lag`. (G. Ellis, Control System Design Guide, 4th ed. 2012, ch. 17.)
+
+
+
+@wp.func
+def pd(e: Any, v: Any, v_end: Any, rate: Any, scale: Any, kp: Any, kd: Any, width: Any, kind: Any, dt: Any, age: Any, share: Any):
+    """(now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a step of dt [s] at unchanged
+    speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then [N.m.s/rad].
+
+    e: error of the measured position [rad]. v, v_end: measured speed that kd acts on, now and then [rad/s]; rate: measured speed
+    of the position; scale: what the encoder shows over what turns; share: of a change of speed, what kd's filter passes in the
+    step; age: of the position [s]. width, kind: the deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all,
+    1 the error counts as zero, 2 it counts from the edge on. acts: 0 no torque, 1 all but the error, 2 all."""
+    now = kp * e - kd * v
+    end = kp * e - kd * v_end - kp * dt * rate
+    slope = scale * (kp * (dt - age) + share * kd)
+    counts = e
+    acts = type(e)(2.0)
+    if kind > type(e)(1.5):
+        inner = wp.clamp(e, -width, width)
+        now -= kp * inner
+        end -= kp * inner
+        counts = e - inner
+    if wp.abs(e) < width:
+        counts = type(e)(0.0)
+        acts = type(e)(0.0)
+        now = type(e)(0.0)
+        end = type(e)(0.0)
+        slope = type(e)(0.0)
+        if kind > type(e)(0.5):
+            acts = type(e)(1.0)
+            now = -kd * v
+            end = -kd * v_end
+            slope = scale * share * kd
+    return wp.vector(now, end, slope, counts, acts)
+
+
+@wp.func
+def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
+    """(now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term [N.m]; the integral goes on
+    over the step: + gain * dt * (e - rate dt), gain = `integral_gain`."""
+    now = asked[0]
+    end = asked[1]
+    slope = asked[2]
+    if asked[4] > type(dt)(0.5):
+        now += feed + integral
+        end += feed + integral
+    if asked[4] > type(dt)(1.5):
+        end += gain * dt * (asked[3] - dt * rate)
+        slope += scale * gain * dt * dt
+    return wp.vector(now, end, slope)
+
 
 HOLDS = wp.constant(2.0)  # intervals between targets for which their speed counts, if no other target comes: one may be late
 SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this are one

@@ -15,6 +15,7 @@ from dexsim.actuator.kernel import (
     EXTRA_SLOTS,
     QUEUE,
     SLOTS,
+    drives,
     given_kernel,
     reset_kernel,
     send_kernel,
@@ -139,6 +140,15 @@ class Servo:
         self._shape = (n, j)
         self._wp = engine.wp
         self._fields = {name: engine.wp_field(name) for name in FIELDS}
+        self._drives = drives(real)()
+        own = ("params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home", "given",
+               "dof", "dof_q", "loop_q", "loop_dof", "loop_motor")  # fmt: skip
+        for name in own:
+            setattr(self._drives, name, getattr(self, f"_{name}"))
+        for name in ("time", "qpos", "qvel", "qfrc_applied"):
+            setattr(self._drives, name, getattr(self._wp, name))
+        for name, field in self._fields.items():
+            setattr(self._drives, name, field)
         self.reset(None, as_tensor(mjm.qpos0[loop_q]).expand(n, j))
 
     # -- parameters ------------------------------------------------------------
@@ -186,12 +196,7 @@ class Servo:
         w = self._wp
         if "sag" in self.features:
             wp.launch(self._sum, dim=self._shape[0], inputs=[self._shape[1], self._torque, self._given], device=self.engine.device)
-        self._launch(
-            self._servo, self.engine.dt, self.queue, self._dof, self._dof_q, self._loop_q, self._loop_dof,
-            self._params, self._inertia, self._base_damping, self._base_frictionloss, self._base_armature, self._home,
-            self._loop_motor, w.time, w.qpos, w.qvel, self._given, self._state, w.qfrc_applied,
-            *(self._fields[name] for name in FIELDS), self._torque,
-        )  # fmt: skip
+        self._launch(self._servo, self.engine.dt, self.queue, self._drives)
 
     # -- what an observer reads ------------------------------------------------------------
 
