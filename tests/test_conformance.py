@@ -27,12 +27,16 @@ N, STEPS = 12, 24
 
 
 class Twin:
-    """A step of each engine from the same state."""
+    """A step of each engine from the same state; `collision` as sim.collision of MuJoCo-Warp's."""
 
-    def __init__(self):
+    def __init__(self, collision: str):
         settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}",  # all shapes alike
                     "sim.iterations=30", "sim.ls_iterations=50")  # solvers that finish
-        self.c, self.w = grasp_env(*settings, worlds=N, engine="mujoco"), grasp_env(*settings, worlds=N, engine="warp")
+        self.c = grasp_env(*settings, worlds=N, engine="mujoco")
+        self.w = grasp_env(*settings, f"sim.collision={collision}", worlds=N, engine="warp")
+        assert (self.w.engine.narrow is not None) == (collision == "hand")
+        if collision == "hand":  # exact; MuJoCo-Warp's own is as inexact as C MuJoCo with the tolerance that both have
+            self.c.engine.batch.expand("opt.ccd_tolerance")[:] = 1e-10
         self.c.skip_idle_resets = False  # the same random numbers for both
         self.copy()
 
@@ -90,10 +94,10 @@ class Twin:
         return {k: (seen["c"][k], seen["w"][k]) for k in seen["c"]}
 
 
-@pytest.fixture(scope="module")
-def record():
+@pytest.fixture(scope="module", params=["hand", "mujoco"])
+def record(request):
     """A catch: objects fall, the hand closes, then moves at random; each step's two outcomes, [STEPS, N, ...]."""
-    twin = Twin()
+    twin = Twin(request.param)
     g = torch.Generator().manual_seed(2)
     everything = []
     for _ in range(9):  # the fall

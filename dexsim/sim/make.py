@@ -29,15 +29,19 @@ def make_engine(
     nconmax: int = 40,
     njmax: int = 160,
     threads: int = 0,
+    collision: str = "auto",
 ) -> Engine:
     """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a CPU).
 
     fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
-    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all.
+    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all. collision (MuJoCo-Warp only): who finds the contacts of
+    convex hulls: "hand" (`dexsim.sim.collision`), "mujoco" (MuJoCo-Warp itself), "auto" (hand, where it serves the model).
     """
     no_log_file()
     if engine not in ("auto", "warp", "mujoco"):
         raise UserError(f"sim.engine='{engine}': must be auto, warp or mujoco")
+    if collision not in ("auto", "hand", "mujoco"):
+        raise UserError(f"sim.collision='{collision}': must be auto, hand or mujoco")
     device = "cuda:0" if device == "cuda" else device  # torch.cuda.set_device wants a number
     if engine == "auto":
         engine = "warp" if device.startswith("cuda") else "mujoco"
@@ -46,7 +50,7 @@ def make_engine(
     if engine == "warp":
         from dexsim.sim.warp_engine import WarpEngine
 
-        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax)
+        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax, collision)
     from dexsim.sim.mujoco_engine import MujocoEngine, compile_with_sensors
 
     return MujocoEngine(compile_with_sensors(spec, pairs), worlds, fields, pairs, threads)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 
 import mujoco
 import mujoco_warp as mjw
@@ -11,7 +12,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from dexsim.errors import UserError
 from dexsim.sim import contact
+from dexsim.sim.collision import NarrowPhase, unsupported
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
@@ -27,7 +30,10 @@ def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
 
 
 class WarpEngine(Engine):
-    """N worlds on MuJoCo-Warp, float32, CPU or CUDA. See `Engine` for the interface."""
+    """N worlds on MuJoCo-Warp, float32, CPU or CUDA. See `Engine` for the interface.
+
+    narrow: who finds the contacts of convex hulls, None = MuJoCo-Warp itself.
+    """
 
     kind = "warp"
 
@@ -41,9 +47,13 @@ class WarpEngine(Engine):
         deterministic: bool,
         nconmax: int,
         njmax: int,
+        collision: str,
     ):
         super().__init__(model, worlds, device, fields, pairs)
         self.real = wp.float32
+        why_not = unsupported(model)
+        if collision == "hand" and why_not:
+            raise UserError(f"sim.collision=hand: {why_not}; use sim.collision=mujoco")
         self.nconmax, self.njmax = nconmax, -(-njmax // 16) * 16  # the solver's tiles want multiples of 16
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
@@ -64,6 +74,9 @@ class WarpEngine(Engine):
             if "opt.gravity" in fields:
                 self.m.opt.gravity = wp.array(np.tile(model.opt.gravity, (worlds, 1)), dtype=wp.vec3)
             self.d = mjw.put_data(model, mujoco.MjData(model), nworld=worlds, nconmax=nconmax, njmax=self.njmax)
+            self.narrow = NarrowPhase(model, self.m, self.d) if collision != "mujoco" and not why_not else None
+            if self.narrow is not None and not self.narrow.number:
+                self.narrow = None
             P = len(self.pairs)
             w = self.wp
             w.time, w.qpos, w.qvel, w.qfrc_applied = self.d.time, self.d.qpos, self.d.qvel, self.d.qfrc_applied
@@ -81,6 +94,7 @@ class WarpEngine(Engine):
         self.t.overflow = wp.to_torch(self._overflow)
         self.t.xfrc_applied = wp.to_torch(self.d.xfrc_applied)
         self._warmstart = wp.to_torch(self.d.qacc_warmstart)
+        self._simplex = wp.to_torch(self.narrow.simplex) if self.narrow is not None else None
         self._fields = {}
         for name in set(fields) | set(_DERIVED):
             owner, attr = (self.m.opt, name[4:]) if name.startswith("opt.") else (self.m, name)
@@ -101,13 +115,18 @@ class WarpEngine(Engine):
             for _ in range(substeps):
                 if before_each is not None:
                     before_each()
-                mjw.step(self.m, self.d)
+                self.physics_step()
             mjw.kinematics(self.m, self.d)
             self._outputs()
             if after is not None:
                 after()
 
         self._run(("step", substeps, before_each, after), program)
+
+    def physics_step(self) -> None:
+        """One bare physics step, launched and not recorded."""
+        with self.narrow.in_place() if self.narrow is not None else nullcontext():
+            mjw.step(self.m, self.d)
 
     def refresh(self) -> None:
         self._run(("refresh",), lambda: mjw.kinematics(self.m, self.d))
@@ -125,6 +144,8 @@ class WarpEngine(Engine):
         t.pair_normal.masked_fill_(m, 0.0)
         t.pair_force.masked_fill_(m[..., None], 0.0)
         t.flags.masked_fill_(mask, 0)
+        if self.narrow is not None:
+            self._simplex.masked_fill_(mask[:, None, None], -1)
 
     def set_const(self) -> None:
         with wp.ScopedDevice(self.device):

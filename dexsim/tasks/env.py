@@ -97,7 +97,8 @@ class HandEnv(VecEnv):
                 spec.delete(geom)
         self.engine = make_engine(
             spec, n_worlds, device, engine, fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
-            pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"])
+            pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"],
+            collision=sim.get("collision", "auto"))
         self.scene = scene
         self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt,
                            varied=list(cfg["randomize"].get("servo", {})))

@@ -1,0 +1,11 @@
+"""A narrow phase for hands, between MuJoCo-Warp's broad phase and its constraints.
+
+`NarrowPhase` takes over the pairs of a convex hull with a sphere, a capsule, a box or another hull, which in a grasp cost
+more than everything else of a physics step. All other pairs stay with MuJoCo-Warp.
+"""
+
+from __future__ import annotations
+
+from dexsim.sim.collision.narrow import NarrowPhase, unsupported
+
+__all__ = ["NarrowPhase", "unsupported"]

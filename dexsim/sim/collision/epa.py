@@ -1,0 +1,183 @@
+"""Depth of two convex cores that overlap: EPA on pairs of corners, from the tetrahedron that GJK ended with.
+
+Van den Bergen, Proximity queries and penetration depth computation on 3D game objects (2001). Cores have corners only, so the
+depth found is the exact one: that of the facet of A - B which is nearest to the origin. Radii and margins add to it, because a
+ball widens A - B by as much in every direction. When GJK was warm-started with the facet of the step before, its tetrahedron
+stands on that facet, and one look confirms it.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dexsim.sim.collision.gjk import GAIN, difference
+from dexsim.sim.collision.shapes import Core, support
+
+POINTS = 32
+"""Most corners of the growing polytope; what needs more is left to MuJoCo-Warp's own routine."""
+FACES = 2 * POINTS - 4
+EDGES = 48
+FAR = wp.constant(1.0e10)
+
+
+@wp.struct
+class Facet:
+    """The facet of A - B nearest to the origin. found: 1 if it is one. normal: outward, which is from A to B, in B's frame.
+    depth [m]: its distance from the origin. i, l: names of its corners, and weights of the nearest point."""
+
+    found: int
+    normal: wp.vec3
+    depth: float
+    i0: int
+    i1: int
+    i2: int
+    l0: float
+    l1: float
+    l2: float
+
+
+@wp.func
+def plane(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
+    """Unit normal of the triangle (counter-clockwise seen from outside) and the origin's depth below it; FAR if it has no area."""
+    n = wp.cross(b - a, c - a)
+    area = wp.length(n)
+    if area <= 1.0e-14:
+        return wp.vec4(0.0, 0.0, 0.0, FAR)
+    n = n / area
+    # of the corner that is nearest to the origin, whose position is the most exact
+    p = a
+    if wp.dot(b, b) < wp.dot(p, p):
+        p = b
+    if wp.dot(c, c) < wp.dot(p, p):
+        p = c
+    return wp.vec4(n[0], n[1], n[2], wp.dot(n, p))
+
+
+@wp.func
+def weights(n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """Barycentric coordinates of the origin's projection on the triangle of normal n."""
+    la = wp.dot(n, wp.cross(b, c))
+    lb = wp.dot(n, wp.cross(c, a))
+    lc = wp.dot(n, wp.cross(a, b))
+    return wp.vec3(la, lb, lc) / (la + lb + lc)
+
+
+@wp.func
+def three(f: int) -> wp.vec3i:
+    """The points of a face."""
+    return wp.vec3i(f & 0xFF, (f >> 8) & 0xFF, (f >> 16) & 0xFF)
+
+
+@wp.func
+def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
+    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose it."""
+    pos = wp.zeros(shape=(POINTS,), dtype=wp.vec3)
+    name = wp.zeros(shape=(POINTS,), dtype=int)
+    face = wp.zeros(shape=(FACES,), dtype=int)  # three points of 8 bits, or -1
+    at = wp.zeros(shape=(FACES,), dtype=wp.vec4)
+    edge = wp.zeros(shape=(EDGES,), dtype=int)
+    none = Facet()
+    for j in range(4):
+        name[j] = names[j]
+        pos[j] = difference(a, b, vertex, R, p, names[j])
+    points = int(4)
+    faces = int(4)
+    turned = wp.dot(wp.cross(pos[1] - pos[0], pos[2] - pos[0]), pos[3] - pos[0]) > 0.0
+    # faces of a tetrahedron whose last point lies below the first three
+    face[0] = wp.where(turned, 0 | (2 << 8) | (1 << 16), 0 | (1 << 8) | (2 << 16))
+    face[1] = wp.where(turned, 0 | (1 << 8) | (3 << 16), 0 | (3 << 8) | (1 << 16))
+    face[2] = wp.where(turned, 1 | (2 << 8) | (3 << 16), 1 | (3 << 8) | (2 << 16))
+    face[3] = wp.where(turned, 2 | (0 << 8) | (3 << 16), 2 | (3 << 8) | (0 << 16))
+    for j in range(4):
+        t = three(face[j])
+        at[j] = plane(pos[t[0]], pos[t[1]], pos[t[2]])
+        if at[j][3] < -GAIN:
+            return none
+    nearest = int(0)
+    done = int(0)
+    for _look in range(2 * POINTS):
+        nearest = int(0)
+        for j in range(1, faces):
+            if at[j][3] < at[nearest][3]:
+                nearest = j
+        n = wp.vec3(at[nearest][0], at[nearest][1], at[nearest][2])
+        i = support(a, vertex, wp.transpose(R) * n) | (support(b, vertex, -n) << 16)
+        w = difference(a, b, vertex, R, p, i)
+        for j in range(points):
+            if name[j] == i:
+                done = int(1)
+        if done == 1 or wp.dot(n, w) - at[nearest][3] <= GAIN:
+            done = int(1)
+            break
+        if points == POINTS:
+            break
+        name[points] = i
+        pos[points] = w
+        # faces that see the new point go; the edges of the hole are those that only one of them had
+        edges = int(0)
+        kept = int(0)
+        for j in range(faces):
+            f = face[j]
+            g = at[j]
+            if g[3] < FAR and g[0] * w[0] + g[1] * w[1] + g[2] * w[2] - g[3] > 0.0:
+                t = three(f)
+                for e in range(3):
+                    u = t[e]
+                    v = t[(e + 1) % 3]
+                    twin = int(-1)
+                    for h in range(edges):
+                        if edge[h] == (v | (u << 8)):
+                            twin = h
+                    if twin >= 0:
+                        edges -= 1
+                        edge[twin] = edge[edges]
+                    elif edges < EDGES:
+                        edge[edges] = u | (v << 8)
+                        edges += 1
+                    else:
+                        return none
+            else:
+                face[kept] = f
+                at[kept] = g
+                kept += 1
+        faces = kept
+        if edges < 3 or faces + edges > FACES:
+            return none
+        for h in range(edges):
+            u = edge[h] & 0xFF
+            v = edge[h] >> 8
+            face[faces] = u | (v << 8) | (points << 16)
+            at[faces] = plane(pos[u], pos[v], w)
+            if at[faces][3] < -GAIN:
+                return none
+            faces += 1
+        points += 1
+    if done == 0:
+        return none
+    # of several triangles of one facet, the one that the origin is below
+    depth = at[nearest][3]
+    best = int(-1)
+    most = float(-FAR)
+    for j in range(faces):
+        if at[j][3] - depth <= 2.0 * GAIN:
+            t = three(face[j])
+            l = weights(wp.vec3(at[j][0], at[j][1], at[j][2]), pos[t[0]], pos[t[1]], pos[t[2]])
+            least = wp.min(l[0], wp.min(l[1], l[2]))
+            if least > most:
+                most = least
+                best = j
+    if best < 0 or most < -0.01:
+        return none
+    t = three(face[best])
+    out = Facet()
+    out.found = 1
+    out.normal = wp.vec3(at[best][0], at[best][1], at[best][2])
+    out.depth = at[best][3]
+    l = weights(out.normal, pos[t[0]], pos[t[1]], pos[t[2]])
+    out.i0 = name[t[0]]
+    out.i1 = name[t[1]]
+    out.i2 = name[t[2]]
+    out.l0 = l[0]
+    out.l1 = l[1]
+    out.l2 = l[2]
+    return out

@@ -1,0 +1,359 @@
+"""The kernels of the narrow phase: for cores that are apart, for cores that overlap, and for the odd pair MuJoCo-Warp's own.
+
+All take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed materials,
+friction, explicit pairs and what a contact is are decided where they always were.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+from mujoco_warp._src.collision_core import (
+    contact_margin_gap,
+    contact_material_params,
+    geom_collision_pair,
+    write_contact,
+)
+from mujoco_warp._src.collision_gjk import epa_phase, gjk
+from mujoco_warp._src.math import make_frame
+from mujoco_warp._src.types import OverflowType, vec5
+
+from dexsim.sim.collision.epa import penetration
+from dexsim.sim.collision.gjk import OVERLAP, distance
+from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, Core, corner, corners, radius_of
+
+CCD_OVERFLOW = wp.constant(int(OverflowType.CCD))
+
+
+@wp.struct
+class Materials:
+    """MuJoCo-Warp's model fields that decide a contact's parameters; shapes as there."""
+
+    geom_condim: wp.array(dtype=int)
+    geom_priority: wp.array(dtype=int)
+    geom_solmix: wp.array2d(dtype=float)
+    geom_solref: wp.array2d(dtype=wp.vec2)
+    geom_solimp: wp.array2d(dtype=vec5)
+    geom_friction: wp.array2d(dtype=wp.vec3)
+    geom_margin: wp.array2d(dtype=float)
+    geom_gap: wp.array2d(dtype=float)
+    geom_adhesion: wp.array2d(dtype=float)
+    pair_dim: wp.array(dtype=int)
+    pair_solref: wp.array2d(dtype=wp.vec2)
+    pair_solreffriction: wp.array2d(dtype=wp.vec2)
+    pair_solimp: wp.array2d(dtype=vec5)
+    pair_margin: wp.array2d(dtype=float)
+    pair_gap: wp.array2d(dtype=float)
+    pair_adhesion: wp.array2d(dtype=float)
+    pair_friction: wp.array2d(dtype=vec5)
+
+
+@wp.struct
+class Meshes:
+    """MuJoCo-Warp's mesh fields that its own search of overlapping bodies reads."""
+
+    vertadr: wp.array(dtype=int)
+    vertnum: wp.array(dtype=int)
+    graphadr: wp.array(dtype=int)
+    vert: wp.array(dtype=wp.vec3)
+    graph: wp.array(dtype=int)
+    polynum: wp.array(dtype=int)
+    polyadr: wp.array(dtype=int)
+    polynormal: wp.array(dtype=wp.vec3)
+    polyvertadr: wp.array(dtype=int)
+    polyvertnum: wp.array(dtype=int)
+    polyvert: wp.array(dtype=int)
+    polymapadr: wp.array(dtype=int)
+    polymapnum: wp.array(dtype=int)
+    polymap: wp.array(dtype=int)
+
+
+@wp.struct
+class Contacts:
+    """MuJoCo-Warp's contact list, and how many contacts are in it."""
+
+    dist: wp.array(dtype=float)
+    pos: wp.array(dtype=wp.vec3)
+    frame: wp.array(dtype=wp.mat33)
+    includemargin: wp.array(dtype=float)
+    friction: wp.array(dtype=vec5)
+    solref: wp.array(dtype=wp.vec2)
+    solreffriction: wp.array(dtype=wp.vec2)
+    solimp: wp.array(dtype=vec5)
+    dim: wp.array(dtype=int)
+    geom: wp.array(dtype=wp.vec2i)
+    efc_address: wp.array2d(dtype=int)
+    worldid: wp.array(dtype=int)
+    type: wp.array(dtype=int)
+    geomcollisionid: wp.array(dtype=int)
+    adhesion: wp.array(dtype=float)
+    nacon: wp.array(dtype=int)
+
+
+@wp.struct
+class Scratch:
+    """MuJoCo-Warp's work space of EPA, one row a pair that overlaps."""
+
+    vert: wp.array2d(dtype=wp.vec3)
+    vert_index: wp.array2d(dtype=int)
+    face: wp.array2d(dtype=int)
+    pr: wp.array2d(dtype=wp.vec3)
+    norm2: wp.array2d(dtype=float)
+    horizon: wp.array2d(dtype=int)
+
+
+@wp.func
+def write(
+    mat: Materials, out: Contacts, room: int, geoms: wp.vec2i, pairid: wp.vec2i, world: int, margin: float, gap: float,
+    dist: float, pos: wp.vec3, normal: wp.vec3,
+):
+    """One contact. dist [m]: of the surfaces, without margin; normal: from geoms[0] to geoms[1], world frame."""
+    condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
+        mat.geom_condim, mat.geom_priority, mat.geom_solmix, mat.geom_solref, mat.geom_solimp, mat.geom_friction, mat.geom_adhesion,
+        mat.pair_dim, mat.pair_solref, mat.pair_solreffriction, mat.pair_solimp, mat.pair_adhesion, mat.pair_friction,
+        geoms, pairid[0], world,
+    )
+    write_contact(
+        room, 0, dist, pos, make_frame(normal), margin, gap, condim, friction, solref, solreffriction, solimp, adhesion,
+        geoms, pairid, world,
+        out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
+        out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, out.nacon,
+    )
+
+
+@wp.func
+def core_of(
+    kind: int, size: wp.vec3, dataid: int, hull_first: wp.array(dtype=int), hull_count: wp.array(dtype=int)
+) -> Core:
+    c = Core()
+    c.kind = kind
+    c.half = size
+    if kind == HULL and dataid >= 0:
+        c.first = hull_first[dataid]
+        c.count = hull_count[dataid]
+    return c
+
+
+@wp.func
+def known(name: int, a: Core, b: Core) -> bool:
+    """Whether both corners exist: another mesh may be there than in the step before."""
+    return name < 0 or ((name & 0xFFFF) < corners(a) and (name >> 16) < corners(b))
+
+
+@wp.struct
+class Pairs:
+    """What the broad phase found, MuJoCo-Warp's shapes, and what is kept of each pair between steps.
+
+    geom_size, geom_dataid, geom_xpos, geom_xmat: as in MuJoCo-Warp. room: most pairs. number: pairs found. geom, id, world: of
+    each. hull_first, hull_count [nmesh], hull [n]: corners of each mesh's convex hull. slot [ngeom, ngeom]: column of
+    `simplex`. simplex [N, P]: names of the corners that were nearest, or -1.
+    """
+
+    geom_type: wp.array(dtype=int)
+    geom_dataid: wp.array2d(dtype=int)
+    geom_size: wp.array2d(dtype=wp.vec3)
+    geom_xpos: wp.array2d(dtype=wp.vec3)
+    geom_xmat: wp.array2d(dtype=wp.mat33)
+    room: int
+    number: wp.array(dtype=int)
+    geom: wp.array(dtype=wp.vec2i)
+    id: wp.array(dtype=wp.vec2i)
+    world: wp.array(dtype=int)
+    hull_first: wp.array(dtype=int)
+    hull_count: wp.array(dtype=int)
+    hull: wp.array(dtype=wp.vec3)
+    slot: wp.array2d(dtype=int)
+    simplex: wp.array2d(dtype=wp.vec3i)
+
+
+@wp.struct
+class Two:
+    """A pair's cores and A's pose in B's frame (R, p); margin, gap and A's radius [m]."""
+
+    a: Core
+    b: Core
+    R: wp.mat33
+    p: wp.vec3
+    margin: float
+    gap: float
+    radius: float
+
+
+@wp.func
+def two(pairs: Pairs, mat: Materials, k: int) -> Two:
+    geoms = pairs.geom[k]
+    world = pairs.world[k]
+    t = Two()
+    margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world)
+    size = pairs.geom_size[world % pairs.geom_size.shape[0], geoms[0]]
+    kind = pairs.geom_type[geoms[0]]
+    meshes = world % pairs.geom_dataid.shape[0]
+    t.a = core_of(kind, size, pairs.geom_dataid[meshes, geoms[0]], pairs.hull_first, pairs.hull_count)
+    t.b = core_of(HULL, size, pairs.geom_dataid[meshes, geoms[1]], pairs.hull_first, pairs.hull_count)
+    to_b = wp.transpose(pairs.geom_xmat[world, geoms[1]])
+    t.R = to_b * pairs.geom_xmat[world, geoms[0]]
+    t.p = to_b * (pairs.geom_xpos[world, geoms[0]] - pairs.geom_xpos[world, geoms[1]])
+    t.margin = margin
+    t.gap = gap
+    t.radius = radius_of(kind, size)
+    return t
+
+
+@wp.func
+def nearest_of_b(pairs: Pairs, b: Core, i: wp.vec3i, l: wp.vec3) -> wp.vec3:
+    """The weighted mean of B's corners named by i (-1: none), in B's frame [m]."""
+    q = l[0] * corner(b, pairs.hull, i[0] >> 16)
+    if i[1] >= 0:
+        q += l[1] * corner(b, pairs.hull, i[1] >> 16)
+    if i[2] >= 0:
+        q += l[2] * corner(b, pairs.hull, i[2] >> 16)
+    return q
+
+
+@wp.func
+def add(pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3, v: wp.vec3, normal: wp.vec3, dist: float):
+    """The contact of pair k. q: B's nearest point; v: from there to A's core; normal: from A to B; all in B's frame. dist [m]:
+    of the cores, negative if they overlap. A contact lies halfway between the surfaces, and margins move both alike."""
+    geoms = pairs.geom[k]
+    world = pairs.world[k]
+    b_mat = pairs.geom_xmat[world, geoms[1]]
+    middle = q + 0.5 * v + (0.5 * t.radius) * normal
+    pos = b_mat * middle + pairs.geom_xpos[world, geoms[1]]
+    write(mat, out, pairs.room, geoms, pairs.id[k], world, t.margin, t.gap, dist - t.radius, pos, b_mat * normal)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def apart(
+    pairs: Pairs,
+    mat: Materials,
+    # out
+    out: Contacts,
+    deep: wp.array(dtype=int),
+    enclosing: wp.array(dtype=wp.vec4i),
+    odd: wp.array(dtype=int),
+    deep_and_odd: wp.array(dtype=int),
+):
+    """Each pair of a point, segment, box or hull with a hull: its contact, if cores are apart. Pairs that overlap are listed in
+    `deep`, with four corners that enclose the origin of A - B; those that only touch in `odd`."""
+    k = wp.tid()
+    if k >= wp.min(pairs.number[0], pairs.room):
+        return
+    geoms = pairs.geom[k]
+    kind = pairs.geom_type[geoms[0]]
+    if pairs.geom_type[geoms[1]] != HULL or (kind != SPHERE and kind != CAPSULE and kind != BOX and kind != HULL):
+        return
+    if pairs.id[k][1] >= 0:  # a sensor asks for this pair at any distance
+        odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
+        return
+    t = two(pairs, mat, k)
+    if t.b.count == 0 or (kind == HULL and t.a.count == 0):
+        return
+    cutoff = t.margin + t.gap + t.radius
+    world = pairs.world[k]
+    home = pairs.slot[geoms[0], geoms[1]]
+    first = pairs.simplex[world, home]
+    if not (known(first[0], t.a, t.b) and known(first[1], t.a, t.b) and known(first[2], t.a, t.b)):
+        first = wp.vec3i(-1, -1, -1)
+    s = distance(t.a, t.b, pairs.hull, t.R, t.p, first, cutoff)
+    if s.inside != 0:
+        j = wp.atomic_add(deep_and_odd, 0, 1)
+        deep[j] = k
+        enclosing[j] = wp.vec4i(s.i0, s.i1, s.i2, s.i3)
+        return
+    names = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
+    pairs.simplex[world, home] = names
+    d = wp.length(s.v)
+    if d <= OVERLAP:
+        odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
+        return
+    if d < cutoff:
+        q = nearest_of_b(pairs, t.b, names, wp.vec3(s.l0, s.l1, s.l2))
+        add(pairs, mat, out, k, t, q, s.v, -s.v / d, d)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def overlapping(
+    pairs: Pairs,
+    mat: Materials,
+    deep: wp.array(dtype=int),
+    enclosing: wp.array(dtype=wp.vec4i),
+    stride: int,
+    # out
+    out: Contacts,
+    odd: wp.array(dtype=int),
+    deep_and_odd: wp.array(dtype=int),
+):
+    """The contacts of the pairs in `deep`; those that take too long are added to `odd`."""
+    for j in range(wp.tid(), wp.min(deep_and_odd[0], pairs.room), stride):
+        k = deep[j]
+        t = two(pairs, mat, k)
+        geoms = pairs.geom[k]
+        home = pairs.slot[geoms[0], geoms[1]]
+        f = penetration(t.a, t.b, pairs.hull, t.R, t.p, enclosing[j])
+        if f.found == 0:
+            pairs.simplex[pairs.world[k], home] = wp.vec3i(-1, -1, -1)
+            odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
+            continue
+        names = wp.vec3i(f.i0, f.i1, f.i2)
+        pairs.simplex[pairs.world[k], home] = names
+        q = nearest_of_b(pairs, t.b, names, wp.vec3(f.l0, f.l1, f.l2))
+        add(pairs, mat, out, k, t, q, f.depth * f.normal, f.normal, -f.depth)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def by_mujoco(
+    tolerance: wp.array(dtype=float),
+    gjk_iterations: int,
+    epa_iterations: int,
+    pairs: Pairs,
+    mat: Materials,
+    mesh: Meshes,
+    odd: wp.array(dtype=int),
+    deep_and_odd: wp.array(dtype=int),
+    stride: int,
+    scratch: Scratch,
+    # out
+    out: Contacts,
+    overflow: wp.array(dtype=int),
+):
+    """MuJoCo-Warp's own search for the pairs in `odd`, on geoms inflated by their margins: what its `gjk_phase` goes on with when
+    cores touch, then EPA. One kernel for all types of geoms, where MuJoCo-Warp builds one for each."""
+    for j in range(wp.tid(), wp.min(deep_and_odd[1], pairs.room), stride):
+        k = odd[j]
+        geoms = pairs.geom[k]
+        world = pairs.world[k]
+        pairid = pairs.id[k]
+        margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairid[0], world)
+        geom1, geom2 = geom_collision_pair(
+            pairs.geom_type, pairs.geom_dataid, pairs.geom_size, mesh.vertadr, mesh.vertnum, mesh.graphadr, mesh.vert, mesh.graph, mesh.polynum, mesh.polyadr,
+            mesh.polynormal, mesh.polyvertadr, mesh.polyvertnum, mesh.polyvert, mesh.polymapadr, mesh.polymapnum, mesh.polymap,
+            pairs.geom_xpos, pairs.geom_xmat, geoms, world,
+        )
+        geom1.margin = margin
+        geom2.margin = margin
+        origin = geom1.pos
+        geom1.pos = wp.vec3(0.0)
+        geom2.pos = geom2.pos - origin
+        kind1, kind2 = pairs.geom_type[geoms[0]], pairs.geom_type[geoms[1]]
+        sensed = pairid[1] >= 0
+        cutoff = wp.where(sensed, 1.0e32, gap)
+        tol = tolerance[world % tolerance.shape[0]]
+        exact = kind1 >= BOX and margin == 0.0  # both geoms have corners only
+        r = gjk(tol, gjk_iterations, geom1, geom2, geom1.pos, geom2.pos, kind1, kind2, cutoff, exact)
+        geom1.index = r.index1
+        geom2.index = r.index2
+        dist = r.dist
+        x1 = r.x1
+        x2 = r.x2
+        if not (r.dist > tol or r.dim < 2 or r.separated):
+            if j >= scratch.vert.shape[0]:
+                wp.atomic_or(overflow, world, CCD_OVERFLOW)
+                continue
+            dist, _number, x1, x2, _face = epa_phase(
+                tol, epa_iterations, r, geom1, geom2, kind1, kind2, scratch.vert[j], scratch.vert_index[j], scratch.face[j],
+                scratch.pr[j], scratch.norm2[j], scratch.horizon[j], False, world, overflow,
+            )
+        if dist >= gap and not sensed:
+            continue
+        dist += margin
+        normal = wp.where(dist <= margin, x1 - x2, x2 - x1)
+        write(mat, out, pairs.room, geoms, pairid, world, margin, gap, dist, 0.5 * (x1 + x2) + origin, normal)

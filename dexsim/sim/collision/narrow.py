@@ -1,0 +1,127 @@
+"""The narrow phase's host side: its tables, its launches, and its place in MuJoCo-Warp's step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from mujoco_warp._src import collision_driver
+from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType
+from mujoco_warp._src.warp_util import event_scope
+
+from dexsim.sim.collision import kernels
+from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, hull_corners
+
+VERSION = "4.0.0"
+"""The MuJoCo-Warp whose stages this replaces and calls; with another one the setting is refused (see `unsupported`)."""
+KINDS = {(GeomType(kind), GeomType.MESH) for kind in (SPHERE, CAPSULE, BOX, HULL)}
+"""Types of geom pairs that are ours."""
+_MOST_CORNERS = 1 << 15  # corners are named by 16 bits
+
+
+def unsupported(model: mujoco.MjModel) -> str | None:
+    """Why `sim.collision=hand` cannot serve this model, or None if it can."""
+    if mjw.__version__ != VERSION:
+        return f"it is written for MuJoCo-Warp {VERSION}, and {mjw.__version__} is installed"
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD:
+        return "it makes one contact a pair, and the model asks for several (multiccd)"
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        return "it does not let bodies sleep, and the model asks for that"
+    most = max((len(c) for c in _hulls(model)), default=0)
+    if most > _MOST_CORNERS:
+        return f"a convex hull of the model has {most} corners, and {_MOST_CORNERS} is the most it takes"
+    return None
+
+
+def _hulls(model: mujoco.MjModel) -> list[np.ndarray]:
+    first, count, corners = hull_corners(model)
+    return [corners[f : f + n] for f, n in zip(first, count, strict=True)]
+
+
+class NarrowPhase:
+    """Contacts of the model's hulls, for N worlds of `m`.
+
+    Attributes:
+      simplex: wp.array [N, P] vec3i, corners that were nearest in the last step, of each of the model's P pairs with a
+        hull; -1 = forget. Results depend on it by rounding only.
+      deep_and_odd: wp.array [2] int, how many pairs of the last step overlapped, and were left to MuJoCo-Warp's routine.
+    """
+
+    def __init__(self, model: mujoco.MjModel, m: mjw.Model, d: mjw.Data):
+        self.m, self.d = m, d
+        slot = np.full((model.ngeom, model.ngeom), -1, np.int32)
+        pairs = np.sort(m.nxn_geom_pair_filtered.numpy().reshape(-1, 2), axis=1)
+        by_type = np.take_along_axis(pairs, np.argsort(model.geom_type[pairs], axis=1, kind="stable"), axis=1)
+        ours = by_type[[(GeomType(int(a)), GeomType(int(b))) in KINDS for a, b in model.geom_type[by_type]]]
+        for k, (a, b) in enumerate(ours):
+            slot[a, b] = slot[b, a] = k
+        first, count, corners = hull_corners(model)
+        self.number = len(ours)
+        if not self.number:
+            return
+        self.simplex = wp.full((d.nworld, self.number), wp.vec3i(-1, -1, -1), dtype=wp.vec3i)
+        self.deep_and_odd = wp.zeros(2, dtype=int)
+        self._deep, self._enclosing = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=wp.vec4i)
+        self._odd = wp.zeros(d.naconmax, dtype=int)
+        self._pairs = _filled(kernels.Pairs, m)
+        p = self._pairs
+        p.geom_xpos, p.geom_xmat, p.room, p.number = d.geom_xpos, d.geom_xmat, d.naconmax, d.ncollision
+        p.hull_first, p.hull_count, p.hull = wp.array(first, dtype=int), wp.array(count, dtype=int), wp.array(corners, dtype=wp.vec3)
+        p.slot, p.simplex = wp.array(slot, dtype=int), self.simplex
+        self._mat = _filled(kernels.Materials, m)
+        self._mesh = _filled(kernels.Meshes, m, "mesh_")
+        self._out = _filled(kernels.Contacts, d.contact)
+        self._out.nacon = d.nacon
+        n, faces = 10 + 2 * m.opt.ccd_iterations, 6 + MJ_MAX_EPAFACES * m.opt.ccd_iterations
+        rows = min(d.naccdmax, max(1024, d.naccdmax // 16))
+        self._scratch = kernels.Scratch()
+        self._scratch.vert, self._scratch.vert_index = wp.empty((rows, n), dtype=wp.vec3), wp.empty((rows, n), dtype=int)
+        self._scratch.face = wp.empty((rows, faces), dtype=int)
+        self._scratch.pr, self._scratch.norm2 = wp.empty((rows, faces), dtype=wp.vec3), wp.empty((rows, faces), dtype=float)
+        self._scratch.horizon = wp.empty((rows, MJ_MAX_EPAHORIZON), dtype=int)
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Within this, `mujoco_warp.step` finds the contacts of hulls here."""
+        theirs = collision_driver.convex_narrowphase
+        def convex(m, d, ctx, table):
+            theirs(m, d, ctx, [pair for pair in table if pair not in KINDS])
+            self.launch(ctx)
+
+        collision_driver.convex_narrowphase = convex
+        try:
+            yield
+        finally:
+            collision_driver.convex_narrowphase = theirs
+
+    def launch(self, ctx: collision_driver.CollisionContext) -> None:
+        """Append the contacts of the broad phase's pairs in `ctx` to the contact list."""
+        hull_narrowphase(self, ctx)
+
+
+@event_scope
+def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> None:
+    m, d, pairs = n.m, n.d, n._pairs
+    pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
+    n.deep_and_odd.zero_()
+    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n._odd, n.deep_and_odd],
+              block_dim=128)
+    threads = min(d.naconmax, 1 << 15)
+    wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, threads],
+              outputs=[n._out, n._odd, n.deep_and_odd], block_dim=32)
+    threads = min(d.naconmax, 1 << 13)
+    wp.launch(kernels.by_mujoco, dim=threads, inputs=[m.opt.ccd_tolerance, m.opt.ccd_iterations, m.opt.ccd_iterations, pairs, n._mat,
+              n._mesh, n._odd, n.deep_and_odd, threads, n._scratch], outputs=[n._out, d.overflow], block_dim=32)
+
+
+def _filled(kind: type, source: object, prefix: str = ""):
+    """A kernel's struct, with the arrays of the same names of `source`."""
+    struct = kind()
+    for name in kind.vars:
+        if hasattr(source, prefix + name):
+            setattr(struct, name, getattr(source, prefix + name))
+    return struct
