@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from dexsim.sim.collision.gjk import GAIN, difference
+from dexsim.sim.collision.gjk import GAIN, OVERLAP, difference
 from dexsim.sim.collision.shapes import Core, support
 
 POINTS = 32
-"""Most corners of the growing polytope; what needs more is left to MuJoCo-Warp's own routine."""
+"""Most corners of the growing polytope."""
 FACES = 2 * POINTS - 4
 EDGES = 48
 FAR = wp.constant(1.0e10)
@@ -22,8 +22,9 @@ FAR = wp.constant(1.0e10)
 
 @wp.struct
 class Facet:
-    """The facet of A - B nearest to the origin. found: 1 if it is one. normal: outward, which is from A to B, in B's frame.
-    depth [m]: its distance from the origin. i, l: names of its corners, and weights of the nearest point."""
+    """The facet of A - B nearest to the origin. found: 0 if there is none (the four corners were flat). normal: outward, which
+    is from A to B, in B's frame. depth [m]: its distance from the origin. i, l: names of its corners, and weights of the
+    nearest point."""
 
     found: int
     normal: wp.vec3
@@ -70,7 +71,12 @@ def three(f: int) -> wp.vec3i:
 
 @wp.func
 def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
-    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose it."""
+    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose it,
+    or have it on a face.
+
+    A search that runs out of room answers with the last facet, moved out to where A - B ends in its direction: a way out of the
+    overlap, if not the shortest.
+    """
     pos = wp.zeros(shape=(POINTS,), dtype=wp.vec3)
     name = wp.zeros(shape=(POINTS,), dtype=int)
     face = wp.zeros(shape=(FACES,), dtype=int)  # three points of 8 bits, or -1
@@ -91,10 +97,14 @@ def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
     for j in range(4):
         t = three(face[j])
         at[j] = plane(pos[t[0]], pos[t[1]], pos[t[2]])
-        if at[j][3] < -GAIN:
+        if at[j][3] < -2.0 * OVERLAP:
             return none
     nearest = int(0)
+    reach = float(0.0)
     done = int(0)
+    lost = int(0)
+    n = wp.vec3(0.0, 0.0, 0.0)
+    i = int(0)
     for _look in range(2 * POINTS):
         nearest = int(0)
         for j in range(1, faces):
@@ -103,13 +113,13 @@ def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
         n = wp.vec3(at[nearest][0], at[nearest][1], at[nearest][2])
         i = support(a, vertex, wp.transpose(R) * n) | (support(b, vertex, -n) << 16)
         w = difference(a, b, vertex, R, p, i)
+        reach = wp.dot(n, w)
         for j in range(points):
             if name[j] == i:
                 done = int(1)
-        if done == 1 or wp.dot(n, w) - at[nearest][3] <= GAIN:
+        if reach - at[nearest][3] <= GAIN:
             done = int(1)
-            break
-        if points == POINTS:
+        if done == 1 or points == POINTS:
             break
         name[points] = i
         pos[points] = w
@@ -135,28 +145,35 @@ def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
                         edge[edges] = u | (v << 8)
                         edges += 1
                     else:
-                        return none
+                        lost = int(1)
             else:
                 face[kept] = f
                 at[kept] = g
                 kept += 1
+        if lost == 1 or edges < 3 or kept + edges > FACES:
+            break
         faces = kept
-        if edges < 3 or faces + edges > FACES:
-            return none
         for h in range(edges):
             u = edge[h] & 0xFF
             v = edge[h] >> 8
             face[faces] = u | (v << 8) | (points << 16)
             at[faces] = plane(pos[u], pos[v], w)
-            if at[faces][3] < -GAIN:
-                return none
             faces += 1
         points += 1
     if done == 0:
-        return none
+        # the faces may be half rebuilt; what is known for sure is the last direction, and how far A - B reaches in it
+        out = Facet()
+        out.found = 1
+        out.normal = n
+        out.depth = reach
+        out.i0 = i
+        out.i1 = i
+        out.i2 = i
+        out.l0 = 1.0
+        return out
     # of several triangles of one facet, the one that the origin is below
     depth = at[nearest][3]
-    best = int(-1)
+    best = int(nearest)
     most = float(-FAR)
     for j in range(faces):
         if at[j][3] - depth <= 2.0 * GAIN:
@@ -166,8 +183,6 @@ def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
             if least > most:
                 most = least
                 best = j
-    if best < 0 or most < -0.01:
-        return none
     t = three(face[best])
     out = Facet()
     out.found = 1

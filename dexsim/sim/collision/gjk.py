@@ -171,6 +171,35 @@ def begin(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.
 
 
 @wp.func
+def outermost(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3) -> int:
+    """The corner of A - B furthest from the plane through `beside` across u, on the side where that is further."""
+    up = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
+    down = support(a, vertex, -(wp.transpose(R) * u)) | (support(b, vertex, u) << 16)
+    height = wp.dot(u, difference(a, b, vertex, R, p, up) - beside)
+    depth = wp.dot(u, beside - difference(a, b, vertex, R, p, down))
+    return wp.where(height > depth, up, down)
+
+
+@wp.func
+def enclose(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
+    """A simplex that goes through the origin, with corners added until it has four. One corner alone stays what it is."""
+    s = simplex
+    if s.n == 2:
+        e = s.p1 - s.p0
+        across = wp.cross(e, wp.vec3(1.0, 0.0, 0.0))
+        other = wp.cross(e, wp.vec3(0.0, 1.0, 0.0))
+        if wp.dot(other, other) > wp.dot(across, across):
+            across = other
+        s.i2 = outermost(a, b, vertex, R, p, across, s.p0)
+        s.p2 = difference(a, b, vertex, R, p, s.i2)
+        s.n = 3
+    if s.n == 3:
+        s.i3 = outermost(a, b, vertex, R, p, wp.cross(s.p1 - s.p0, s.p2 - s.p0), s.p0)
+        s.inside = 1
+    return s
+
+
+@wp.func
 def distance(
     a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
 ) -> Simplex:
@@ -183,6 +212,7 @@ def distance(
     for _look in range(LOOKS):
         vv = wp.dot(s.v, s.v)
         if vv <= OVERLAP * OVERLAP:
+            s = enclose(a, b, vertex, R, p, s)
             break
         i = support(a, vertex, -(wp.transpose(R) * s.v)) | (support(b, vertex, s.v) << 16)
         if i == s.i0 or (s.n > 1 and i == s.i1) or (s.n > 2 and i == s.i2):
@@ -199,3 +229,26 @@ def distance(
         if s.inside != 0:
             break
     return s
+
+
+@wp.func
+def touching(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3) -> wp.vec4:
+    """Normal (from A to B, in B's frame) and distance [m] of cores that touch with a corner, or whose enclosing corners are flat.
+
+    There the difference of positions has no direction. So A is moved away by a little, along the line of centres, and the
+    distance found is corrected by what that move must have added to it.
+    """
+    away = wp.vec3(0.0, 0.0, 1.0)
+    if wp.dot(p, p) > 0.0:
+        away = wp.normalize(p)
+    step = float(1.0e-5)
+    for _try in range(3):
+        s = distance(a, b, vertex, R, p + step * away, wp.vec3i(-1, -1, -1), 1.0)
+        d = wp.length(s.v)
+        if s.inside == 0 and d > OVERLAP:
+            n = -s.v / d
+            return wp.vec4(n[0], n[1], n[2], d + step * wp.dot(n, away))
+        step = 10.0 * step
+    n = -away
+    i = support(a, vertex, wp.transpose(R) * n) | (support(b, vertex, -n) << 16)
+    return wp.vec4(n[0], n[1], n[2], -wp.dot(n, difference(a, b, vertex, R, p, i)))

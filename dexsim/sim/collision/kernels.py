@@ -1,27 +1,20 @@
-"""The kernels of the narrow phase: for cores that are apart, for cores that overlap, and for the odd pair MuJoCo-Warp's own.
+"""The two kernels of the narrow phase: for cores that are apart, and for cores that overlap.
 
-All take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed materials,
+Both take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed materials,
 friction, explicit pairs and what a contact is are decided where they always were.
 """
 
 from __future__ import annotations
 
 import warp as wp
-from mujoco_warp._src.collision_core import (
-    contact_margin_gap,
-    contact_material_params,
-    geom_collision_pair,
-    write_contact,
-)
-from mujoco_warp._src.collision_gjk import epa_phase, gjk
+from mujoco_warp._src.collision_core import contact_margin_gap, contact_material_params, write_contact
 from mujoco_warp._src.math import make_frame
-from mujoco_warp._src.types import OverflowType, vec5
+from mujoco_warp._src.types import vec5
 
-from dexsim.sim.collision.epa import penetration
-from dexsim.sim.collision.gjk import OVERLAP, distance
-from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, Core, corner, corners, radius_of
+from dexsim.sim.collision.epa import Facet, penetration
+from dexsim.sim.collision.gjk import OVERLAP, distance, touching
+from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, Core, corner, corners, radius_of, support
 
-CCD_OVERFLOW = wp.constant(int(OverflowType.CCD))
 
 
 @wp.struct
@@ -48,26 +41,6 @@ class Materials:
 
 
 @wp.struct
-class Meshes:
-    """MuJoCo-Warp's mesh fields that its own search of overlapping bodies reads."""
-
-    vertadr: wp.array(dtype=int)
-    vertnum: wp.array(dtype=int)
-    graphadr: wp.array(dtype=int)
-    vert: wp.array(dtype=wp.vec3)
-    graph: wp.array(dtype=int)
-    polynum: wp.array(dtype=int)
-    polyadr: wp.array(dtype=int)
-    polynormal: wp.array(dtype=wp.vec3)
-    polyvertadr: wp.array(dtype=int)
-    polyvertnum: wp.array(dtype=int)
-    polyvert: wp.array(dtype=int)
-    polymapadr: wp.array(dtype=int)
-    polymapnum: wp.array(dtype=int)
-    polymap: wp.array(dtype=int)
-
-
-@wp.struct
 class Contacts:
     """MuJoCo-Warp's contact list, and how many contacts are in it."""
 
@@ -87,18 +60,6 @@ class Contacts:
     geomcollisionid: wp.array(dtype=int)
     adhesion: wp.array(dtype=float)
     nacon: wp.array(dtype=int)
-
-
-@wp.struct
-class Scratch:
-    """MuJoCo-Warp's work space of EPA, one row a pair that overlaps."""
-
-    vert: wp.array2d(dtype=wp.vec3)
-    vert_index: wp.array2d(dtype=int)
-    face: wp.array2d(dtype=int)
-    pr: wp.array2d(dtype=wp.vec3)
-    norm2: wp.array2d(dtype=float)
-    horizon: wp.array2d(dtype=int)
 
 
 @wp.func
@@ -229,20 +190,16 @@ def apart(
     out: Contacts,
     deep: wp.array(dtype=int),
     enclosing: wp.array(dtype=wp.vec4i),
-    odd: wp.array(dtype=int),
-    deep_and_odd: wp.array(dtype=int),
+    deep_number: wp.array(dtype=int),
 ):
     """Each pair of a point, segment, box or hull with a hull: its contact, if cores are apart. Pairs that overlap are listed in
-    `deep`, with four corners that enclose the origin of A - B; those that only touch in `odd`."""
+    `deep`, with four corners that enclose the origin of A - B, or -1 where they only touch."""
     k = wp.tid()
     if k >= wp.min(pairs.number[0], pairs.room):
         return
     geoms = pairs.geom[k]
     kind = pairs.geom_type[geoms[0]]
     if pairs.geom_type[geoms[1]] != HULL or (kind != SPHERE and kind != CAPSULE and kind != BOX and kind != HULL):
-        return
-    if pairs.id[k][1] >= 0:  # a sensor asks for this pair at any distance
-        odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
         return
     t = two(pairs, mat, k)
     if t.b.count == 0 or (kind == HULL and t.a.count == 0):
@@ -254,18 +211,14 @@ def apart(
     if not (known(first[0], t.a, t.b) and known(first[1], t.a, t.b) and known(first[2], t.a, t.b)):
         first = wp.vec3i(-1, -1, -1)
     s = distance(t.a, t.b, pairs.hull, t.R, t.p, first, cutoff)
-    if s.inside != 0:
-        j = wp.atomic_add(deep_and_odd, 0, 1)
-        deep[j] = k
-        enclosing[j] = wp.vec4i(s.i0, s.i1, s.i2, s.i3)
-        return
     names = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
     pairs.simplex[world, home] = names
     d = wp.length(s.v)
-    if d <= OVERLAP:
-        odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
-        return
-    if d < cutoff:
+    if s.inside != 0 or d <= OVERLAP:
+        j = wp.atomic_add(deep_number, 0, 1)
+        deep[j] = k
+        enclosing[j] = wp.where(s.inside != 0, wp.vec4i(s.i0, s.i1, s.i2, s.i3), wp.vec4i(-1, -1, -1, -1))
+    elif d < cutoff:
         q = nearest_of_b(pairs, t.b, names, wp.vec3(s.l0, s.l1, s.l2))
         add(pairs, mat, out, k, t, q, s.v, -s.v / d, d)
 
@@ -276,84 +229,28 @@ def overlapping(
     mat: Materials,
     deep: wp.array(dtype=int),
     enclosing: wp.array(dtype=wp.vec4i),
+    deep_number: wp.array(dtype=int),
     stride: int,
     # out
     out: Contacts,
-    odd: wp.array(dtype=int),
-    deep_and_odd: wp.array(dtype=int),
 ):
-    """The contacts of the pairs in `deep`; those that take too long are added to `odd`."""
-    for j in range(wp.tid(), wp.min(deep_and_odd[0], pairs.room), stride):
+    """The contacts of the pairs in `deep`."""
+    for j in range(wp.tid(), wp.min(deep_number[0], pairs.room), stride):
         k = deep[j]
         t = two(pairs, mat, k)
         geoms = pairs.geom[k]
         home = pairs.slot[geoms[0], geoms[1]]
-        f = penetration(t.a, t.b, pairs.hull, t.R, t.p, enclosing[j])
-        if f.found == 0:
-            pairs.simplex[pairs.world[k], home] = wp.vec3i(-1, -1, -1)
-            odd[wp.atomic_add(deep_and_odd, 1, 1)] = k
-            continue
-        names = wp.vec3i(f.i0, f.i1, f.i2)
-        pairs.simplex[pairs.world[k], home] = names
-        q = nearest_of_b(pairs, t.b, names, wp.vec3(f.l0, f.l1, f.l2))
-        add(pairs, mat, out, k, t, q, f.depth * f.normal, f.normal, -f.depth)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def by_mujoco(
-    tolerance: wp.array(dtype=float),
-    gjk_iterations: int,
-    epa_iterations: int,
-    pairs: Pairs,
-    mat: Materials,
-    mesh: Meshes,
-    odd: wp.array(dtype=int),
-    deep_and_odd: wp.array(dtype=int),
-    stride: int,
-    scratch: Scratch,
-    # out
-    out: Contacts,
-    overflow: wp.array(dtype=int),
-):
-    """MuJoCo-Warp's own search for the pairs in `odd`, on geoms inflated by their margins: what its `gjk_phase` goes on with when
-    cores touch, then EPA. One kernel for all types of geoms, where MuJoCo-Warp builds one for each."""
-    for j in range(wp.tid(), wp.min(deep_and_odd[1], pairs.room), stride):
-        k = odd[j]
-        geoms = pairs.geom[k]
-        world = pairs.world[k]
-        pairid = pairs.id[k]
-        margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairid[0], world)
-        geom1, geom2 = geom_collision_pair(
-            pairs.geom_type, pairs.geom_dataid, pairs.geom_size, mesh.vertadr, mesh.vertnum, mesh.graphadr, mesh.vert, mesh.graph, mesh.polynum, mesh.polyadr,
-            mesh.polynormal, mesh.polyvertadr, mesh.polyvertnum, mesh.polyvert, mesh.polymapadr, mesh.polymapnum, mesh.polymap,
-            pairs.geom_xpos, pairs.geom_xmat, geoms, world,
-        )
-        geom1.margin = margin
-        geom2.margin = margin
-        origin = geom1.pos
-        geom1.pos = wp.vec3(0.0)
-        geom2.pos = geom2.pos - origin
-        kind1, kind2 = pairs.geom_type[geoms[0]], pairs.geom_type[geoms[1]]
-        sensed = pairid[1] >= 0
-        cutoff = wp.where(sensed, 1.0e32, gap)
-        tol = tolerance[world % tolerance.shape[0]]
-        exact = kind1 >= BOX and margin == 0.0  # both geoms have corners only
-        r = gjk(tol, gjk_iterations, geom1, geom2, geom1.pos, geom2.pos, kind1, kind2, cutoff, exact)
-        geom1.index = r.index1
-        geom2.index = r.index2
-        dist = r.dist
-        x1 = r.x1
-        x2 = r.x2
-        if not (r.dist > tol or r.dim < 2 or r.separated):
-            if j >= scratch.vert.shape[0]:
-                wp.atomic_or(overflow, world, CCD_OVERFLOW)
-                continue
-            dist, _number, x1, x2, _face = epa_phase(
-                tol, epa_iterations, r, geom1, geom2, kind1, kind2, scratch.vert[j], scratch.vert_index[j], scratch.face[j],
-                scratch.pr[j], scratch.norm2[j], scratch.horizon[j], False, world, overflow,
-            )
-        if dist >= gap and not sensed:
-            continue
-        dist += margin
-        normal = wp.where(dist <= margin, x1 - x2, x2 - x1)
-        write(mat, out, pairs.room, geoms, pairid, world, margin, gap, dist, 0.5 * (x1 + x2) + origin, normal)
+        corners4 = enclosing[j]
+        f = Facet()
+        if corners4[0] >= 0:
+            f = penetration(t.a, t.b, pairs.hull, t.R, t.p, corners4)
+        if f.found != 0:
+            names = wp.vec3i(f.i0, f.i1, f.i2)
+            pairs.simplex[pairs.world[k], home] = names
+            q = nearest_of_b(pairs, t.b, names, wp.vec3(f.l0, f.l1, f.l2))
+            add(pairs, mat, out, k, t, q, f.depth * f.normal, f.normal, -f.depth)
+        else:
+            h = touching(t.a, t.b, pairs.hull, t.R, t.p)
+            normal = wp.vec3(h[0], h[1], h[2])
+            q = corner(t.b, pairs.hull, support(t.b, pairs.hull, -normal))
+            add(pairs, mat, out, k, t, q, -h[3] * normal, normal, h[3])

@@ -10,7 +10,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_driver
-from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType
+from mujoco_warp._src.types import GeomType
 from mujoco_warp._src.warp_util import event_scope
 
 from dexsim.sim.collision import kernels
@@ -20,6 +20,7 @@ VERSION = "4.0.0"
 """The MuJoCo-Warp whose stages this replaces and calls; with another one the setting is refused (see `unsupported`)."""
 KINDS = {(GeomType(kind), GeomType.MESH) for kind in (SPHERE, CAPSULE, BOX, HULL)}
 """Types of geom pairs that are ours."""
+_DISTANCE_SENSORS = (mujoco.mjtSensor.mjSENS_GEOMDIST, mujoco.mjtSensor.mjSENS_GEOMNORMAL, mujoco.mjtSensor.mjSENS_GEOMFROMTO)
 _MOST_CORNERS = 1 << 15  # corners are named by 16 bits
 
 
@@ -31,6 +32,8 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         return "it makes one contact a pair, and the model asks for several (multiccd)"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         return "it does not let bodies sleep, and the model asks for that"
+    if any(model.sensor_type[k] in _DISTANCE_SENSORS for k in range(model.nsensor)):
+        return "it answers no sensor of distances between geoms, and the model has one"
     most = max((len(c) for c in _hulls(model)), default=0)
     if most > _MOST_CORNERS:
         return f"a convex hull of the model has {most} corners, and {_MOST_CORNERS} is the most it takes"
@@ -48,7 +51,7 @@ class NarrowPhase:
     Attributes:
       simplex: wp.array [N, P] vec3i, corners that were nearest in the last step, of each of the model's P pairs with a
         hull; -1 = forget. Results depend on it by rounding only.
-      deep_and_odd: wp.array [2] int, how many pairs of the last step overlapped, and were left to MuJoCo-Warp's routine.
+      deep_number: wp.array [1] int, pairs of the last step whose cores overlapped.
     """
 
     def __init__(self, model: mujoco.MjModel, m: mjw.Model, d: mjw.Data):
@@ -64,25 +67,16 @@ class NarrowPhase:
         if not self.number:
             return
         self.simplex = wp.full((d.nworld, self.number), wp.vec3i(-1, -1, -1), dtype=wp.vec3i)
-        self.deep_and_odd = wp.zeros(2, dtype=int)
+        self.deep_number = wp.zeros(1, dtype=int)
         self._deep, self._enclosing = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=wp.vec4i)
-        self._odd = wp.zeros(d.naconmax, dtype=int)
         self._pairs = _filled(kernels.Pairs, m)
         p = self._pairs
         p.geom_xpos, p.geom_xmat, p.room, p.number = d.geom_xpos, d.geom_xmat, d.naconmax, d.ncollision
         p.hull_first, p.hull_count, p.hull = wp.array(first, dtype=int), wp.array(count, dtype=int), wp.array(corners, dtype=wp.vec3)
         p.slot, p.simplex = wp.array(slot, dtype=int), self.simplex
         self._mat = _filled(kernels.Materials, m)
-        self._mesh = _filled(kernels.Meshes, m, "mesh_")
         self._out = _filled(kernels.Contacts, d.contact)
         self._out.nacon = d.nacon
-        n, faces = 10 + 2 * m.opt.ccd_iterations, 6 + MJ_MAX_EPAFACES * m.opt.ccd_iterations
-        rows = min(d.naccdmax, max(1024, d.naccdmax // 16))
-        self._scratch = kernels.Scratch()
-        self._scratch.vert, self._scratch.vert_index = wp.empty((rows, n), dtype=wp.vec3), wp.empty((rows, n), dtype=int)
-        self._scratch.face = wp.empty((rows, faces), dtype=int)
-        self._scratch.pr, self._scratch.norm2 = wp.empty((rows, faces), dtype=wp.vec3), wp.empty((rows, faces), dtype=float)
-        self._scratch.horizon = wp.empty((rows, MJ_MAX_EPAHORIZON), dtype=int)
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
@@ -107,15 +101,11 @@ class NarrowPhase:
 def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> None:
     m, d, pairs = n.m, n.d, n._pairs
     pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
-    n.deep_and_odd.zero_()
-    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n._odd, n.deep_and_odd],
-              block_dim=128)
+    n.deep_number.zero_()
+    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number], block_dim=128)
     threads = min(d.naconmax, 1 << 15)
-    wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, threads],
-              outputs=[n._out, n._odd, n.deep_and_odd], block_dim=32)
-    threads = min(d.naconmax, 1 << 13)
-    wp.launch(kernels.by_mujoco, dim=threads, inputs=[m.opt.ccd_tolerance, m.opt.ccd_iterations, m.opt.ccd_iterations, pairs, n._mat,
-              n._mesh, n._odd, n.deep_and_odd, threads, n._scratch], outputs=[n._out, d.overflow], block_dim=32)
+    wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads], outputs=[n._out],
+              block_dim=32)
 
 
 def _filled(kind: type, source: object, prefix: str = ""):
