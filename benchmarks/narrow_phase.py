@@ -238,3 +238,98 @@ def _rivals(model: mujoco.MjModel, k: int, poses: Poses, u: np.ndarray) -> np.nd
         height = d[own] @ corners[first[m] :][: count[m]].T.astype(float)
         out[own] = np.where((height > height.max(1, keepdims=True) - 1e-5).sum(1) > 1, 2, 1)
     return out
+
+
+def confirmed(model: mujoco.MjModel, poses: Poses, normal: np.ndarray) -> np.ndarray:
+    """Depth [m] along a direction from A to B, in float64: how far A must move against it to be free of B. The true depth is the
+    least over all directions, so that this never is too small."""
+    kinds = ["hull" if t == mujoco.mjtGeom.mjGEOM_MESH else next(k for k, g in GEOM.items() if int(g) == t) for t in model.geom_type]
+    reach = sum(_reach(model, kinds[k], poses.mesh[:, k], poses.size[:, k], poses.rot[:, k], s * normal) for k, s in ((0, 1.0), (1, -1.0)))
+    return reach - ((poses.pos[:, 1] - poses.pos[:, 0]) * normal).sum(1)
+
+
+def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """(what is compared with, where C MuJoCo itself was wrong [n]).
+
+    EPA of C MuJoCo ends at a facet that is not the nearest in one of some thousand overlapping poses. Any direction's depth
+    can be confirmed in float64, so there the least of all the answers' confirmed depths counts.
+    """
+    dist, normal, pos = (x.copy() for x in answers[0])
+    least = -dist
+    for _, n, _ in answers[1:]:
+        depth = np.where(np.linalg.norm(n, axis=1) > 0.5, confirmed(model, poses, n), np.inf)
+        least = np.minimum(least, np.where(dist < 0, depth, np.inf))
+    wrong = (dist < 0) & (-dist - least > 1e-7)
+    dist[wrong] = -least[wrong]
+    return (dist, normal, pos), wrong
+
+
+def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> dict:
+    """Errors and times of one pair of types under both settings, over n random poses, `worlds` at a time."""
+    model, a, b = scene(kind)
+    rng = np.random.default_rng(seed)
+    both = {s: Worlds(model, worlds, device, s) for s in SETTINGS}
+    errors: dict[str, list] = {s: [] for s in SETTINGS}
+    times: dict[str, list[float]] = {s: [] for s in SETTINGS}
+    wrong = 0
+    for _ in range(-(-n // worlds)):
+        poses = draw(model, kind, a, b, worlds, rng)
+        answers = [reference(model, poses)]
+        for setting, w in both.items():
+            w.put(poses)
+            w.collide()  # compiled
+            w.forget()
+            tools.wait(device)
+            begin = time.perf_counter()
+            w.collide()
+            tools.wait(device)
+            times[setting].append(1e6 * (time.perf_counter() - begin) / worlds)
+            answers.append(w.found())
+        want, mistaken = truth(model, poses, answers)
+        wrong += int(mistaken.sum())
+        for setting, got in zip(SETTINGS, answers[1:], strict=True):
+            r = compare(model, poses, want, got)
+            r["angle"][mistaken] = r["pos"][mistaken] = np.nan
+            errors[setting].append(r)
+    out: dict = {"poses": worlds * len(errors["hand"]), "reference_wrong": wrong}
+    for setting, parts in errors.items():
+        r = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+        out[setting] = {"contacts": int(np.isfinite(r["dist"]).sum()), "missed": int(r["missed"].sum()), "extra": int(r["extra"].sum()),
+                        "dist_m": spread(r["dist"]), "normal_rad": spread(r["angle"]), "point_m": spread(r["pos"]),
+                        "us_a_pair": round(float(np.median(times[setting])), 4)}  # fmt: skip
+    return out
+
+
+def spread(x: np.ndarray) -> dict[str, float]:
+    """Median, 99th and 99.99th percentile, and worst, of the finite magnitudes; how many there are."""
+    x = np.abs(x[np.isfinite(x)])
+    if not len(x):
+        return {"number": 0}
+    return {"number": len(x)} | {k: float(f"{np.percentile(x, q):.3g}") for k, q in (("median", 50), ("p99", 99), ("p99_99", 99.99), ("worst", 100))}
+
+
+def main(argv: list[str]) -> dict:
+    own, rest = tools.split(argv, {"poses": "100000", "out": "", "kinds": ",".join(KINDS)})
+    cfg = tools.config(rest)
+    n = tools.numbers(own["poses"], "poses")[0]
+    kinds = own["kinds"].split(",")
+    if set(kinds) - set(KINDS):
+        raise UserError(f"kinds={own['kinds']}: must be of {', '.join(KINDS)}")
+    out: dict = {"benchmark": "narrow_phase", **tools.about(cfg["device"])}
+    for kind in kinds:
+        r = out[kind] = kind_of_pair(kind, n, cfg["device"], min(n, cfg["worlds"]))
+        print(f"{kind} against hull: {r['poses']} poses, in {r['reference_wrong']} of them C MuJoCo's depth is not the least")
+        for setting in SETTINGS:
+            s = r[setting]
+            print(f"  {setting:8s}{s['contacts']} contacts, {s['missed']} missed, {s['extra']} too many, {s['us_a_pair']:.3f} us a pair")
+            for name in ("dist_m", "normal_rad", "point_m"):
+                print(f"    {name:12s}" + "  ".join(f"{k} {v:g}" for k, v in s[name].items()))
+        sys.stdout.flush()
+    if own["out"]:
+        Path(own["out"]).write_text(json.dumps(out, indent=1) + "\n")
+    print(json.dumps(out), flush=True)
+    return out
+
+
+if __name__ == "__main__":
+    tools.command(main, __doc__)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from typing import Any
 
 import torch
 
@@ -23,19 +24,10 @@ from benchmarks.tape import Tape
 from dexsim.tasks import make_env
 
 
-def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"steps": "", "rounds": "3"})
-    cfg = tools.config(rest)
-    device, worlds = cfg["device"], cfg["worlds"]
-    steps = tools.numbers(own["steps"] or ("40" if device.startswith("cuda") else "20"), "steps")[0]
-    rounds = tools.numbers(own["rounds"], "rounds")[0]
-    begin = time.perf_counter()
-    env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
+def measure(env: Any, steps: int, rounds: int) -> dict[str, list[float]]:
+    """Seconds a control step, of each round, by name (see above), from the state the worlds are in."""
+    device, worlds = env.device, env.num_envs
     action = torch.zeros(worlds, env.num_actions, device=device)
-    env.step(action)
-    env.step(action)
-    ready = time.perf_counter() - begin
-    tools.close_hand(env)
     e, k = env.engine, env.decimation
     grasp, tape = tools.Snapshot(env), Tape(e, env.servo, (steps + 2) * k)
 
@@ -61,7 +53,25 @@ def main(argv: list[str]) -> dict:
         for name, call in calls.items():
             back()
             times[name].append(tools.seconds(device, call, steps))
-    bare, driven, touched, full = (1e3 * statistics.median(times[name]) for name in calls)
+    return times
+
+
+def main(argv: list[str]) -> dict:
+    own, rest = tools.split(argv, {"steps": "", "rounds": "3"})
+    cfg = tools.config(rest)
+    device, worlds = cfg["device"], cfg["worlds"]
+    steps = tools.numbers(own["steps"] or ("40" if device.startswith("cuda") else "20"), "steps")[0]
+    rounds = tools.numbers(own["rounds"], "rounds")[0]
+    begin = time.perf_counter()
+    env = make_env(cfg, worlds, device, 0, cfg["sim"]["engine"])
+    action = torch.zeros(worlds, env.num_actions, device=device)
+    env.step(action)
+    env.step(action)
+    ready = time.perf_counter() - begin
+    tools.close_hand(env)
+    times = measure(env, steps, rounds)
+    bare, driven, touched, full = (1e3 * statistics.median(t) for t in times.values())
+    e, k = env.engine, env.decimation
     peaks = e.peaks()
     return tools.report({
         "benchmark": "step", **tools.about(device), "engine": e.kind, "worlds": worlds, "physics_steps": k, "ready_s": ready,

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
@@ -37,6 +36,20 @@ def _spread(values: Any) -> list[float]:
     return [round(float(v.mean()), 2), float(np.percentile(v, 99)), float(v.max())]
 
 
+def stages(e: Any, steps: int) -> dict[str, float]:
+    """Microseconds of each stage of a physics step, its path as name: medians of `steps` replays of a recorded one."""
+    found: dict[str, list[float]] = {}
+    with wp.ScopedDevice(e.device), EventTracer() as tracer:
+        with wp.ScopedCapture() as capture:
+            e.physics_step()
+        for _ in range(steps):
+            wp.capture_launch(capture.graph)
+            wp.synchronize_device()
+            for name, us in _flat(tracer.trace()).items():
+                found.setdefault(name, []).append(us)
+    return {name: round(float(np.median(us)), 1) for name, us in found.items()}
+
+
 def main(argv: list[str]) -> dict:
     own, rest = tools.split(argv, {"steps": "30", "setting": "chosen"})
     cfg = tools.config(rest)
@@ -50,16 +63,7 @@ def main(argv: list[str]) -> dict:
         env = make_env({**cfg, "sim": {**cfg["sim"], **chosen.sim}}, cfg["worlds"], device, 0, "warp")
     tools.close_hand(env)
     e = env.engine
-    stages: dict[str, list[float]] = {}
-    with wp.ScopedDevice(device), EventTracer() as tracer:
-        with wp.ScopedCapture() as capture:
-            mjw.step(e.m, e.d)
-        for _ in range(tools.numbers(own["steps"], "steps")[0]):
-            wp.capture_launch(capture.graph)
-            wp.synchronize_device()
-            for name, us in _flat(tracer.trace()).items():
-                stages.setdefault(name, []).append(us)
-    median = {name: round(float(np.median(us)), 1) for name, us in stages.items()}
+    median = stages(e, tools.numbers(own["steps"], "steps")[0])
     torch.cuda.synchronize()
     d = e.d
     nacon = int(d.nacon.numpy()[0])

@@ -16,6 +16,7 @@ from dexsim.errors import UserError
 from dexsim.sim import contact
 from dexsim.sim.collision import NarrowPhase, unsupported
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
+from dexsim.sim.warmup import compile_together
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 _STREAMS: dict[int, wp.Stream] = {}
@@ -102,6 +103,7 @@ class WarpEngine(Engine):
         self._fields_t = {k: wp.to_torch(v) for k, v in self._fields.items()}
         self._graphs: dict = {}
         self._eager_done: set = set()
+        compile_together(self._one_step, device)
         self.refresh()
 
     def field(self, name: str) -> torch.Tensor:
@@ -127,6 +129,11 @@ class WarpEngine(Engine):
         """One bare physics step, launched and not recorded."""
         with self.narrow.in_place() if self.narrow is not None else nullcontext():
             mjw.step(self.m, self.d)
+
+    def _one_step(self) -> None:
+        self.physics_step()
+        mjw.kinematics(self.m, self.d)
+        self._outputs()
 
     def refresh(self) -> None:
         self._run(("refresh",), lambda: mjw.kinematics(self.m, self.d))

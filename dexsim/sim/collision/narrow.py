@@ -56,6 +56,7 @@ class NarrowPhase:
 
     def __init__(self, model: mujoco.MjModel, m: mjw.Model, d: mjw.Data):
         self.m, self.d = m, d
+        self.block_dim = 128  # threads a block of the kernel for bodies that are apart
         slot = np.full((model.ngeom, model.ngeom), -1, np.int32)
         pairs = np.sort(m.nxn_geom_pair_filtered.numpy().reshape(-1, 2), axis=1)
         by_type = np.take_along_axis(pairs, np.argsort(model.geom_type[pairs], axis=1, kind="stable"), axis=1)
@@ -102,7 +103,7 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
     m, d, pairs = n.m, n.d, n._pairs
     pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
     n.deep_number.zero_()
-    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number], block_dim=128)
+    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number], block_dim=n.block_dim)
     threads = min(d.naconmax, 1 << 15)
     wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads], outputs=[n._out],
               block_dim=32)

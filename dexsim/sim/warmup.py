@@ -1,0 +1,63 @@
+"""Compile many kernels at once: a first start takes as long as the longest of them, not as their sum.
+
+Warp compiles a kernel when it is first launched, one after another. Here a program's launches are first only listed, then all
+their modules are compiled on as many threads as there are cores, then the program may run.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import warp as wp
+from warp._src import context
+
+
+def compile_together(program: Callable[[], None], device: str) -> int:
+    """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what it
+    reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
+    device = wp.get_device(device)
+    if not device.is_cuda:
+        return 0
+    with wp.ScopedDevice(device):
+        modules = listed(program)
+        with ThreadPoolExecutor(max_workers=max(1, min(len(modules), os.cpu_count() or 1))) as pool:
+            for done in [pool.submit(module.load, device, block_dim=block_dim) for module, block_dim in modules]:
+                done.result()
+    return len(modules)
+
+
+def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
+    """(module, threads a block) of each kernel that `program` launches, in order, none twice."""
+    found: dict[tuple[int, int], tuple[Any, int]] = {}
+    with _instead_of_launching(lambda module, block_dim: found.setdefault((id(module), block_dim), (module, block_dim))):
+        program()
+    return list(found.values())
+
+
+@contextmanager
+def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
+    def launch(kernel, dim, inputs=(), outputs=(), *args, block_dim: int | None = None, **kwargs) -> None:
+        # an empty launch compiles nothing; which types a generic kernel has, only a launch finds out
+        if math.prod(dim if isinstance(dim, (tuple, list)) else (dim,)) and not kernel.is_generic:
+            keep(kernel.module, int(block_dim or 256))
+
+    def once(condition, while_body=None, **kwargs) -> None:
+        while_body(**kwargs)
+
+    def suggested(kernel, device=None) -> tuple[int, int]:
+        return 256, 132  # the real one compiles the kernel to know; it decides about sizes only
+
+    kept = [(owner, name, getattr(owner, name)) for owner, name in (
+        (wp, "launch"), (context, "launch"), (wp, "capture_while"), (wp, "get_suggested_block_size"))]
+    wp.launch = context.launch = launch
+    wp.capture_while, wp.get_suggested_block_size = once, suggested
+    try:
+        yield
+    finally:
+        for owner, name, what in kept:
+            setattr(owner, name, what)
