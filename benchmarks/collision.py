@@ -36,6 +36,7 @@ from benchmarks.physics import edited
 from benchmarks.tape import Tape
 from dexsim.cli import start as start_up
 from dexsim.learning.ppo import load_policy
+from dexsim.paths import CONFIGS
 from dexsim.sim import warp_engine
 from dexsim.tasks import make_env
 
@@ -219,7 +220,7 @@ class Run:
         worlds = min(self.episodes, 2048)
         argv = [f"checkpoint={tools.ROOT / 'checkpoints' / task}.pt", f"device={self.device}", f"episodes={self.episodes}", f"worlds={worlds}",
                 "sim.engine=warp", *(["task.evaluation.cap_s=30"] if task == "rotate" else [])]
-        begun = start_up.for_play(argv, tools.ROOT / "configs")
+        begun = start_up.for_play(argv, CONFIGS)
         cfg = {**begun.cfg, "sim": {**begun.cfg["sim"], "collision": setting}}
         env = make_env(cfg, cfg["worlds"], self.device, cfg["seed"], "warp")
         policy = load_policy(begun.data, env, str(begun.source), begun.typed)
