@@ -22,7 +22,7 @@ class Backlash(Effect):
     words = "has free play between motor and joint"
     shows = "when the load changes sign"
     experiment = "small steps about a pose without load, both encoders logged if there are two"
-    classes = ("friction or play",)
+    classes = ("friction or play", "about a reversal")
     motions = ("triangles", "chirp")
     parts_motor = True
     demo = {"backlash": 0.06}

@@ -14,6 +14,10 @@ from dexsim.gap.effects.coulomb_friction import CoulombFriction
 from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.effects.deadband import Deadband
 from dexsim.gap.effects.effect import Effect, Variant
+from dexsim.gap.effects.braking_limit import BrakingLimit
+from dexsim.gap.effects.controller_term import ControllerTerm
+from dexsim.gap.effects.presliding import Presliding
+from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.effects.gain_mismatch import GainMismatch
 from dexsim.gap.effects.inertia import Inertia
 from dexsim.gap.effects.joint_coupling import JointCoupling
@@ -59,6 +63,10 @@ CATALOGUE: tuple[Effect, ...] = (
     GainMismatch(),
     Deadband(),
     CurrentSensor(),
+    BrakingLimit(),
+    ControllerTerm(),
+    Presliding(),
+    ExternalForce(),
 )
 """Effects of a joint and its drive."""
 EFFECTS: dict[str, Effect] = {e.id: e for e in CATALOGUE}

@@ -13,6 +13,10 @@ CLASSES: dict[str, str] = {
     "drive weakens": "this joint alone, then with the others loaded, cold and warm in random order",
     "zero or gravity": "static poses over the whole range, and the same with the mechanism turned over: "
     "what gravity does changes sign, an encoder's zero stays",
+    "limits at speed": "large steps at full speed, and stops from it: one limit acts while driving, the other while braking",
+    "loop": "constant speeds from slow to fast, steps of several sizes and long holds against a known load",
+    "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint to a side",
+    "weight or push": "static poses over the whole range, twice, with nothing in reach",
 }
 TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
 """Of touch: the first one's own experiment tells its members apart."""

@@ -23,7 +23,7 @@ class Payload(Effect):
     words = "carries another mass (or another direction of gravity) than the model"
     shows = "with the pose, also at rest"
     experiment = "static poses over the whole range, and the same turned over"
-    classes = ("static load", "zero or gravity")
+    classes = ("static load", "zero or gravity", "weight or push")
     motions = ("holds",)
     kinds = 2
     from_poses = True

@@ -21,7 +21,7 @@ class TorqueSpeedLimit(Effect):
     words = "runs out of torque at a lower speed than believed"
     shows = "at high speed and torque"
     experiment = "large steps at full speed"
-    classes = ("with speed", "drive weakens")
+    classes = ("with speed", "drive weakens", "limits at speed")
     motions = ("ladder", "steps")
 
     def variants(self, s: Scales) -> list[Variant]:

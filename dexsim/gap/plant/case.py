@@ -10,6 +10,7 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
+from dexsim.actuator.table import ALL
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants, along
@@ -34,6 +35,7 @@ class Case:
     sigma_torque: float
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)  # servo columns believed in a range
     unknown: tuple[str, ...] = ()
+    stated: frozenset[str] = frozenset()  # servo columns of which the believed table says anything
     regimes: dict[str, np.ndarray] = field(default_factory=dict)  # what residuals are set against, by measurement row
     moved: bool = True
     loop_rate: float | None = None
@@ -210,7 +212,8 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     moved = scales.span > 6 * sigma
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
     regimes |= regimes_extra
-    return Case(joint, j, plant, constants, scales, sigma, quantum, effort_noise, ranges, tuple(unknown), regimes, moved,
+    stated = frozenset(n for k in (joint, ALL) for n in table.entries.get(k, {}))
+    return Case(joint, j, plant, constants, scales, sigma, quantum, effort_noise, ranges, tuple(unknown), stated, regimes, moved,
                 table.loop_rate)
 
 

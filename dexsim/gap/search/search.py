@@ -9,6 +9,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import CATALOGUE, compatible, confusable
 from dexsim.gap.effects.effect import Effect, Variant
+from dexsim.gap.effects.presliding import give
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX
@@ -42,7 +43,6 @@ MAYBE = {"braking_slope": 1.0, "limit_speed": 0.0}  # beliefs about a drive near
 PIN = 1e-6  # of room for what is held at a value
 LATE = 0.75  # periods of its loop by which any drive may act on its commands late
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
-GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: how far dry friction gives way before it slides, at most
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class JointSearch:
         self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
         self.all_nuisances = self._nuisances()
         self.nuisances = self.all_nuisances
-        believed = [p for p in self.all_nuisances if p.key not in case.unknown and not (p.mode == "factor" and p.span > 0.3)]
+        believed = [p for p in self.all_nuisances if p.key not in case.unknown and p.key not in MAYBE and not (p.mode == "factor" and p.span > 0.3)]
         self.wide = {c for p in self.all_nuisances if p not in believed for c in p.columns}
 
     def _on(self, share: float) -> None:
@@ -187,10 +187,10 @@ class JointSearch:
         # what it acts on was sampled up to a period ago, and acts until the next sample: half a period on average
         out.append(Param("feedback_delay", ("feedback_delay",), "set", 0.0, 1.5 / rate, 0.5 / rate, "s", nuisance=True, sd=0.5 / rate))
         # what holds a joint gives a little before it slides
-        give = GIVE_SLIDE if s.slide else GIVE
-        out.append(Param("presliding", ("presliding",), "set", 0.0, give, 0.1 * give, nuisance=True))
+        small = give(s)
+        out.append(Param("presliding", ("presliding",), "set", 0.0, small, 0.1 * small, nuisance=True))
         if not s.voltage and s.nominal["no_load_speed"] < 1e8:
-            if "braking_slope" not in taken:
+            if "braking_slope" not in taken and "braking_slope" not in c.stated:
                 out.append(Param("braking_slope", ("braking_slope",), "set", -1.0, 1.0, s.nominal["braking_slope"], nuisance=True))
             if s.nominal["kd"] > 0:  # a limit of the motor, or of a firmware that goes by its own reading
                 out.append(Param("limit_speed", ("limit_speed",), "set", 0.0, 1.0, 0.5, nuisance=True))
