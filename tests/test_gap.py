@@ -242,7 +242,8 @@ def test_rms_interval_covers():
 def test_catalogue_is_that_of_the_specification():
     joint = {"coulomb_friction", "stribeck_friction", "viscous_friction", "load_friction", "backlash", "compliance", "command_delay", "lag",
              "torque_limit", "torque_speed_limit", "supply_sag", "torque_ripple", "thermal", "joint_coupling", "position_offset", "position_scale",
-             "payload", "inertia", "gain_mismatch", "deadband", "current_sensor"}  # fmt: skip
+             "payload", "inertia", "gain_mismatch", "deadband", "current_sensor", "braking_limit", "controller_term", "presliding",
+             "external_force"}  # fmt: skip
     assert joint == set(EFFECTS)
     assert confusable("backlash", "stribeck_friction") and not confusable("backlash", "inertia")
     runs = [plant_run("s", 0, 3.0, {})]

@@ -16,6 +16,7 @@ from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TO
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import NAMES, SERIES
 from dexsim.gap.read.runs import conditions
+from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
 
 ROOM = Path(dexsim.gap.__file__).parent
@@ -75,7 +76,42 @@ def steps(kind: int, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndar
 FAST = {"torque_limit": 0.3, "no_load_speed": 14.0, "braking_slope": 1.0}
 
 
-def test_a_drive_that_brakes_with_all_its_torque_is_told_from_what_was_stated(monkeypatch):
+BRAKING = ({"braking_slope": 0.0}, FAST, {"braking_limit", "torque_limit", "torque_speed_limit"})
+LEADING = ({"speed_feedforward": 0.04}, None, {"controller_term"})
+CREEPING = ({"integral_gain": 3.0}, None, {"controller_term", "payload"})
+GIVING = ({"presliding": 0.02, "coulomb_friction": 0.06}, {"coulomb_friction": 0.06}, {"presliding", "backlash", "stribeck_friction"})
+
+
+@pytest.mark.parametrize(("planted", "effect", "key", "value", "jumps"), [
+    (LEADING, "controller_term", "gain", 0.04, False),
+    pytest.param(BRAKING, "braking_limit", "slope", 0.0, True, marks=pytest.mark.slow),
+    pytest.param(CREEPING, "controller_term", "gain", 3.0, False, marks=pytest.mark.slow),
+    pytest.param(GIVING, "presliding", "distance", 0.02, False, marks=pytest.mark.slow)],
+    ids=["feed-forward", "braking", "integral", "presliding"])  # fmt: skip
+def test_a_law_that_is_not_believed_is_named_and_sized(monkeypatch, planted, effect, key, value, jumps):
+    monkeypatch.setattr(test_gap, "motion", steps if jumps else test_gap.motion)
+    best = found(*planted).best
+    assert best.ids == (effect,) and best.fit.value(f"{effect}.{key}") == pytest.approx(value, rel=0.1, abs=0.05 if jumps else 0)
+
+
+def test_what_is_not_stated_of_braking_is_no_effect(monkeypatch):
+    """Nothing is believed of how an unknown drive brakes: it is refitted, and no name is given to it."""
     monkeypatch.setattr(test_gap, "motion", steps)
-    best = found({"braking_slope": 0.0}, FAST, {"braking_limit", "torque_limit"}).best
-    assert best.ids == ("braking_limit",) and best.fit.value("braking_limit.slope") == pytest.approx(0.0, abs=0.1)
+    unsaid = {k: v for k, v in FAST.items() if k != "braking_slope"}
+    outcome = found({"braking_slope": 0.0}, unsaid, {"braking_limit"})
+    assert outcome.best.ids == () and outcome.best.fit.value("braking_slope") == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_an_interval_holds_the_size_by_another_law():
+    """Breakaway friction that falls with the speed itself and not with its square: the law is tried too, and the interval holds the truth."""
+    off = {"*kp": 1.02, "*inertia_scale": 0.98, "stribeck_peak": 0.06, "stribeck_speed": 0.25, "stribeck_exponent": 1.0}
+    runs = [plant_run(f"run{k}", k, 5.0, off, seed=k) for k in (0, 1, 3)]
+    for r in runs:
+        r.smooth()
+    search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"stribeck_friction"})
+    best = search.run().best
+    assert best.ids == ("stribeck_friction",) and len(search.by_law["stribeck_friction"]) == 2
+    low, high = search.widen(best, intervals(best.fit, search.blocks, knee=search.r.knee))[0]
+    assert low < 0.06 < high < 0.1
+    assert best.members[0].variant.label == "exponential in speed"

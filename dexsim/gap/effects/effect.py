@@ -7,7 +7,7 @@ To add an effect: a file here with a class of its own, its line in `catalogue.CA
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -33,6 +33,13 @@ class Variant:
     note: dict = field(default_factory=dict)
     refines: bool = False  # adds parameters to the first variant: tried only where that one was found
     dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
+    laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)
+
+    def by_law(self) -> list[Variant]:
+        """The variant by its other laws, each with its constants in the place of those of the same columns."""
+        label = lambda name: f"{self.label}, {name}" if self.label else name  # noqa: E731
+        kept = lambda by: tuple(f for f in self.fixed if f[0] not in {name for name, _ in by})  # noqa: E731
+        return [replace(self, label=label(name), fixed=(*kept(by), *by), laws=()) for name, by in self.laws]
 
 
 @dataclass(frozen=True)

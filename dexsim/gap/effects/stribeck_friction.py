@@ -1,4 +1,4 @@
-"""Breakaway friction above the sliding level: (peak) exp(-(v / v_s)^2) sign(v)."""
+"""Breakaway friction above the sliding level: peak exp(-|v / v_s|^n) sign(v), n 2 or 1."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class StribeckFriction(Effect):
-    """Breakaway friction above the sliding level: (peak) exp(-(v / v_s)^2) sign(v)."""
+    """Breakaway friction above the sliding level: peak exp(-|v / v_s|^n) sign(v), n 2 or 1."""
 
     id = "stribeck_friction"
     words = "needs a breakaway torque above its sliding friction"
@@ -27,12 +27,8 @@ class StribeckFriction(Effect):
     def variants(self, s: Scales) -> list[Variant]:
         peak = param("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
         v_s = param("v_s", "stribeck_speed", "set", 0.003 * s.speed, 0.35 * s.speed, 0.1 * s.speed, "rad/s")
-        return [
-            Variant(
-                (peak, v_s),
-                tuple((a * s.tau, b * s.speed) for a in (0.03, 0.08, 0.2, 0.45) for b in (0.02, 0.08, 0.25)),
-            )
-        ]
+        starts = tuple((a * s.tau, b * s.speed) for a in (0.03, 0.08, 0.2, 0.45) for b in (0.02, 0.08, 0.25))
+        return [Variant((peak, v_s), starts, laws=(("exponential in speed", (("stribeck_exponent", 1.0),)),))]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         m, s = case.regimes, case.scales

@@ -12,6 +12,8 @@ from dexsim.gap.plant.scales import Scales
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
 
+SAWTOOTH = (("rising sawtooth", (("ripple_shape", 1.0),)), ("falling sawtooth", (("ripple_shape", -1.0),)))
+
 
 class TorqueRipple(Effect):
     """Cogging and gear eccentricity: a torque that repeats with the position."""
@@ -43,7 +45,7 @@ class TorqueRipple(Effect):
                 )
                 a = 0.1 * s.tau
                 starts = tuple((a, float(turns), ph) for ph in (0.0, np.pi / 2, np.pi, -np.pi / 2))
-                out.append(Variant(params, starts, f"{turns} a turn"))
+                out.append(Variant(params, starts, f"{turns} a turn", laws=SAWTOOTH))
         return out
 
     def unseen(self, s: Scales) -> str:

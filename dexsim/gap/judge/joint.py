@@ -59,7 +59,8 @@ class JointAnswer:
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
         self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
-        self.bounds = stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0)
+        told, laws = stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0), search.law_spread(self.best)
+        self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}

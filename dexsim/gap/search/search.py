@@ -35,6 +35,7 @@ HINT = 0.03  # of the squared error with what the beliefs give for it: an effect
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
 AGAIN = 3  # hypotheses from which the fit without any effect is begun again before one is claimed
 TIE = 0.02  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
+ALIKE = 0.06  # of the loss on what was left out: laws of one effect that come within as much may each be the true one
 CLEAR = 0.11  # of the squared error: what an effect must remove where the error is within the noise without it
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
@@ -131,6 +132,7 @@ class JointSearch:
             self.fold_of = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
             self.fold_by = "time"
         self.blocks = self._blocks(self.fitter, self.long)
+        self.by_law: dict[str, list[Trial]] = {}  # by effect: the hypothesis by every law that the effect may have
         self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
         self.all_nuisances = self._nuisances()
         self.nuisances = self.all_nuisances
@@ -584,7 +586,7 @@ class JointSearch:
             current, level = best, trials
             if len(current.members) > 1:
                 current, level = self._swap(current, pool, level)
-        current = self._refine(self._drop(current))
+        current = self._lawful(self._refine(self._drop(current)))
         self._on(0.1)
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):  # one that only seemed worse before it was fitted in full takes the place
@@ -741,6 +743,33 @@ class JointSearch:
                     current = more
                     break
         return current
+
+    def _lawful(self, current: Trial) -> Trial:
+        """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the others kept beside
+        it, so that intervals hold what the law is not known to be."""
+        for i, member in enumerate(current.members):
+            tries = [current]
+            for variant in member.variant.by_law():
+                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+                tries.append(self.fit(members, self._values(current), current, quick=True))
+            current = min(tries, key=self._score)
+            self.by_law[member.id] = tries
+        return current
+
+    def law_spread(self, trial: Trial) -> np.ndarray:
+        """[P, 2] lowest and highest value of each parameter over the laws that do about as well (`ALIKE` of the loss on what was left out)."""
+        x = trial.fit.x
+        out = np.stack([x, x], 1)
+        at = {p.key: i for i, p in enumerate(trial.fit.params)}
+        for tries in self.by_law.values():
+            least = min(float(self._left(t).sum()) for t in tries)
+            for t in tries:
+                if t.ids != trial.ids or float(self._left(t).sum()) > (1 + ALIKE) * least:
+                    continue
+                for p, value in zip(t.fit.params, t.fit.x, strict=True):
+                    if not p.nuisance and p.key in at:
+                        out[at[p.key]] = min(out[at[p.key], 0], value), max(out[at[p.key], 1], value)
+        return out
 
     def _overtaken(self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]) -> Trial | None:
         """The hypothesis in which a rival stands in the place of the member that it beats in most bootstraps; None where each holds its own."""
@@ -910,8 +939,8 @@ class JointSearch:
             square[i] += ((1.645 * answer * off) ** 2).sum(1)
         itself = np.array([0.03 if p.key.endswith(("kp_factor", "kd_factor")) else DOUBT for p in f.params])
         square += (1.645 * itself * np.abs(x)) ** 2
-        half = np.sqrt(square)
-        return np.stack([np.maximum(x - half, low), np.minimum(x + half, high)], 1)
+        half, laws = np.sqrt(square), self.law_spread(trial)
+        return np.stack([np.maximum(laws[:, 0] - half, low), np.minimum(laws[:, 1] + half, high)], 1)
 
 
 class _Fixed:
