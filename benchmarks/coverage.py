@@ -30,6 +30,7 @@ from dexsim.assets import xhand
 from dexsim.cli import machine, start
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tactile.layout import xhand_layout
 
 CONTACT = 0.1  # N
@@ -85,7 +86,7 @@ def played(argv: list[str], worlds: int, seconds: float, seed: int) -> list[Cont
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_env
 
-    begun = start.for_play([*argv, f"episodes={worlds}", f"worlds={worlds}", f"seed={seed}"], tools.ROOT / "configs")
+    begun = start.for_play([*argv, f"episodes={worlds}", f"worlds={worlds}", f"seed={seed}"], CONFIGS)
     cfg = begun.cfg
     machine.set_threads(cfg["device"])
     quiet_warp(cfg["device"])

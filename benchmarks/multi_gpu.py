@@ -27,6 +27,7 @@ import numpy as np
 
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[1]
 DEFAULTS = {"gpus": "1,2,4,8", "learn_s": "120", "until": "0.97", "seconds": "600", "fixed": "false", "parallel": "false", "out": "out/multi_gpu"}
@@ -158,7 +159,7 @@ def main(argv: list[str]) -> int:
 
     own = DEFAULTS | {a.partition("=")[0]: a.partition("=")[2] for a in argv if a.partition("=")[0] in DEFAULTS}
     rest = [a for a in argv if a.partition("=")[0] not in DEFAULTS]
-    cfg = start_up.for_train(rest, ROOT / "configs").cfg
+    cfg = start_up.for_train(rest, CONFIGS).cfg
     if not any(a.startswith("task=") for a in rest):
         rest = ["task=grasp", *rest]
     try:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from benchmarks import tools
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 
 def main(argv: list[str]) -> dict:
@@ -55,9 +55,8 @@ def environment(worlds: int, device: str, tactile: str) -> tuple:
     from dexsim.tasks import make_env
 
     quiet_warp(device)
-    configs = Path(__file__).resolve().parents[1] / "configs"
     kind = "cuda" if device.startswith("cuda") else "cpu"
-    cfg = start.for_train(["task=grasp", "preset=none", f"worlds={worlds}", f"device={kind}", f"tactile={tactile}"], configs).cfg
+    cfg = start.for_train(["task=grasp", "preset=none", f"worlds={worlds}", f"device={kind}", f"tactile={tactile}"], CONFIGS).cfg
     env = make_env(cfg, worlds, device, 0)
     env.reset_all()
     return env, cfg

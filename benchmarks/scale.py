@@ -23,6 +23,7 @@ import numpy as np
 
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 COUNTS = {"cuda": (1, 16, 256, 1024, 4096, 8192, 16384, 32768, 65536, 131072), "cpu": (1, 4, 16, 64, 256)}
 OWN = ("counts", "seconds", "limit", "modes", "out", "mode", "prior")
@@ -230,7 +231,7 @@ def main(argv: list[str]) -> int:
 
     own = {a.partition("=")[0]: a.partition("=")[2] for a in argv if a.partition("=")[0] in OWN}
     rest = [a for a in argv if a.partition("=")[0] not in OWN]
-    cfg = start_up.for_train(rest, Path(__file__).parents[1] / "configs").cfg
+    cfg = start_up.for_train(rest, CONFIGS).cfg
     if "mode" in own:
         print(json.dumps(measure(cfg, own["mode"])))
         return 0

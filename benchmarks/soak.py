@@ -32,6 +32,7 @@ from dexsim.cli import train as training
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.learning.runner import Runner
+from dexsim.paths import CONFIGS
 
 COLUMNS = ("iteration", "wall_s", "cpu_s", "update_cpu_s", "rss_mib", "heap_mib", "files", "threads", "touching")
 BLOCKS = 30
@@ -123,7 +124,7 @@ def main(argv: list[str]) -> int:
     defaults = ["task=grasp", "device=cpu", "worlds=32", "sim.threads=1", "save_interval=100"]
     run = out / "run"
     shutil.rmtree(run, ignore_errors=True)
-    start = start_up.for_train([*defaults, *rest, "iterations=1000000000", f"out={run}"], Path(__file__).parents[1] / "configs")
+    start = start_up.for_train([*defaults, *rest, "iterations=1000000000", f"out={run}"], CONFIGS)
     cfg = start.cfg
     where = folder.for_run(cfg)
     env = build.build_env(cfg, None, {"run": where})

@@ -18,6 +18,7 @@ from dexsim.cli import machine
 from dexsim.cli import start as start_up
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.sim.scene import OBJECT_FIELDS
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +59,7 @@ def numbers(text: str, name: str) -> list[int]:
 
 def config(argv: Sequence[str]) -> dict[str, Any]:
     """The resolved settings of `dexsim train ARGV`; torch's threads set as there."""
-    cfg = start_up.for_train(list(argv), ROOT / "configs").cfg
+    cfg = start_up.for_train(list(argv), CONFIGS).cfg
     machine.set_threads(cfg["device"])
     return cfg
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.touch [device=cuda:0] [worlds=1024,4096,8192,16384] [alternatives=true] [variants=false]
 
-The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, configs/tactile/default.yaml; launches
+The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, dexsim/configs/tactile/default.yaml; launches
 are captured in a graph and replayed, as in training; median microseconds. Rows: shape; `solver` (the contact force spread
 over the taxels, the default) or `spring` (the sum of springs); `raw` if every taxel's force is written; `grid 32` and the
 like: the rock baked with so many samples along its longest axis. `others=false`: fingers do not feel each other.
@@ -28,6 +28,7 @@ from benchmarks.touch_cost import Cost, cost_of
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tactile import ShapeSet, Tactile, xhand_layout
 from dexsim.tactile.posed import PosedEngine
 from dexsim.tactile.shapes import TouchShape, bake_convex
@@ -170,7 +171,7 @@ def main(argv: list[str]) -> dict:
         raise UserError("benchmarks.touch: variants=true needs a CUDA device; the CPU has one kernel")
     worlds = args["worlds"] or ("16,128" if cpu else "4096,16384" if variants else "1024,4096,8192,16384")
     worlds = tools.numbers(worlds, "worlds")
-    folder = tools.ROOT / "configs" / "tactile"
+    folder = CONFIGS / "tactile"
     default = yaml.safe_load((folder / "default.yaml").read_text())
     full = {**default, **yaml.safe_load((folder / "full.yaml").read_text())}
     del full["defaults"]

@@ -22,6 +22,7 @@ from benchmarks.tape import Tape
 from benchmarks.touch_alternatives import alternatives
 from benchmarks.touch_cost import cost_of
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[1]
 
@@ -94,7 +95,7 @@ def test_an_edited_scene_is_edited_only_inside():
 
 @pytest.fixture(scope="module")
 def touch_scene():
-    default = yaml.safe_load((ROOT / "configs" / "tactile" / "default.yaml").read_text())
+    default = yaml.safe_load((CONFIGS / "tactile" / "default.yaml").read_text())
     poses = touch_benchmark.grasp_poses(np.random.default_rng(0))
     return default, poses, touch_benchmark.shape_set("cpu")
 

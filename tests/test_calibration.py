@@ -15,13 +15,13 @@ from dexsim.calibration import command, current, line, presses, rubber, simulate
 from dexsim.calibration.file import Calibration, save
 from dexsim.calibration.line import Levels
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.recording.realistic import CURRENT_PER_TORQUE, realistic
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
 from dexsim.recording.writer import write
 from dexsim.tactile.reference import mooney_rivlin_force
 
 torch.set_num_threads(1)
-CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 # -- lines ----------------------------------------------------------------------------------------------------------------------

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from dexsim.assets.objects import library
 from dexsim.cli import start
+from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env
 
 
 @pytest.fixture(scope="module")
 def env():
     torch.set_num_threads(1)
-    cfg = start.for_train(["task=grasp", "worlds=12", "device=cpu", "task.objects.train=[box,sphere,rock]"], Path("configs").resolve()).cfg
+    cfg = start.for_train(["task=grasp", "worlds=12", "device=cpu", "task.objects.train=[box,sphere,rock]"], CONFIGS).cfg
     return make_env(cfg, 12, "cpu", 0, "mujoco")
 
 

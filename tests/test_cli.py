@@ -21,6 +21,7 @@ from dexsim.cli import checks, console, folder, machine, settings
 from dexsim.console import tables
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
+from dexsim.paths import CONFIGS
 
 torch.set_num_threads(1)
 QUICK = ("task=dummy", "device=cpu", "worlds=4", "iterations=2", "final_episodes=0",
@@ -373,7 +374,7 @@ def test_device_choice(monkeypatch):
 
 def test_limits_name_existing_settings():
     """A limit on a setting that was renamed would check nothing."""
-    cfg = settings.resolve(settings.from_files(shell.ROOT / "configs", {"task": "grasp"}))
+    cfg = settings.resolve(settings.from_files(CONFIGS, {"task": "grasp"}))
     missing = [k for k in checks.LIMITS if k not in ("episodes", "view_port") and checks.get(cfg, k) is None
                and k.rpartition(".")[2] not in (checks.get(cfg, k.rpartition(".")[0]) if "." in k else cfg)]
     assert not missing
@@ -383,7 +384,7 @@ def test_limits_name_existing_settings():
 def test_every_setting_has_a_line_in_the_help(name):
     from dexsim.cli.help import settings as lines
 
-    path = shell.ROOT / "configs" / f"{name}.yaml"
+    path = CONFIGS / f"{name}.yaml"
     content = yaml.safe_load(path.read_text())
     content.pop("defaults", None)
     names = [f"{k}.{i}" for k, v in content.items() if isinstance(v, dict) for i in v]

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks import coverage
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tactile.layout import xhand_layout
 
 
@@ -80,7 +81,7 @@ def test_trainings_side_may_play_on_a_gpu(tmp_path, monkeypatch):
     assert coverage.main(["checkpoint=checkpoints/rotate.pt", "device=cuda", "reality=bench", f"out={tmp_path}"]) == 0
     ours, theirs = asked
     assert [a for a in ours if a.startswith("device=")] == ["device=cuda"]
-    begun = coverage.start.for_play([*theirs, "worlds=2"], coverage.tools.ROOT / "configs")
+    begun = coverage.start.for_play([*theirs, "worlds=2"], CONFIGS)
     assert begun.cfg["device"] == "cpu" and begun.cfg["reality"]["name"] == "bench"
 
 
@@ -94,7 +95,7 @@ def test_against_the_other_world_and_a_recording(tmp_path):
     found = json.loads((tmp_path / "coverage.json").read_text())["fingers"]
     assert set(found) == {"thumb", "index", "mid", "ring", "pinky"} and (tmp_path / "coverage.png").stat().st_size > 1000
     begun = start.for_play(["checkpoint=checkpoints/rotate.pt", "episodes=1", "video=false", f"record={tmp_path}/a.mcap", "device=cpu",
-                            "task.evaluation.cap_s=2", "tactile=raw", f"out={tmp_path}/play"], coverage.tools.ROOT / "configs")
+                            "task.evaluation.cap_s=2", "tactile=raw", f"out={tmp_path}/play"], CONFIGS)
     assert play.run(begun) == 0
     touch = coverage.recorded(str(tmp_path / "a.mcap"), {})
     assert sum(len(c.force) for c in touch) > 5 and set(np.concatenate([c.block for c in touch])) <= {0, 1, 2}

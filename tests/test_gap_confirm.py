@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -20,6 +19,7 @@ from dexsim.gap.judge.full_model import Hypothesis, World, free_runs
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.search.search import JointSearch, Member
+from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.recording.mechanism import drive, mechanism, replay
 from dexsim.recording.schema import COMMANDS, Series
@@ -156,5 +156,5 @@ def test_what_the_engine_follows_in_the_main_is_said_so():
 
 
 def test_the_tasks_step_is_that_of_the_configuration():
-    configured = yaml.safe_load((Path(__file__).parents[1] / "configs" / "config.yaml").read_text())
+    configured = yaml.safe_load((CONFIGS / "config.yaml").read_text())
     assert full_model.TASKS == configured["sim"]["timestep"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -21,6 +19,7 @@ from dexsim.gap.touch import press_rig
 from dexsim.gap.touch.handed_on import HEAD, chord, handed
 from dexsim.gap.touch.handed_on import save as write
 from dexsim.gap.touch.settings import PadFacts
+from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.tactile.file import load
 
@@ -91,8 +90,7 @@ def test_a_checkpoint_carries_it_and_play_takes_it(late, tmp_path):
     moved.write_text(path.read_text())
     trained = make_checkpoint(tmp_path / "trained.pt", f"tactile_file={moved}", "+tactile.pads.index.taxels={17: [0.4, 0.5]}")
     moved.unlink()
-    configs = (Path(__file__).parents[1] / "configs").resolve()
-    play = start.for_play([f"checkpoint={trained}", "device=cpu", "episodes=2"], configs)
+    play = start.for_play([f"checkpoint={trained}", "device=cpu", "episodes=2"], CONFIGS)
     assert play.cfg["tactile_file"] == str(moved) and play.cfg["tactile"]["pads"]["index"]["taxels"] == {"17": [0.4, 0.5]}
     from dexsim.tasks import make_env
 
@@ -101,9 +99,9 @@ def test_a_checkpoint_carries_it_and_play_takes_it(late, tmp_path):
     gain = env.touch.gain[:, INDEX, 17]
     assert float(gain.min()) >= 0.4 and float(gain.max()) <= 0.5
     plain = make_checkpoint(tmp_path / "plain.pt")
-    play = start.for_play([f"checkpoint={plain}", f"tactile_file={path}", "device=cpu", "episodes=2"], configs)
+    play = start.for_play([f"checkpoint={plain}", f"tactile_file={path}", "device=cpu", "episodes=2"], CONFIGS)
     assert play.cfg["tactile"]["pads"] == load(path)["tactile"]["pads"]
-    bench = start.for_play([f"checkpoint={trained}", "reality=bench", "episodes=2"], configs)
+    bench = start.for_play([f"checkpoint={trained}", "reality=bench", "episodes=2"], CONFIGS)
     assert "pads" not in bench.cfg["tactile"]  # another world has fingertips of its own
 
 
@@ -313,8 +311,7 @@ def test_a_file_that_is_not_there():
 
 
 def test_help_names_it():
-    configs = Path(__file__).parents[1] / "configs"
-    assert "tactile_file=null" in help_page.text("train", configs)
+    assert "tactile_file=null" in help_page.text("train", CONFIGS)
     from dexsim.gap.command import HELP
 
     assert "tactile.yaml" in HELP and xhand.FINGERS[INDEX] == "index"

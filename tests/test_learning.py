@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from shell import ROOT
 
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -24,13 +23,14 @@ from dexsim.learning.gym_env import GymVectorEnv
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import load_policy, plain_policy
 from dexsim.learning.runner import Runner
+from dexsim.paths import CONFIGS
 
 torch.set_num_threads(1)  # tiny networks: more threads only wait for each other
 SMALL = {"hidden_dims": [16, 16]}
 
 
 def config(**task):
-    agent = OmegaConf.to_container(OmegaConf.load(ROOT / "configs" / "agent" / "ppo.yaml"))
+    agent = OmegaConf.to_container(OmegaConf.load(CONFIGS / "agent" / "ppo.yaml"))
     agent["actor"] |= SMALL
     agent["critic"] |= SMALL
     return {"task": {"steps": 20} | task, "agent": agent, "seed": 3, "save_interval": 10, "choices": {"task": "dummy"}}

@@ -18,6 +18,7 @@ from browser import CHROMIUM, Page
 
 from dexsim.cli import start as start_up
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tactile.layout import xhand_layout
 from dexsim.view import live_panels as panels
 from dexsim.view.live_meshes import body_meshes
@@ -114,7 +115,7 @@ def env():
     torch.set_num_threads(1)
     from dexsim.tasks import make_env
 
-    start = start_up.for_play(["policy=zero", "task=grasp", "device=cpu", "view=true", "worlds=2", "seed=3", "sim.threads=1"], shell.ROOT / "configs")
+    start = start_up.for_play(["policy=zero", "task=grasp", "device=cpu", "view=true", "worlds=2", "seed=3", "sim.threads=1"], CONFIGS)
     assert start.cfg["tactile"]["raw"] is True
     return make_env(start.cfg, 2, "cpu", 3, "auto")
 

@@ -13,6 +13,7 @@ import yaml
 
 from benchmarks.loop import __main__ as loop
 from benchmarks.loop import worlds
+from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[1]
 
@@ -153,9 +154,9 @@ def test_training_draws_near_what_was_found(tmp_path):
 
 
 def test_realities_are_as_drawn_and_hide_what_the_catalogue_has():
-    nominal = yaml.safe_load((ROOT / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    nominal = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     for name in worlds.SEEDS:
-        kept = yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
+        kept = yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
         drawn = worlds.draw(name)
         assert kept["servo"]["joints"] == drawn["servo"]["joints"]
         for joint, p in kept["servo"]["joints"].items():
@@ -226,7 +227,7 @@ def test_presses_are_the_realitys_sensor(tmp_path):
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    world = yaml.safe_load((ROOT / "configs" / "reality" / "late.yaml").read_text(encoding="utf-8"))
+    world = yaml.safe_load((CONFIGS / "reality" / "late.yaml").read_text(encoding="utf-8"))
     model, sensor, rng = presses.rig("ring").compile(), presses.Sensor(world, "ring"), np.random.default_rng(0)
     presses._one(model, sensor, presses.path([(0.0, 0.0), (0.0, 5.5e-3)], lambda u, v: presses._onset(model, u, v), rng), 0, rng, tmp_path / "p.mcap")
     r = read(tmp_path / "p.mcap", audit=False)
@@ -247,7 +248,7 @@ def test_fast_moves_reach_a_speed_limit_and_stay_clear_of_the_ends():
     believed = mechanism()
     t, value, home = dashes(believed)
     assert t[-1] < 25.0 and np.allclose(value[[0, -1]], home)
-    world = yaml.safe_load((ROOT / "configs" / "reality" / "late.yaml").read_text(encoding="utf-8"))
+    world = yaml.safe_load((CONFIGS / "reality" / "late.yaml").read_text(encoding="utf-8"))
     run = drive(mechanism(servo=world["servo"], gravity=believed.spec.option.gravity), Series(t, value), believed.joints, float(t[-1]), home, 0.002)
     limit = np.array([world["servo"]["joints"][j]["no_load_speed"] for j in believed.joints])
     assert ((np.abs(run.velocity) > 0.9 * limit).sum(0) * 0.002 > 0.3).sum() >= 10

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers import scene, sysid
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def test_the_written_scene_is_the_environments(folder):
     from dexsim.cli import start as start_up
     from dexsim.tasks import make_env
 
-    cfg = start_up.for_train([*scene.SETTINGS, "device=cpu", "worlds=1"], peers.ROOT / "configs").cfg
+    cfg = start_up.for_train([*scene.SETTINGS, "device=cpu", "worlds=1"], CONFIGS).cfg
     env = make_env(cfg, 1, "cpu", 0, "mujoco")
     model, own = mujoco.MjModel.from_xml_string((folder / "scene.xml").read_text()), env.engine.mjm
     for name in ("timestep", "impratio", "integrator", "cone", "iterations", "ls_iterations"):

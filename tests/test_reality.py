@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,9 +11,8 @@ import yaml
 from dexsim.assets import xhand
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env, reality
-
-CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 def world(*overrides: str) -> dict:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.cli import recorded as replay_cli
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.recording import Series, read, write
 from dexsim.recording import mechanism as mech
 from dexsim.recording.audit import audit, table
@@ -22,7 +22,6 @@ from dexsim.recording.realistic import Hardware, realistic, sample_times
 from dexsim.sim.pendulum import pendulum_spec
 
 torch.set_num_threads(1)
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SERVO = {
     "joints": {
         "*": {

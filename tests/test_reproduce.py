@@ -21,8 +21,9 @@ from benchmarks.reproduce.schedule import Schedule
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
+from dexsim.paths import CONFIGS
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+ROOT = Path(__file__).parents[1]
 
 
 def plan(out: Path, task: str = "rotate", **changed) -> jobs.Plan:
@@ -487,7 +488,7 @@ def test_a_row_end_to_end(tmp_path):
     """Train, judge in both worlds, write the table, on the CPU with a tiny budget."""
     argv = [sys.executable, "-m", "benchmarks.reproduce", "table=rotation", "rows=full,fixed", "seeds=1", "budget=1e-7", "episodes=4", "cap=2",
             f"out={tmp_path}", "worlds=4", "device=cpu", "agent.num_steps_per_env=8", "agent.algorithm.num_mini_batches=2"]  # fmt: skip
-    done = subprocess.run(argv, capture_output=True, text=True, cwd=CONFIGS.parent, timeout=900)
+    done = subprocess.run(argv, capture_output=True, text=True, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["missing"] == 0
     table, ours = (json.loads((tmp_path / name).read_text())["rows"] for name in ("rotation.json", "rotation_own.json"))
@@ -496,7 +497,7 @@ def test_a_row_end_to_end(tmp_path):
     elsewhere = tmp_path / "elsewhere"
     pack.main([f"unpack={tmp_path / 'state'}", f"out={elsewhere}"])
     again = [a for a in argv if not a.startswith(("budget=", "out=", "rows="))] + ["budget=3e-7", "rows=full", f"out={elsewhere}"]
-    done = subprocess.run(again, capture_output=True, text=True, cwd=CONFIGS.parent, timeout=900)
+    done = subprocess.run(again, capture_output=True, text=True, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads((elsewhere / "rotation.json").read_text())["rows"]["full"]["simulation"]["steps"] == [64]
     assert set(table) == {"full"} and set(ours) == {"fixed"} and set(table["full"]) == set(ours["fixed"]) == {"simulation", "reality"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ import torch
 from dexsim import rotation
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env
 from dexsim.tasks.make_grasps import DRIFT
 from dexsim.tasks.rotate import ACTOR_SIZE, CRITIC_SIZE
@@ -19,7 +19,6 @@ from dexsim.tasks.rotate_eval import summary
 from dexsim.tasks.stable_grasps import DEFAULT, GraspSet
 
 torch.set_num_threads(1)
-CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 def config(*overrides: str) -> dict:

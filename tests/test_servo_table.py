@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,9 @@ from dexsim.actuator import COLUMNS, ServoTable, describe
 from dexsim.actuator.columns import INDEX, NAMES
 from dexsim.assets.xhand import JOINTS
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
-CONFIGS = Path(__file__).parents[1] / "configs" / "servo"
+SERVOS = CONFIGS / "servo"
 
 EXAMPLE = """
 drive: torque
@@ -81,9 +81,9 @@ def test_round_trip(example, tmp_path):
     assert [p.name for p in tmp_path.iterdir() if p.suffix == ".part"] == []
 
 
-@pytest.mark.parametrize("name", sorted(p.stem for p in CONFIGS.glob("*.yaml")))
+@pytest.mark.parametrize("name", sorted(p.stem for p in SERVOS.glob("*.yaml")))
 def test_shipped_servos(name):
-    table = ServoTable.load(CONFIGS / f"{name}.yaml")
+    table = ServoTable.load(SERVOS / f"{name}.yaml")
     table.check_joints(JOINTS)
     nominal = table.nominal(JOINTS)
     strong = [j for j in JOINTS if j not in ("thumb_rota_joint2", "index_bend_joint") and not (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -16,6 +15,7 @@ from tactile_fixtures import SPRING, flat_layout, primitives, random_rotation, t
 from dexsim.assets import xhand
 from dexsim.assets.objects import Grid, library
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 from dexsim.tactile import ShapeSet, TaxelLayout, load_layout, xhand_layout
 from dexsim.tactile import reference as ref
 from dexsim.tactile.lanes import lane_ballot, lane_from, lanes_min, lanes_sum, lanes_sum4, lowest_bit
@@ -483,7 +483,7 @@ def test_spring_sum_agrees_with_the_contact_law_in_the_median():
     from dexsim.tactile.config import tactile_config
     from dexsim.tactile.fit_stiffness import CONTACT_STIFFNESS, press_library
 
-    path = Path(__file__).parents[1] / "configs" / "tactile" / "default.yaml"
+    path = CONFIGS / "tactile" / "default.yaml"
     cfg = tactile_config(yaml.safe_load(path.read_text()))
     for pad in (0, 1):
         pressed = press_library(hand().lifted(tips()), pad, tips()[pad], 20, seed=3)
@@ -588,7 +588,7 @@ def test_shipped_settings_are_valid_for_the_hand(name):
 
     from dexsim.tactile.config import stiffness_of, tactile_config
 
-    folder = Path(__file__).parents[1] / "configs" / "tactile"
+    folder = CONFIGS / "tactile"
     with initialize_config_dir(str(folder), version_base="1.3"):
         cfg = tactile_config(compose(name))
     assert all(k > 0.0 for k in stiffness_of(cfg, hand().kinds))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 import yaml
 
 from dexsim.cli.main import COMMANDS, dispatch, first_screen
+from dexsim.console import program
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,6 +42,30 @@ def test_what_is_no_command(capsys):
     with pytest.raises(UserError, match="unknown command 'trian': did you mean train"):
         dispatch(["trian"])
     assert dispatch([]) == 2 and capsys.readouterr().out == first_screen()
+
+
+@pytest.mark.parametrize("job", program.DOORS)
+def test_the_scripts_at_the_top_are_doors(job, capsys, monkeypatch):
+    """They name themselves in help pages, as `dexsim` names itself."""
+    monkeypatch.setattr(sys, "argv", [f"{job}.py", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / f"{job}.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert ended.value.code == 0 and said.startswith(f"usage: python {job}.py ")
+    assert f"dexsim {job}" not in said.replace(f"-m dexsim {job}", "")
+
+
+def test_hints_name_what_was_typed(monkeypatch):
+    text = "dexsim train, python play.py, torchrun -m dexsim train, dexsim audit"
+    for called, said in (
+        ("/home/a/.venv/bin/dexsim", "dexsim train, dexsim play, torchrun -m dexsim train, dexsim audit"),
+        ("train.py", "python train.py, python play.py, torchrun -m dexsim train, dexsim audit"),
+        ("/x/dexsim/__main__.py", "python -m dexsim train, python -m dexsim play, torchrun -m dexsim train, dexsim audit"),
+    ):
+        monkeypatch.setattr(sys, "argv", [called])
+        assert program.words(text) == said
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    assert program.torchrun("train", 2) == "torchrun --nproc_per_node=2 train.py"
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import torch
 
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
+from dexsim.paths import CONFIGS
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, hand_object_scene
 from dexsim.tasks.objects import Objects
@@ -23,11 +24,10 @@ def grasp_cfg(*settings: str, worlds: int = 8) -> dict:
 
 def task_cfg(*settings: str, worlds: int = 8, task: str = "grasp") -> dict:
     """The same of any task."""
-    from pathlib import Path
 
     from dexsim.cli import start
 
-    return start.for_train([f"task={task}", "preset=none", f"worlds={worlds}", "device=cpu", *settings], Path(__file__).parents[1] / "configs").cfg
+    return start.for_train([f"task={task}", "preset=none", f"worlds={worlds}", "device=cpu", *settings], CONFIGS).cfg
 
 
 def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int = 0):

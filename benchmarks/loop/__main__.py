@@ -39,6 +39,7 @@ from benchmarks.loop import presses
 from benchmarks.loop.steps import FAST, KEPT
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
@@ -222,7 +223,7 @@ class Loop:
 
     def _ranges(self, task: str, values: dict) -> dict:
         """Those that the task's randomization has."""
-        own = yaml.safe_load((ROOT / "configs" / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(encoding="utf-8"))["servo"]
+        own = yaml.safe_load((CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(encoding="utf-8"))["servo"]
         return {k: v for k, v in values.items() if k in own}
 
     def tune(self, task: str, seed: int, variant: str, world: str):
@@ -240,7 +241,7 @@ class Loop:
                 if presses.feels_others(self.out / f"touch_{world}" / "pinch.mcap"):
                     argv.append("tactile.feel_others=true")
             else:
-                true = yaml.safe_load((ROOT / "configs" / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
+                true = yaml.safe_load((CONFIGS / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
                 (base / world).mkdir(parents=True, exist_ok=True)
                 (base / world / "true.yaml").write_text(yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8")
                 argv.append(f"servo_file={base / world / 'true.yaml'}")
@@ -256,7 +257,7 @@ class Loop:
         `diagnose` let reach the belief, being unsure, is cut like the others."""
         from dexsim.actuator.table import ServoTable
 
-        belief, table = ServoTable.load(ROOT / "configs" / "servo" / "xhand.yaml"), ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml")
+        belief, table = ServoTable.load(CONFIGS / "servo" / "xhand.yaml"), ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml")
         for joint, columns in table.entries.items():
             for name, v in columns.items():
                 if not v.unknown and v.low < v.high:

@@ -24,6 +24,8 @@ import mujoco
 import numpy as np
 import yaml
 
+from dexsim.paths import CONFIGS
+
 ROOT = Path(__file__).parents[2]
 SETS = 3  # recordings of a fingertip; diagnose keeps the last out of the fit
 RATE, INNER = 90.0, 4  # readings a second; times the sensor itself runs between two
@@ -70,7 +72,7 @@ def record(given: dict[str, str]) -> None:
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
+    world = yaml.safe_load((CONFIGS / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
     finger, out = given["finger"], Path(given["out"])
     out.mkdir(parents=True, exist_ok=True)
     s = rig(finger)
@@ -104,7 +106,7 @@ class Sensor:
         self.pad, self.stiffness, self.lsb = xhand.FINGERS.index(finger), world["tasks"]["grasp"]["randomize"]["contact.stiffness"], world["tactile"]["lsb"]
         pads = [f"tip_{x}" for x in xhand.FINGERS]
         self.engine = PosedEngine(1, [*xhand.TIP_BODIES, "indenter"], pads)
-        settings = yaml.safe_load((ROOT / "configs" / "tactile" / "default.yaml").read_text(encoding="utf-8")) | world["tactile"]
+        settings = yaml.safe_load((CONFIGS / "tactile" / "default.yaml").read_text(encoding="utf-8")) | world["tactile"]
         if not pinched:  # nothing but the ball comes near, and the work is spared
             settings |= {"feel_others": False, "others": False}
         settings |= {"raw": True, "period": 0.5 / (RATE * INNER)}
@@ -219,7 +221,7 @@ def pinch(given: dict[str, str]) -> None:
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    world = yaml.safe_load((ROOT / "configs" / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
+    world = yaml.safe_load((CONFIGS / "reality" / f"{given['world']}.yaml").read_text(encoding="utf-8"))
     sensor, rng = Sensor(world, "index", pinched=True), np.random.default_rng(world["seed"])
     t = np.cumsum(rng.uniform(0.9, 1.1, 270)) / RATE
     depth = 0.8e-3 * np.sin(np.pi * t) ** 2

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from dexsim.paths import CONFIGS
+
 ROOT = Path(__file__).parents[2]
 EXCITED = (("random", 0.6), ("chirp", 0.6), ("random", 0.8))
 """The excitation: motions of all joints (or of fingers) at once, since most is seen in little time, and the share of the `used` speeds
@@ -37,7 +39,7 @@ def start(given: dict[str, str]) -> None:
 
     own = {k: given.pop(k) for k in ("checkpoint", "out", "device")}
     ready = settings.for_train([f"resume={own['checkpoint']}", "device=cpu", "worlds=16", "iterations=1000000", *(f"{k}={v}" for k, v in given.items())],
-                               ROOT / "configs")  # fmt: skip
+                               CONFIGS)  # fmt: skip
     env = build.build_env(ready.cfg, None, {"start": own["checkpoint"]})
     runner = Runner(env, ready.cfg, machine.versions())
     checkpoint.check_layout(ready.data, checkpoint.layout_of(env), own["checkpoint"])
@@ -144,7 +146,7 @@ def _world(name: str) -> dict:
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
-    return yaml.safe_load((ROOT / "configs" / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
+    return yaml.safe_load((CONFIGS / "reality" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def _drive(world: dict, believed, t: np.ndarray, value: np.ndarray, home: np.ndarray, rng: np.random.Generator, path: Path) -> None:

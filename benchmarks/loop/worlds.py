@@ -1,6 +1,6 @@
 """The concealed realities of the loop: other contacts, solver, timing and touch, and drives with effects that the belief lacks.
 
-    python -m benchmarks.loop.worlds        # writes configs/reality/late.yaml and stiff.yaml, drawn once
+    python -m benchmarks.loop.worlds        # writes dexsim/configs/reality/late.yaml and stiff.yaml, drawn once
 
 Built as `dexsim.tasks.reality` builds its own, but the drives are the believed ones, each quantity off by up to 3 %, with
 two or three effects of the catalogue in every joint. late: a delay, a lag, a lower no-load speed. stiff: twice the gain, less than half
@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from dexsim.paths import CONFIGS
+
 SEEDS = {"late": 4102, "stiff": 4104}
 ROOT = Path(__file__).parents[2]
 
@@ -25,7 +27,7 @@ def draw(name: str) -> dict:
     from dexsim.assets import xhand
     from dexsim.tasks.reality import draw as other
 
-    nominal = yaml.safe_load((ROOT / "configs" / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    nominal = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     world = other(SEEDS[name], nominal)
     rng = np.random.default_rng(SEEDS[name])
     joints = {}
@@ -54,7 +56,7 @@ def main(argv: list[str]) -> int:
         raise UserError(f"'{argv[0]}': there are no settings; the numbers are drawn from SEEDS in benchmarks/loop/worlds.py")
 
     for name in SEEDS:
-        path = ROOT / "configs" / "reality" / f"{name}.yaml"
+        path = CONFIGS / "reality" / f"{name}.yaml"
         body = text(draw(name)).split("\n")
         kept = [line for line in body if not line.startswith("#")]
         head = ["# A concealed reality of the closed loop (`python -m benchmarks.loop`), standing in for hardware: never trained in.",

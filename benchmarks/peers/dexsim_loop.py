@@ -12,6 +12,7 @@ import torch
 from benchmarks.peers.scene import SETTINGS
 from dexsim.cli import machine
 from dexsim.cli import start as start_up
+from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env
 
 
@@ -19,7 +20,7 @@ def main(folder: str, worlds: int, device: str) -> dict:
     """Milliseconds of one environment step of all worlds in the grasp."""
     about = json.loads((Path(folder) / "scene.json").read_text())
     engine = "warp" if device.startswith("cuda") else "auto"
-    cfg = start_up.for_train([*SETTINGS, f"device={device}", f"worlds={worlds}", f"sim.engine={engine}"], Path(__file__).parents[2] / "configs").cfg
+    cfg = start_up.for_train([*SETTINGS, f"device={device}", f"worlds={worlds}", f"sim.engine={engine}"], CONFIGS).cfg
     machine.set_threads(cfg["device"])
     env = make_env(cfg, worlds, cfg["device"], 0, engine)
 

@@ -17,6 +17,7 @@ import numpy as np
 from dexsim.actuator.columns import NAMES
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
+from dexsim.paths import CONFIGS
 from dexsim.tasks.env import OBJECT, HandEnv, _solver_options
 
 # One box, dropped with a spread of places and joint angles that all simulators get: worlds that are all alike would all need the
@@ -37,7 +38,7 @@ def targets() -> tuple[np.ndarray, np.ndarray]:
     """Start pose and closed targets [12] (rad), from the grasp task's settings."""
     from dexsim.cli import start as start_up
 
-    pose = start_up.for_train(["task=grasp", "device=cpu"], Path(__file__).parents[2] / "configs").cfg["task"]["initial"]["pose"]
+    pose = start_up.for_train(["task=grasp", "device=cpu"], CONFIGS).cfg["task"]["initial"]["pose"]
     start = np.array([pose[j] for j in xhand.JOINTS])
     low, high = np.array(xhand.joint_limits()).T
     still = np.isin(xhand.JOINTS, STILL)
@@ -110,7 +111,7 @@ def main(folder: str) -> None:
     from dexsim.cli import start as start_up
     from dexsim.tasks import make_env
 
-    cfg = start_up.for_train([*SETTINGS, "device=cpu", "worlds=1"], Path(__file__).parents[2] / "configs").cfg
+    cfg = start_up.for_train([*SETTINGS, "device=cpu", "worlds=1"], CONFIGS).cfg
     write(make_env(cfg, 1, "cpu", 0, "mujoco"), Path(folder))
 
 

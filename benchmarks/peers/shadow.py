@@ -15,13 +15,13 @@ from dexsim.errors import UserError
 
 CODE = """
 import json, sys, time, torch
-from pathlib import Path
 from dexsim.cli import build, start
+from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env
 worlds, seconds = int(sys.argv[1]), float(sys.argv[2])
 torch.set_num_threads(1)
 build.quiet_warp("cpu")
-cfg = start.for_train(["task=grasp", "device=cpu", f"worlds={worlds}", "sim.threads=1", "task.objects.train=[box]"], Path("configs")).cfg
+cfg = start.for_train(["task=grasp", "device=cpu", f"worlds={worlds}", "sim.threads=1", "task.objects.train=[box]"], CONFIGS).cfg
 env = make_env(cfg, worlds, "cpu", 0, "auto")
 random = lambda: 2 * torch.rand(worlds, 12) - 1
 for _ in range(20):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from dexsim.console import program
 from dexsim.errors import UserError
 
 LINEAR_R2 = 0.97  # a press curve under this is not called linear
@@ -23,7 +24,7 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
     """Returns the exit status. Raises UserError."""
     file = config_dir / "calibrate.yaml"
     if not argv or argv[0] in ("-h", "--help", "help"):
-        print(_help(file), end="")
+        print(program.words(_help(file)), end="")
         return 0 if argv else 2
     s, meta = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
     if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate", "simulate_touch")):

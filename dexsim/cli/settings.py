@@ -35,7 +35,7 @@ class Request:
 
 
 def groups(config_dir: Path) -> dict[str, list[str]]:
-    """The config groups and their options: the folders under ``configs/`` and the YAML files in them."""
+    """The config groups and their options: the folders under ``dexsim/configs/`` and the YAML files in them."""
     found = {d.name: sorted(f.stem for f in d.glob("*.yaml")) for d in sorted(config_dir.iterdir()) if d.is_dir()}
     return {name: options for name, options in found.items() if options}
 
@@ -78,7 +78,8 @@ def _option(item: Override, options: list[str]) -> str:
 
 
 def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
-    """Compose ``configs/config.yaml`` with these group choices; ``choices`` in the result records all of them."""
+    """Compose ``dexsim/configs/config.yaml`` with these group choices; ``choices`` in the result records all of
+    them."""
     overrides = [f"{group}={option}" for group, option in choices.items()]
     GlobalHydra.instance().clear()
     try:

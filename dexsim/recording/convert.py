@@ -1,4 +1,4 @@
-"""`python -m dexsim.recording.convert IN out=OUT.mcap`: any recording that is read (CSV, NPZ, MCAP, a bag folder) as one of ours."""
+"""`dexsim convert IN out=OUT.mcap`: any recording that is read (CSV, NPZ, MCAP, a bag folder) as one of ours."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dexsim.errors import UserError
 
-HELP = """usage: python -m dexsim.recording.convert IN out=OUT.mcap [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]
+HELP = """usage: dexsim convert IN out=OUT.mcap [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]
 
 Writes a recording as MCAP in dexsim's own topics and in SI units. IN: a CSV, TSV or NPZ file with named columns
 (time, command.JOINT, position.JOINT, effort.JOINT ...), an MCAP file or a bag folder. What was assumed is printed.
@@ -51,8 +51,6 @@ def main(argv: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    from dexsim.console.ending import guard
+
+    sys.exit(guard(main, sys.argv[1:]))

@@ -59,7 +59,7 @@ class Mechanism:
 
 
 def xhand_servo_dict() -> dict[str, Any]:
-    """The xHand's nominal servo table: `configs/servo/xhand.yaml`."""
+    """The xHand's nominal servo table: `dexsim/configs/servo/xhand.yaml`."""
     return yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
 
 

@@ -32,7 +32,7 @@ COLUMNS: dict[str, tuple[str, float, float, float]] = {
 
 @dataclass(frozen=True)
 class TactileConfig:
-    """See configs/tactile/default.yaml for what each key means."""
+    """See dexsim/configs/tactile/default.yaml for what each key means."""
 
     sum: str = "solver"
     law: str = "hertz"

@@ -1,6 +1,6 @@
 """`tactile.yaml`: what a diagnosis found of touch and contact, as training takes it (`train.py tactile_file=FILE`).
 
-    tactile:                        # over the settings of configs/tactile
+    tactile:                        # over the settings of dexsim/configs/tactile
       friction: [0.35, 0.45]
       pads:                         # by fingertip, see `dexsim.tactile.pads`
         index: {delay: {value: 0.02, low: 0.018, high: 0.022}}

@@ -31,7 +31,7 @@ class Tactile:
 
     engine: N worlds; `engine.wp.xpos`, `xmat` are read, and `pair_normal` for sum=solver; `launch` runs in `after` of
     `engine.step`. layout: F pads of up to T taxels. shapes: what objects can be. object_body: name of the object's body
-    (its frame is the shape's frame), or several names. cfg: see configs/tactile/default.yaml.
+    (its frame is the shape's frame), or several names. cfg: see dexsim/configs/tactile/default.yaml.
     pairs: for sum=solver, name of the engine's contact pair (pad, object) of each pad, [F] (or [F][O] for O objects).
     tips: points [V, 3] (body frame) of each pad's tip, whose convex hull carries the taxels (lift=true) and is what
     other pads feel (others=true).

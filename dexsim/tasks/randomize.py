@@ -1,4 +1,4 @@
-"""Sampling of what varies by episode: named ranges from `configs/randomize/`, drawn for all worlds at once."""
+"""Sampling of what varies by episode: named ranges from `dexsim/configs/randomize/`, drawn for all worlds at once."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Another world to be judged in: `python play.py checkpoint=... reality=bench`.
 
-A policy can only be as good as the world it is judged in is different from the one it was trained in. `configs/reality/`
+A policy can only be as good as the world it is judged in is different from the one it was trained in. `dexsim/configs/reality/`
 holds worlds that no training sees (`train.py` refuses them): C MuJoCo with its own step, cone, solver and contact
 softness; one hand whose drives have effects that no randomization contains; encoders and currents in whole counts,
 touch in counts and late; control periods that vary and targets that are late or lost. It stands in for hardware: it is
 not hardware, and what it leaves out (soft pads, bending, cables) stays unjudged.
 
-The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121 out=configs/reality/bench.yaml`. The
+The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121 out=dexsim/configs/reality/bench.yaml`. The
 ranges below are ours.
 """
 
@@ -47,7 +47,7 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     world, cfg = cfg["reality"], copy.deepcopy(cfg)
     for key in world:
         if key not in KEYS:
-            raise UserError(f"reality.{key}: unknown; a file of configs/reality has {', '.join(sorted(KEYS))}")
+            raise UserError(f"reality.{key}: unknown; a file of dexsim/configs/reality has {', '.join(sorted(KEYS))}")
     task = cfg["task"]["name"]
     if task not in world["tasks"]:
         raise UserError(f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])}")
@@ -78,7 +78,7 @@ def _middle(cfg: dict[str, Any], column: str) -> float:
 class Reality:
     """What of another world is no setting of the training's: contacts, solver, sensor counts, timing.
 
-    cfg: a file of configs/reality. The environment calls `change_model` before it compiles, and at each control step
+    cfg: a file of dexsim/configs/reality. The environment calls `change_model` before it compiles, and at each control step
     `substeps`, `late` and `read`. Runs on the CPU.
     """
 
@@ -132,7 +132,7 @@ class Reality:
 
 
 def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
-    """The numbers of another world, all from one seed. servo: the nominal table (configs/servo/xhand.yaml)."""
+    """The numbers of another world, all from one seed. servo: the nominal table (dexsim/configs/servo/xhand.yaml)."""
     rng = np.random.default_rng(seed)
 
     def u(low: float, high: float, digits: int = 4) -> float:
@@ -190,7 +190,7 @@ def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
 
 HEAD = """\
 # Another world to be judged in (`python play.py checkpoint=... reality={name}`): never trained in, standing in for hardware.
-# Drawn once, not tuned: python -m dexsim.tasks.reality seed={seed} out=configs/reality/{name}.yaml. See dexsim/tasks/reality.py.
+# Drawn once, not tuned: python -m dexsim.tasks.reality seed={seed} out=dexsim/configs/reality/{name}.yaml. See dexsim/tasks/reality.py.
 """
 
 
@@ -210,7 +210,7 @@ def main(argv: list[str]) -> int:
     if not isinstance(own["seed"], int) or own["seed"] < 0:
         raise UserError(f"seed={own['seed']}: must be a whole number from 0 up")
     if own["out"] is None:
-        raise UserError("out=PATH: say where to write the world, e.g. out=configs/reality/bench.yaml")
+        raise UserError("out=PATH: say where to write the world, e.g. out=dexsim/configs/reality/bench.yaml")
     servo = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
     out = Path(own["out"]).expanduser()
     world = draw(own["seed"], servo)
