@@ -172,7 +172,9 @@ def diagnose(
         "remap": dict(remap or {}),
     }
     where = Path(out).expanduser()
-    found = search(command.settings_of(given, where, command.started(device)), say=say or _silent)
+    asked = command.settings_of(given, where, command.started(device))
+    command.claim(asked)
+    found = search(asked, say=say or _silent)
     save(found, where)
     return found
 

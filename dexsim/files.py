@@ -13,7 +13,8 @@ MAX_YAML = 4 << 20
 
 
 def check(path: Path, most: int, what: str) -> int:
-    """The file's size in bytes. Raises UserError where it is missing, not a plain file (a device or a pipe never ends), or larger than `most`."""
+    """The file's size in bytes. Raises UserError where it is missing, not a plain file (a device or a pipe never ends),
+    or larger than `most`."""
     try:
         about = os.stat(path)
     except FileNotFoundError:

@@ -1,7 +1,9 @@
-"""Files that a command writes into the folder the user named: nothing that is not ours is overwritten, and what is there is whole.
+"""Files that a command writes into the folder the user named: nothing that is not ours is overwritten, and what is
+there is whole.
 
-Each folder keeps `.dexsim.json`: what was written there, with its SHA-256. A file is ours as long as it is as we wrote it. Results are
-written beside (a folder `.writing-...` in the same place) and renamed once all of them are there: a full disk or a kill leaves what was.
+Each folder keeps `.dexsim.json`: what was written there, with its SHA-256. A file is ours as long as it is as we wrote
+it. Results are written beside (a folder `.writing-...` in the same place) and renamed once all of them are there: a
+full disk or a kill leaves what was.
 """
 
 from __future__ import annotations
@@ -22,23 +24,26 @@ WRITTEN = ".dexsim.json"
 
 
 def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Path] = ()) -> Path:
-    """The folder, made and writable, before the work begins. Raises UserError where it cannot be written, or where one of `names` (of a
-    file, or of a folder of files) is there and not ours, or is one of `inputs`."""
+    """The folder, made and writable, before the work begins. Raises UserError where it cannot be written, or where one
+    of `names` (of a file, or of a folder of files) is there and not ours, or is one of `inputs`."""
     make(folder, setting)
     read = {p.expanduser().resolve() for p in inputs}
     for name in names:
         path = folder / name
         if path.resolve() in read:
             raise UserError(f"{path} is read and would be written: choose another {setting}")
-        for there in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() and not path.is_symlink() else [path]:
+        for there in (
+            sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() and not path.is_symlink() else [path]
+        ):
             _refuse(folder, there, setting)
     return folder
 
 
 @contextmanager
 def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
-    """A folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and noted as ours. Where the
-    block raises, `folder` stays as it was. Raises UserError where a file would go over one that is not ours, or the disk is full."""
+    """A folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and noted as
+    ours. Where the block raises, `folder` stays as it was. Raises UserError where a file would go over one that is not
+    ours, or the disk is full."""
     make(folder, setting)
     stage = Path(tempfile.mkdtemp(prefix=".writing-", dir=folder))
     try:
@@ -53,7 +58,9 @@ def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
             os.replace(path, to)
         note(folder, sums)
     except OSError as error:
-        raise UserError(f"cannot write into {folder}: {error.strerror or error}; choose another place with {setting}") from None
+        raise UserError(
+            f"cannot write into {folder}: {error.strerror or error}; choose another place with {setting}"
+        ) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
 
@@ -88,7 +95,11 @@ def _refuse(folder: Path, path: Path, setting: str) -> None:
     inside = path.parent.resolve().is_relative_to(folder.resolve()) and not path.is_symlink()
     known = _known(folder).get(str(path.relative_to(folder)))
     if not inside or known is None or not path.is_file() or _sum(path) != known:
-        what = "was changed since it was written" if known is not None and inside else "is not a result written here before"
+        what = (
+            "was changed since it was written"
+            if known is not None and inside
+            else "is not a result written here before"
+        )
         raise UserError(f"{path} {what}, and would be overwritten: choose another {setting}, or move it away")
 
 

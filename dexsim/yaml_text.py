@@ -58,7 +58,8 @@ def parse(text: str | bytes, source: object) -> Any:
 
 
 def load(path: Path, what: str) -> Any:
-    """The plain data of a YAML file of people (at most `files.MAX_YAML` bytes); `what` it is, for the message. Raises UserError."""
+    """The plain data of a YAML file of people (at most `files.MAX_YAML` bytes); `what` it is, for the message. Raises
+    UserError."""
     return parse(files.text(path, files.MAX_YAML, what), f"{what} '{path}'")
 
 

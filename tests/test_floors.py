@@ -16,7 +16,8 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
         "errors paths version rotation",
-        "console typed yaml_text",
+        "console files typed",
+        "outputs yaml_text",
         "assets",
         "sim",
         "actuator tactile",

@@ -133,8 +133,7 @@ def main(argv: list[str]) -> int:
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
     settings = settings_of(given, out, device)
-    read = [*settings.recordings, *(settings.held_out or []), *(Path(p) for p in (settings.model, settings.servo) if p)]
-    outputs.claim(out, "out=", RESULTS, read)
+    claim(settings)
     if given.get("demo"):
         outputs.note_paths(out, [out / "recordings"])
     result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
@@ -144,6 +143,15 @@ def main(argv: list[str]) -> int:
         print(f"\nWhat was hidden: {', '.join(f'{k} {v:g}' for k, v in demo.items())}")
     print("\n" + "\n".join(str(p) for p in written) + f"\n{time.perf_counter() - start:.0f} s")
     return 0
+
+
+def claim(s: Settings) -> None:
+    """Make the folder of the results. Raises UserError where they would go over a file that is read, or is not ours."""
+    from dexsim import outputs
+    from dexsim.gap.report.files import RESULTS
+
+    read = [*s.recordings, *(s.held_out or []), *(Path(p) for p in (s.model, s.servo) if p)]
+    outputs.claim(s.out, "out=", RESULTS, read)
 
 
 def settings_of(given: dict, out: Path, device: str) -> Settings:

@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from dexsim.actuator.columns import did_you_mean
 from dexsim import files, yaml_text
+from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
 from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers
 
