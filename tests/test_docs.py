@@ -18,7 +18,17 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 LISTED = ("train", "play", "diagnose", "calibrate")
-HYDRA = {"task", "agent", "servo", "tactile", "randomize", "reality", "sweep", "hydra/launcher", "hydra.launcher.n_jobs"}
+HYDRA = {
+    "task",
+    "agent",
+    "servo",
+    "tactile",
+    "randomize",
+    "reality",
+    "sweep",
+    "hydra/launcher",
+    "hydra.launcher.n_jobs",
+}
 
 
 def _reference():
@@ -40,10 +50,18 @@ def _fences(text: str) -> list[str]:
 def _commands() -> list[tuple[str, str]]:
     """(page, command) of every command in README, tutorials and how-to, without its comment."""
     found = []
-    for path in (ROOT / "README.md", *sorted((DOCS / "tutorials").glob("*.md")), *sorted((DOCS / "howto").glob("*.md"))):
+    for path in (
+        ROOT / "README.md",
+        *sorted((DOCS / "tutorials").glob("*.md")),
+        *sorted((DOCS / "howto").glob("*.md")),
+    ):
         for line in _fences(path.read_text(encoding="utf-8")):
             line = re.sub(r"\s+#\s.*$", "", line)
-            if re.match(r"(torchrun|chrt|python|dexsim|make) ", line) and "python -c" not in line and "-m venv" not in line:
+            if (
+                re.match(r"(torchrun|chrt|python|dexsim|make) ", line)
+                and "python -c" not in line
+                and "-m venv" not in line
+            ):
                 found.append((path.name, line))
     return found
 
@@ -85,14 +103,18 @@ def test_there_are_commands_to_check():
 def test_command_exists(page, command):
     words = shlex.split(command)
     if words[0] == "make":
-        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M), f"{page}: no target {words[1]}"
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M), (
+            f"{page}: no target {words[1]}"
+        )
         return
     while words[0] in ("torchrun", "chrt", "python") or words[0].startswith("-") or words[0].isdigit():
         words.pop(0)
     name, given = words[0], [w.partition("=")[0] for w in words[1:] if "=" in w and not w.startswith("-")]
     if name != "dexsim":
         where = ROOT / name.replace(".", "/")
-        assert name == "pytest" or where.with_suffix(".py").is_file() or (where / "__init__.py").is_file(), f"{page}: no module {name}"
+        assert name == "pytest" or where.with_suffix(".py").is_file() or (where / "__init__.py").is_file(), (
+            f"{page}: no module {name}"
+        )
         return
     assert words[1] in COMMANDS or words[1].startswith("--"), f"{page}: no command dexsim {words[1]}"
     if words[1] in LISTED:
@@ -131,14 +153,19 @@ def test_tables_from_the_code_are_whole():
     for page, names in (("columns", NAMES), ("audit", KINDS), ("metadata", KEYS)):
         text = REFERENCE.PAGES[page]()
         assert [n for n in names if f"| `{n}` |" not in text] == []
-    assert {"backlash", "command_delay", "tactile_gain", "contact_stiffness"} <= set(re.findall(r"^\| `(\w+)` \|", REFERENCE.effects(), re.M))
+    assert {"backlash", "command_delay", "tactile_gain", "contact_stiffness"} <= set(
+        re.findall(r"^\| `(\w+)` \|", REFERENCE.effects(), re.M)
+    )
 
 
 def test_settings_are_listed_with_their_comments(tmp_path):
     file = tmp_path / "x.yaml"
-    file.write_text("# top\ndefaults: [a]\nseed: 1  # of all\npart:\n  low: [0, 1]  # m\n  inner: {a: 1, b: 2}\nlast: null\n")
+    file.write_text(
+        "# top\ndefaults: [a]\nseed: 1  # of all\npart:\n  low: [0, 1]  # m\n  inner: {a: 1, b: 2}\nlast: null\n"
+    )
     assert [(s.key, s.default, s.comment) for s in REFERENCE.leaves(file)] == [
-        ("seed", "1", "of all"), ("part.low", "[0, 1]", "m"), ("part.inner", "{a: 1, b: 2}", ""), ("last", "null", "")]  # fmt: skip
+        ("seed", "1", "of all"), ("part.low", "[0, 1]", "m"), ("part.inner", "{a: 1, b: 2}", ""), ("last", "null", ""),
+    ]  # fmt: skip
     task = next(REFERENCE.config_folder().glob("task/grasp.yaml"))
 
     def leaves(node, prefix="task"):
@@ -158,7 +185,22 @@ def test_generated_tables_that_pages_ask_for_exist():
 
 
 def test_pages_that_the_code_names_exist():
-    named = {(p, m) for folder in ("dexsim", "benchmarks") for p in (ROOT / folder).rglob("*.[py]*") if p.suffix in (".py", ".yaml")
-             for m in re.findall(r"docs/[\w/]+\.md", p.read_text(encoding="utf-8"))}
+    named = {
+        (p, m)
+        for folder in ("dexsim", "benchmarks")
+        for p in (ROOT / folder).rglob("*.[py]*")
+        if p.suffix in (".py", ".yaml")
+        for m in re.findall(r"docs/[\w/]+\.md", p.read_text(encoding="utf-8"))
+    }
     assert len(named) > 5
     assert [f"{p}: {m}" for p, m in sorted(named) if not (ROOT / m).is_file()] == []
+
+
+def test_files_that_the_pages_name_exist():
+    named = {
+        (p, m)
+        for p in (ROOT / "README.md", *PAGES)
+        for m in re.findall(r"`((?:dexsim|benchmarks|tests)/[\w/.*-]+)`", p.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 30
+    assert [f"{p.name}: {m}" for p, m in sorted(named) if not list(ROOT.glob(m.rstrip("/").replace("NAME", "*")))] == []

@@ -1,4 +1,4 @@
-"""MkDocs hooks: generated tables where a page says `<!-- GENERATED: name -->`, and equations as MathML, without a script.
+"""MkDocs hooks: generated tables where a page says `<!-- GENERATED: name -->`; equations as MathML, without a script.
 
 An equation is a fenced block of the language `math`, or $`...`$ within a line, in LaTeX; both show on GitHub too.
 """
@@ -23,5 +23,9 @@ INLINE = re.compile(r"\$`([^`\n]+)`\$")
 def on_page_markdown(markdown: str, **_: object) -> str:
     """A page's Markdown before it is rendered. Raises KeyError for a generated table that does not exist."""
     markdown = GENERATED.sub(lambda m: reference.PAGES[m[1]](), markdown)
-    markdown = BLOCK.sub(lambda m: "".join(f"<p>{convert(line, display='block')}</p>\n" for line in m[1].split("\\\\\n")), markdown)
-    return INLINE.sub(lambda m: f"<span>{convert(m[1])}</span>", markdown)  # a line that begins with <math> would be a block
+    markdown = BLOCK.sub(
+        lambda m: "".join(f"<p>{convert(line, display='block')}</p>\n" for line in m[1].split("\\\\\n")), markdown
+    )
+    return INLINE.sub(
+        lambda m: f"<span>{convert(m[1])}</span>", markdown
+    )  # a line that begins with <math> would be a block

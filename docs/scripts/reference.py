@@ -24,7 +24,7 @@ LONGEST = 90  # characters of a default that are shown
 
 @dataclass(frozen=True)
 class Setting:
-    """One leaf of a config file: dotted key, default as YAML text, and the comment behind it ("" where there is none)."""
+    """One leaf of a config file: dotted key, default as YAML text, the comment behind it ("" where there is none)."""
 
     key: str
     default: str
@@ -71,7 +71,13 @@ def leaves(path: Path) -> list[Setting]:
             comment = lines[value.end_mark.line if value.end_mark.column else value.start_mark.line]
             comment = comment[value.end_mark.column if value.end_mark.line == key.start_mark.line else 0 :]
             found = re.search(r"#\s*(.+)$", comment)
-            out.append(Setting(dotted, default if len(default) <= LONGEST else default[: LONGEST - 3] + "...", found[1].strip() if found else ""))
+            out.append(
+                Setting(
+                    dotted,
+                    default if len(default) <= LONGEST else default[: LONGEST - 3] + "...",
+                    found[1].strip() if found else "",
+                )
+            )
 
     root = yaml.compose(text)
     if root is not None:
@@ -92,7 +98,14 @@ def heading_comment(path: Path) -> str:
 def settings() -> str:
     """All groups, their options, and every setting of every config file but the drawn numbers of realities."""
     folder, out = config_folder(), []
-    names = [*ORDER, *sorted(p.name for p in folder.iterdir() if p.name not in ORDER and (p.is_dir() or p.suffix == ".yaml") and not p.name.startswith("__"))]
+    names = [
+        *ORDER,
+        *sorted(
+            p.name
+            for p in folder.iterdir()
+            if p.name not in ORDER and (p.is_dir() or p.suffix == ".yaml") and not p.name.startswith("__")
+        ),
+    ]
     for name in names:
         path = folder / name
         if path.is_file():
@@ -104,21 +117,31 @@ def settings() -> str:
             out += [f"## {name}=", "", "Options: " + ", ".join(f"`{o.stem}`" for o in options) + ".", ""]
             for option in options:
                 out += [f"### {name}={option.stem}", "", heading_comment(option), ""]
-                out += ["Its numbers are drawn once from a seed; read the file itself.", ""] if name == "reality" else [_rows(option, name + ".")]
+                out += (
+                    ["Its numbers are drawn once from a seed; read the file itself.", ""]
+                    if name == "reality"
+                    else [_rows(option, name + ".")]
+                )
     return "\n".join(out)
 
 
 def _rows(path: Path, prefix: str = "") -> str:
     found = leaves(path)
-    return table(("setting", "default", "meaning"), [(f"`{prefix}{s.key}`", f"`{s.default}`", s.comment) for s in found]) if found else ""
+    return (
+        table(("setting", "default", "meaning"), [(f"`{prefix}{s.key}`", f"`{s.default}`", s.comment) for s in found])
+        if found
+        else ""
+    )
 
 
 def columns() -> str:
     """The servo table's columns."""
     from dexsim.actuator.columns import COLUMNS
 
-    return table(("column", "unit", "neutral", "allowed", "meaning"),
-                 [(f"`{c.name}`", c.unit, f"{c.neutral:g}", f"{c.low:g} to {c.high:g}", c.text) for c in COLUMNS])
+    return table(
+        ("column", "unit", "neutral", "allowed", "meaning"),
+        [(f"`{c.name}`", c.unit, f"{c.neutral:g}", f"{c.low:g} to {c.high:g}", c.text) for c in COLUMNS],
+    )
 
 
 def effects() -> str:
@@ -129,7 +152,9 @@ def effects() -> str:
 
     def rows(what: str, entries: Sequence, confusable: Callable[[str, str], bool]) -> list[tuple[str, ...]]:
         like = {e.id: [f"`{x.id}`" for x in entries if x.id != e.id and confusable(e.id, x.id)] for e in entries}
-        return [(f"`{e.id}`", f"the {what} {e.words}", e.shows, e.experiment, ", ".join(like[e.id]) or "-") for e in entries]
+        return [
+            (f"`{e.id}`", f"the {what} {e.words}", e.shows, e.experiment, ", ".join(like[e.id]) or "-") for e in entries
+        ]
 
     joints = table(head, rows("joint", catalogue.CATALOGUE, catalogue.confusable))
     touches = table(head, rows("fingertip", catalogue.TOUCH_CATALOGUE, catalogue.touch_confusable))
@@ -148,7 +173,10 @@ def metadata() -> str:
     from dexsim.recording.schema import DEFAULTS, KEYS, TOPICS, UNIT_KEYS
 
     topics = table(("topic", "ROS 2 type"), [(f"`{k}`", f"`{v}`") for k, v in TOPICS.items()])
-    keys = table(("key", "meaning", "where it is not stated"), [(f"`{k}`", v, f"`{DEFAULTS[k]}`" if DEFAULTS.get(k) else "-") for k, v in KEYS.items()])
+    keys = table(
+        ("key", "meaning", "where it is not stated"),
+        [(f"`{k}`", v, f"`{DEFAULTS[k]}`" if DEFAULTS.get(k) else "-") for k, v in KEYS.items()],
+    )
     units = table(("key", "values"), [(f"`{k}`", ", ".join(f"`{u}`" for u in v)) for k, v in UNIT_KEYS.items()])
     return f"### Topics\n\n{topics}\n### Metadata\n\n{keys}\nFor recordings in other units:\n\n{units}"
 
@@ -161,11 +189,21 @@ def commands() -> str:
     for name, command in COMMANDS.items():
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             dispatch([name, "--help"])
-        out.append(f"## dexsim {name}\n\n{command.about[0].upper()}{command.about[1:]}.\n\n```text\n{printed.getvalue().strip()}\n```\n")
+        out.append(
+            f"## dexsim {name}\n\n{command.about[0].upper()}{command.about[1:]}.\n\n"
+            f"```text\n{printed.getvalue().strip()}\n```\n"
+        )
     return "\n".join(out)
 
 
-PAGES = {"settings": settings, "columns": columns, "effects": effects, "audit": audit, "metadata": metadata, "commands": commands}
+PAGES = {
+    "settings": settings,
+    "columns": columns,
+    "effects": effects,
+    "audit": audit,
+    "metadata": metadata,
+    "commands": commands,
+}
 
 
 def main(argv: Sequence[str]) -> int:
