@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.fold import brief, fold, joint
+from benchmarks.real.fold import brief, finger, fold, joint
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -148,8 +148,27 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
             "cpu_seconds": round(cpu, 1), "seconds": round(time.perf_counter() - wall, 1), "shares": d.shares}  # fmt: skip
 
 
+def ergocub(data: Path, out: Path, jobs: int) -> dict:
+    """Each run of a finger alone, its last quarter kept out; and each finger's runs together, every third kept out."""
+    from benchmarks.real.convert_ergocub import FINGERS, held_out
+
+    work = [(data, out, run, which, (run,), ()) for which, runs in FINGERS.items() for run in runs]
+    for which, runs in FINGERS.items():
+        kept = held_out(which)
+        work += [(data, out, f"all_{which}", which, tuple(r for r in runs if r not in kept), kept)] if kept else []
+    start, rows = time.perf_counter(), {}
+    for done in _parts(finger, work, jobs):
+        rows[done["name"]] = done
+        print(f"{done['name']:<16} {done['verdict']:<16} plain {done['plain_mrad']} -> {done['after_mrad']} mrad  "
+              f"{', '.join(_named(f) for f in done['findings']) or '-'} ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+    rows = {x[2]: rows[x[2]] for x in work}
+    first = {which: {r: rows[r]["first_name"] for r in runs} for which, runs in FINGERS.items()}
+    return {"benchmark": "ergocub", "first_name_by_run": first, "dead_encoder_named": any(f["effect"] == "bad_channel" for f in rows["thumb1"]["findings"]),
+            "runs": rows, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+
+
 HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
-JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda}
+JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda, "ergocub": ergocub}
 
 
 def figure(result: dict, path: Path) -> None:

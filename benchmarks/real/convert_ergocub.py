@@ -1,0 +1,98 @@
+"""Fingers of the ergoCub humanoid hand, driven open loop (github.com/icub-tech-iit/ergocub-software, BSD-3-Clause): one tendon-driven joint a run.
+
+Each run as an npz: t [s], pwm_set and pwm_read [% of full duty], theta_deg [deg, 0 is a stop]. Only ratios of torque, inertia and friction show in a
+motion without a load cell: inertias are in units of an assumed one (`INERTIA`), torques with it.
+
+Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third, beginning with the
+third; of each run alone its last quarter, as the tool itself chooses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.real.common import dump, save
+from dexsim.errors import UserError
+
+FINGERS = {"middle": ("middle", "middle1", "middle3", "middle4", "middle5", "middle6", "output"), "ring_little": ("rinky", "rinky1", "rinky3"), "thumb": ("thumb1",)}
+EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
+INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
+PER_DUTY = 1e-3 / np.pi  # duty per rad of the loop that stands for none: a finger's whole turn is 0.03 % of the duty
+MODEL = f"""<mujoco model="ergocub_finger">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <body name="finger">
+      <joint name="joint" type="hinge" axis="0 1 0" range="0 1.6" armature="{0.9 * INERTIA}"/>
+      <geom name="link" type="sphere" size="0.005" pos="0 0 0.05" mass="{0.1 * INERTIA / 0.05**2}" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+# Nothing is known of the drive but that duty makes torque less back-EMF; Coulomb and viscous friction are fitted with everything.
+SERVO = {
+    "drive": "voltage",
+    "joints": {"*": {
+        "kp": float(PER_DUTY), "kd": 0.0, "torque_limit": {"value": 0.05, "low": 0.005, "high": 0.5}, "no_load_speed": {"value": 6.0, "low": 1.5, "high": 60.0},
+        "coulomb_friction": "unknown", "viscous_friction": "unknown",
+    }},
+}  # fmt: skip
+
+
+@dataclass
+class Ergocub:
+    """Converted files: recordings by run."""
+
+    runs: dict[str, Path]
+    model: Path
+    servo: Path
+
+
+def held_out(finger: str) -> tuple[str, ...]:
+    """Runs of a finger that are kept out of the fit."""
+    return FINGERS[finger][2::3]
+
+
+def convert(data: Path, out: Path) -> Ergocub:
+    """Converts all runs. The duty that was set is a command (as a target far off, through a gain that makes a duty of it); what was read back
+    is the duty topic."""
+    names = [n for runs in FINGERS.values() for n in runs]
+    absent = [n for n in names if not (data / f"{n}.npz").is_file()]
+    if absent:
+        raise UserError(f"{data}: no {', '.join(f'{n}.npz' for n in absent)}; give the folder of the fingers' runs as npz")
+    out.mkdir(parents=True, exist_ok=True)
+    model, servo = out / "finger.xml", dump(out / "finger.yaml", SERVO)
+    model.write_text(MODEL, encoding="utf-8")
+    made = {}
+    for name in names:
+        raw = np.load(data / f"{name}.npz")
+        t, set_, read = raw["t"], raw["pwm_set"] / 100.0, raw["pwm_read"] / 100.0
+        changed = np.flatnonzero(np.r_[True, np.diff(set_) != 0])
+        keep = slice(None, None, EVERY)
+        q = np.radians(raw["theta_deg"])
+        made[name] = save(out / f"{name}.mcap", ("joint",), t[changed], (set_ / PER_DUTY)[changed, None], t[keep], q[keep, None],
+                          duty=read[keep, None] if np.ptp(read) > 0 else None, robot="ergocub_finger", gravity="0 0 0")  # fmt: skip
+    return Ergocub(made, model, servo)
+
+
+def repeat_noise(data: Path, name: str) -> float:
+    """What strokes at one duty differ by from one to the next, each from where it began [rad, rms over root 2]; NaN where none repeats."""
+    raw = np.load(data / f"{name}.npz")
+    t, duty, q = raw["t"], raw["pwm_set"], np.radians(raw["theta_deg"])
+    edges = np.r_[0, np.flatnonzero(np.diff(duty) != 0) + 1, len(t)]
+    last: dict[float, np.ndarray] = {}
+    squares = []
+    for a, b in zip(edges[1:-2], edges[2:-1], strict=True):  # neither the first nor the last, which are cut
+        if t[b - 1] - t[a] < 0.05:
+            continue
+        even = np.arange(t[a], t[b - 1], 0.005)
+        stroke = np.interp(even, t[a:b], q[a:b]) - q[a]
+        other = last.get(float(duty[a]))
+        if other is not None:
+            n = min(len(other), len(stroke))
+            squares.append((stroke[:n] - other[:n]) ** 2)
+        last[float(duty[a])] = stroke
+    return float(np.sqrt(np.concatenate(squares).mean() / 2)) if squares else float("nan")
