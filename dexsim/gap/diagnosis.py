@@ -23,7 +23,7 @@ from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_experiment import rival_of
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Clock, Diagnosis, Settings, empty
-from dexsim.gap.search import baseline, inverse_dynamics
+from dexsim.gap.search import baseline, external_force, inverse_dynamics
 from dexsim.gap.search.parallel import together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch import handed_on as touch_handed
@@ -139,6 +139,9 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         runs, held = inputs.free_air(runs, held, inputs.merged_spans(pressed), notes, "presses against an end of its motion that no recording for the fit has shown")
         if s.held_out and not held:
             return alone("the recordings kept out do nothing but press against an end of a joint's motion")
+    pushes = external_force.find(model, runs, [i for i in range(len(runs)) if i not in held], s.seed)
+    runs, held = external_force.without(pushes, runs, held, notes)
+    clock.lap("forces from outside")
     for run in runs:
         run.smooth()
     moving = [j for j, name in enumerate(runs[0].joints) if max(float(np.ptp(r.q[:, j])) for r in runs) > 2e-3]
@@ -219,6 +222,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     result.stages = [x.text for x in stages] + behind
     add_behind(result, inverse_dynamics.findings(by_torque, nothing_believed, runs, train), by_torque)
     inverse_dynamics.hand_on(by_torque, result, outcomes, test, span_test)
+    external_force.claim(result, pushes)
     result.data["unexplained"]["not_considered"] = left_out
     add_touch(result, felt)
     result.lengths = lengths

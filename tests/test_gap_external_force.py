@@ -1,0 +1,53 @@
+"""A joint that something outside pushes in stretches of time: said with when and how hard, and not taken for physics of its own."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_gap_torque_route import arm, run
+
+from dexsim.gap.search import external_force
+
+SPANS = ((4.0, 6.5), (11.0, 12.5), (16.0, 18.0))
+
+
+def shove(t: np.ndarray, size: float = 6.0) -> np.ndarray:
+    """N.m on the elbow: half waves within SPANS."""
+    return sum(size * np.where((t > a) & (t < b), np.sin(np.pi * (t - a) / (b - a)), 0.0) for a, b in SPANS)
+
+
+def test_pushes_are_told_with_when_and_how_hard():
+    model = arm()
+    runs = [run(model, 0, pushed=shove), run(model, 1)]
+    pushes = external_force.find(model, runs, [0, 1])
+    assert [p.joint for p in pushes] == ["elbow"]
+    (push,) = pushes
+    assert push.clear and push.torque == pytest.approx(6.0, rel=0.1) and set(push.spans) == {"run0.mcap"}
+    t = runs[0].t
+    inside = lambda spans: np.any([(t >= a) & (t <= b) for a, b in spans], 0)  # noqa: E731
+    told, true = inside(push.spans["run0.mcap"]), np.abs(shove(t)) > 0.25 * 6.0
+    assert (told & true).sum() / (told | true).sum() > 0.8
+    finding = push.finding()
+    assert finding["effect"] == "external_force" and finding["confidence"] >= 0.8 and len(finding["when"]) == 3
+    assert finding["parameters"]["torque"]["low"] < 6.0 < finding["parameters"]["torque"]["high"] * 1.05
+    assert "pushes on elbow" in push.text
+
+
+def test_nothing_is_told_where_nothing_pushes():
+    model = arm()
+    assert external_force.find(model, [run(model, 0), run(model, 1, friction=(1.5, 0.6))], [0, 1]) == []
+
+
+def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
+    model = arm()
+    r = run(model, 0)
+    r.torque[:, 1] = np.random.default_rng(0).standard_normal(len(r.t) // 20 + 1).repeat(20)[: len(r.t)]
+    (push,) = external_force.find(model, [r], [0])
+    assert not push.clear and push.finding()["confidence"] < 0.5
+    of = lambda effect, joint: {"effect": effect, "where": {"joints": [joint]}, "confidence": 0.7}  # noqa: E731
+    d = SimpleNamespace(data={"findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")], "verdict": "explained"}, notes=[], sentence="It does.")
+    external_force.claim(d, [push])
+    assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"] and "does not fit its body" in d.sentence
+    assert d.data["verdict"] == "explained" and len(d.notes) == 1
