@@ -1,10 +1,12 @@
 """Fingers of the ergoCub humanoid hand, driven open loop (github.com/icub-tech-iit/ergocub-software, BSD-3-Clause): one tendon-driven joint a run.
 
 Each run as an npz: t [s], pwm_set and pwm_read [% of full duty], theta_deg [deg, 0 is a stop]. Only ratios of torque, inertia and friction show in a
-motion without a load cell: inertias are in units of an assumed one (`INERTIA`), torques with it.
+motion without a load cell: inertias are in units of an assumed one (`INERTIA`), torques with it. The host turned the duty round where the finger
+passed a threshold, which a free run of the whole would not know: each run is cut into clips of whole cycles of `CLIP` s and more, each of them
+free from its first sample.
 
 Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third, beginning with the
-third; of each run alone its last quarter, as the tool itself chooses.
+third; of each run alone the last quarter of its clips.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from dexsim.errors import UserError
 
 FINGERS = {"middle": ("middle", "middle1", "middle3", "middle4", "middle5", "middle6", "output"), "ring_little": ("rinky", "rinky1", "rinky3"), "thumb": ("thumb1",)}
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
+CLIP = 2.0  # s
+KEPT = 0.25  # of a run's clips
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
 PER_DUTY = 1e-3 / np.pi  # duty per rad of the loop that stands for none: a finger's whole turn is 0.03 % of the duty
 MODEL = f"""<mujoco model="ergocub_finger">
@@ -44,9 +48,9 @@ SERVO = {
 
 @dataclass
 class Ergocub:
-    """Converted files: recordings by run."""
+    """Converted files: clips by run, in the order of time."""
 
-    runs: dict[str, Path]
+    runs: dict[str, list[Path]]
     model: Path
     servo: Path
 
@@ -70,12 +74,28 @@ def convert(data: Path, out: Path) -> Ergocub:
     for name in names:
         raw = np.load(data / f"{name}.npz")
         t, set_, read = raw["t"], raw["pwm_set"] / 100.0, raw["pwm_read"] / 100.0
-        changed = np.flatnonzero(np.r_[True, np.diff(set_) != 0])
-        keep = slice(None, None, EVERY)
         q = np.radians(raw["theta_deg"])
-        made[name] = save(out / f"{name}.mcap", ("joint",), t[changed], (set_ / PER_DUTY)[changed, None], t[keep], q[keep, None],
-                          duty=read[keep, None] if np.ptp(read) > 0 else None, robot="ergocub_finger", gravity="0 0 0")  # fmt: skip
+        made[name] = []
+        for k, (a, b) in enumerate(_clips(t, set_, q)):
+            on = slice(a, b)
+            changed = a + np.flatnonzero(np.r_[True, np.diff(set_[on]) != 0])
+            keep = slice(a, b, EVERY)
+            made[name].append(save(out / f"{name}_{k:02d}.mcap", ("joint",), t[changed], (set_ / PER_DUTY)[changed, None], t[keep], q[keep, None],
+                                   duty=read[keep, None] if np.ptp(read) > 0 else None, robot="ergocub_finger", gravity="0 0 0"))  # fmt: skip
     return Ergocub(made, model, servo)
+
+
+def _clips(t: np.ndarray, duty: np.ndarray, q: np.ndarray) -> list[tuple[int, int]]:
+    """Samples at which clips begin and end: where the duty turns positive; all in one where the encoder says nothing."""
+    turns = np.flatnonzero((duty[1:] > 0) & (duty[:-1] <= 0)) + 1
+    if np.ptp(q) == 0 or len(turns) < 2:
+        return [(0, len(t))]
+    out, begin = [], turns[0]
+    for k in turns[1:]:
+        if t[k] - t[begin] >= CLIP:
+            out.append((int(begin), int(k)))
+            begin = k
+    return out or [(int(turns[0]), len(t))]
 
 
 def repeat_noise(data: Path, name: str) -> float:

@@ -53,8 +53,8 @@ def joint(job: tuple[Any, Path, str]) -> dict:
 
 
 def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -> dict:
-    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: the last quarter of the time)."""
-    from benchmarks.real.convert_ergocub import convert, repeat_noise
+    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: on the last clips of the first)."""
+    from benchmarks.real.convert_ergocub import KEPT, convert, repeat_noise
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
 
@@ -62,14 +62,17 @@ def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -
     quiet_warp("cpu")
     made = convert(data, out / f"recordings_{name}")
     start = time.perf_counter()
-    judged = [made.runs[n] for n in held] or None
-    d = diagnose(Settings([made.runs[n] for n in fitted], out / name, judged, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
+    clips, judged = [p for n in fitted for p in made.runs[n]], [p for n in held for p in made.runs[n]]
+    if not held and len(clips) > 3:
+        cut = len(clips) - max(round(KEPT * len(clips)), 1)
+        clips, judged = clips[:cut], clips[cut:]
+    d = diagnose(Settings(clips, out / name, judged or None, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
     save(d, out / name)
     v, plain = d.joints.get("joint", {}), d.data["baseline"]
     named = [f for f in d.data["findings"] if f["effect"] != "bad_channel"]
     return _keep(out, name, {
         "name": name, "finger": which, "fitted": fitted, "held_out": held, "verdict": d.data["verdict"], "sentence": d.sentence,
-        "first_name": named[0]["effect"] if named else None, "findings": [brief(f) for f in d.data["findings"]],
+        "clips": [len(clips), len(judged)], "first_name": named[0]["effect"] if named else None, "findings": [brief(f) for f in d.data["findings"]],
         "before_mrad": _milli(v.get("before")), "after_mrad": _milli(v.get("after")), "plain_mrad": _milli(plain.get("error")),
         "plain": plain.get("joints", {}).get("joint", {}).get("parameters"), "less_than_plain": round(1 - v["after"] / plain["error"], 3) if v and plain else None,
         "repeat_noise_mrad": {n: _milli(repeat_noise(data, n)) for n in (*fitted, *held)}, "floor_mrad": _milli(d.data["noise_floor"]["position_rad"]),

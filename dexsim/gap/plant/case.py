@@ -18,6 +18,7 @@ from dexsim.gap.plant.scales import Scales
 from dexsim.gap.read.runs import Run
 
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
+REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
 BELIEF = 0.05  # nominal figures of a real machine are off by as much, and no finding before
 
 
@@ -53,6 +54,9 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
         smallest = steps[0]
         if len(steps) < 0.2 * len(x) + 20 and np.mean(np.abs(steps[:20] / smallest - np.round(steps[:20] / smallest)) < 0.05) > 0.9:
             quantum = float(smallest)
+    changes = np.abs(np.diff(x))
+    if not quantum and np.mean(changes == 0.0) > REPEATS and (changes > 1e-7).any():  # steps of an encoder that are not all alike
+        quantum = float(np.median(changes[changes > 1e-7]))
     if len(x) < 9:
         return max(quantum / np.sqrt(12), 1e-9), quantum
     k = 3
