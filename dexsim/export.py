@@ -27,7 +27,8 @@ settings (key=default):
   check=              a bundle to recompute
   steps=64            golden rows from a simulated episode; as many again are drawn at random
   seed=0              of both
-  agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class): typed here, its code runs
+  agent.NAME=         a class of your own that the checkpoint names (agent.actor.class_name=package.module:Class);
+                      typed here, its code runs
 """
 KEYS = ("checkpoint", "out", "calibration", "check", "steps", "seed")
 TOLERANCE = 1e-5
@@ -50,13 +51,25 @@ def main(argv: Sequence[str]) -> int:
     for key in ("checkpoint", "out"):
         if not given.get(key):
             raise UserError(f"say {key}=... (dexsim export --help)")
-    out = export(given["checkpoint"], given["out"], given.get("calibration"), _whole(given, "steps", 64), _whole(given, "seed", 0),
-                 frozenset((k, v) for k, v in given.items() if k.startswith("agent.")))
+    out = export(
+        given["checkpoint"],
+        given["out"],
+        given.get("calibration"),
+        _whole(given, "steps", 64),
+        _whole(given, "seed", 0),
+        frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
+    )
     return 0 if check(out) else 1
 
 
-def export(checkpoint: str, out: str | Path, calibration: str | None = None, steps: int = 64, seed: int = 0,
-           typed: frozenset[tuple[str, Any]] = frozenset()) -> Path:
+def export(
+    checkpoint: str,
+    out: str | Path,
+    calibration: str | None = None,
+    steps: int = 64,
+    seed: int = 0,
+    typed: frozenset[tuple[str, Any]] = frozenset(),
+) -> Path:
     """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
     from dexsim.calibration.file import Calibration
     from dexsim.console import folders
@@ -68,7 +81,9 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
     data = checkpoints.load(checkpoint)
     task = data["config"]["choices"]["task"]
     if data["config"]["task"].get("name", task) not in BUILDERS:
-        raise UserError(f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of {', '.join(BUILDERS)}")
+        raise UserError(
+            f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of {', '.join(BUILDERS)}"
+        )
     measured = None if calibration is None else Calibration.load(calibration)
     out = Path(out).expanduser()
     if out.is_dir() and any(out.iterdir()):
@@ -89,7 +104,8 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
     path = out / bundle.POLICY
     with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
         warnings.simplefilter("ignore")
-        torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False, opset_version=OPSET,
+        torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False,
+                          opset_version=OPSET,
                           input_names=["observation"], output_names=["action"],
                           dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
     rows = golden(env, policy, model, steps, seed)
@@ -108,8 +124,8 @@ def export(checkpoint: str, out: str | Path, calibration: str | None = None, ste
 
 
 def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
-    """Inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets before and
-    after they were built from and led to, and as many random observations."""
+    """Inputs and outputs of this machine: `steps` observations of a simulated episode with the signals, targets before
+    and after they were built from and led to, and as many random observations."""
     import torch
 
     from dexsim.deploy import bundle
@@ -117,7 +133,9 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     observations = bundle.builder(env.task["name"])
     seen: list[tuple] = []
     build = observations.build
-    kept: dict[str, list] = {k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))}
+    kept: dict[str, list] = {
+        k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))
+    }
 
     def watch(signals: Any, settings: Any) -> Any:
         seen.append(type(signals)(*(x.clone() for x in signals)))  # some are the task's own memory
@@ -160,10 +178,13 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
     own = _grasp(env) if task["name"] == "grasp" else _rotate(env)
     table, at = [], 0
     for name, width, unit, source, scaling in own.pop("rows"):
-        table.append({"name": name, "start": at, "stop": at + width, "unit": unit, "frame": bundle.builder(task["name"]).FRAME[name],
-                      "order": bundle.builder(task["name"]).ORDER[name], "scaling": scaling, "source": source})  # fmt: skip
+        table.append({"name": name, "start": at, "stop": at + width, "unit": unit,
+                      "frame": bundle.builder(task["name"]).FRAME[name],
+                      "order": bundle.builder(task["name"]).ORDER[name], "scaling": scaling,
+                      "source": source})  # fmt: skip
         at += width
-    action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]), "lead": float(task["action"]["lead"]),
+    action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
+              "lead": float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": _floats(env.q_low), "high": _floats(env.q_high),
               "speed_limit_rad_s": _floats(xhand.speeds()), "order": "joints"}  # fmt: skip
     return {
@@ -191,22 +212,29 @@ def _grasp(env: Any) -> dict[str, Any]:
     """The parts of a manifest that differ between tasks."""
     from dexsim.deploy import observations
 
-    scaling = {"tau/tau_max": "torque [N.m] / normalization.tau_max", "F/F_max": "force [N] / normalization.force_max_N"}
+    scaling = {
+        "tau/tau_max": "torque [N.m] / normalization.tau_max",
+        "F/F_max": "force [N] / normalization.force_max_N",
+    }
     named = {"force_command": "the commanded share of normalization.force_max_N"}
-    rows = [(name, width, unit, source, named.get(name, scaling.get(unit, "none"))) for name, width, unit, source in observations.OBSERVATION]
+    rows = [
+        (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
+        for name, width, unit, source in observations.OBSERVATION
+    ]
     return {
         "rows": rows, "initial_pose": _floats(env.pose0),
         "rates": {"height_delay_s": [float(x) for x in env.task["sensors"]["vision_delay"]]},
         "normalization": {"force_max_N": float(env.f_max)},
-        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the palm's centre,"
+        "perception": {"object_height": "vision: a depth image and the object's mask; z of the mask's centroid from the"
+                                        " palm's centre,"
                                         " along the palm's normal", "object_xy": "held at the first value",
                        "object_velocity": "finite difference of z over one policy period", "critic": "not deployed"},
     }  # fmt: skip
 
 
 def _rotate(env: Any) -> dict[str, Any]:
-    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose that is
-    most like all others: where the fingers wait for the cube, and the targets they close to."""
+    """The same for the rotation. `task_settings` is what the observation and the goal depend on; `grip` the held pose
+    that is most like all others: where the fingers wait for the cube, and the targets they close to."""
     import copy
 
     from dexsim.deploy import observations_rotate
@@ -214,7 +242,10 @@ def _rotate(env: Any) -> dict[str, Any]:
     task, g = env.task, env.grasps
     targets = task["observe"].get("last_action", "step") != "step"
     scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
-    rows = [(name, width, unit, source, scaled.get(name, "none")) for name, width, unit, source in observations_rotate.rows(task)]
+    rows = [
+        (name, width, unit, source, scaled.get(name, "none"))
+        for name, width, unit, source in observations_rotate.rows(task)
+    ]
     imu = task["perception"] == "imu"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())
     settings = {k: copy.deepcopy(task[k]) for k in ("perception", "history", "observe", "goal")}
@@ -224,13 +255,17 @@ def _rotate(env: Any) -> dict[str, Any]:
         "rates": {"imu_delay_s": [float(x) for x in env.sampler.range("imu.delay")[:2]]} if imu else {},
         "normalization": {},
         "task_settings": settings,
-        "grip": {"hand": _floats(g.hand[middle]), "target": _floats(g.target[middle]), "object_pose": _floats(g.pose[middle]),
+        "grip": {"hand": _floats(g.hand[middle]), "target": _floats(g.target[middle]),
+                 "object_pose": _floats(g.pose[middle]),
                  "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
                  "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
-        "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up; any heading" if imu else "none",
-                       "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the angle left is below"
+        "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up;"
+                                             " any heading" if imu else "none",
+                       "goal": "the orientation first seen, turned by goal.angle about goal.axis; the next one once the"
+                               " angle left is below"
                                " reward.delta_rot" if imu else "none: the policy turns without end",
-                       "history": "none" if imu else f"{task['history']} control steps, newest first; the first fills all",
+                       "history": "none" if imu else f"{task['history']} control steps, newest first; the first fills"
+                                                     " all",
                        "critic": "not deployed"},
     }  # fmt: skip
 
@@ -252,8 +287,8 @@ def _versions(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def check(path: str | Path) -> bool:
-    """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints the largest
-    differences. False where one is beyond the manifest's tolerance."""
+    """Recompute a bundle's golden outputs with onnxruntime and its golden observations with the builder; prints the
+    largest differences. False where one is beyond the manifest's tolerance."""
     import numpy as np
     import torch
 
@@ -270,20 +305,29 @@ def check(path: str | Path) -> bool:
     except UserError:
         raise
     except Exception as error:  # a damaged zip or array header ends in many ways
-        raise UserError(f"{file}: cannot be read ({' '.join(str(error).split())[:100]}); export the bundle again") from None
-    observations, settings = bundle.builder(m["task"]), m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"]
+        raise UserError(
+            f"{file}: cannot be read ({' '.join(str(error).split())[:100]}); export the bundle again"
+        ) from None
+    observations, settings = (
+        bundle.builder(m["task"]),
+        m["task_settings"] if m["task"] == "rotate" else m["normalization"]["force_max_N"],
+    )
     rule = ActionRule.from_manifest(m["action"])
     try:
         signals = observations.Signals(*(torch.from_numpy(rows[f"signal_{k}"]) for k in observations.Signals._fields))
         built = observations.build(signals, settings).numpy() - observation[:n]
-        targets = np.stack([rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)])
+        targets = np.stack(
+            [rule.target(a, t, q) for a, t, q in zip(b.act(observation[:n]), rows["before"], rows["q"], strict=True)]
+        )
         single = np.concatenate([b.act(row[None]) for row in observation])
         whole, aimed = b.act(observation), targets - rows["target"]
         single - expected, whole - expected
     except KeyError as error:
         raise UserError(f"{file}: lacks {error}; export the bundle again") from None
     except Exception as error:  # onnxruntime's, numpy's and torch's for arrays of the wrong shape or type
-        raise UserError(f"{file}: its arrays do not fit the bundle ({' '.join(str(error).split())[:160]}); export it again") from None
+        raise UserError(
+            f"{file}: its arrays do not fit the bundle ({' '.join(str(error).split())[:160]}); export it again"
+        ) from None
     apart = lambda x, y: np.abs(x - y) / np.maximum(1.0, np.abs(y))  # noqa: E731 (random rows give actions far over 1)
     found = {
         "actions": float(apart(whole, expected).max()),
@@ -293,10 +337,16 @@ def check(path: str | Path) -> bool:
     }
     limit = float(m["golden"]["tolerance"])
     for name, value in found.items():
-        print(f"golden   {name}: largest difference {value:.2g} over {len(observation)} rows ({'ok' if value <= limit else 'FAILED'})")
+        print(
+            f"golden   {name}: largest difference {value:.2g} over {len(observation)} rows"
+            f" ({'ok' if value <= limit else 'FAILED'})"
+        )
     good = all(v <= limit for v in found.values())
     if not good:
-        print(f"golden   FAILED: allowed {limit:g}; this onnxruntime computes otherwise than the exporting machine", file=sys.stderr)
+        print(
+            f"golden   FAILED: allowed {limit:g}; this onnxruntime computes otherwise than the exporting machine",
+            file=sys.stderr,
+        )
     return good
 
 
@@ -309,7 +359,9 @@ def _golden_rows(file: Path) -> dict[str, Any]:
     with zipfile.ZipFile(file) as archive:
         size = sum(i.file_size for i in archive.infolist())
     if size > MOST_GOLDEN:
-        raise UserError(f"{file}: unpacks to {size / 2**20:.0f} MiB, allowed {MOST_GOLDEN >> 20} MiB; export the bundle again")
+        raise UserError(
+            f"{file}: unpacks to {size / 2**20:.0f} MiB, allowed {MOST_GOLDEN >> 20} MiB; export the bundle again"
+        )
     with np.load(file, allow_pickle=False) as stored:
         return {k: stored[k] for k in stored.files}
 

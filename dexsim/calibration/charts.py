@@ -20,7 +20,16 @@ def lines(half: Half, path: Path, title: str) -> Path:
         ax.set_title(joint, fontsize=9)
         levels, f = half.levels.get(joint), half.fits.get(joint)
         if f is None:
-            ax.text(0.5, 0.5, half.left_out.get(joint, ""), ha="center", va="center", fontsize=7, wrap=True, transform=ax.transAxes)
+            ax.text(
+                0.5,
+                0.5,
+                half.left_out.get(joint, ""),
+                ha="center",
+                va="center",
+                fontsize=7,
+                wrap=True,
+                transform=ax.transAxes,
+            )
             continue
         for way, name, mark in ((True, "loading", "o"), (False, "unloading", "s")):
             m = levels.up == way
@@ -28,7 +37,9 @@ def lines(half: Half, path: Path, title: str) -> Path:
         x = np.array([min(0, levels.effort.min()), levels.effort.max()])
         ax.plot(x, f.slope * x + f.offset, lw=1, label=f"{f.slope:.3g} x {f.offset:+.2f}")
         ax.plot(x, f.ratio * x, "--", lw=0.8, label=f"{f.ratio:.3g} x")
-        text = f"R2 {f.r2:.4f}\nheld out {f.held_out:.2f} N\nhysteresis {100 * f.hysteresis:.0f} %" + ("" if f.linear else "\nnot linear")
+        text = f"R2 {f.r2:.4f}\nheld out {f.held_out:.2f} N\nhysteresis {100 * f.hysteresis:.0f} %" + (
+            "" if f.linear else "\nnot linear"
+        )
         color = "black" if f.linear else "tab:red"
         ax.text(0.97, 0.04, text, ha="right", va="bottom", fontsize=7, transform=ax.transAxes, color=color)
         ax.legend(fontsize=6, loc="upper left")
@@ -60,7 +71,11 @@ def press(depth: np.ndarray, force: np.ndarray, fit: Stiffness, path: Path) -> P
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     ax = figure.subplots()
     ax.plot(1e3 * depth, force, ".-", lw=0.6, label="measured")
-    ax.plot([0, 1e3 * depth.max()], [0, fit.value * depth.max()], label=f"{fit.value:.0f} N/m, held out {fit.held_out:.2f} N")
+    ax.plot(
+        [0, 1e3 * depth.max()],
+        [0, fit.value * depth.max()],
+        label=f"{fit.value:.0f} N/m, held out {fit.held_out:.2f} N",
+    )
     ax.set(xlabel="depth, mm", ylabel="force, N")
     ax.legend()
     ax.grid(alpha=0.25)
@@ -80,7 +95,9 @@ def pads(found: dict[str, Pad], path: Path) -> Path:
         for n, pair in enumerate(pad.swapped):
             for k in pair:
                 ax.text(*divmod(k, xhand.ROWS), chr(ord("a") + n % 26), ha="center", va="center", color="black")
-        ax.set_title(f"{finger}: held out {100 * pad.held_out:.1f} % ({100 * pad.held_out_equal:.1f} % equal gains)", fontsize=7)
+        ax.set_title(
+            f"{finger}: held out {100 * pad.held_out:.1f} % ({100 * pad.held_out_equal:.1f} % equal gains)", fontsize=7
+        )
         ax.set(xlabel="column", ylabel="row")
     figure.colorbar(image, ax=figure.axes, shrink=0.6, label="gain (x dead, letters swapped)")
     figure.savefig(path, dpi=110)

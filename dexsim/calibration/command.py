@@ -28,7 +28,9 @@ def main(argv: Sequence[str], config_dir: Path) -> int:
         return 0 if argv else 2
     s, meta = _settings(argv, yaml.safe_load(file.read_text(encoding="utf-8")))
     if not any(s[k] for k in ("real", "sim", "touch", "curve", "simulate", "simulate_touch")):
-        raise UserError("say what to calibrate: real=, sim=, simulate=true, touch=, simulate_touch=true or curve= (--help)")
+        raise UserError(
+            "say what to calibrate: real=, sim=, simulate=true, touch=, simulate_touch=true or curve= (--help)"
+        )
     return run(s, meta)
 
 
@@ -40,7 +42,9 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
 
     out = Path(str(s["out"])).expanduser()
     given = [Path(p.strip()) for k in ("real", "sim", "touch", "curve") if s[k] for p in str(s[k]).split(",")]
-    made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES["real" if s["realistic"] else "sim"]] * s["simulate"]
+    made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES["real" if s["realistic"] else "sim"]] * s[
+        "simulate"
+    ]
     outputs.claim(out, "out=", (*RESULTS, *made_here), given)
     report: dict[str, Any] = {"schema": 1, "robot": "xhand_right", "normalization": s["normalization"], "source": {}}
     if s["simulate"]:
@@ -84,7 +88,10 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
         if real and sim:
             _print_ratio(report["joints"])
         elif real:
-            print("note     only the real half: current_per_torque stays unknown; add sim= (or simulate=true) with the same presses\n")
+            print(
+                "note     only the real half: current_per_torque stays unknown; add sim= (or simulate=true) with the"
+                " same presses\n"
+            )
     touch: dict[str, Any] = {}
     if real and real.lsb:  # alpha is in the newtons that these counts were taken for
         touch["lsb"] = real.lsb
@@ -113,9 +120,28 @@ def _print_half(half: Any, key: str, symbol: str) -> None:
         if f is None:
             rows.append((joint, "-", "-", "-", "-", "-", "-", half.left_out.get(joint, "")))
             continue
-        rows.append((joint, f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]", f"{f.slope:.4g} {f.offset:+.2f}", f"{f.r2:.4f}",
-                     f"{f.held_out:.2f}", f"{100 * f.hysteresis:.0f}", f"{f.effort_max:.3g} / {f.force_max:.3g}", "; ".join(f.why) or "linear"))
-    head = ("joint", f"{symbol} N/{half.unit}, 95 %", "slope, offset", "R2", "held out N", "hysteresis %", f"max {half.unit} / N", "verdict")
+        rows.append(
+            (
+                joint,
+                f"{f.ratio:.4g} [{f.ratio_low:.4g}, {f.ratio_high:.4g}]",
+                f"{f.slope:.4g} {f.offset:+.2f}",
+                f"{f.r2:.4f}",
+                f"{f.held_out:.2f}",
+                f"{100 * f.hysteresis:.0f}",
+                f"{f.effort_max:.3g} / {f.force_max:.3g}",
+                "; ".join(f.why) or "linear",
+            )
+        )
+    head = (
+        "joint",
+        f"{symbol} N/{half.unit}, 95 %",
+        "slope, offset",
+        "R2",
+        "held out N",
+        "hysteresis %",
+        f"max {half.unit} / N",
+        "verdict",
+    )
     print(table(f"{key}: fingertip force over effort", head, rows))
     for note in half.notes:
         print(f"note     {note}")
@@ -127,9 +153,22 @@ def _print_ratio(joints: dict[str, Any]) -> None:
     rows = []
     for joint, e in joints.items():
         c = e.get("current_per_torque")
-        rows.append((joint, "-" if c is None else f"{c['value']:.4g} [{c['low']:.4g}, {c['high']:.4g}]", f"{e.get('current_max', float('nan')):.3g}",
-                     f"{e.get('torque_seen', float('nan')):.3g}"))
-    print(table("current for torque (equal fingertip force)", ("joint", "A per N.m, 95 %", "I_max A", "tau_max pressed N.m"), rows) + "\n")
+        rows.append(
+            (
+                joint,
+                "-" if c is None else f"{c['value']:.4g} [{c['low']:.4g}, {c['high']:.4g}]",
+                f"{e.get('current_max', float('nan')):.3g}",
+                f"{e.get('torque_seen', float('nan')):.3g}",
+            )
+        )
+    print(
+        table(
+            "current for torque (equal fingertip force)",
+            ("joint", "A per N.m, 95 %", "I_max A", "tau_max pressed N.m"),
+            rows,
+        )
+        + "\n"
+    )
 
 
 def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any]) -> dict[str, Any]:
@@ -165,12 +204,20 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
     result: dict[str, Any] = {"dead": {}, "swapped": {}, "gain": {}, "bias": {}, "hysteresis": {}}
     scales = [p.scale for p in found.values() if p.scale]
     count = lsb if lsb is not None else (float(np.mean(scales)) if scales else None)
-    result["lsb"] = float(f"{np.mean(scales):.6g}") if scales and unit == "count" else (count if unit == "count" else None)
+    result["lsb"] = (
+        float(f"{np.mean(scales):.6g}") if scales and unit == "count" else (count if unit == "count" else None)
+    )
     for finger, p in found.items():
-        words = [f"threshold {p.threshold:.3g} {unit}", f"{len(p.dead)} dead", f"{len(p.swapped)} swapped pairs", f"{len(p.unseen)} not pressed enough to tell"]
+        words = [
+            f"threshold {p.threshold:.3g} {unit}",
+            f"{len(p.dead)} dead",
+            f"{len(p.swapped)} swapped pairs",
+            f"{len(p.unseen)} not pressed enough to tell",
+        ]
         if p.gain is not None:
             words.append(f"{p.scale:.4g} N a {unit}, load on held-out presses to {100 * p.held_out:.1f} %"
-                         f" ({100 * p.held_out_equal:.1f} % with equal gains), hysteresis {100 * p.hysteresis:.1f} %")  # fmt: skip
+                         f" ({100 * p.held_out_equal:.1f} % with equal gains), hysteresis"
+                         f" {100 * p.hysteresis:.1f} %")  # fmt: skip
             base = np.mean(scales)
             result["gain"][finger] = [round(float(g * p.scale / base), 4) for g in p.gain]
             result["hysteresis"][finger] = round(float(p.hysteresis), 4) if np.isfinite(p.hysteresis) else None
@@ -200,23 +247,40 @@ def _curve(s: dict[str, Any], out: Path) -> dict[str, Any]:
     if kind == "press":
         k = rubber.fit_linear(a, b)
         loop = f", hysteresis {100 * k.hysteresis:.1f} %" if np.isfinite(k.hysteresis) else ""
-        print(f"curve    linear stiffness {k.value:.4g} [{k.low:.4g}, {k.high:.4g}] N/m, R2 {k.r2:.4f}, held out {k.held_out:.3g} N{loop}")
+        print(
+            f"curve    linear stiffness {k.value:.4g} [{k.low:.4g}, {k.high:.4g}] N/m, R2 {k.r2:.4f}, held out"
+            f" {k.held_out:.3g} N{loop}"
+        )
         print(f"plot     {_moved(charts.press(a, b, k, out / 'press.png'))}")
-        result["stiffness"] = {"value": k.value, "low": k.low, "high": k.high, "r2": k.r2, "held_out_N": k.held_out, "linear": k.r2 >= LINEAR_R2}
+        result["stiffness"] = {
+            "value": k.value,
+            "low": k.low,
+            "high": k.high,
+            "r2": k.r2,
+            "held_out_N": k.held_out,
+            "linear": k.r2 >= LINEAR_R2,
+        }
         if k.r2 < LINEAR_R2:
-            print(f"note     R2 under {LINEAR_R2}: the force does not grow in proportion to depth; the Mooney-Rivlin fit (area=) may hold")
+            print(
+                f"note     R2 under {LINEAR_R2}: the force does not grow in proportion to depth; the Mooney-Rivlin fit"
+                " (area=) may hold"
+            )
         if s["area"] is None:
             print("note     area= is not given: no rubber constants from force and depth")
             return result
         a, b = rubber.from_press(a, b, float(s["area"]), float(s["thickness"]))
     keep = a <= float(s["stretch_max"])
     fit = rubber.fit_mooney_rivlin(a[keep], b[keep])
-    print(f"curve    Mooney-Rivlin c10 {fit.c10:.4g} [{fit.c10_range[0]:.4g}, {fit.c10_range[1]:.4g}] Pa, c01 {fit.c01:.4g}"
-          f" [{fit.c01_range[0]:.4g}, {fit.c01_range[1]:.4g}] Pa, R2 {fit.r2:.4f}, held out {fit.held_out:.3g} Pa, stretch"
+    print(f"curve    Mooney-Rivlin c10 {fit.c10:.4g} [{fit.c10_range[0]:.4g}, {fit.c10_range[1]:.4g}] Pa, c01"
+          f" {fit.c01:.4g}"
+          f" [{fit.c01_range[0]:.4g}, {fit.c01_range[1]:.4g}] Pa, R2 {fit.r2:.4f}, held out {fit.held_out:.3g} Pa,"
+          " stretch"
           f" {fit.stretch[0]:.2f} to {fit.stretch[1]:.2f}")  # fmt: skip
     print(f"plot     {_moved(charts.rubber(a[keep], b[keep], fit, out / 'rubber.png'))}\n")
-    result["rubber"] = {"c10": fit.c10, "c01": fit.c01, "c10_range": list(fit.c10_range), "c01_range": list(fit.c01_range), "r2": fit.r2,
-                        "held_out_Pa": fit.held_out, "thickness": float(s["thickness"]), "shear_modulus": fit.shear_modulus}  # fmt: skip
+    result["rubber"] = {"c10": fit.c10, "c01": fit.c01, "c10_range": list(fit.c10_range),
+                        "c01_range": list(fit.c01_range), "r2": fit.r2,
+                        "held_out_Pa": fit.held_out, "thickness": float(s["thickness"]),
+                        "shear_modulus": fit.shear_modulus}  # fmt: skip
     return result
 
 
@@ -244,7 +308,10 @@ def _settings(argv: Sequence[str], defaults: dict[str, Any]) -> tuple[dict[str, 
                 out[key] = float("nan")
             least = {"levels": 4, "seed": 0, "stretch_max": 1.01}.get(key, 1e-12)
             if not least <= out[key] < float("inf") or (key in ("levels", "seed") and out[key] != int(out[key])):
-                raise UserError(f"{key}={text}: must be a{' whole' if key in ('levels', 'seed') else ''} number of at least {least:g}")
+                raise UserError(
+                    f"{key}={text}: must be a{' whole' if key in ('levels', 'seed') else ''} number of at least"
+                    f" {least:g}"
+                )
         else:
             out[key] = text
         if key in CHOICES and out[key] not in CHOICES[key]:
@@ -260,4 +327,10 @@ def _help(file: Path) -> str:
             setting, _, comment = line.partition("  # ")
             key, _, value = setting.partition(": ")
             lines.append(f"  {key + '=' + value:<34} {comment}")
-    return "\n".join([*lines, "  meta.KEY=VALUE                     metadata that wins over what real= and touch= recordings say", ""])
+    return "\n".join(
+        [
+            *lines,
+            "  meta.KEY=VALUE                     metadata that wins over what real= and touch= recordings say",
+            "",
+        ]
+    )

@@ -1,8 +1,8 @@
-"""Current against torque, joint by joint: what a real milliampere presses, what a simulated newton-metre presses, and the
-current that is worth a torque because both press equally hard.
+"""Current against torque, joint by joint: what a real milliampere presses, what a simulated newton-metre presses, and
+the current that is worth a torque because both press equally hard.
 
-Paper, "Current-Torque Calibration": F_real = alpha I, F_sim = beta tau; I / I_max and tau / tau_max stand for F / F_max. The
-two halves press the same place in the same posture, so that the lever arm cancels: I = (beta / alpha) tau.
+Paper, "Current-Torque Calibration": F_real = alpha I, F_sim = beta tau; I / I_max and tau / tau_max stand for F /
+F_max. The two halves press the same place in the same posture, so that the lever arm cancels: I = (beta / alpha) tau.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ UNIT = {"current_A": "A", "torque_Nm": "N.m"}
 
 @dataclass
 class Half:
-    """The presses of one side: by joint its levels, its line and the file. unit of the effort. left_out: joint -> why."""
+    """The presses of one side: by joint its levels, its line and the file. unit of the effort. left_out: joint ->
+    why."""
 
     unit: str
     levels: dict[str, Levels] = field(default_factory=dict)
@@ -38,28 +39,37 @@ class Half:
 
 
 def files_of(where: str | Sequence[str], key: str) -> list[Path]:
-    """Recordings named by a folder (its *.mcap, else *.csv and *.npz), a file, or several separated by commas. Raises UserError."""
+    """Recordings named by a folder (its *.mcap, else *.csv and *.npz), a file, or several separated by commas. Raises
+    UserError."""
     parts = where.split(",") if isinstance(where, str) else list(where)
     out: list[Path] = []
     for part in parts:
         path = Path(part.strip()).expanduser()
-        found = [path] if path.is_file() else sorted(path.glob("*.mcap")) or sorted([*path.glob("*.csv"), *path.glob("*.npz")])
+        found = (
+            [path]
+            if path.is_file()
+            else sorted(path.glob("*.mcap")) or sorted([*path.glob("*.csv"), *path.glob("*.npz")])
+        )
         if not found:
-            raise UserError(f"{key}={part.strip()}: no recording there (a .mcap, .csv or .npz file, or a folder of them)")
+            raise UserError(
+                f"{key}={part.strip()}: no recording there (a .mcap, .csv or .npz file, or a folder of them)"
+            )
         out += found
     return out
 
 
 def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = None, seed: int = 0) -> Half:
-    """Read presses and fit each joint: from the recording that was made for it (notes say `press: joint=NAME`), else from the one
-    in which it works hardest. Raises UserError if none shows a press."""
+    """Read presses and fit each joint: from the recording that was made for it (notes say `press: joint=NAME`), else
+    from the one in which it works hardest. Raises UserError if none shows a press."""
     out = Half(UNIT[effort_is])
     score: dict[str, tuple[bool, float]] = {}
     for path in paths:
         r = read(path, meta=meta)
         if r.effort_is != effort_is:
-            raise UserError(f"{path}: its effort is {r.effort_is}, expected {effort_is}; correct it with meta.effort_is=...,"
-                            f" or give it as {'sim' if r.effort_is == 'torque_Nm' else 'real'}=")
+            raise UserError(
+                f"{path}: its effort is {r.effort_is}, expected {effort_is}; correct it with meta.effort_is=...,"
+                f" or give it as {'sim' if r.effort_is == 'torque_Nm' else 'real'}="
+            )
         for f in r.findings:
             if f.severity == "error" or f.kind in ("lost_sign", "sign_mismatch", "saturation", "wrap"):
                 out.notes.append(f"{path.name}: {f.severity}: {f.kind} {f.topic} {f.joint} {f.text}".replace("  ", " "))
@@ -72,8 +82,11 @@ def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = No
                 score[joint] = rank
                 out.levels[joint], out.files[joint] = levels, path.name
     if not out.levels:
-        raise UserError(f"{', '.join(str(p) for p in paths[:3])}: no press found: commands (or the force) must hold still for 0.2 s at"
-                        " several levels while a fingertip presses with more than 0.3 N")
+        raise UserError(
+            f"{', '.join(str(p) for p in paths[:3])}: no press found: commands (or the force) must hold still for 0.2 s"
+            " at"
+            " several levels while a fingertip presses with more than 0.3 N"
+        )
     for joint in xhand.JOINTS:
         if joint not in out.levels:
             out.left_out[joint] = "no press of it in the recordings"
@@ -87,8 +100,8 @@ def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = No
 
 
 def combine(real: Half | None, sim: Half | None) -> dict[str, dict[str, Any]]:
-    """By joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per N.m) with intervals,
-    normalizations and reasons."""
+    """By joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per N.m) with
+    intervals, normalizations and reasons."""
     out: dict[str, dict[str, Any]] = {}
     for joint in xhand.JOINTS:
         entry: dict[str, Any] = {}

@@ -10,15 +10,15 @@ from scipy import stats
 BOOTSTRAP = 1000
 R2_LEAST, HYSTERESIS_MOST, OFFSET_MOST, BEND_MOST = 0.97, 0.10, 0.10, 0.05
 """A fit is called linear if R2 is at least the first, loading and unloading differ by at most the second share of the
-largest force, the line meets zero force within the third share of the effort's range, and a parabola through the same points
-leaves the line by at most the fourth share (or is not significant at 1 %)."""
+largest force, the line meets zero force within the third share of the effort's range, and a parabola through the same
+points leaves the line by at most the fourth share (or is not significant at 1 %)."""
 
 
 @dataclass
 class Levels:
     """Steady presses of one joint: effort [n] (A or N.m, positive while closing), force [n] N, level [n]: number of the
-    commanded level (loading and unloading of one level share it), up [n]: loading. position [n] rad; full [n]: a taxel stood
-    at its largest count; rows with no contact are left out (`free` counts them)."""
+    commanded level (loading and unloading of one level share it), up [n]: loading. position [n] rad; full [n]: a taxel
+    stood at its largest count; rows with no contact are left out (`free` counts them)."""
 
     effort: np.ndarray
     force: np.ndarray
@@ -34,8 +34,8 @@ class Levels:
 
 @dataclass
 class LineFit:
-    """force = ratio * effort (the paper's), and force = slope * effort + offset (N). *_low, *_high: 95 % intervals, by a
-    bootstrap over levels. hysteresis: mean gap between unloading and loading at equal effort over the largest force.
+    """force = ratio * effort (the paper's), and force = slope * effort + offset (N). *_low, *_high: 95 % intervals, by
+    a bootstrap over levels. hysteresis: mean gap between unloading and loading at equal effort over the largest force.
     held_out: RMS error [N] of lines fitted without the level they predict; bend: largest distance of a parabola
     from the line over the range of force. why: what keeps it from being a line; empty: linear."""
 
@@ -62,20 +62,23 @@ class LineFit:
 
     def table(self) -> dict[str, object]:
         """Plain numbers, rounded to 6 digits."""
+
         def nice(x):
             return float(f"{x:.6g}")
 
         return {
             "ratio": {"value": nice(self.ratio), "low": nice(self.ratio_low), "high": nice(self.ratio_high)},
             "slope": {"value": nice(self.slope), "low": nice(self.slope_low), "high": nice(self.slope_high)},
-            "offset_N": nice(self.offset), "r2": nice(self.r2), "r2_through_zero": nice(self.r2_ratio), "held_out_N": nice(self.held_out),
+            "offset_N": nice(self.offset), "r2": nice(self.r2), "r2_through_zero": nice(self.r2_ratio),
+            "held_out_N": nice(self.held_out),
             "hysteresis": nice(self.hysteresis), "bend": nice(self.bend), "effort_max": nice(self.effort_max),
             "force_max_N": nice(self.force_max), "presses": self.count, "linear": self.linear, "why": list(self.why),
         }  # fmt: skip
 
 
 def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
-    """The line of one joint's presses; None where there are fewer than 3 with contact. unit: of the effort, for texts."""
+    """The line of one joint's presses; None where there are fewer than 3 with contact. unit: of the effort, for
+    texts."""
     x, y, n = levels.effort, levels.force, len(levels)
     if n < 3 or np.ptp(x) == 0:
         return None
@@ -102,7 +105,8 @@ def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
     held = float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else float("nan")
     bend, significant = _bend(x, y)
     out = LineFit(
-        ratio, low[0], high[0], slope, low[1], high[1], offset, float(r2), float(r2_ratio), held, _hysteresis(levels), bend,
+        ratio, low[0], high[0], slope, low[1], high[1], offset, float(r2), float(r2_ratio), held, _hysteresis(levels),
+        bend,
         float(np.abs(x).max()), float(y.max()), n)  # fmt: skip
     out.why = reasons(levels, out, significant, unit)
     return out
@@ -117,22 +121,37 @@ def reasons(levels: Levels, f: LineFit, bends: bool, unit: str) -> list[str]:
     if f.slope <= 0:
         out.append("force falls while effort grows: the effort's sign is wrong, or another joint carries the force")
     if levels.full.any():
-        out.append(f"{int(levels.full.sum())} presses have a taxel at its largest count: press less hard or over a larger area")
-    top = np.argsort(x)[-max(3, len(x) // 4):]
+        out.append(
+            f"{int(levels.full.sum())} presses have a taxel at its largest count: press less hard or over a larger area"
+        )
+    top = np.argsort(x)[-max(3, len(x) // 4) :]
     if len(x) >= 8 and np.ptp(x[top]) > 0.05 * np.ptp(x) and np.ptp(y[top]) < 0.2 * f.slope * np.ptp(x[top]):
-        out.append(f"over {x[top].min():.3g} {unit} more effort gives no more force: something else stops the joint, or the sensor is full")
+        out.append(
+            f"over {x[top].min():.3g} {unit} more effort gives no more force: something else stops the joint, or the"
+            " sensor is full"
+        )
     if f.r2 < R2_LEAST:
         out.append(f"R2 {f.r2:.3f} is under {R2_LEAST}: presses scatter about the line")
     if bends and f.bend > BEND_MOST and not levels.full.any():
-        out.append(f"the points bend by {100 * f.bend:.0f} % of their range: the lever arm or the contact changes with force")
+        out.append(
+            f"the points bend by {100 * f.bend:.0f} % of their range: the lever arm or the contact changes with force"
+        )
     if f.hysteresis > HYSTERESIS_MOST:
-        out.append(f"loading and unloading differ by {100 * f.hysteresis:.0f} % of the largest force: dry friction in the gears")
+        out.append(
+            f"loading and unloading differ by {100 * f.hysteresis:.0f} % of the largest force: dry friction in the"
+            " gears"
+        )
     zero = -f.offset / f.slope if f.slope > 0 else 0.0
     if abs(zero) > OFFSET_MOST * np.abs(x).max():
-        out.append(f"force begins at {zero:.3g} {unit}: friction, gravity or a zero that is off; through zero the slope is {f.ratio:.3g}")
+        out.append(
+            f"force begins at {zero:.3g} {unit}: friction, gravity or a zero that is off; through zero the slope is"
+            f" {f.ratio:.3g}"
+        )
     moved = float(np.ptp(levels.position)) if len(levels) else 0.0
     if moved > 0.2:
-        out.append(f"the joint turned by {moved:.2f} rad while pressing, so its lever arm changed: fix the object better")
+        out.append(
+            f"the joint turned by {moved:.2f} rad while pressing, so its lever arm changed: fix the object better"
+        )
     return out
 
 
@@ -144,7 +163,8 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def _bend(x: np.ndarray, y: np.ndarray) -> tuple[float, bool]:
-    """(largest distance of the best parabola from the best line over the range of y, significant at 1 % by an F test)."""
+    """(largest distance of the best parabola from the best line over the range of y, significant at 1 % by an F
+    test)."""
     if len(x) < 5 or np.ptp(y) == 0:
         return 0.0, False
     u = (x - x.mean()) / np.ptp(x)

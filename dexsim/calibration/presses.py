@@ -1,4 +1,5 @@
-"""From a press recording to steady levels: for each joint that presses, effort and fingertip force while nothing moves."""
+"""From a press recording to steady levels: for each joint that presses, effort and fingertip force while nothing
+moves."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def levels_of(recording: Recording) -> dict[str, Levels]:
     column = {j: recording.joints.index(j) for j in joints}
     lost = [j for j in joints if np.isnan(effort.value[:, column[j]]).all()]
     if len(lost) == len(joints):
-        raise UserError(f"{recording.path}: the effort's sign is not known; state meta.effort_sign=-1 (the xHand's current)")
+        raise UserError(
+            f"{recording.path}: the effort's sign is not known; state meta.effort_sign=-1 (the xHand's current)"
+        )
     holds = _holds(recording)
     moving = {j: _pressing(recording, column[j], holds) for j in joints if j not in lost}
     if any(len(w) >= 3 for w in moving.values()):
@@ -115,8 +118,15 @@ def _steady(force: Series, width: float = 0.25) -> list[tuple[int, int]]:
     return out
 
 
-def _collect(recording: Recording, effort: Series, force: Series, full: np.ndarray, joint: str, column: int,
-             windows: list[tuple[float, float, float]]) -> Levels | None:
+def _collect(
+    recording: Recording,
+    effort: Series,
+    force: Series,
+    full: np.ndarray,
+    joint: str,
+    column: int,
+    windows: list[tuple[float, float, float]],
+) -> Levels | None:
     """Means over the settled part of each window; rows without contact are counted and left out."""
     f, position = finger_of(joint), recording.states.position
     rows, free, before = [], 0, None
@@ -133,7 +143,11 @@ def _collect(recording: Recording, effort: Series, force: Series, full: np.ndarr
         if touch.mean() < CONTACT:
             free, before = free + 1, None
             continue
-        up = True if before is None else (level > before[0] if known and level != before[0] else touch.mean() > before[1])
+        up = (
+            True
+            if before is None
+            else (level > before[0] if known and level != before[0] else touch.mean() > before[1])
+        )
         before = level, float(touch.mean())
         number = steps[round(level / MOVED)] if known else k
         rows.append((e.mean(), touch.mean(), number, up, np.nanmean(p), full[window, f].any()))

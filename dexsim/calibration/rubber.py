@@ -1,7 +1,8 @@
 """Stiffness of the fingertips' rubber from a force-depth or stress-stretch curve.
 
-Mooney-Rivlin, incompressible, uniaxial (Mooney 1940, Rivlin 1948): nominal stress P = 2 (l - l^-2) (c10 + c01 / l) at stretch l;
-linear in c10 and c01. In compression (l < 1) it is the foundation law of `dexsim.tactile` (law: mooney_rivlin).
+Mooney-Rivlin, incompressible, uniaxial (Mooney 1940, Rivlin 1948): nominal stress P = 2 (l - l^-2) (c10 + c01 / l) at
+stretch l; linear in c10 and c01. In compression (l < 1) it is the foundation law of `dexsim.tactile` (law:
+mooney_rivlin).
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ import numpy as np
 from dexsim.errors import UserError
 
 TRELOAR_1944 = np.array([
-    [1.000, 0.00], [1.020, 0.26], [1.125, 1.37], [1.240, 2.30], [1.390, 3.23], [1.585, 4.16], [1.900, 5.10], [2.180, 6.00],
-    [2.420, 6.90], [3.020, 8.80], [3.570, 10.7], [4.030, 12.5], [4.760, 16.2], [5.360, 19.9], [5.750, 23.6], [6.150, 27.4],
-    [6.400, 31.0], [6.600, 34.8], [6.850, 38.5], [7.050, 42.1], [7.150, 45.8], [7.250, 49.6], [7.400, 53.3], [7.500, 57.0],
+    [1.000, 0.00], [1.020, 0.26], [1.125, 1.37], [1.240, 2.30], [1.390, 3.23], [1.585, 4.16], [1.900, 5.10],
+    [2.180, 6.00],
+    [2.420, 6.90], [3.020, 8.80], [3.570, 10.7], [4.030, 12.5], [4.760, 16.2], [5.360, 19.9], [5.750, 23.6],
+    [6.150, 27.4],
+    [6.400, 31.0], [6.600, 34.8], [6.850, 38.5], [7.050, 42.1], [7.150, 45.8], [7.250, 49.6], [7.400, 53.3],
+    [7.500, 57.0],
     [7.600, 64.4],
 ]) * [1.0, 98066.5]  # fmt: skip
 """Stretch and nominal stress [Pa] of 8 % sulphur rubber in simple elongation: L. R. G. Treloar, "Stress-strain data for
-vulcanised rubber under various types of deformation", Trans. Faraday Soc. 40 (1944) 59-70, there in kg/cm2, as its figure is
-commonly digitised."""
+vulcanised rubber under various types of deformation", Trans. Faraday Soc. 40 (1944) 59-70, there in kg/cm2, as its
+figure is commonly digitised."""
 
 
 @dataclass
@@ -61,7 +65,10 @@ def fit_mooney_rivlin(stretch: np.ndarray, nominal: np.ndarray) -> Rubber:
         raise UserError(f"rubber curve: {len(x)} usable points; at least 4 with stretch other than 1 are needed")
     a = _columns(x)
     if np.linalg.cond(a / np.linalg.norm(a, axis=0)) > 500:
-        raise UserError(f"rubber curve: stretch {x.min():.3f} to {x.max():.3f} is too narrow to tell c10 from c01; press or pull further")
+        raise UserError(
+            f"rubber curve: stretch {x.min():.3f} to {x.max():.3f} is too narrow to tell c10 from c01; press or pull"
+            " further"
+        )
     c = np.linalg.lstsq(a, y, rcond=None)[0]
     rest = y - a @ c
     from scipy import stats
@@ -74,7 +81,8 @@ def fit_mooney_rivlin(stretch: np.ndarray, nominal: np.ndarray) -> Rubber:
         held.append(y[k] - a[k] @ np.linalg.lstsq(a[others], y[others], rcond=None)[0])
     total = ((y - y.mean()) ** 2).sum()
     return Rubber(
-        float(c[0]), float(c[1]), (float(c[0] - wide[0]), float(c[0] + wide[0])), (float(c[1] - wide[1]), float(c[1] + wide[1])),
+        float(c[0]), float(c[1]), (float(c[0] - wide[0]), float(c[0] + wide[0])),
+        (float(c[1] - wide[1]), float(c[1] + wide[1])),
         float(1 - rest @ rest / total), float(np.sqrt(np.mean(rest**2))), float(np.sqrt(np.mean(np.square(held)))),
         (float(x.min()), float(x.max())))  # fmt: skip
 
@@ -94,8 +102,8 @@ def from_press(depth: np.ndarray, force: np.ndarray, area: float, thickness: flo
 
 @dataclass
 class Stiffness:
-    """Linear stiffness [N/m] with its 95 % interval, R2, held-out rms [N], and hysteresis: the loop's mean width over the
-    largest force (NaN where the press does not go back)."""
+    """Linear stiffness [N/m] with its 95 % interval, R2, held-out rms [N], and hysteresis: the loop's mean width over
+    the largest force (NaN where the press does not go back)."""
 
     value: float
     low: float
@@ -122,16 +130,23 @@ def fit_linear(depth: np.ndarray, force: np.ndarray) -> Stiffness:
     loop = float("nan")
     if 2 <= top <= len(d) - 3:
         up, down = np.argsort(d[: top + 1]), np.argsort(d[top:])
-        at = np.linspace(max(d[:top].min(), d[top + 1:].min()), d[top], 40)
+        at = np.linspace(max(d[:top].min(), d[top + 1 :].min()), d[top], 40)
         width = np.interp(at, d[: top + 1][up], f[: top + 1][up]) - np.interp(at, d[top:][down], f[top:][down])
         loop = float(np.mean(np.abs(width)) / f.max())
     total = ((f - f.mean()) ** 2).sum()
-    return Stiffness(float(k), float(k - wide), float(k + wide), float(1 - rest @ rest / total), float(np.sqrt(np.mean(np.square(held)))), loop)
+    return Stiffness(
+        float(k),
+        float(k - wide),
+        float(k + wide),
+        float(1 - rest @ rest / total),
+        float(np.sqrt(np.mean(np.square(held)))),
+        loop,
+    )
 
 
 def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
-    """A CSV with columns depth_m, force_N or stretch, stress_Pa, or "treloar": ("press" | "stress", first, second). Raises
-    UserError."""
+    """A CSV with columns depth_m, force_N or stretch, stress_Pa, or "treloar": ("press" | "stress", first, second).
+    Raises UserError."""
     if str(path) == "treloar":
         return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()

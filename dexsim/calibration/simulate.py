@@ -1,4 +1,5 @@
-"""The simulated half: each joint presses its fingertip on a fixed ball at several forces, through its servo, in C MuJoCo."""
+"""The simulated half: each joint presses its fingertip on a fixed ball at several forces, through its servo, in C
+MuJoCo."""
 
 from __future__ import annotations
 
@@ -26,11 +27,18 @@ POSE = {"thumb_bend_joint": 0.9, "thumb_rota_joint1": 0.3, "thumb_rota_joint2": 
 """rad: half bent, so that every joint can turn further."""
 
 
-def press_recording(joint: str, servo: dict | str | Path | None = None, levels: int = 8, most: float = 0.8, stiffness: float = STIFFNESS,
-                    timestep: float = 0.002) -> Recording:
-    """One joint presses: up a ladder of `levels` torques to the share `most` of its torque limit (less where another joint of the
-    finger could not hold against it), and down again; torque in N.m, touch in N. The finger's other joints lean in by what they
-    carry (arm times force over kp), so that the finger stands still and every lever arm stays what it is."""
+def press_recording(
+    joint: str,
+    servo: dict | str | Path | None = None,
+    levels: int = 8,
+    most: float = 0.8,
+    stiffness: float = STIFFNESS,
+    timestep: float = 0.002,
+) -> Recording:
+    """One joint presses: up a ladder of `levels` torques to the share `most` of its torque limit (less where another
+    joint of the finger could not hold against it), and down again; torque in N.m, touch in N. The finger's other joints
+    lean in by what they carry (arm times force over kp), so that the finger stands still and every lever arm stays what
+    it is."""
     if joint not in xhand.JOINTS:
         raise UserError(f"joints={joint}: no such joint; joints: {', '.join(xhand.JOINTS)}")
     m = mechanism.mechanism(None, servo, gravity=[0.0, 0.0, -9.81])
@@ -55,20 +63,43 @@ def press_recording(joint: str, servo: dict | str | Path | None = None, levels: 
     for other in xhand.JOINTS_OF_FINGER[finger]:  # every joint leans in by what it will carry, so that none gives way
         goals[:, other] += force * arms[other] / kp[other]
     if goals[:, j].max() > high + 1.0 or goals[:, j].min() < low - 1.0:
-        raise UserError(f"{joint}: pressing to {top:.2f} N.m would need a target of {goals[:, j].max():.2f} rad: kp {kp[j]:g} is too soft")
+        raise UserError(
+            f"{joint}: pressing to {top:.2f} N.m would need a target of {goals[:, j].max():.2f} rad: kp {kp[j]:g} is"
+            " too soft"
+        )
     commands = _ladder(pose, goals, (j, pose[j] + reach))
-    run = mechanism.drive(m, commands, xhand.JOINTS, float(commands.t[-1]), pose, timestep, frame_s=0.01,
-                          pairs=[ContactPair("press", ("geom", f"tip_{finger}"), ("geom", "anvil"))])
+    run = mechanism.drive(
+        m,
+        commands,
+        xhand.JOINTS,
+        float(commands.t[-1]),
+        pose,
+        timestep,
+        frame_s=0.01,
+        pairs=[ContactPair("press", ("geom", f"tip_{finger}"), ("geom", "anvil"))],
+    )
     out = mechanism.recorded(run, m, commands, xhand.JOINTS)
     times = np.minimum((np.arange(len(run.qpos)) + 1) * run.frame_s, run.t[-1])
     out.tactile = Series(times, _taxels(run, finger, place), TACTILE)
-    out.meta |= {"tactile_unit": "N", "tactile_lsb": "1", "notes": f"press: joint={joint}; ball of {RADIUS * 1e3:g} mm; friction {friction[j]:g} N.m"}
+    out.meta |= {
+        "tactile_unit": "N",
+        "tactile_lsb": "1",
+        "notes": f"press: joint={joint}; ball of {RADIUS * 1e3:g} mm; friction {friction[j]:g} N.m",
+    }
     return out
 
 
-def make(out: str | Path, joints: Sequence[str] = xhand.JOINTS, servo: dict | str | Path | None = None, levels: int = 8, realistic: bool = False,
-         seed: int = 0, say: Callable[[str], None] = print) -> list[Path]:
-    """Write press_<joint>.mcap of each joint into a folder; realistic: as the hardware would have delivered it (mA, counts)."""
+def make(
+    out: str | Path,
+    joints: Sequence[str] = xhand.JOINTS,
+    servo: dict | str | Path | None = None,
+    levels: int = 8,
+    realistic: bool = False,
+    seed: int = 0,
+    say: Callable[[str], None] = print,
+) -> list[Path]:
+    """Write press_<joint>.mcap of each joint into a folder; realistic: as the hardware would have delivered it (mA,
+    counts)."""
     from dexsim.console import folders
     from dexsim.recording.realistic import realistic as as_hardware
     from dexsim.recording.writer import write
@@ -87,8 +118,9 @@ def make(out: str | Path, joints: Sequence[str] = xhand.JOINTS, servo: dict | st
 
 
 def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Recording:
-    """A ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and /external_force [N], the hand at
-    rest. Each of `presses` places a finger is pressed to 2..8 N and let go within `frames` samples, and followed by a rest."""
+    """A ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and /external_force
+    [N], the hand at rest. Each of `presses` places a finger is pressed to 2..8 N and let go within `frames` samples,
+    and followed by a rest."""
     import torch
 
     from dexsim.assets.objects import library
@@ -112,8 +144,15 @@ def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Rec
             centre[row : row + frames] = point + np.outer(RADIUS - size / STIFFNESS, table["normal"][k])
             row += frames + rest
     posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
-    touch = Tactile(posed, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
-                    tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])
+    touch = Tactile(
+        posed,
+        xhand_layout(),
+        ShapeSet([library()["sphere"]], "cpu"),
+        "anvil",
+        {"raw": True, "others": False},
+        pairs=pairs,
+        tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
+    )
     posed.t.xpos[:, :5] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(5)])  # the pads, far apart
     posed.t.xmat[:] = torch.eye(3)
     active = force.argmax(1)
@@ -131,17 +170,20 @@ def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Rec
     load[:, 2] = felt[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
     pose = np.tile([POSE[x] for x in xhand.JOINTS], (n, 1))
     notes = f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"
-    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS), "effort_is": "torque_Nm",
+    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS),
+                       "effort_is": "torque_Nm",
                        "effort_sign": "+1", "tactile_unit": "N", "tactile_lsb": "1", "notes": notes}  # fmt: skip
     series = lambda x, topic: Series(t, x, topic, t.copy())  # noqa: E731
     states = States(series(pose, STATES), None, series(0 * pose, STATES))
     return Recording(Path("rolled.mcap"), meta, xhand.JOINTS, Series.empty(COMMANDS, 12), states,
-                     tactile=Series(t, felt, TACTILE), external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
+                     tactile=Series(t, felt, TACTILE),
+                     external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
                      start_ns=1_000_000_000)  # fmt: skip
 
 
 def delivered(recording: Recording, seed: int = 0) -> Recording:
-    """A press recording as the hardware would have delivered it. The load cell is read with the taxels, which hold their last
+    """A press recording as the hardware would have delivered it. The load cell is read with the taxels, which hold
+    their last
     value: else that delay would look like hysteresis."""
     from dexsim.recording.realistic import realistic
 
@@ -152,9 +194,11 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
     return out
 
 
-def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: bool = False, say: Callable[[str], None] = print) -> Path:
-    """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on the index finger, as a
-    rehearsal; what was planted is said."""
+def make_rolled(
+    out: str | Path, realistic: bool = True, seed: int = 0, faults: bool = False, say: Callable[[str], None] = print
+) -> Path:
+    """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on the index
+    finger, as a rehearsal; what was planted is said."""
     from dexsim.console import folders
     from dexsim.recording.writer import write
 
@@ -165,7 +209,9 @@ def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: 
         z /= np.exp(0.15 * rng.standard_normal((5, xhand.TAXELS_PER_FINGER)))
         z[:, 1, list(PLANTED_DEAD)] = 0.0
         z[:, 1, list(PLANTED_SWAP)] = z[:, 1, list(PLANTED_SWAP[::-1])]
-        say(f"planted  index finger: dead {list(PLANTED_DEAD)}, swapped {PLANTED_SWAP}; every pad: gains of 15 % spread")
+        say(
+            f"planted  index finger: dead {list(PLANTED_DEAD)}, swapped {PLANTED_SWAP}; every pad: gains of 15 % spread"
+        )
     if realistic:
         recording = delivered(recording, seed)
     path = folders.make(Path(out).expanduser(), "out=") / "rolled.mcap"
@@ -175,8 +221,8 @@ def make_rolled(out: str | Path, realistic: bool = True, seed: int = 0, faults: 
 
 
 def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Series:
-    """Commands [T, 12] at RATE: ramps of RAMP_S between levels [L, 12] held for HOLD_S. touch: (joint, its angle at contact),
-    reached first."""
+    """Commands [T, 12] at RATE: ramps of RAMP_S between levels [L, 12] held for HOLD_S. touch: (joint, its angle at
+    contact), reached first."""
     first = pose.copy()
     first[touch[0]] = touch[1]
     t, q = [0.0, 0.3], [pose, first]
@@ -189,8 +235,8 @@ def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Se
 
 
 def _site(spec: mujoco.MjSpec, joint: str, finger: str) -> tuple[np.ndarray, dict[int, float]]:
-    """Where the ball goes: against the taxel whose normal lies most along the joint's motion there. Returns its centre [3] m and
-    the lever arms [m] of the finger's joints about the contact's normal."""
+    """Where the ball goes: against the taxel whose normal lies most along the joint's motion there. Returns its centre
+    [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
     model = spec.compile()
     data = mujoco.MjData(model)
     for name, q in POSE.items():
@@ -219,8 +265,15 @@ def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
     model = spec.compile()
     d = 0.95
     k = stiffness * (1 - d) * model.body_invweight0[model.geom(tip).bodyid[0], 0]
-    spec.add_pair(name="press", geomname1=tip, geomname2="anvil", condim=3, friction=[0.8, 0.8, 0.005, 1e-4, 1e-4],
-                  solref=[-k, -2 * np.sqrt(k)], solimp=[d, d, 1e-3, 0.5, 2])
+    spec.add_pair(
+        name="press",
+        geomname1=tip,
+        geomname2="anvil",
+        condim=3,
+        friction=[0.8, 0.8, 0.005, 1e-4, 1e-4],
+        solref=[-k, -2 * np.sqrt(k)],
+        solimp=[d, d, 1e-3, 0.5, 2],
+    )
 
 
 def _taxels(run: mechanism.Run, finger: str, place: np.ndarray) -> np.ndarray:
@@ -236,8 +289,15 @@ def _taxels(run: mechanism.Run, finger: str, place: np.ndarray) -> np.ndarray:
     n, pairs = len(run.qpos), [f"tip_{x}" for x in xhand.FINGERS]
     posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
     shape = library()["sphere"]
-    touch = Tactile(posed, xhand_layout(), ShapeSet([shape], "cpu"), "anvil", {"raw": True, "others": False}, pairs=pairs,
-                    tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])
+    touch = Tactile(
+        posed,
+        xhand_layout(),
+        ShapeSet([shape], "cpu"),
+        "anvil",
+        {"raw": True, "others": False},
+        pairs=pairs,
+        tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
+    )
     data = mujoco.MjData(run.model)
     ids = [run.model.body(b).id for b in xhand.TIP_BODIES]
     for w in range(n):

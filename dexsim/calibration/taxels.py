@@ -1,4 +1,5 @@
-"""The state of a fingertip's taxels from recordings in which it is pressed all over: threshold, dead and swapped ones, gains.
+"""The state of a fingertip's taxels from recordings in which it is pressed all over: threshold, dead and swapped ones,
+gains.
 
 Readings of one pad are [T, 120]; taxel k = column * 12 + row, neighbours are those beside it in column or row.
 """
@@ -21,16 +22,23 @@ def neighbours(columns: int = COLUMNS, rows: int = ROWS) -> list[list[int]]:
     out = []
     for k in range(columns * rows):
         c, r = divmod(k, rows)
-        out.append([a * rows + b for a, b in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1)) if 0 <= a < columns and 0 <= b < rows])
+        out.append(
+            [
+                a * rows + b
+                for a, b in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1))
+                if 0 <= a < columns and 0 <= b < rows
+            ]
+        )
     return out
 
 
 @dataclass
 class Pad:
-    """What was found of one pad. threshold: a reading at or under it may be noise (readings' unit); bias [120]; dead, swapped;
-    unseen: taxels that nothing pressed, of which nothing is known; gain [120] or None without a load; held_out: error of the
-    load by these gains on presses that were not fitted, over the mean load (and with equal gains); hysteresis: of force
-    against load. notes: in words."""
+    """What was found of one pad. threshold: a reading at or under it may be noise (readings' unit); bias [120]; dead,
+    swapped;
+    unseen: taxels that nothing pressed, of which nothing is known; gain [120] or None without a load; held_out: error
+    of the load by these gains on presses that were not fitted, over the mean load (and with equal gains); hysteresis:
+    of force against load. notes: in words."""
 
     threshold: float
     bias: np.ndarray
@@ -78,11 +86,12 @@ def inspect(readings: np.ndarray, load: np.ndarray | None = None) -> Pad:
 
 
 def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[list[int], list[int]]:
-    """(dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the presses do not tell.
+    """(dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the presses do
+    not tell.
 
-    One pressed side is not enough: a contact has an edge, and beyond it a healthy taxel feels nothing. A taxel must feel
-    something between two pressed ones, on opposite sides of it; and in most of the presses whose strongest taxel lies beside it,
-    as the pad's other taxels do: it is dead where such silence had a chance under 1e-4.
+    One pressed side is not enough: a contact has an edge, and beyond it a healthy taxel feels nothing. A taxel must
+    feel something between two pressed ones, on opposite sides of it; and in most of the presses whose strongest taxel
+    lies beside it, as the pad's other taxels do: it is dead where such silence had a chance under 1e-4.
     """
     strong = max(4 * threshold, 0.1 * np.percentile(clean.max(0), 90))
     silent = clean.max(0) <= 2 * threshold
@@ -98,7 +107,12 @@ def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[l
                 if None not in sides:
                     between = np.maximum(between, clean[:, sides].min(1))
             pressed = between > strong
-            if pressed.sum() >= 5 and clean[pressed, k].mean() < 0.1 * between[pressed].mean() or silent[k] and surprise[k] < 1e-4:
+            if (
+                pressed.sum() >= 5
+                and clean[pressed, k].mean() < 0.1 * between[pressed].mean()
+                or silent[k]
+                and surprise[k] < 1e-4
+            ):
                 dead.append(k)
             elif silent[k]:
                 unseen.append(k)
@@ -106,8 +120,8 @@ def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[l
 
 
 def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray, near: list[list[int]]) -> np.ndarray:
-    """[120]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is what lies
-    between two rests, at most 200 frames."""
+    """[120]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is
+    what lies between two rests, at most 200 frames."""
     on = clean.max(1) > strong
     press = np.cumsum(np.diff(on, prepend=False) & on) * 1000 + np.arange(len(on)) // 200
     top = clean.argmax(1)
@@ -141,11 +155,17 @@ def _beside(k: int, step: tuple[int, int], way: int, gone: set[int], far: int = 
 
 
 def _swapped(
-    clean: np.ndarray, near: list[list[int]], skip: set[int], least: float = 0.15, sure: float = 2.5, beside: float = 5.0
+    clean: np.ndarray,
+    near: list[list[int]],
+    skip: set[int],
+    least: float = 0.15,
+    sure: float = 2.5,
+    beside: float = 5.0,
 ) -> list[tuple[int, int]]:
     """Pairs that each fit the other's neighbours better than their own by `least` (correlation), and by `sure` standard
-    deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies much. Taxels
-    side by side feel nearly the same, and a contact's edge between them looks like an exchange: `beside` deviations."""
+    deviations of that figure over blocks of the recording: wires exchanged. Where few presses met a place, it varies
+    much. Taxels side by side feel nearly the same, and a contact's edge between them looks like an exchange: `beside`
+    deviations."""
     fit, own_std = _fits(clean, near, skip)
     live = [k for k in range(clean.shape[1]) if k not in skip]
     own = np.diag(fit)
@@ -160,9 +180,11 @@ def _swapped(
     return out
 
 
-def _fits(clean: np.ndarray, near: list[list[int]], skip: set[int], blocks: int = 20, draws: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """(correlation [taxel, place] of each taxel with the mean of the neighbours of each place; standard deviation [a, b] of what a
-    swap of a and b would better, by bootstrap over blocks of the recording)."""
+def _fits(
+    clean: np.ndarray, near: list[list[int]], skip: set[int], blocks: int = 20, draws: int = 40
+) -> tuple[np.ndarray, np.ndarray]:
+    """(correlation [taxel, place] of each taxel with the mean of the neighbours of each place; standard deviation [a,
+    b] of what a swap of a and b would better, by bootstrap over blocks of the recording)."""
     around = np.zeros_like(clean)
     for k in range(clean.shape[1]):
         beside = [n for n in near[k] if n not in skip]
@@ -187,9 +209,9 @@ def _fits(clean: np.ndarray, near: list[list[int]], skip: set[int], blocks: int 
 
 
 def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
-    """One common scale from the load; each taxel's gain from its neighbours, or else from the load alone with gains believed to
-    lie near one: only if it tells the load of presses that were not fitted (five folds of the recording) better than equal gains
-    do."""
+    """One common scale from the load; each taxel's gain from its neighbours, or else from the load alone with gains
+    believed to lie near one: only if it tells the load of presses that were not fitted (five folds of the recording)
+    better than equal gains do."""
     live = np.array([k for k in range(clean.shape[1]) if k not in out.dead and k not in out.unseen])
     pressed = load > 0.05 * load.max()
     x, y = clean[pressed], load[pressed]
@@ -209,7 +231,8 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         return float(np.sqrt(np.mean(np.concatenate(rest) ** 2)) / y.mean())
 
     def neighbours_and_load(rows: np.ndarray) -> np.ndarray:
-        """Neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a surface of degree 3."""
+        """Neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a surface of
+        degree 3."""
         local = smooth_gains(x[rows], set(live.tolist()), floor)
         basis = _surface()[live]
         seen = (x[rows][:, live] * local[live]) @ basis
@@ -238,7 +261,10 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
     out.held_out_equal, out.held_out = tried["equal"], tried[best]
     if best == "equal":
         others = min(v for k, v in tried.items() if k != "equal")
-        out.notes.append(f"gains by taxel would not tell the load better ({100 * others:.1f} % on held-out presses): equal ones are kept")
+        out.notes.append(
+            f"gains by taxel would not tell the load better ({100 * others:.1f} % on held-out presses): equal ones are"
+            " kept"
+        )
     gain = ways[best](np.ones(len(y), bool))
     gain = gain / gain[live].mean()
     out.scale = scale(gain, np.ones(len(y), bool))
@@ -255,11 +281,14 @@ def _surface(degree: int = 3) -> np.ndarray:
     return np.stack([a[:, i] * b[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 
 
-def smooth_gains(readings: np.ndarray, live: set[int], floor: float, prior: float = 0.2, columns: int = COLUMNS, rows: int = ROWS) -> np.ndarray:
+def smooth_gains(
+    readings: np.ndarray, live: set[int], floor: float, prior: float = 0.2, columns: int = COLUMNS, rows: int = ROWS
+) -> np.ndarray:
     """Gains [120] (times a reading: its force) from readings [T, 120] of presses all over, because pressure is smooth.
 
-    The logarithm of a round press falls off as a parabola, so a taxel's logarithm lies above the mean of the two taxels beside
-    it, in column or row, by the same on average wherever it is; what a taxel differs by beyond that is its gain and
+    The logarithm of a round press falls off as a parabola, so a taxel's logarithm lies above the mean of the two taxels
+    beside it, in column or row, by the same on average wherever it is; what a taxel differs by beyond that is its gain
+    and
     theirs: log r_k - (log r_a + log r_b) / 2 = c - log g_k + (log g_a + log g_b) / 2. Solved by least squares over all
     triples with readings over `floor`, with gains believed to lie within `prior` (standard deviation of the logarithm).
     The load is not used: it sees sums over neighbours only, which cannot tell them apart.
@@ -271,7 +300,10 @@ def smooth_gains(readings: np.ndarray, live: set[int], floor: float, prior: floa
     for k in sorted(live):
         c, r = divmod(k, rows)
         for kind, (da, db) in enumerate((((-1, 0), (1, 0)), ((0, -1), (0, 1)))):
-            a, b = (((c + d[0]) * rows + r + d[1]) if 0 <= c + d[0] < columns and 0 <= r + d[1] < rows else -1 for d in (da, db))
+            a, b = (
+                ((c + d[0]) * rows + r + d[1]) if 0 <= c + d[0] < columns and 0 <= r + d[1] < rows else -1
+                for d in (da, db)
+            )
             if a not in live or b not in live:
                 continue
             good = (readings[:, [a, k, b]] > floor).all(1)
@@ -302,6 +334,13 @@ def _loop(force: np.ndarray, load: np.ndarray) -> float:
     for way in (change > 1e-3 * top, change < -1e-3 * top):
         if way.sum() < 20:
             return float("nan")
-        means.append([force[way & (np.abs(load - a) < 0.05 * top)].mean() if (way & (np.abs(load - a) < 0.05 * top)).any() else np.nan for a in at])
+        means.append(
+            [
+                force[way & (np.abs(load - a) < 0.05 * top)].mean()
+                if (way & (np.abs(load - a) < 0.05 * top)).any()
+                else np.nan
+                for a in at
+            ]
+        )
     gap = np.abs(np.subtract(*means))
     return float(np.nanmean(gap) / force.max()) if np.isfinite(gap).any() else float("nan")

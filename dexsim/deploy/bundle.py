@@ -40,8 +40,8 @@ class Bundle:
 
 
 def load(path: str | Path) -> Bundle:
-    """The bundle in a folder. Raises UserError: a file missing or changed, a manifest of the wrong types or beyond the hand's limits,
-    another version, a network that does not fit it or reads other files, no onnxruntime."""
+    """The bundle in a folder. Raises UserError: a file missing or changed, a manifest of the wrong types or beyond the
+    hand's limits, another version, a network that does not fit it or reads other files, no onnxruntime."""
     path = Path(path).expanduser()
     if not (path / MANIFEST).is_file():
         raise UserError(f"{path}: no {MANIFEST} there; dexsim export checkpoint=... out=DIR writes a bundle")
@@ -75,7 +75,10 @@ def _same_table(m: dict[str, Any], file: Path) -> None:
     ours = [tuple(row[:3]) for row in (own.rows(m["task_settings"]) if m["task"] == "rotate" else own.OBSERVATION)]
     if here != ours:
         bad = next(i for i in range(max(len(here), len(ours))) if here[i : i + 1] != ours[i : i + 1])
-        raise UserError(f"{file}: observation {here[bad:bad + 1]} is not this dexsim's {ours[bad:bad + 1]}: use the dexsim of its versions")
+        raise UserError(
+            f"{file}: observation {here[bad : bad + 1]} is not this dexsim's {ours[bad : bad + 1]}: use the dexsim of"
+            " its versions"
+        )
 
 
 def _mapping(file: Path) -> dict[str, Any]:
@@ -91,20 +94,26 @@ def _mapping(file: Path) -> dict[str, Any]:
 
 
 def session(data: bytes, policy: Path) -> Any:
-    """onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander. The network is
-    taken from `data` alone: one that keeps weights in other files is refused, so that it reads none."""
+    """onnxruntime on one thread: a policy this small gains nothing from more, and a loop's time must not wander. The
+    network is taken from `data` alone: one that keeps weights in other files is refused, so that it reads none."""
     try:
         import onnx
         import onnxruntime
     except ImportError:
-        raise UserError("onnxruntime is not installed: pip install 'dexsim[deploy]' (or pip install onnxruntime)") from None
+        raise UserError(
+            "onnxruntime is not installed: pip install 'dexsim[deploy]' (or pip install onnxruntime)"
+        ) from None
     try:
         model = onnx.ModelProto.FromString(data)
-        outside = next((t.name for t in _tensors(model) if t.data_location == onnx.TensorProto.EXTERNAL or t.external_data), None)
+        outside = next(
+            (t.name for t in _tensors(model) if t.data_location == onnx.TensorProto.EXTERNAL or t.external_data), None
+        )
     except Exception as error:  # protobuf's
         raise UserError(f"{policy}: not an ONNX network ({' '.join(str(error).split())[:120]})") from None
     if outside is not None:
-        raise UserError(f"{policy}: refused, its tensor {outside[:60]!r} is kept in another file; a bundle's network is one file")
+        raise UserError(
+            f"{policy}: refused, its tensor {outside[:60]!r} is kept in another file; a bundle's network is one file"
+        )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -131,12 +140,19 @@ def _try(bundle: Bundle, policy: Path) -> None:
     try:
         out = np.asarray(bundle.act(np.zeros((1, p["observation_size"]), np.float32)))
     except Exception as error:  # onnxruntime's
-        raise UserError(f"{policy}: does not take the observations that {MANIFEST} states: {str(error).splitlines()[0][:160]}") from None
+        raise UserError(
+            f"{policy}: does not take the observations that {MANIFEST} states: {str(error).splitlines()[0][:160]}"
+        ) from None
     if out.shape != (1, p["action_size"]) or not np.issubdtype(out.dtype, np.floating):
-        raise UserError(f"{policy}: gives {out.dtype} of shape {list(out.shape)}, must give floats of shape [1, {p['action_size']}]; export the"
-                        " bundle again")
+        raise UserError(
+            f"{policy}: gives {out.dtype} of shape {list(out.shape)}, must give floats of shape [1,"
+            f" {p['action_size']}]; export the"
+            " bundle again"
+        )
     if not np.isfinite(out).all():
-        raise UserError(f"{policy}: its action is not finite: its weights are not, or overflow; export another checkpoint")
+        raise UserError(
+            f"{policy}: its action is not finite: its weights are not, or overflow; export another checkpoint"
+        )
 
 
 def sha256(path: Path) -> str:

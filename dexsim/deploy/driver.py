@@ -1,7 +1,7 @@
 """What the real-time loop needs of a hand: `HandDriver`, in the vendor SDK's fields, units and signs.
 
-Writing another driver: four calls that return at once. A bus that blocks (RS485: about 9.6 ms a round trip) is served by
-a thread of the driver's own, which keeps the newest state for `read`.
+Writing another driver: four calls that return at once. A bus that blocks (RS485: about 9.6 ms a round trip) is served
+by a thread of the driver's own, which keeps the newest state for `read`.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class HandCommand:
 
 class HandDriver(Protocol):
     """A hand. None of the calls waits for the bus. Two more may be absent, and tell what a person beside the hand does:
-    `present()`, an object is held out and the fingers are about to close on it; `started()`, the policy begins and it is
-    let go."""
+    `present()`, an object is held out and the fingers are about to close on it; `started()`, the policy begins and it
+    is let go."""
 
     name: str
 

@@ -1,8 +1,9 @@
-"""How the object is turned, from an IMU inside it: an interface, and a source over UDP for one that a program of yours reads.
+"""How the object is turned, from an IMU inside it: an interface, and a source over UDP for one that a program of yours
+reads.
 
-The palm of the hand looks up, and orientations are from the object's frame to one whose z axis points up; its heading may
-be any: the policy sees only R_object^T R_goal, in which a heading common to both cancels (`observations_rotate.relative`).
-A hand mounted otherwise needs its IMU's readings turned into the palm frame first.
+The palm of the hand looks up, and orientations are from the object's frame to one whose z axis points up; its heading
+may be any: the policy sees only R_object^T R_goal, in which a heading common to both cancels
+(`observations_rotate.relative`). A hand mounted otherwise needs its IMU's readings turned into the palm frame first.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ class OrientationSource(Protocol):
 class UdpImu:
     """Orientations that another program sends to a UDP port of this machine, a line of text each: `w x y z`.
 
-    The newest counts, at the time it is read here; a line that is not four finite numbers is counted in `bad` and left out. The
-    first sender of a good line is the only one from then on (`sender`; sender_port names it beforehand): the socket is bound to it,
-    so that the lines of others never fill the queue. Lines of others that were waiting by then are counted in `foreign`.
+    The newest counts, at the time it is read here; a line that is not four finite numbers is counted in `bad` and left
+    out. The first sender of a good line is the only one from then on (`sender`; sender_port names it beforehand): the
+    socket is bound to it, so that the lines of others never fill the queue. Lines of others that were waiting by then
+    are counted in `foreign`.
     """
 
     def __init__(self, port: int, host: str = "127.0.0.1", sender_port: int | None = None):

@@ -35,9 +35,12 @@ class HandKinematics:
         mujoco.mj_kinematics(self.model, d)
         return d.site_xpos[self._site].copy(), d.xpos[self._body].copy(), d.xmat[self._body].reshape(5, 3, 3).copy()
 
-    def touch(self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def touch(
+        self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Normal forces [5, 120] N and the pads' poses -> (force [5] N, centre [5, 3] m in the palm frame: the
-        force-weighted mean of the taxels, or the mean of those that feel anything; the pad's centre where nothing is felt)."""
+        force-weighted mean of the taxels, or the mean of those that feel anything; the pad's centre where nothing is
+        felt)."""
         force = normal.sum(1)
         weight = normal if weighted else (normal > 0).astype(float)
         total = weight.sum(1)

@@ -1,8 +1,8 @@
 """The real-time loop: reads at 100 Hz, acts at the policy's rate, and lets go of the hand when something is wrong.
 
-Phases: HOMING (slow, at reduced current, from wherever the hand is) -> SETTLE (taxels are zeroed) -> PLACE (only where the task
-starts with an object in the hand: the hand waits, then its fingers close slowly on what is held out) -> RUN (the policy) ->
-RELAXED. Nothing moves before the homing, and every way out of `run` relaxes the hand.
+Phases: HOMING (slow, at reduced current, from wherever the hand is) -> SETTLE (taxels are zeroed) -> PLACE (only where
+the task starts with an object in the hand: the hand waits, then its fingers close slowly on what is held out) -> RUN
+(the policy) -> RELAXED. Nothing moves before the homing, and every way out of `run` relaxes the hand.
 """
 
 from __future__ import annotations
@@ -32,15 +32,18 @@ from dexsim.errors import UserError
 
 HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
 SEEN = {ORIENTATION: 0.1, "place": 0.5}
-"""s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second; a camera's
-thirty, and fingers hide an object for a moment."""
+"""s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second;
+a camera's thirty, and fingers hide an object for a moment."""
 RELAX_TRIES, RELAX_EVERY = 100, 0.01
 """How often, and s apart, the hand is told to relax where its driver fails to."""
 LIMITS: dict[str, tuple[float, float, str]] = {
     "seconds": (0, 1e7, "s"), "command": (0, 1, ""), "home_speed": (0.01, 10, "rad/s"), "home_current": (0.01, 1, ""),
-    "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"), "read_hz": (20, 1000, "Hz"),
-    "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "late": (0.005, 10, "s"), "overruns": (1, 1e6, ""), "hang": (0.02, 10, "s"),
-    "speed": (0.001, 100, ""), "margin": (0, 3.2, "rad"), "tor_max": (1, 32767, "mA"), "kp": (0, 32767, ""), "recover_s": (0, 3600, "s"),
+    "home_error": (0.001, 3.2, "rad"), "settle": (0, 60, "s"), "wait": (0, 3600, "s"), "grip": (0, 60, "s"),
+    "read_hz": (20, 1000, "Hz"),
+    "stale": (0.005, 10, "s"), "seen": (0.005, 10, "s"), "late": (0.005, 10, "s"), "overruns": (1, 1e6, ""),
+    "hang": (0.02, 10, "s"),
+    "speed": (0.001, 100, ""), "margin": (0, 3.2, "rad"), "tor_max": (1, 32767, "mA"), "kp": (0, 32767, ""),
+    "recover_s": (0, 3600, "s"),
 }  # fmt: skip
 """Lowest and highest of each of `LoopSettings`, and its unit."""
 
@@ -50,12 +53,14 @@ class LoopSettings:
     """seconds of policy; command: force 0..1; home: whether to home first (False only for replays).
 
     home_speed rad/s, of the joint that has farthest to go; home_current: share of the current limit while homing;
-    home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task starts with
-    one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: relaxes when the last good reading is older
-    than this (one that cannot be true is none), when every reading since has an error code, or the policy's actions since are not
-    finite; seen s: so does what was last seen of the object (default: `SEEN`); late s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading period after
-    they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed: targets' largest, over
-    the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the firmware's current limit, [12] or one;
+    home_error rad: allowed at its end; settle s. wait s: how long the hand then waits for the object, where the task
+    starts with one in the hand; grip s: how long its fingers take to close on it. read_hz; stale s: relaxes when the
+    last good reading is older than this (one that cannot be true is none), when every reading since has an error code,
+    or the policy's actions since are not finite; seen s: so does what was last seen of the object (default: `SEEN`);
+    late s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading
+    period after they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed:
+    targets' largest, over the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the
+    firmware's current limit, [12] or one;
     kp: its gain.
     recover: after letting go, home again once readings have been good for recover_s; else the run ends.
     """
@@ -112,11 +117,20 @@ class Report:
 class Loop:
     """One bundle on one hand. See `LoopSettings` and `run`."""
 
-    def __init__(self, bundle: Bundle, driver: HandDriver, eye: HeightSource | OrientationSource | None, calibration: Calibration,
-                 settings: LoopSettings = LoopSettings(), clock: Clock | None = None, recorder: Recorder | None = None, keep: bool = False,
-                 say: Callable[[str], None] | None = None):
-        """eye: what sees the object, as `measure.needs` of the bundle's task has it (None: nothing has to). say: told what a
-        person beside the hand has to do."""
+    def __init__(
+        self,
+        bundle: Bundle,
+        driver: HandDriver,
+        eye: HeightSource | OrientationSource | None,
+        calibration: Calibration,
+        settings: LoopSettings = LoopSettings(),
+        clock: Clock | None = None,
+        recorder: Recorder | None = None,
+        keep: bool = False,
+        say: Callable[[str], None] | None = None,
+    ):
+        """eye: what sees the object, as `measure.needs` of the bundle's task has it (None: nothing has to). say: told
+        what a person beside the hand has to do."""
         m, self.settings = bundle.manifest, settings
         settings.check()
         self.bundle, self.driver, self.eye, self.clock = bundle, driver, eye, clock or Clock()
@@ -129,13 +143,20 @@ class Loop:
         self.measure = for_bundle(m, calibration)
         wanted = {None: None, "place": "place", ORIENTATION: "orientation"}[self.measure.needs]
         if wanted is not None and not hasattr(eye, wanted):
-            raise UserError(f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it"
-                            " (dexsim/deploy/vision.py, imu.py)")
+            raise UserError(
+                f"bundle {bundle.path}: its policy needs the object's {wanted}, and nothing here sees it"
+                " (dexsim/deploy/vision.py, imu.py)"
+            )
         tor_max = 1e3 * calibration.current_max if settings.tor_max is None else settings.tor_max
         self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (12,)), 1, 32767)
         self.guard = Guard(
-            self.rule.low + settings.margin, self.rule.high - settings.margin, settings.speed * np.array(m["action"]["speed_limit_rad_s"]),
-            self.tor_max, calibration.current_sign, tuple(m["joints"]))
+            self.rule.low + settings.margin,
+            self.rule.high - settings.margin,
+            settings.speed * np.array(m["action"]["speed_limit_rad_s"]),
+            self.tor_max,
+            calibration.current_sign,
+            tuple(m["joints"]),
+        )
         self.home = np.clip(self.home, self.guard.low, self.guard.high)
         self.state: HandState | None = None
         self.target: np.ndarray | None = None
@@ -150,7 +171,8 @@ class Loop:
         self._nonsense_since: float | None = None  # since when no action was finite
         self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs, 0.5)
 
-    # -- the run -------------------------------------------------------------------------------------------------------------
+    # -- the run
+    # -------------------------------------------------------------------------------------------------------------
     def run(self) -> Report:
         """Home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand first."""
         c = self.clock
@@ -202,7 +224,9 @@ class Loop:
             if wrong is None:
                 break
             if now > limit:
-                raise UserError(f"{self.driver.name}: no good reading of the hand within 2 s ({wrong}); check power, cable and bus")
+                raise UserError(
+                    f"{self.driver.name}: no good reading of the hand within 2 s ({wrong}); check power, cable and bus"
+                )
             self._beat = now
             self.clock.sleep_until(now + self.read_period)
         self.state, self._sequence, self._good_at, self._checked = state, state.sequence, now, now
@@ -263,8 +287,8 @@ class Loop:
                     self._begin_homing(now)
 
     def _problem(self, now: float, late: float) -> str | None:
-        """What forbids going on: an old reading, or none that can be true; error codes, actions that are no numbers; a late turn;
-        too much current or heat."""
+        """What forbids going on: an old reading, or none that can be true; error codes, actions that are no numbers; a
+        late turn; too much current or heat."""
         s = self.settings
         age = now - min(self.state.time, self._good_at)  # a stamp may be wrong; when it came is known
         if age > s.stale:
@@ -272,7 +296,10 @@ class Loop:
             return f"the hand's state is {1e3 * age:.0f} ms old, allowed {1e3 * s.stale:.0f}{why}"
         if self._coded_since is not None and now - self._coded_since > s.stale:
             j = int(np.argmax(np.asarray(self.state.error) != 0))
-            return f"{xhand.JOINTS[j]} reports error code {self.state.error[j]} for {1e3 * (now - self._coded_since):.0f} ms"
+            return (
+                f"{xhand.JOINTS[j]} reports error code {self.state.error[j]}"
+                f" for {1e3 * (now - self._coded_since):.0f} ms"
+            )
         if self._nonsense_since is not None and now - self._nonsense_since > s.stale:
             return f"the policy's actions are not finite for {1e3 * (now - self._nonsense_since):.0f} ms"
         if self.phase == RUN and self.measure.needs is not None:
@@ -280,14 +307,19 @@ class Loop:
             limit = s.stale if self._seen_at is None else self._seen_limit + self.period  # looked for once a period
             if now - seen_at > limit:
                 why = f" ({self._unseen})" if self._unseen else ""
-                never = "was never seen" if self._seen_at is None else f"was seen {1e3 * (now - seen_at):.0f} ms ago, allowed {1e3 * limit:.0f}"
+                never = (
+                    "was never seen"
+                    if self._seen_at is None
+                    else f"was seen {1e3 * (now - seen_at):.0f} ms ago, allowed {1e3 * limit:.0f}"
+                )
                 return f"the object {never}{why}"
         if late > s.late:
             return f"the loop woke {1e3 * late:.0f} ms late, allowed {1e3 * s.late:.0f}"
         elapsed, self._checked = min(now - self._checked, s.stale), now
         return self.guard.must_relax(self.state.current, self.state.temperature, elapsed)
 
-    # -- parts of a turn -------------------------------------------------------------------------------------------------------
+    # -- parts of a turn
+    # -------------------------------------------------------------------------------------------------------
     def _read(self, now: float) -> None:
         if not self._take(now):
             # a driver at about our rate gives the same one twice now and then; `stale` is what matters
@@ -367,7 +399,11 @@ class Loop:
             return True
         turned = self.measure.needs == ORIENTATION
         seen = self.eye.orientation(now) if turned else self.eye.place(now)
-        self._unseen = "there is no reading" if seen is None else bad_stamp(seen[1], now) or (bad_orientation if turned else bad_place)(seen[0])
+        self._unseen = (
+            "there is no reading"
+            if seen is None
+            else bad_stamp(seen[1], now) or (bad_orientation if turned else bad_place)(seen[0])
+        )
         if self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
@@ -410,15 +446,24 @@ class Loop:
 
     def _send(self, now: float, target: np.ndarray, current_share: float) -> None:
         """Limit, remember, send, record."""
-        safe = self.guard.apply(target, self.target, np.asarray(self.state.position, float), np.asarray(self.state.current, float), self.period)
+        safe = self.guard.apply(
+            target,
+            self.target,
+            np.asarray(self.state.position, float),
+            np.asarray(self.state.current, float),
+            self.period,
+        )
         self.target = safe.astype(np.float32)
         with self._lock:  # the watchdog relaxes from its own thread
             if self._tripped is None:
-                self.driver.send(HandCommand(self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION))
+                self.driver.send(
+                    HandCommand(self.target, np.round(self.tor_max * current_share), kp=self.settings.kp, mode=POSITION)
+                )
         if self.recorder is not None:
             self.recorder.put("command", now, self.target)
 
-    # -- phases ------------------------------------------------------------------------------------------------------------------
+    # -- phases
+    # ------------------------------------------------------------------------------------------------------------------
     def _begin_homing(self, now: float) -> None:
         self.phase, self._began = HOMING, now
         self._from = np.asarray(self.state.position, float).copy()
@@ -431,8 +476,10 @@ class Loop:
         error = np.abs(np.asarray(self.state.position, float) - self.home)
         if error.max() > self.settings.home_error:
             j = int(error.argmax())
-            raise UserError(f"homing: {xhand.JOINTS[j]} is {error[j]:.2f} rad from its home {self.home[j]:.2f} rad, allowed"
-                            f" {self.settings.home_error:g}; free the hand, or check its zero and the current limit")
+            raise UserError(
+                f"homing: {xhand.JOINTS[j]} is {error[j]:.2f} rad from its home {self.home[j]:.2f} rad, allowed"
+                f" {self.settings.home_error:g}; free the hand, or check its zero and the current limit"
+            )
         rest = np.mean(self._rest, 0)
         if rest.sum() > 0:
             self.report.counts["taxels_zeroed"] = int((rest > 0.5).sum())
@@ -454,8 +501,8 @@ class Loop:
         self._let_go()
 
     def _let_go(self, lock: bool = True) -> None:
-        """Tell the driver to relax until it does; an interrupt in the middle changes nothing. Between tries the passive mode is sent,
-        which a driver whose relaxing fails may still pass on."""
+        """Tell the driver to relax until it does; an interrupt in the middle changes nothing. Between tries the passive
+        mode is sent, which a driver whose relaxing fails may still pass on."""
         for _ in range(RELAX_TRIES):
             held = lock and self._lock.acquire(timeout=0.02)  # whoever holds it longer hangs
             try:
@@ -469,7 +516,9 @@ class Loop:
                 if held:
                     self._lock.release()
             try:
-                self.driver.send(HandCommand(np.zeros(12) if self.target is None else self.target, np.zeros(12), kp=0, mode=PASSIVE))
+                self.driver.send(
+                    HandCommand(np.zeros(12) if self.target is None else self.target, np.zeros(12), kp=0, mode=PASSIVE)
+                )
                 self.clock.sleep_until(self.clock.now() + RELAX_EVERY)
             except BaseException:
                 continue

@@ -132,8 +132,8 @@ class Manifest(msgspec.Struct):
 
 
 def check(raw: dict[str, Any], source: object) -> Manifest:
-    """The manifest as declared above. Raises UserError, one line: not a manifest, another version, a key missing or of the wrong
-    type, a value outside its range or beyond what the hand can do."""
+    """The manifest as declared above. Raises UserError, one line: not a manifest, another version, a key missing or of
+    the wrong type, a value outside its range or beyond what the hand can do."""
     if raw.get("format") != FORMAT:
         raise UserError(f"{source}: not the manifest of a policy bundle")
     if raw.get("version") != VERSION:
@@ -144,12 +144,17 @@ def check(raw: dict[str, Any], source: object) -> Manifest:
     if m.task == "rotate":
         convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", AGAIN)
         if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
-            raise UserError(f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {AGAIN}")
+            raise UserError(
+                f"{source}: task_settings.goal.axis={m.task_settings.goal.axis}: must have a length; {AGAIN}"
+            )
     if m.task == "grasp" and m.normalization.force_max_N is None:
         raise UserError(f"{source}: lacks normalization.force_max_N, which task=grasp needs; {AGAIN}")
     for key, ours in (("joints", xhand.JOINTS), ("fingers", xhand.FINGERS)):
         if getattr(m, key) != list(ours):
-            raise UserError(f"{source}: {key} are {', '.join(getattr(m, key))[:120]}; this hand's are {', '.join(ours)}, in this order")
+            raise UserError(
+                f"{source}: {key} are {', '.join(getattr(m, key))[:120]}; this hand's are {', '.join(ours)}, in this"
+                " order"
+            )
     _table(m, source)
     _limits(m, source)
     return m
@@ -160,24 +165,36 @@ def _table(m: Manifest, source: object) -> None:
     at = 0
     for k, row in enumerate(m.observation):
         if row.start != at or row.stop <= row.start:
-            raise UserError(f"{source}: observation[{k}] ({row.name}) is {row.start} to {row.stop}, must begin at {at}; {AGAIN}")
+            raise UserError(
+                f"{source}: observation[{k}] ({row.name}) is {row.start} to {row.stop}, must begin at {at}; {AGAIN}"
+            )
         at = row.stop
     if at != m.policy.observation_size:
-        raise UserError(f"{source}: policy.observation_size={m.policy.observation_size}, its observation table has {at}; {AGAIN}")
+        raise UserError(
+            f"{source}: policy.observation_size={m.policy.observation_size}, its observation table has {at}; {AGAIN}"
+        )
 
 
 def _limits(m: Manifest, source: object) -> None:
     """Ranges and speeds lie within the hand's own, poses within the ranges."""
     low, high = xhand.joint_limits().T
     slack = 1e-3
-    checks = [("action.low", m.action.low, low, high), ("action.high", m.action.high, low, high),
-              ("action.speed_limit_rad_s", m.action.speed_limit_rad_s, np.zeros(12), xhand.speeds()), ("initial_pose", m.initial_pose, low, high)]
+    checks = [
+        ("action.low", m.action.low, low, high),
+        ("action.high", m.action.high, low, high),
+        ("action.speed_limit_rad_s", m.action.speed_limit_rad_s, np.zeros(12), xhand.speeds()),
+        ("initial_pose", m.initial_pose, low, high),
+    ]
     if m.grip is not None:
         checks += [("grip.target", m.grip.target, low, high)]
     for key, values, least, most in checks:
         for joint, value, a, b in zip(xhand.JOINTS, values, least, most, strict=True):
             if not a - slack <= value <= b + slack:
-                raise UserError(f"{source}: {key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}; {AGAIN}")
+                raise UserError(
+                    f"{source}: {key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}; {AGAIN}"
+                )
     for joint, a, b in zip(xhand.JOINTS, m.action.low, m.action.high, strict=True):
         if not a < b:
-            raise UserError(f"{source}: action.low of {joint} is {a:g}, action.high {b:g}; low must be below high; {AGAIN}")
+            raise UserError(
+                f"{source}: action.low of {joint} is {a:g}, action.high {b:g}; low must be below high; {AGAIN}"
+            )

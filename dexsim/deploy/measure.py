@@ -27,7 +27,8 @@ def for_bundle(manifest: dict[str, Any], calibration: Calibration) -> Measure | 
 
 
 class Measure:
-    """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last height.
+    """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last
+    height.
 
     period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training.
     """
@@ -48,7 +49,8 @@ class Measure:
     def observe(
         self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame; command 0..1."""
+        """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame;
+        command 0..1."""
         s = self.signals(state, seen, command)
         return self.observation(s), s.touch_force[0].numpy()
 
@@ -63,7 +65,8 @@ class Measure:
         vz = torch.zeros_like(z) if self._z is None else observations.height_speed(z, self._z, self.period)
         self._z = z
         return observations.Signals(
-            _tensor(state.position), _tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)), _tensor(self._xy), z, vz,
+            _tensor(state.position), _tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
+            _tensor(self._xy), z, vz,
             _tensor(force), _tensor(centre), _tensor(tips), _tensor([command])[0])  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
@@ -74,8 +77,8 @@ class Measure:
 class TurnMeasure:
     """The rotation: turns readings into observations; keeps the goal, the history and the last angles.
 
-    goal [1, 4]: the orientation to reach, in the IMU's frame (None without one); goals: how many were reached. In training a goal
-    is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
+    goal [1, 4]: the orientation to reach, in the IMU's frame (None without one); goals: how many were reached. In
+    training a goal is reached by its angle and by the drift of the cube, which no IMU measures: here the angle decides.
     """
 
     def __init__(self, calibration: Calibration, manifest: dict[str, Any], period: float):
@@ -103,15 +106,17 @@ class TurnMeasure:
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y z as its
-        IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
+        """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y
+        z as its IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
         s = self.signals(state, seen, target, action)
         out = observations_rotate.build(s, self.task)
         if self.task["perception"] == "proprioception":
             self._past = out.view(1, -1, self.frame)
         return out.numpy(), s.touch_force[0].numpy()
 
-    def signals(self, state: HandState, seen: np.ndarray | None, target: np.ndarray, action: np.ndarray) -> observations_rotate.Signals:
+    def signals(
+        self, state: HandState, seen: np.ndarray | None, target: np.ndarray, action: np.ndarray
+    ) -> observations_rotate.Signals:
         """See `observe`; moves the goal on where it is reached."""
         imu = self.task["perception"] == "imu"
         q = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
@@ -122,12 +127,19 @@ class TurnMeasure:
         tips, position, turned = self.hand(state.position)
         force, centre = self.hand.touch(normal, position, turned, weighted=self.task["observe"]["force_weighted"])
         fresh = not imu and self._past is None
-        past = torch.zeros(1, 0, 0) if imu else torch.zeros(1, int(self.task["history"]), self.frame) if fresh else self._past
+        past = (
+            torch.zeros(1, 0, 0)
+            if imu
+            else torch.zeros(1, int(self.task["history"]), self.frame)
+            if fresh
+            else self._past
+        )
         sent = observations_rotate.sent(
             _tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), _tensor(target), self._middle, self._half,
             self.task["observe"].get("last_action", "step"))  # fmt: skip
         return observations_rotate.Signals(
-            _tensor(state.position), _tensor(self._velocity(state)), q, self.goal if imu else q, sent, _tensor(force), _tensor(centre),
+            _tensor(state.position), _tensor(self._velocity(state)), q, self.goal if imu else q, sent, _tensor(force),
+            _tensor(centre),
             _tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
 
     def _aim(self, q: torch.Tensor) -> None:

@@ -22,7 +22,8 @@ OBSERVATION = (  # table (a) of the paper: name, width, unit, what it is on hard
 )
 FRAME = {
     "joint_angle": "joint", "joint_torque": "joint", "object_position": "palm", "object_velocity": "palm",
-    "contact_force": "taxel, along the normal", "contact_centre": "palm", "fingertip_position": "palm", "force_command": "none",
+    "contact_force": "taxel, along the normal", "contact_centre": "palm", "fingertip_position": "palm",
+    "force_command": "none",
 }  # fmt: skip
 """Frame of each row of OBSERVATION. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 ORDER = {
@@ -36,7 +37,8 @@ ACTOR_SIZE = sum(row[1] for row in OBSERVATION)
 class Signals(NamedTuple):
     """What is measured, N hands at once. joint_position [N, 12] rad; joint_torque [N, 12] over tau_max, positive along
     positive joint position; object_xy [N, 2], object_z [N] m, object_vz [N] m/s; touch_force [N, 5] N; touch_centre
-    [N, 5, 3] and fingertip [N, 5, 3] m, palm frame; command [N] 0..1. Joints in the SDK's order, fingers from the thumb."""
+    [N, 5, 3] and fingertip [N, 5, 3] m, palm frame; command [N] 0..1. Joints in the SDK's order, fingers from the
+    thumb."""
 
     joint_position: torch.Tensor
     joint_torque: torch.Tensor

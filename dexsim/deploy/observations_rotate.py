@@ -1,5 +1,5 @@
-"""The rotation policy's observation, built from named measured signals: the one builder of the simulated task and of the
-real-time loop, as `observations.py` is for the grasp.
+"""The rotation policy's observation, built from named measured signals: the one builder of the simulated task and of
+the real-time loop, as `observations.py` is for the grasp.
 
 Torch only, no branches on values, no allocation beyond its results: it can be part of a CUDA graph.
 """
@@ -36,17 +36,18 @@ FRAME = {
 }  # fmt: skip
 """Frame of each row. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 ORDER = {
-    "joint_angle": "joints", "joint_velocity": "joints", "last_action": "joints", "contact_centre": "fingers, x y z each",
+    "joint_angle": "joints", "joint_velocity": "joints", "last_action": "joints",
+    "contact_centre": "fingers, x y z each",
     "contact_force": "fingers", "fingertip_position": "fingers, x y z each",
     "relative_orientation": "6d: the matrix's first two columns, one after the other; quaternion: w x y z",
 }  # fmt: skip
 
 
 class Signals(NamedTuple):
-    """What is measured, N hands at once. joint_position [N, 12] rad; joint_velocity [N, 12] rad/s (used without an IMU only);
-    orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, 12], see `sent`;
-    touch_force [N, 5] N; touch_centre, fingertip [N, 5, 3] m, palm frame; past [N, H, F]: the last H frames, newest first
-    (perception=proprioception, else empty); fresh [N] bool: an episode begins."""
+    """What is measured, N hands at once. joint_position [N, 12] rad; joint_velocity [N, 12] rad/s (used without an IMU
+    only); orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, 12], see
+    `sent`; touch_force [N, 5] N; touch_centre, fingertip [N, 5, 3] m, palm frame; past [N, H, F]: the last H frames,
+    newest first (perception=proprioception, else empty); fresh [N] bool: an episode begins."""
 
     joint_position: torch.Tensor
     joint_velocity: torch.Tensor
@@ -61,8 +62,8 @@ class Signals(NamedTuple):
 
 
 def rows(task: Mapping[str, Any], frames: int | None = None) -> list[tuple[str, int, str, str]]:
-    """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`. frames: of how many
-    control steps a row of the history is taken (default: `history`)."""
+    """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`. frames: of how
+    many control steps a row of the history is taken (default: `history`)."""
     o = task["observe"]
     proprioception = task["perception"] == "proprioception"
     out = []
@@ -81,12 +82,13 @@ def rows(task: Mapping[str, Any], frames: int | None = None) -> list[tuple[str, 
 
 
 def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
-    """The actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is put before
-    `past`, whose oldest is left out; a fresh episode's history is its first frame."""
+    """The actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is put
+    before `past`, whose oldest is left out; a fresh episode's history is its first frame."""
     n = s.joint_position.shape[0]
     parts = {
         "joint_angle": s.joint_position, "joint_velocity": s.joint_velocity, "last_action": s.sent,
-        "contact_centre": s.touch_centre.reshape(n, 15), "contact_force": s.touch_force, "fingertip_position": s.fingertip.reshape(n, 15),
+        "contact_centre": s.touch_centre.reshape(n, 15), "contact_force": s.touch_force,
+        "fingertip_position": s.fingertip.reshape(n, 15),
     }  # fmt: skip
     proprioception = task["perception"] == "proprioception"
     if not proprioception:
@@ -98,16 +100,19 @@ def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
     return torch.where(s.fresh[:, None, None], frame[:, None].expand_as(moved), moved).reshape(n, -1)
 
 
-def sent(action: torch.Tensor, target: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, what: str) -> torch.Tensor:
-    """What was last sent to the drives [N, 12]. target: the targets over each joint's range (middle, half [12] rad) in [-1, 1],
-    in absolute mode the action itself; in relative mode a step alone would not tell how hard a finger is told to press.
+def sent(
+    action: torch.Tensor, target: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, what: str
+) -> torch.Tensor:
+    """What was last sent to the drives [N, 12]. target: the targets over each joint's range (middle, half [12] rad) in
+    [-1, 1], in absolute mode the action itself; in relative mode a step alone would not tell how hard a finger is told
+    to press.
     step: the action [N, 12]."""
     return action if what == "step" else (target - middle) / half
 
 
 def relative(seen: torch.Tensor, goal: torch.Tensor, how: str) -> torch.Tensor:
-    """R_object^T R_goal [N, 6, 4 or 0] from quaternions [N, 4] in one frame. A heading that both share cancels, so an IMU that
-    does not know north will do.
+    """R_object^T R_goal [N, 6, 4 or 0] from quaternions [N, 4] in one frame. A heading that both share cancels, so an
+    IMU that does not know north will do.
 
     As a quaternion: both orientations pass through rotation matrices, whose quaternion has the sign of its largest
     component, so the sign of the product jumps with the object's attitude. It is left so: the double cover is what
@@ -122,8 +127,8 @@ def relative(seen: torch.Tensor, goal: torch.Tensor, how: str) -> torch.Tensor:
 
 
 def next_goal(q: torch.Tensor, axis: torch.Tensor, turn: torch.Tensor, keep_tilt: bool) -> torch.Tensor:
-    """The goal after orientation q [N, 4] was reached: q turned by `turn` [4] (about the unit vector axis [3]), its tilt against
-    the axis removed unless `keep_tilt`."""
+    """The goal after orientation q [N, 4] was reached: q turned by `turn` [4] (about the unit vector axis [3]), its
+    tilt against the axis removed unless `keep_tilt`."""
     if not keep_tilt:
         q = rotation.upright(q, axis)
     return rotation.normalize(rotation.multiply(turn.expand_as(q), q))

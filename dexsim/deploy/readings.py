@@ -36,8 +36,9 @@ _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded o
 
 
 def implausible(state: HandState, now: float) -> str | None:
-    """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead, an array
-    of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged here."""
+    """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead,
+    an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged
+    here."""
     if (wrong := bad_stamp(state.time, now)) is not None:
         return wrong
     for b in _JOINT:

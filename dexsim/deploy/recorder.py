@@ -15,9 +15,16 @@ import numpy as np
 from dexsim.recording import schema
 from dexsim.recording.writer import Writer
 
-OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = "/policy/observation", "/policy/action", "/policy/force_command", "/object_seen", "/joint_errors"
+OBSERVATION, ACTION, FORCE_COMMAND, HEIGHT, ERRORS = (
+    "/policy/observation",
+    "/policy/action",
+    "/policy/force_command",
+    "/object_seen",
+    "/joint_errors",
+)
 TURNED, GOAL = "/object_turned", "/policy/goal"
-LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",), ERRORS: ("joint",),
+LABELS = {OBSERVATION: ("entry",), ACTION: ("joint",), FORCE_COMMAND: ("command",), HEIGHT: ("axis",),
+          ERRORS: ("joint",),
           TURNED: ("wxyz",), GOAL: ("wxyz",)}  # fmt: skip
 """Topics beside those of a recording: Float32MultiArray."""
 
@@ -28,8 +35,17 @@ class Recorder:
     Times given are of the loop's clock; `zero` of it is the recording's start.
     """
 
-    def __init__(self, path: str | Path, joints: Sequence[str], meta: Mapping[str, Any], config: str | None, zero: float,
-                 start_ns: int | None = None, most: int = 4000, chunk_s: float = 0.5):
+    def __init__(
+        self,
+        path: str | Path,
+        joints: Sequence[str],
+        meta: Mapping[str, Any],
+        config: str | None,
+        zero: float,
+        start_ns: int | None = None,
+        most: int = 4000,
+        chunk_s: float = 0.5,
+    ):
         self.writer = Writer(path, joints, meta, start_ns, config, chunk_s=chunk_s)
         self.path, self.zero, self.dropped, self.written = self.writer.path, zero, 0, 0
         self.error: str | None = None
@@ -40,29 +56,41 @@ class Recorder:
         self._thread.start()
 
     def put(self, kind: str, t: float, *values: Any) -> None:
-        """kind: command, state, tactile, temperature, or a topic of `LABELS`; values are not to be changed afterwards."""
+        """kind: command, state, tactile, temperature, or a topic of `LABELS`; values are not to be changed
+        afterwards."""
         if self._queue.qsize() >= self._most or self.error:
             self.dropped += 1
         else:
             self._queue.put((kind, t - self.zero, values))
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and the index. Raises nothing: what went wrong is said in `error`, and a run's report outlives its recording."""
+        """Write what waits, and the index. Raises nothing: what went wrong is said in `error`, and a run's report
+        outlives its recording."""
         self._queue.put(None)
         self._thread.join(timeout)
         if self._thread.is_alive():
-            self.error = self.error or f"{self.path}: the disk did not take the last samples within {timeout:g} s; the index is missing"
+            self.error = (
+                self.error
+                or f"{self.path}: the disk did not take the last samples within {timeout:g} s; the index is missing"
+            )
             return
         try:
             self.writer.close()
         except Exception as error:
-            self.error = self.error or f"{self.path}: {_reason(error)}; the index is missing, what was written before is there"
+            self.error = (
+                self.error or f"{self.path}: {_reason(error)}; the index is missing, what was written before is there"
+            )
             with contextlib.suppress(Exception):
                 self.writer._file.close()
 
     def _run(self) -> None:
         w = self.writer
-        add = {"command": w.add_command, "tactile": w.add_tactile, "temperature": w.add_temperature, "object": w.add_object_pose}
+        add = {
+            "command": w.add_command,
+            "tactile": w.add_tactile,
+            "temperature": w.add_temperature,
+            "object": w.add_object_pose,
+        }
         while (item := self._queue.get()) is not None:
             kind, t, values = item
             try:

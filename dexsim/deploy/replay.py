@@ -14,11 +14,12 @@ EPS = 1e-6  # s, of rounding in stored times
 
 
 class ReplayHand:
-    """A HandDriver that gives a recording's samples at the clock's time; also a HeightSource, from its object pose, and an
-    OrientationSource, from the IMU in the object or else its pose.
+    """A HandDriver that gives a recording's samples at the clock's time; also a HeightSource, from its object pose, and
+    an OrientationSource, from the IMU in the object or else its pose.
 
-    Simulated recordings are in N.m and N: they are given as the current and counts that `calibration` makes of them, not
-    rounded. A simulated effort stamped t is of the physics step that begins at t, so the newest one *before* the clock is given.
+    Simulated recordings are in N.m and N: they are given as the current and counts that `calibration` makes of them,
+    not rounded. A simulated effort stamped t is of the physics step that begins at t, so the newest one *before* the
+    clock is given.
     """
 
     name = "replay"
@@ -35,7 +36,9 @@ class ReplayHand:
         self._current = None
         if effort is not None:
             value = np.nan_to_num(effort.value[:, self._order])
-            amps = calibration.current(value) if recording.effort_is == "torque_Nm" else value * calibration.current_sign
+            amps = (
+                calibration.current(value) if recording.effort_is == "torque_Nm" else value * calibration.current_sign
+            )
             self._current = effort.t, amps * 1e3
         speed = recording.states.velocity
         self._speed = None if speed is None or not np.isfinite(speed.value).any() else speed.value[:, self._order]

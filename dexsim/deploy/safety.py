@@ -14,8 +14,8 @@ from dexsim.errors import UserError
 class Guard:
     """Applied to targets after the policy, joint by joint.
 
-    low, high [12] rad; speed [12] rad/s, of targets; current [12] mA; current_sign [12]: of the current that drives toward
-    positive position. counts: how often each limit changed a target (joint-steps). Over its current for
+    low, high [12] rad; speed [12] rad/s, of targets; current [12] mA; current_sign [12]: of the current that drives
+    toward positive position. counts: how often each limit changed a target (joint-steps). Over its current for
     `sustained` s, or over `temperature` degC, a joint makes `must_relax` say why.
     """
 
@@ -32,12 +32,17 @@ class Guard:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low).all() and np.isfinite(self.high).all() and (self.low < self.high).all()):
             j = int(np.argmax(~(self.low < self.high)))
-            raise UserError(f"limits of {self.names[j]}: {self.low[j]:.4g} to {self.high[j]:.4g} rad leave nothing between them; use a smaller margin=")
+            raise UserError(
+                f"limits of {self.names[j]}: {self.low[j]:.4g} to {self.high[j]:.4g} rad leave nothing between them;"
+                " use a smaller margin="
+            )
         self._over = np.zeros(len(self.low))
 
-    def apply(self, target: np.ndarray, before: np.ndarray, q: np.ndarray, current: np.ndarray, period: float) -> np.ndarray:
-        """Safe targets [12] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and current mA:
-        measured; period s since the last."""
+    def apply(
+        self, target: np.ndarray, before: np.ndarray, q: np.ndarray, current: np.ndarray, period: float
+    ) -> np.ndarray:
+        """Safe targets [12] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and
+        current mA: measured; period s since the last."""
         t = np.asarray(target, float).copy()
         middle = 0.5 * (self.low + self.high)
         q = np.where(np.isfinite(q), q, middle)
@@ -46,8 +51,8 @@ class Guard:
         bad = ~np.isfinite(t)
         self._count("not_finite", bad)
         t[bad] = before[bad]
-        # where the motor draws too much, the target may lead the joint only by the share of its lead that draws the limit:
-        # a position loop's current is proportional to it
+        # where the motor draws too much, the target may lead the joint only by the share of its lead that draws the
+        # limit: a position loop's current is proportional to it
         over = np.abs(current) > self.current
         if over.any():
             way = np.sign(self.current_sign * current)
@@ -70,7 +75,10 @@ class Guard:
         self._over = np.where(over, self._over + elapsed, 0.0)
         if (self._over > self.sustained).any():
             j = int(np.argmax(self._over))
-            return f"{self.names[j]} drew {abs(float(current[j])):.0f} mA, over its {self.current[j]:.0f} mA for {self.sustained:g} s"
+            return (
+                f"{self.names[j]} drew {abs(float(current[j])):.0f} mA, "
+                f"over its {self.current[j]:.0f} mA for {self.sustained:g} s"
+            )
         if (np.asarray(temperature) > self.temperature).any():
             j = int(np.argmax(temperature))
             return f"{self.names[j]} is at {temperature[j]:.0f} degC, over {self.temperature:g} degC"

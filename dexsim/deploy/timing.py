@@ -8,7 +8,8 @@ import numpy as np
 
 
 class Timing:
-    """One row a turn: CPU seconds of this thread, wall seconds, lateness at waking [s]. Beyond `most` rows it goes round."""
+    """One row a turn: CPU seconds of this thread, wall seconds, lateness at waking [s]. Beyond `most` rows it goes
+    round."""
 
     def __init__(self, most: int = 400_000):
         self._rows = np.zeros((most, 3))

@@ -1,8 +1,9 @@
-"""The vendor's driver as a `HandDriver`: an adapter for the Python package `xhand_controller`, imported only when opened.
+"""The vendor's driver as a `HandDriver`: an adapter for the Python package `xhand_controller`, imported only when
+opened.
 
 Not run on a hand by us: written from the SDK's published fields (see the table below); check signs and limits at low
-current first. The bus blocks for about 9.6 ms a round trip, so a thread of this driver's own talks to it, and the newest
-state waits for `read`.
+current first. The bus blocks for about 9.6 ms a round trip, so a thread of this driver's own talks to it, and the
+newest state waits for `read`.
 
     theirs                                          ours (`HandState`)
     finger_state[i].position        rad             position
@@ -90,25 +91,33 @@ class VendorXHand:
         finally:
             self._device = None
         if not carried:
-            raise UserError(f"xHand on {self.port}: the bus did not carry the command to relax within {CLOSE:g} s"
-                            f"{f' ({self.error})' if self.error else ''}; cut the hand's power")
+            raise UserError(
+                f"xHand on {self.port}: the bus did not carry the command to relax within {CLOSE:g} s"
+                f"{f' ({self.error})' if self.error else ''}; cut the hand's power"
+            )
 
     @staticmethod
     def _import() -> Any:
         try:
             from xhand_controller import xhand_control
         except ImportError:
-            raise UserError("driver=xhand: the vendor's package xhand_controller is not installed; get it from the vendor of the"
-                            " hand, or use driver=sim") from None
+            raise UserError(
+                "driver=xhand: the vendor's package xhand_controller is not installed; get it from the vendor of the"
+                " hand, or use driver=sim"
+            ) from None
         return xhand_control
 
     def _run(self) -> None:
-        """Bus cycles until the end; one that fails is counted, shows as no new state to the loop, and is tried again."""
+        """Bus cycles until the end; one that fails is counted, shows as no new state to the loop, and is tried
+        again."""
         while not self._stop.is_set():
             try:
                 self._cycle()
             except Exception as error:  # whatever the package raises; a thread that ended could relax no more
-                self.bad_reads, self.error = self.bad_reads + 1, f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+                self.bad_reads, self.error = (
+                    self.bad_reads + 1,
+                    f"{type(error).__name__}: {' '.join(str(error).split())[:160]}",
+                )
                 self._stop.wait(0.002)
 
     def _cycle(self) -> None:
@@ -143,6 +152,7 @@ def convert(raw: Any, now: float, sequence: int) -> HandState:
     speed = np.array([getattr(j, "default5", 0) for j in joints], np.float32) * 1e-3
     error = [next((e for e in (j.commboard_err, j.jonitboard_err, j.tipboard_err) if e), 0) for j in joints]
     return HandState(
-        now, sequence, np.array([j.position for j in joints], np.float32), np.array([j.torque for j in joints], np.int16),
+        now, sequence, np.array([j.position for j in joints], np.float32),
+        np.array([j.torque for j in joints], np.int16),
         np.array([j.temperature & 0xFF for j in joints], float), np.array(error, np.int64), tactile,
         speed if speed.any() else None)  # fmt: skip

@@ -1,8 +1,8 @@
 """Where the object is, from a depth image and its mask: an interface, and the rule of the paper behind it.
 
-Paper, "Force-adaptive grasping": z is the distance between the palm's centre and the centroid of the segmented mask; x and
-y are held at their first value (`dexsim.deploy.measure` holds them). The distance is taken along the palm's normal, which
-is what z is in training; `rule="distance"` takes the straight distance.
+Paper, "Force-adaptive grasping": z is the distance between the palm's centre and the centroid of the segmented mask; x
+and y are held at their first value (`dexsim.deploy.measure` holds them). The distance is taken along the palm's normal,
+which is what z is in training; `rule="distance"` takes the straight distance.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ RULES = ("normal", "distance")
 
 @dataclass(frozen=True)
 class CameraPose:
-    """A pinhole camera in the palm frame. position [3] m; rotation [3, 3]: columns are the camera's right, up and backward
-    axes (OpenGL, as MuJoCo's cam_xmat); focal: pixels; centre (u, v): pixels from the image's upper left corner."""
+    """A pinhole camera in the palm frame. position [3] m; rotation [3, 3]: columns are the camera's right, up and
+    backward axes (OpenGL, as MuJoCo's cam_xmat); focal: pixels; centre (u, v): pixels from the image's upper left
+    corner."""
 
     position: np.ndarray
     rotation: np.ndarray
@@ -57,13 +58,15 @@ class HeightSource(Protocol):
     def place(self, now: float) -> tuple[np.ndarray, float] | None: ...
 
 
-def centroid(frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 12, solid: bool = True) -> np.ndarray | None:
+def centroid(
+    frame: Frame, pose: CameraPose, rule: str = "normal", least: int = 12, solid: bool = True
+) -> np.ndarray | None:
     """The mask's centroid as (x, y, z) m in the palm frame; None where fewer than `least` pixels are the object's.
 
     The centroid is the mean of the mask's pixels; its depth is their median, so that a few pixels of the background (a
-    mask's ragged edge) move nothing. The median lies on the side of the object that faces the camera; `solid` moves the point to
-    where a ball of the mask's area has its centre (0.71 of its radius behind the median), since training knows the object's
-    middle. Seen from the side this moves x and y, and hardly z.
+    mask's ragged edge) move nothing. The median lies on the side of the object that faces the camera; `solid` moves the
+    point to where a ball of the mask's area has its centre (0.71 of its radius behind the median), since training knows
+    the object's middle. Seen from the side this moves x and y, and hardly z.
     """
     if rule not in RULES:
         raise UserError(f"vision rule={rule}: must be one of {', '.join(RULES)}")

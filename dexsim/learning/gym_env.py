@@ -23,9 +23,9 @@ class GymVectorEnv(VectorEnv):
     """Worlds reset in the step that ends their episode (``AutoresetMode.SAME_STEP``).
 
     Observations [N, D] float32 are one group of the environment's, by default what the actor sees; the other groups
-    are in ``info``. Actions [N, A] float32 lie in [-1, 1]. Where an episode ends, ``info["final_obs"]`` [N, D] holds its
-    last observation for the worlds of ``info["_final_obs"]`` (rows of the others are not meaningful). Time limits are
-    truncations, all else is termination.
+    are in ``info``. Actions [N, A] float32 lie in [-1, 1]. Where an episode ends, ``info["final_obs"]`` [N, D] holds
+    its last observation for the worlds of ``info["_final_obs"]`` (rows of the others are not meaningful). Time limits
+    are truncations, all else is termination.
 
     Args:
         env: the environment (rsl-rl's ``VecEnv``) with its generator ``rng`` and ``reset_all()``; it gives

@@ -1,8 +1,9 @@
 """How the ranks of one run end together when one of them is gone.
 
-A rank that dies in the middle of training leaves the others waiting inside a collective operation, where no signal handler
-of Python runs; with NCCL for ten minutes. So each rank holds a plain TCP connection to rank 0, watched by a thread:
-the kernel closes it however the process ends. Rank 0 passes the news on, one line is printed, and all processes exit.
+A rank that dies in the middle of training leaves the others waiting inside a collective operation, where no signal
+handler of Python runs; with NCCL for ten minutes. So each rank holds a plain TCP connection to rank 0, watched by a
+thread: the kernel closes it however the process ends. Rank 0 passes the news on, one line is printed, and all processes
+exit.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ class Lifeline:
         threading.Thread(target=self._watch, name="lifeline", daemon=True).start()
 
     def fail(self, text: str, status: int) -> None:
-        """This rank ends on purpose: the others follow. Rank 0 prints the text of another rank; its own is printed by the
-        caller. An empty text: nothing to say. Ranks other than 0 exit here with ``status``."""
+        """This rank ends on purpose: the others follow. Rank 0 prints the text of another rank; its own is printed by
+        the caller. An empty text: nothing to say. Ranks other than 0 exit here with ``status``."""
         with self._lock:
             self._said = True
         self._send(FAIL, f"rank {self.rank}: {text}" if text and self.rank else "")

@@ -17,7 +17,8 @@ class Meter:
     def __init__(self, n: int, device: str) -> None:
         self._return = torch.zeros(n, device=device)
         self._length = torch.zeros(n, device=device)
-        self._sums = torch.zeros(4, dtype=torch.float64, device=device)  # returns, lengths and number of ended episodes;
+        # returns, lengths and number of ended episodes;
+        self._sums = torch.zeros(4, dtype=torch.float64, device=device)
         self._device = device                                            # reward of all steps
         self._steps = 0
         self._logs: dict[tuple[str, ...], list[torch.Tensor]] = {}

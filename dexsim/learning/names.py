@@ -1,5 +1,5 @@
-"""Which classes agent settings may name: rsl-rl imports and calls whatever its settings name, so a checkpoint that names code of
-its own would run it. Names come from the lists here, unless the user types them on the command line."""
+"""Which classes agent settings may name: rsl-rl imports and calls whatever its settings name, so a checkpoint that
+names code of its own would run it. Names come from the lists here, unless the user types them on the command line."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def check(agent: dict[str, Any], typed: Iterable[tuple[str, Any]] = (), where: s
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted name, value) of every single value below a nest of dicts and lists; a logger's own mapping is looked into too."""
+    """(dotted name, value) of every single value below a nest of dicts and lists; a logger's own mapping is looked into
+    too."""
     items = node.items() if isinstance(node, dict) else enumerate(node)
     for name, value in items:
         key = f"{prefix}{name}"

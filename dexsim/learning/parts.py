@@ -92,14 +92,18 @@ def check(data: dict[str, Any], path: object) -> None:
     typed.convert(data, Train if data["kind"] == "train" else Policy, f"{path}: damaged checkpoint", again)
     for name, tensor in tensors(data):
         if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
-            raise UserError(f"{path}: damaged checkpoint, {name} is said to have the shape {list(tensor.shape)}, which is more than"
-                            f" was stored; {again}")
+            raise UserError(
+                f"{path}: damaged checkpoint, {name} is said to have the shape {list(tensor.shape)}, which is more than"
+                f" was stored; {again}"
+            )
     for group in ("actor", "critic"):
         for name, tensor in data.get(group, {}).items():
             if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
                 bad = int((~tensor.isfinite()).sum())
-                raise UserError(f"{path}: {group}.{name} holds {bad} of {tensor.numel()} weights that are not finite: learning had"
-                                " diverged; use an earlier checkpoint of its run folder")
+                raise UserError(
+                    f"{path}: {group}.{name} holds {bad} of {tensor.numel()} weights that are not finite: learning had"
+                    " diverged; use an earlier checkpoint of its run folder"
+                )
 
 
 def tensors(node: Any, prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:

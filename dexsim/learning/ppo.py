@@ -21,7 +21,9 @@ from dexsim.learning import names
 Policy = Callable[[TensorDict], torch.Tensor]  # observations -> actions [N, A]
 
 
-def agent_config(cfg: dict[str, Any], device: str, typed: names.Typed = frozenset(), where: str = "agent settings") -> dict[str, Any]:
+def agent_config(
+    cfg: dict[str, Any], device: str, typed: names.Typed = frozenset(), where: str = "agent settings"
+) -> dict[str, Any]:
     """The nested dict rsl-rl takes, from ``cfg["agent"]``; its save interval is ours to keep.
 
     typed: settings that the user typed, which alone may name code of another package. where: whose settings these are.
@@ -44,7 +46,9 @@ def agent_errors() -> Iterator[None]:
         with contextlib.redirect_stdout(io.StringIO()):
             yield
     except (TypeError, ImportError, AttributeError, KeyError, IndexError, AssertionError, NotImplementedError) as error:
-        raise UserError(f"agent settings: rsl-rl refuses them: {(str(error) or type(error).__name__).splitlines()[0]}") from error
+        raise UserError(
+            f"agent settings: rsl-rl refuses them: {(str(error) or type(error).__name__).splitlines()[0]}"
+        ) from error
     except ValueError as error:
         if isinstance(error, UserError):
             raise
@@ -72,14 +76,16 @@ def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = 
     actor.eval()
     with torch.no_grad():
         if not bool(actor(env.get_observations()).isfinite().all()):
-            raise UserError(f"{path}: its policy's actions are not finite in this environment; its weights are out of range, use an"
-                            " earlier checkpoint of its run folder")
+            raise UserError(
+                f"{path}: its policy's actions are not finite in this environment; its weights are out of range, use an"
+                " earlier checkpoint of its run folder"
+            )
     return actor
 
 
 def plain_policy(name: str, env: Any, seed: int) -> Policy:
-    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform in [-1, 1], what every task's actions are
-    clipped to) or ``scripted`` (the task's own, from ``env.scripted_policy()``)."""
+    """A policy without learning: ``zero`` (all actions 0), ``random`` (uniform in [-1, 1], what every task's actions
+    are clipped to) or ``scripted`` (the task's own, from ``env.scripted_policy()``)."""
     shape = (env.num_envs, env.num_actions)
     if name == "zero":
         return lambda obs: torch.zeros(shape, device=env.device)

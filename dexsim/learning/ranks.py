@@ -2,8 +2,9 @@
 
     torchrun --nproc_per_node=8 train.py task=grasp
 
-Gradients, normalization statistics, KL divergence and learning rate go through rsl-rl's own distributed PPO (NCCL between GPUs,
-gloo between CPU processes). What is here is the rest: which device, which seed, who writes, and how all of them end.
+Gradients, normalization statistics, KL divergence and learning rate go through rsl-rl's own distributed PPO (NCCL
+between GPUs, gloo between CPU processes). What is here is the rest: which device, which seed, who writes, and how all
+of them end.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ COMPILE_LIMIT = datetime.timedelta(minutes=30)  # how long others wait for rank 
 class Ranks:
     """This process among those of one training run.
 
-    Attributes: rank (0 .. size - 1, over all machines), local (on this machine), size, here (size on this machine); leader: whether this is rank 0, which
-    alone prints, logs and saves. With size 1 everything here does nothing.
+    Attributes: rank (0 .. size - 1, over all machines), local (on this machine), size, here (size on this machine);
+    leader: whether this is rank 0, which alone prints, logs and saves. With size 1 everything here does nothing.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -40,15 +41,20 @@ class Ranks:
             self.rank, self.local = (int(environment.get(k, "0")) for k in ("RANK", "LOCAL_RANK"))
             self.here = int(environment.get("LOCAL_WORLD_SIZE", self.size))
         except ValueError:
-            raise UserError("WORLD_SIZE, LOCAL_WORLD_SIZE, RANK and LOCAL_RANK must be whole numbers; torchrun sets them") from None
+            raise UserError(
+                "WORLD_SIZE, LOCAL_WORLD_SIZE, RANK and LOCAL_RANK must be whole numbers; torchrun sets them"
+            ) from None
         if self.size > 1 and "MASTER_ADDR" not in environment:
-            raise UserError(f"WORLD_SIZE={self.size} without MASTER_ADDR: start several processes with torchrun"
-                            " --nproc_per_node=N train.py ..., or unset WORLD_SIZE")
+            raise UserError(
+                f"WORLD_SIZE={self.size} without MASTER_ADDR: start several processes with torchrun"
+                " --nproc_per_node=N train.py ..., or unset WORLD_SIZE"
+            )
         self.leader = self.rank == 0
         self._lifeline: Lifeline | None = None
 
     def device(self, asked: str | None, cuda_devices: int) -> str | None:
-        """The device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do not suffice.
+        """The device to ask for: each rank of a machine gets a GPU of its own. Raises UserError where they do not
+        suffice.
 
         Args:
             asked: the setting ``device``. cuda_devices: how many this machine has.
@@ -56,11 +62,15 @@ class Ranks:
         if self.size == 1 or asked == "cpu" or (asked is None and not cuda_devices):
             return asked
         if asked not in (None, "cuda"):
-            raise UserError(f"device={asked}: under torchrun each process takes the GPU of its own number; leave device= away"
-                            " (CUDA_VISIBLE_DEVICES chooses which)")
+            raise UserError(
+                f"device={asked}: under torchrun each process takes the GPU of its own number; leave device= away"
+                " (CUDA_VISIBLE_DEVICES chooses which)"
+            )
         if self.here > cuda_devices:
-            raise UserError(f"torchrun: {self.here} processes on this machine, which has {cuda_devices} CUDA device(s); use"
-                            f" --nproc_per_node={max(cuda_devices, 1)}{'' if cuda_devices else ' or device=cpu'}")
+            raise UserError(
+                f"torchrun: {self.here} processes on this machine, which has {cuda_devices} CUDA device(s); use"
+                f" --nproc_per_node={max(cuda_devices, 1)}{'' if cuda_devices else ' or device=cpu'}"
+            )
         return f"cuda:{self.local}"
 
     def seed(self, seed: int, iteration: int = 0) -> int:
@@ -92,7 +102,9 @@ class Ranks:
         except Exception as error:
             if not self.leader:
                 traceback.print_exc()  # here: the interpreter's own would come after fail(), which ends this process
-            self._lifeline.fail(f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'see above'}", 1)
+            self._lifeline.fail(
+                f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'see above'}", 1
+            )
             raise
         self.leave()
 
@@ -142,7 +154,8 @@ class Ranks:
 
     @contextlib.contextmanager
     def one_compiles(self) -> Iterator[None]:
-        """Around what compiles kernels: the first rank of each machine does it alone, the others then find them cached."""
+        """Around what compiles kernels: the first rank of each machine does it alone, the others then find them
+        cached."""
         first = self.local == 0
         if self.together and not first:
             self.wait()
@@ -165,4 +178,3 @@ def seed_all(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
-

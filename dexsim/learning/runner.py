@@ -32,17 +32,26 @@ class Runner(OnPolicyRunner):
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
         ranks: the processes that learn together, already joined; one alone where not given.
-        typed: settings that the user typed, which alone may name code of another package (:mod:`dexsim.learning.names`).
+        typed: settings that the user typed, which alone may name code of another package
+        (:mod:`dexsim.learning.names`).
 
-    ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included; steps are those of all ranks.
+    ``iteration`` and ``steps`` count what was learned so far, a resumed run's past included; steps are those of all
+    ranks.
     """
 
-    def __init__(self, env: Any, cfg: dict[str, Any], versions: dict[str, str], ranks: Ranks | None = None,
-                 typed: names.Typed = frozenset()) -> None:
+    def __init__(
+        self,
+        env: Any,
+        cfg: dict[str, Any],
+        versions: dict[str, str],
+        ranks: Ranks | None = None,
+        typed: names.Typed = frozenset(),
+    ) -> None:
         self.ranks = ranks or Ranks({})
         self.full_cfg, self._versions, self._git = cfg, versions, checkpoint.git_state()
         device = str(env.device)
-        # Networks of noisy gradients do not need the last bits of a product; the update takes a quarter less time (H200).
+        # Networks of noisy gradients do not need the last bits of a product; the update takes a quarter less time
+        # (H200).
         torch.backends.cuda.matmul.allow_tf32 = bool(cfg.get("tf32", True))
         with agent_errors():
             super().__init__(env, agent_config(cfg, device, typed), log_dir=None, device=device)
@@ -52,12 +61,16 @@ class Runner(OnPolicyRunner):
         self._fresh = True
 
     def _configure_multi_gpu(self) -> None:
-        """Tell rsl-rl about the other ranks. Its own version also starts the group, for GPUs only; ours runs already."""
+        """Tell rsl-rl about the other ranks. Its own version also starts the group, for GPUs only; ours runs
+        already."""
         ranks = self.ranks
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.size, ranks.rank, ranks.local
         self.is_distributed = ranks.size > 1
-        self.cfg["multi_gpu"] = None if ranks.size == 1 else {
-            "global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
+        self.cfg["multi_gpu"] = (
+            None
+            if ranks.size == 1
+            else {"global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
+        )
 
     def open_writer(self, folder: Path) -> Any:
         """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
@@ -65,7 +78,9 @@ class Runner(OnPolicyRunner):
         self.logger.log_dir, self.logger.git_status_repos = str(folder), [__file__] if known else []
         with agent_errors():  # rsl-rl writes git/<repository>.diff as well
             if self.cfg.get("logger") == "wandb":
-                weights_and_biases.open_writer(self.logger, folder, self.cfg.get("wandb_project") or "dexsim", self.full_cfg)
+                weights_and_biases.open_writer(
+                    self.logger, folder, self.cfg.get("wandb_project") or "dexsim", self.full_cfg
+                )
             else:
                 self.logger.init_logging_writer()
         if not known:
@@ -80,12 +95,14 @@ class Runner(OnPolicyRunner):
     ) -> bool:
         """Learn until ``iterations`` are done in all; False when ``stop()`` ended it early.
 
-        ``on_iteration`` gets the iteration's scalars, over all ranks. A rollout that ``stop`` breaks off is dropped, an update
-        never; several ranks agree on it before the next rollout, so that none waits for another that has left. Raises UserError when learning diverges or the environment's ``check()`` finds something lost.
+        ``on_iteration`` gets the iteration's scalars, over all ranks. A rollout that ``stop`` breaks off is dropped, an
+        update never; several ranks agree on it before the next rollout, so that none waits for another that has left.
+        Raises UserError when learning diverges or the environment's ``check()`` finds something lost.
         """
         if self._fresh and self.cfg.get("init_at_random_ep_len"):
             self.env.episode_length_buf = torch.randint_like(
-                self.env.episode_length_buf, high=max(int(self.env.max_episode_length), 1))
+                self.env.episode_length_buf, high=max(int(self.env.max_episode_length), 1)
+            )
         self._fresh = False
         self.alg.train_mode()
         if self.is_distributed:  # each rank drew its own initial weights
@@ -112,8 +129,10 @@ class Runner(OnPolicyRunner):
             self.steps += self.steps_per_iteration
             row = self._meter.read(self.ranks.sum)
             row |= {f"Loss/{k}": float(v) for k, v in losses.items()}
-            row |= {"Loss/learning_rate": self.alg.learning_rate,
-                    "Policy/mean_std": self.alg.get_policy().output_std.mean().item()}
+            row |= {
+                "Loss/learning_rate": self.alg.learning_rate,
+                "Policy/mean_std": self.alg.get_policy().output_std.mean().item(),
+            }
             row |= {"collect_s": collected - start, "learn_s": time.perf_counter() - collected}
             on_iteration({"iteration": self.iteration, "steps": self.steps} | row)
         return True
@@ -148,8 +167,10 @@ class Runner(OnPolicyRunner):
         if not bad and not self._finite():
             bad = [f"{self._first_not_finite()}: weights not finite"]
         if bad:
-            raise UserError(f"learning diverged at iteration {self.iteration + 1} ({', '.join(bad)}); continue from the"
-                            " last checkpoint with a lower agent.algorithm.learning_rate or desired_kl")
+            raise UserError(
+                f"learning diverged at iteration {self.iteration + 1} ({', '.join(bad)}); continue from the"
+                " last checkpoint with a lower agent.algorithm.learning_rate or desired_kl"
+            )
         return losses
 
     def _finite(self) -> bool:
@@ -161,27 +182,46 @@ class Runner(OnPolicyRunner):
     def _first_not_finite(self) -> str:
         """Name of the first weights that are not finite."""
         state = self.alg.save()
-        return next((f"{part}.{name}" for part in ("actor", "critic") for name, w in state[f"{part}_state_dict"].items()
-                     if not bool(w.isfinite().all())), "the optimizer's")
+        return next(
+            (
+                f"{part}.{name}"
+                for part in ("actor", "critic")
+                for name, w in state[f"{part}_state_dict"].items()
+                if not bool(w.isfinite().all())
+            ),
+            "the optimizer's",
+        )
 
     def _config(self) -> dict[str, Any]:
         """The config as a checkpoint keeps it: playing or resuming it logs to nobody's account unless asked again."""
         agent = self.full_cfg["agent"]
-        return self.full_cfg | {"agent": agent | {"logger": "tensorboard"}} if agent.get("logger") == "wandb" else self.full_cfg
+        return (
+            self.full_cfg | {"agent": agent | {"logger": "tensorboard"}}
+            if agent.get("logger") == "wandb"
+            else self.full_cfg
+        )
 
     def payload(self) -> dict[str, Any]:
         """Everything a checkpoint holds (see :mod:`dexsim.learning.checkpoint`)."""
         learned = self.alg.save()
         return {
-            "kind": "train", "config": self._config(), "versions": self._versions, "git": self._git,
-            "layout": self._layout, "iteration": self.iteration, "steps": self.steps,
-            "actor": learned["actor_state_dict"], "critic": learned["critic_state_dict"],
-            "optimizer": learned["optimizer_state_dict"], "env": self.env.state_dict(), "rng": checkpoint.rng_state(),
+            "kind": "train",
+            "config": self._config(),
+            "versions": self._versions,
+            "git": self._git,
+            "layout": self._layout,
+            "iteration": self.iteration,
+            "steps": self.steps,
+            "actor": learned["actor_state_dict"],
+            "critic": learned["critic_state_dict"],
+            "optimizer": learned["optimizer_state_dict"],
+            "env": self.env.state_dict(),
+            "rng": checkpoint.rng_state(),
         }
 
     def restore(self, data: dict[str, Any], path: str) -> None:
-        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state. The random state is
-        rank 0's; the others begin streams of their own.
+        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state. The random
+        state is rank 0's; the others begin streams of their own.
 
         Raises UserError when it holds only a policy or does not fit this environment.
         """
@@ -189,8 +229,15 @@ class Runner(OnPolicyRunner):
             raise UserError(f"{path}: holds only a policy, nothing to resume; use the last.pt of its run folder")
         checkpoint.check_layout(data, self._layout, path)
         try:
-            self.alg.load({"actor_state_dict": data["actor"], "critic_state_dict": data["critic"],
-                           "optimizer_state_dict": data["optimizer"]}, None, True)
+            self.alg.load(
+                {
+                    "actor_state_dict": data["actor"],
+                    "critic_state_dict": data["critic"],
+                    "optimizer_state_dict": data["optimizer"],
+                },
+                None,
+                True,
+            )
         except Exception as error:  # torch's optimizers meet a wrong state with any of Python's exceptions
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path}: does not fit the networks of this run ({reason})") from None
@@ -200,15 +247,18 @@ class Runner(OnPolicyRunner):
             checkpoint.set_rng_state(data["rng"])
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
-            raise UserError(f"{path}: damaged checkpoint, its env or rng does not fit ({type(error).__name__}: {reason}); use another"
-                            " checkpoint of its run folder") from None
+            raise UserError(
+                f"{path}: damaged checkpoint, its env or rng does not fit ({type(error).__name__}: {reason}); use"
+                " another"
+                " checkpoint of its run folder"
+            ) from None
         if self.ranks.rank:
             seed = self.ranks.seed(self.full_cfg["seed"], self.iteration)
             seed_all(seed)
             self.env.rng.manual_seed(seed)
             self.env.reset_all()
-        # An environment whose state does not hold its episodes began them all anew just now; their ages are then spread as at
-        # the first start, or all worlds would time out, and dip in the curves, together.
+        # An environment whose state does not hold its episodes began them all anew just now; their ages are then spread
+        # as at the first start, or all worlds would time out, and dip in the curves, together.
         self._fresh = not bool(self.env.episode_length_buf.any())
 
     def policy(self) -> Any:

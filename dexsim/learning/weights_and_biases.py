@@ -20,8 +20,11 @@ class _Settings:
 def check_installed() -> None:
     """It is no dependency of dexsim. Raises UserError where it is missing."""
     spec = importlib.util.find_spec("wandb")
-    if spec is None or spec.origin is None:  # a folder wandb/, which its runs leave, is found as a package without a file
-        raise UserError("agent.logger=wandb: Weights & Biases is not installed here; pip install wandb, then wandb login")
+    # a folder wandb/, which its runs leave, is found as a package without a file
+    if spec is None or spec.origin is None:
+        raise UserError(
+            "agent.logger=wandb: Weights & Biases is not installed here; pip install wandb, then wandb login"
+        )
 
 
 def open_writer(logger: Any, folder: Path, project: str, config: dict[str, Any]) -> None:
@@ -29,7 +32,8 @@ def open_writer(logger: Any, folder: Path, project: str, config: dict[str, Any])
 
     Args:
         logger: rsl-rl's `Logger`; its writer is set.
-        folder: the run's, which also names the run; what is kept of it locally goes there unless WANDB_DIR says otherwise.
+        folder: the run's, which also names the run; what is kept of it locally goes there unless WANDB_DIR says
+        otherwise.
         config: the resolved settings, shown with the run.
 
     Raises:

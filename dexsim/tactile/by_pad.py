@@ -1,9 +1,9 @@
 """What is known of single pads (`tactile.pads`), between what a skin feels and what its sensor reports.
 
-Order, that of `dexsim.gap.touch.plant`: spread by rubber -> hysteresis -> neighbours -> exchanged wires -> gain -> (noise,
-threshold, counts: `dexsim.tactile.measure`) -> stuck -> delay by pad. Nothing here is compiled or launched without
-`tactile.pads`. Plain kernels, a thread for each pad or taxel, the same on every device; launches only, on memory that never
-moves, so that they can be recorded.
+Order, that of `dexsim.gap.touch.plant`: spread by rubber -> hysteresis -> neighbours -> exchanged wires -> gain ->
+(noise, threshold, counts: `dexsim.tactile.measure`) -> stuck -> delay by pad. Nothing here is compiled or launched
+without `tactile.pads`. Plain kernels, a thread for each pad or taxel, the same on every device; launches only, on
+memory that never moves, so that they can be recorded.
 """
 
 from __future__ import annotations
@@ -48,12 +48,14 @@ LEFT = 1.0e-4
 class ByPad:
     """Memory and launches of `tactile.pads` on N worlds, F pads, T taxels.
 
-    layout: its names are the keys of cfg.pads. world: the per-world parameters by name, [N] each, of which pads without their
-    own have theirs. values [C, N, F]: the parameters by `COLUMNS`, drawn by `randomize`. Raises UserError for a pad or taxel
-    that the layout lacks.
+    layout: its names are the keys of cfg.pads. world: the per-world parameters by name, [N] each, of which pads without
+    their own have theirs. values [C, N, F]: the parameters by `COLUMNS`, drawn by `randomize`. Raises UserError for a
+    pad or taxel that the layout lacks.
     """
 
-    def __init__(self, cfg: TactileConfig, layout: TaxelLayout, n: int, device: str, seed: int, world: dict[str, torch.Tensor]):
+    def __init__(
+        self, cfg: TactileConfig, layout: TaxelLayout, n: int, device: str, seed: int, world: dict[str, torch.Tensor]
+    ):
         f, t = layout.pads, layout.taxels
         self.cfg, self.shape, self.device, self.seed, self._world = cfg, (n, f, t), device, int(seed) + 15485863, world
         low, high = (np.repeat(np.array([PAD_COLUMNS[c][3] for c in COLUMNS])[:, None], f, 1) for _ in range(2))
@@ -68,7 +70,9 @@ class ByPad:
             i = layout.names.index(name)
             for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
                 if k >= layout.count[i]:
-                    raise UserError(f"tactile.pads.{name}: no taxel {k}; this pad has {layout.count[i]}, counted from 0")
+                    raise UserError(
+                        f"tactile.pads.{name}: no taxel {k}; this pad has {layout.count[i]}, counted from 0"
+                    )
             for c, (a, b) in pad.params.items():
                 j = COLUMNS.index(c)
                 low[j, i], high[j, i], own[j, i] = a, b, True
@@ -87,7 +91,11 @@ class ByPad:
             for i in np.flatnonzero(high[COLUMNS.index("crosstalk")]):
                 beside[i, : layout.count[i]] = layout.beside(int(i))
         tensor = lambda x, kind=torch.float32: torch.as_tensor(x, dtype=kind, device=device)  # noqa: E731
-        self._low, self._wide, self._own = tensor(low)[:, None], tensor(high - low)[:, None], tensor(own, torch.bool)[:, None]
+        self._low, self._wide, self._own = (
+            tensor(low)[:, None],
+            tensor(high - low)[:, None],
+            tensor(own, torch.bool)[:, None],
+        )
         with wp.ScopedDevice(device):
             self._m = SimpleNamespace(
                 values=wp.zeros((len(COLUMNS), n, f), dtype=float),
@@ -122,8 +130,11 @@ class ByPad:
         j = COLUMNS.index("delay")
         return float((self._low + self._wide)[j].max())
 
-    def randomize(self, mask: torch.Tensor, generator: torch.Generator | None, episode: wp.array, gain: wp.array) -> None:
-        """Where mask [N] (bool) holds: draw the pads' parameters anew, and lay the gains over `gain` [N, F, T], which was drawn before."""
+    def randomize(
+        self, mask: torch.Tensor, generator: torch.Generator | None, episode: wp.array, gain: wp.array
+    ) -> None:
+        """Where mask [N] (bool) holds: draw the pads' parameters anew, and lay the gains over `gain` [N, F, T], which
+        was drawn before."""
         n, f, _ = self.shape
         u = torch.rand((len(COLUMNS), n, f), generator=generator, device=self.values.device)
         drawn = self._low + self._wide * u
@@ -135,21 +146,37 @@ class ByPad:
         wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
 
     def launch_skin(self, touch, felt: wp.array) -> wp.array:
-        """[N, F, T] N: felt forces as they reach each taxel's wire; `felt` itself where nothing lies between. touch: `Tactile`."""
+        """[N, F, T] N: felt forces as they reach each taxel's wire; `felt` itself where nothing lies between. touch:
+        `Tactile`."""
         m, n, f = self._m, self.shape[0], self.shape[1]
         if self.rubber:
             a, e = touch._a, touch.engine.wp
             kernel = spread_kernel(self.cfg.sum == "solver", LAWS[self.cfg.law], self.cfg.feel_others)
-            args = [e.xpos, e.xmat, touch._pair_normal, touch._pads, touch._law, touch.shapes.wp, a.object_body, a.shape_id, a.shape_size, a.pair_column,
-                    touch._row["stiffness_scale"], touch._row["threshold"], self._row["c10"], self._row["c01"], m.thickness, m.rubber, felt, m.depth, m.spread]  # fmt: skip
+            args = [e.xpos, e.xmat, touch._pair_normal, touch._pads, touch._law, touch.shapes.wp, a.object_body,
+                    a.shape_id, a.shape_size, a.pair_column,
+                    touch._row["stiffness_scale"], touch._row["threshold"], self._row["c10"], self._row["c01"],
+                    m.thickness, m.rubber, felt, m.depth, m.spread]  # fmt: skip
             wp.launch(kernel, dim=(n, f), inputs=args, device=self.device)
             felt = m.spread
         if self.hysteresis:
-            args = [felt, self._row["hysteresis"], self._row["hysteresis_time"], touch._m.now, touch._m.last, touch._m.state, m.skin]
+            args = [
+                felt,
+                self._row["hysteresis"],
+                self._row["hysteresis_time"],
+                touch._m.now,
+                touch._m.last,
+                touch._m.state,
+                m.skin,
+            ]
             wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
             felt = m.skin
         if self.mixes:
-            wp.launch(mix, dim=self.shape, inputs=[felt, self._row["crosstalk"], m.order, m.beside, m.mixed], device=self.device)
+            wp.launch(
+                mix,
+                dim=self.shape,
+                inputs=[felt, self._row["crosstalk"], m.order, m.beside, m.mixed],
+                device=self.device,
+            )
             felt = m.mixed
         return felt
 
@@ -161,13 +188,29 @@ class ByPad:
             wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
 
     def launch_choice(self, touch) -> tuple[wp.array, wp.array, wp.array]:
-        """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have delays."""
+        """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have
+        delays."""
         m, own = touch._m, self._m
         if not self.delayed:
             return m.ring, m.ring_shear, m.chosen
         n, f, _ = self.shape
-        wp.launch(choose, dim=(n, f), inputs=[m.stamps, m.now, self._row["delay"], own.older, own.newer, own.part, m.late], device=self.device)
-        args = [m.ring, m.ring_shear, own.older, own.newer, own.part, m.effects.threshold, m.effects.lsb, float(self.cfg.full_scale), self.cfg.shear]
+        wp.launch(
+            choose,
+            dim=(n, f),
+            inputs=[m.stamps, m.now, self._row["delay"], own.older, own.newer, own.part, m.late],
+            device=self.device,
+        )
+        args = [
+            m.ring,
+            m.ring_shear,
+            own.older,
+            own.newer,
+            own.part,
+            m.effects.threshold,
+            m.effects.lsb,
+            float(self.cfg.full_scale),
+            self.cfg.shear,
+        ]
         wp.launch(pick, dim=self.shape, inputs=[*args, own.ring, own.ring_shear], device=self.device)
         return own.ring, own.ring_shear, own.chosen
 
@@ -181,9 +224,9 @@ def rubber_pressure(depth: float, thickness: float, c10: float, c01: float):
 
 @cache
 def spread_kernel(solver: bool, kind: int, feel_others: bool) -> wp.Kernel:
-    """One thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under each taxel, in
-    place of the law in `dexsim.tactile.kernel`; the sum stays the solver's. A contact that reaches no taxel stays as it is. With
-    sum=spring the taxels' forces are the rubber's own. One object."""
+    """One thread per (world, pad). Where the pad's rubber is known its force spreads as the rubber presses under each
+    taxel, in place of the law in `dexsim.tactile.kernel`; the sum stays the solver's. A contact that reaches no taxel
+    stays as it is. With sum=spring the taxels' forces are the rubber's own. One object."""
 
     def spread(
         xpos: wp.array2d(dtype=wp.vec3),
@@ -293,8 +336,8 @@ def mix(
     # out
     out: wp.array3d(dtype=float),
 ):
-    """A taxel keeps 1 - c of its force and gives c in equal parts to those beside it: the pad's sum stays. Then each wire carries
-    the taxel at order[t]."""
+    """A taxel keeps 1 - c of its force and gives c in equal parts to those beside it: the pad's sum stays. Then each
+    wire carries the taxel at order[t]."""
     w, f, t = wp.tid()
     k = order[f, t]
     c = crosstalk[w, f]
@@ -360,8 +403,8 @@ def choose(
     part: wp.array2d(dtype=float),
     late: wp.array(dtype=int),
 ):
-    """The two readings between which each pad's delayed moment lies, and how far along; `dexsim.tactile.measure.stamp` has noted the
-    times. older -1: none is as old yet."""
+    """The two readings between which each pad's delayed moment lies, and how far along; `dexsim.tactile.measure.stamp`
+    has noted the times. older -1: none is as old yet."""
     w, f = wp.tid()
     n = stamps.shape[1]
     wanted = time[w] - delay[w, f]

@@ -12,7 +12,8 @@ from dexsim.tactile.tactile import Tactile
 
 @wp.kernel(enable_backward=False)
 def clearance_kernel(
-    xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), pads: Pads, shapes: Shapes, body: wp.array(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3), xmat: wp.array2d(dtype=wp.mat33), pads: Pads, shapes: Shapes,
+    body: wp.array(dtype=int),
     shape_id: wp.array2d(dtype=int), shape_size: wp.array2d(dtype=wp.vec3), out: wp.array2d(dtype=float)
 ):  # fmt: skip
     w, f = wp.tid()
@@ -25,8 +26,8 @@ def clearance_kernel(
 class Clearance:
     """Signed distance from the centre of each pad to the surface of the (first) object of `touch`.
 
-    Out: `distance` [N, F] in m, negative inside, 1 m where a world has no object; refreshed by `launch`, which only launches
-    and so can be recorded in a graph. Exact for primitives, trilinear on grids (`dexsim.tactile.sdf`).
+    Out: `distance` [N, F] in m, negative inside, 1 m where a world has no object; refreshed by `launch`, which only
+    launches and so can be recorded in a graph. Exact for primitives, trilinear on grids (`dexsim.tactile.sdf`).
     """
 
     def __init__(self, touch: Tactile):
@@ -37,5 +38,9 @@ class Clearance:
     def launch(self) -> None:
         t, a = self.touch, self.touch._a
         state = t.engine.wp
-        wp.launch(clearance_kernel, dim=self._out.shape, device=t.device, inputs=[
-            state.xpos, state.xmat, t._pads, t.shapes.wp, a.object_body, a.shape_id, a.shape_size, self._out])
+        wp.launch(
+            clearance_kernel,
+            dim=self._out.shape,
+            device=t.device,
+            inputs=[state.xpos, state.xmat, t._pads, t.shapes.wp, a.object_body, a.shape_id, a.shape_size, self._out],
+        )

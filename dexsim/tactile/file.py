@@ -23,7 +23,10 @@ from dexsim.errors import UserError
 from dexsim.tactile.config import COLUMNS
 from dexsim.tactile.pads import pad_configs, value_range
 
-RANGES: dict[str, tuple[str, float, float]] = {"object.friction": ("1", 0.05, 3.0), "contact.stiffness": ("N/m", 100.0, 1e5)}
+RANGES: dict[str, tuple[str, float, float]] = {
+    "object.friction": ("1", 0.05, 3.0),
+    "contact.stiffness": ("N/m", 100.0, 1e5),
+}
 """Ranges of `randomize` that the file may set: unit, lowest, highest (what the tasks allow)."""
 
 
@@ -34,7 +37,9 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
     path = Path(path).expanduser()
     where = f"tactile file '{path}'"
     if not path.exists():
-        raise UserError(f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (dexsim diagnose writes one)")
+        raise UserError(
+            f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (dexsim diagnose writes one)"
+        )
     raw = yaml_text.load(path, "tactile file")
     try:
         return _checked(raw)
@@ -43,21 +48,27 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
 
 
 def lay_over(cfg: MutableMapping[str, Any], path: str | Path) -> None:
-    """Puts the file's content into a config with `tactile` and `randomize`, so that a checkpoint carries it. Raises UserError as `load`
-    does, and where the task has no such range."""
+    """Puts the file's content into a config with `tactile` and `randomize`, so that a checkpoint carries it. Raises
+    UserError as `load` does, and where the task has no such range."""
     found = load(path)
     for key, value in found["tactile"].items():
         cfg["tactile"][key] = value
     for name, value in found["randomize"].items():
         part, _, last = name.partition(".")
         if part not in cfg["randomize"] or last not in cfg["randomize"][part]:
-            raise UserError(f"tactile file '{path}': randomize.{name}: this task draws no {name}; take it out of the file")
+            raise UserError(
+                f"tactile file '{path}': randomize.{name}: this task draws no {name}; take it out of the file"
+            )
         cfg["randomize"][part][last] = value
 
 
 def _checked(raw: Any) -> dict[str, dict[str, Any]]:
     if not isinstance(raw, Mapping) or not raw or set(raw) - {"tactile", "randomize"}:
-        extra = f"{', '.join(str(k) for k in raw if k not in ('tactile', 'randomize'))}: unknown; " if isinstance(raw, Mapping) and raw else ""
+        extra = (
+            f"{', '.join(str(k) for k in raw if k not in ('tactile', 'randomize'))}: unknown; "
+            if isinstance(raw, Mapping) and raw
+            else ""
+        )
         raise UserError(f"{extra}must map tactile and randomize to what was found")
     out: dict[str, dict[str, Any]] = {"tactile": {}, "randomize": {}}
     for part in out:
@@ -84,5 +95,7 @@ def _pads(value: Any) -> dict[str, Any]:
             raise UserError(f"tactile.pads.{name}: no such fingertip; fingertips: {', '.join(xhand.FINGERS)}")
         for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
             if k >= xhand.TAXELS_PER_FINGER:
-                raise UserError(f"tactile.pads.{name}: no taxel {k}; a fingertip has {xhand.TAXELS_PER_FINGER}, counted from 0")
+                raise UserError(
+                    f"tactile.pads.{name}: no taxel {k}; a fingertip has {xhand.TAXELS_PER_FINGER}, counted from 0"
+                )
     return dict(value)

@@ -140,7 +140,8 @@ def xyz(v: wp.vec4):
 
 @wp.func
 def centre_of(pads: Pads, f: int, total: wp.vec4):
-    """Centre of pressure of pad f, body frame, of the sums (moment of force, force); the pad's centre where nothing presses."""
+    """Centre of pressure of pad f, body frame, of the sums (moment of force, force); the pad's centre where nothing
+    presses."""
     at = pads.centre[f]
     if total[3] > 0.0:
         at = xyz(total) / total[3]

@@ -20,7 +20,8 @@ class TaxelLayout:
     constants such as the foundation stiffness. count: taxels of each pad [F].
     point [F, T, 3]: positions [m]; normal, tx, ty [F, T, 3]: unit directions (z, x and y of a taxel's frame; tx and ty
     lie in the tangent plane). Both in the frame of the carrying body.
-    area [F, T]: area that a taxel stands for [m^2]. rows: of the lattice that a pad's taxels form, index k = column * rows + row;
+    area [F, T]: area that a taxel stands for [m^2]. rows: of the lattice that a pad's taxels form, index k = column *
+    rows + row;
     0: none is known.
     """
 
@@ -50,12 +51,18 @@ class TaxelLayout:
         return np.einsum("ft,ftk->fk", w, self.point)
 
     def beside(self, pad: int) -> np.ndarray:
-        """Taxels beside each taxel of a pad in its lattice, [count, 4], -1 where there is none. UserError without a lattice."""
+        """Taxels beside each taxel of a pad in its lattice, [count, 4], -1 where there is none. UserError without a
+        lattice."""
         n = int(self.count[pad])
         if not self.rows or n % self.rows:
-            raise UserError(f"tactile.pads.{self.names[pad]}.crosstalk: which taxels lie beside one another is not known of this layout; use 0")
+            raise UserError(
+                f"tactile.pads.{self.names[pad]}.crosstalk: which taxels lie beside one another is not known of this"
+                " layout; use 0"
+            )
         lattice = np.pad(np.arange(n).reshape(-1, self.rows), 1, constant_values=-1)
-        return np.stack([lattice[:-2, 1:-1], lattice[2:, 1:-1], lattice[1:-1, :-2], lattice[1:-1, 2:]], -1).reshape(n, 4)
+        return np.stack([lattice[:-2, 1:-1], lattice[2:, 1:-1], lattice[1:-1, :-2], lattice[1:-1, 2:]], -1).reshape(
+            n, 4
+        )
 
     def bound(self) -> tuple[np.ndarray, np.ndarray]:
         """Centre [F, 3] and radius [F] of a sphere around each pad's taxels [m], body frame."""

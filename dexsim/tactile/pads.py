@@ -44,8 +44,8 @@ KEYS = ("gain", "taxels", "dead", "stuck", "swapped", "crosstalk", "hysteresis",
 
 @dataclass(frozen=True)
 class PadConfig:
-    """One pad. params: ranges by `PAD_COLUMNS`, of what is set. taxels: ranges of single gains (a dead one (0, 0)); stuck:
-    readings in N; swapped: pairs; thickness [m] of its rubber."""
+    """One pad. params: ranges by `PAD_COLUMNS`, of what is set. taxels: ranges of single gains (a dead one (0, 0));
+    stuck: readings in N; swapped: pairs; thickness [m] of its rubber."""
 
     params: Mapping[str, Range] = field(default_factory=dict)
     taxels: Mapping[int, Range] = field(default_factory=dict)
@@ -59,7 +59,8 @@ class PadConfig:
 
 
 def pad_configs(value: object) -> dict[str, PadConfig]:
-    """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is allowed."""
+    """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is
+    allowed."""
     if not isinstance(value, Mapping):
         raise UserError(f"tactile.pads={value}: must map names of pads to their settings")
     return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
@@ -71,22 +72,29 @@ def _pad(where: str, entry: object) -> PadConfig:
     for key in entry:
         if key not in KEYS:
             raise UserError(f"{where}.{key}: unknown setting; a pad has: {', '.join(KEYS)}")
-    params = {k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in KEYS if k in entry and k in PAD_COLUMNS}
+    params = {
+        k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in KEYS if k in entry and k in PAD_COLUMNS
+    }
     thickness = THICKNESS
     if "rubber" in entry:
         rubber = _mapping(f"{where}.rubber", entry["rubber"], "c10, c01 [Pa] and thickness [m] to values")
         for key in rubber:
             if key not in ("c10", "c01", "thickness"):
                 raise UserError(f"{where}.rubber.{key}: unknown; valid: c10, c01, thickness")
-        params |= {k: value_range(f"{where}.rubber.{k}", rubber.get(k, 0.0), *PAD_COLUMNS[k][:3]) for k in ("c10", "c01")}
+        params |= {
+            k: value_range(f"{where}.rubber.{k}", rubber.get(k, 0.0), *PAD_COLUMNS[k][:3]) for k in ("c10", "c01")
+        }
         if params["c10"][0] + params["c01"][0] <= 0.0:
             raise UserError(f"{where}.rubber: the lowest c10 + c01 must be positive [Pa]")
         thickness = value_range(f"{where}.rubber.thickness", rubber.get("thickness", THICKNESS), "m", 1e-5, 0.1)[0]
     taxels = {_index(f"{where}.taxels", k): value_range(f"{where}.taxels.{k}", v, *GAIN[:3])
               for k, v in _mapping(f"{where}.taxels", entry.get("taxels", {}), "taxels to gains").items()}  # fmt: skip
-    taxels |= {_index(f"{where}.dead", k): (0.0, 0.0) for k in _list(f"{where}.dead", entry.get("dead", []), "of taxels")}
+    taxels |= {
+        _index(f"{where}.dead", k): (0.0, 0.0) for k in _list(f"{where}.dead", entry.get("dead", []), "of taxels")
+    }
     stuck = {_index(f"{where}.stuck", k): value_range(f"{where}.stuck.{k}", v, *STUCK[:3])[0]
-             for k, v in _mapping(f"{where}.stuck", entry.get("stuck", {}), "taxels to readings [N]").items()}  # fmt: skip
+             for k,
+             v in _mapping(f"{where}.stuck", entry.get("stuck", {}), "taxels to readings [N]").items()}  # fmt: skip
     return PadConfig(params, taxels, stuck, _swaps(f"{where}.swapped", entry.get("swapped", [])), thickness)
 
 

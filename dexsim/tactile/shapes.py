@@ -86,7 +86,8 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     low, high = points.min(0) - margin, points.max(0) + margin
     n = np.ceil((high - low) / spacing).astype(int) + 1
     out = np.empty(tuple(n), dtype=np.float32)
-    # By blocks within blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest in it.
+    # By blocks within blocks: planes have slope 1, so only those nearly highest at a block's centre can be highest in
+    # it.
 
     def block(first: np.ndarray, size: int, last: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Of the planes `near`, those that can be highest in the block of `size` samples from `first` on."""
@@ -102,7 +103,9 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
             first = start + np.array(part) * inner
             last = np.minimum(first + inner, end)
             near = block(first, inner, last, around)
-            cells = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1)
+            cells = np.stack(
+                np.meshgrid(*(np.arange(a, b) for a, b in zip(first, last, strict=True)), indexing="ij"), -1
+            )
             d = (low + spacing * cells) @ near[:, :3].T + near[:, 3]
             out[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = d.max(-1)
     return Grid(low, float(spacing), out)
@@ -145,7 +148,8 @@ def _cells(d: np.ndarray) -> np.ndarray:
 
 
 def _surface_bound(g: Grid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Radius about the frame's origin, and middle and half sizes of a box, that hold every cell with a corner inside."""
+    """Radius about the frame's origin, and middle and half sizes of a box, that hold every cell with a corner
+    inside."""
     points = [np.argwhere(g.data <= limit) * g.spacing + g.origin for limit in (g.spacing, 0.0)]
     radius = np.sqrt((points[0] ** 2).sum(1).max()) + np.sqrt(3.0) * g.spacing
     low, high = points[1].min(0) - g.spacing, points[1].max(0) + g.spacing

@@ -23,7 +23,8 @@ from dexsim.tactile.shapes import ShapeSet, TouchShape, bake_convex
 BLOCK_DIM = 128
 """Threads a block of the touch kernel on CUDA: 4 warps, each a pad of its own."""
 REGISTERS = 80
-"""Most registers of its threads: 3 to 10 % faster than as many as the compiler likes (H200; `benchmarks.touch variants=true`)."""
+"""Most registers of its threads: 3 to 10 % faster than as many as the compiler likes (H200; `benchmarks.touch
+variants=true`)."""
 
 
 class Tactile:
@@ -133,7 +134,9 @@ class Tactile:
         if measured:
             if cfg.shear and o != 1:
                 raise UserError(f"tactile.shear=true: works with one object, {o} were given")
-            self.by_pad = ByPad(cfg, layout, n, self.device, seed, {k: self.column(k) for k in OF_WORLD}) if cfg.pads else None
+            self.by_pad = (
+                ByPad(cfg, layout, n, self.device, seed, {k: self.column(k) for k in OF_WORLD}) if cfg.pads else None
+            )
             if self.by_pad is not None and self.by_pad.rubber and o != 1:
                 raise UserError(f"tactile.pads: rubber works with one object, {o} were given")
             self._measure(seed)

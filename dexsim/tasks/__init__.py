@@ -20,5 +20,7 @@ def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "au
     name = cfg["task"]["name"]
     if name not in tasks:
         near = difflib.get_close_matches(name, tasks, 1)
-        raise UserError(f"task.name='{name}': must be one of {', '.join(tasks)}" + (f"; did you mean {near[0]}?" if near else ""))
+        raise UserError(
+            f"task.name='{name}': must be one of {', '.join(tasks)}" + (f"; did you mean {near[0]}?" if near else "")
+        )
     return tasks[name](cfg, n_worlds, device, seed, engine)

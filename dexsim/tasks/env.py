@@ -36,13 +36,24 @@ from dexsim.tasks.reality import Reality, present
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
-FINGER_ROOTS = ("right_hand_thumb_bend_link", "right_hand_index_bend_link", "right_hand_mid_link1", "right_hand_ring_link1",
-                "right_hand_pinky_link1")
+FINGER_ROOTS = (
+    "right_hand_thumb_bend_link",
+    "right_hand_index_bend_link",
+    "right_hand_mid_link1",
+    "right_hand_ring_link1",
+    "right_hand_pinky_link1",
+)
 PAIRS = (
     *(ContactPair(f"tip_{f}", ("geom", f"tip_{f}"), ("body", OBJECT)) for f in xhand.FINGERS),
-    *(ContactPair(f"finger_{f}", ("subtree", root), ("body", OBJECT)) for f, root in zip(xhand.FINGERS, FINGER_ROOTS, strict=True)),
+    *(
+        ContactPair(f"finger_{f}", ("subtree", root), ("body", OBJECT))
+        for f, root in zip(xhand.FINGERS, FINGER_ROOTS, strict=True)
+    ),
     ContactPair("palm", ("body", "right_hand_link"), ("body", OBJECT)),
-    *(ContactPair(f"self_{f}", ("body", b), ("subtree", "right_hand_link")) for f, b in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)),
+    *(
+        ContactPair(f"self_{f}", ("body", b), ("subtree", "right_hand_link"))
+        for f, b in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)
+    ),
 )
 """Contact pairs of the hand scenes: fingertip on object (0-4), whole finger on object (5-9), palm on object (10),
 distal link on the hand itself (11-15)."""
@@ -64,7 +75,9 @@ class HandEnv(VecEnv):
         self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
         shapes = library()
-        self.shape_names = [_known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])]
+        self.shape_names = [
+            _known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])
+        ]
         spec = hand(cfg.get("model_file"))  # a checkpoint from before has none
         contact = self.task["contact"]
         d = contact["impedance"]
@@ -73,7 +86,9 @@ class HandEnv(VecEnv):
         firm = contact.get("hand_impedance")  # links and palm; null, and in checkpoints from before: MuJoCo's default
         if firm is not None and not 0.5 <= firm < 1.0:
             raise UserError(f"task.contact.hand_impedance={firm}: must be null or lie in [0.5, 1)")
-        scene = hand_object_scene(spec, [shapes[s] for s in self.shape_names], self.task["objects"]["baked_scales"], sim["timestep"])
+        scene = hand_object_scene(
+            spec, [shapes[s] for s in self.shape_names], self.task["objects"]["baked_scales"], sim["timestep"]
+        )
         for geom in spec.geoms:
             if geom.name in xhand.TIP_GEOMS:
                 geom.solimp = [d, d, 1e-3, 0.5, 2.0]
@@ -96,18 +111,41 @@ class HandEnv(VecEnv):
             if not geom.contype and not geom.conaffinity:
                 spec.delete(geom)
         self.engine = make_engine(
-            spec, n_worlds, device, engine, fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
-            pairs=PAIRS, deterministic=sim["deterministic"], nconmax=sim["nconmax"], njmax=sim["njmax"], threads=sim["threads"],
-            collision=sim.get("collision", "auto"))
+            spec,
+            n_worlds,
+            device,
+            engine,
+            fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
+            pairs=PAIRS,
+            deterministic=sim["deterministic"],
+            nconmax=sim["nconmax"],
+            njmax=sim["njmax"],
+            threads=sim["threads"],
+            collision=sim.get("collision", "auto"),
+        )
         self.scene = scene
-        self.servo = Servo(self.engine, xhand.JOINTS, ServoTable.from_dict(cfg["servo"]), control_period=self.dt,
-                           varied=list(cfg["randomize"].get("servo", {})))
+        self.servo = Servo(
+            self.engine,
+            xhand.JOINTS,
+            ServoTable.from_dict(cfg["servo"]),
+            control_period=self.dt,
+            varied=list(cfg["randomize"].get("servo", {})),
+        )
         self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
         if self.reality is not None:
-            self.objects.friction_factor = self.reality.friction_factor(self.engine.mjm, self.objects.hand_geoms.tolist())
+            self.objects.friction_factor = self.reality.friction_factor(
+                self.engine.mjm, self.objects.hand_geoms.tolist()
+            )
         touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
-        self.touch = Tactile(self.engine, xhand_layout(), touch_shapes, OBJECT, cfg["tactile"],
-                             pairs=[f"tip_{f}" for f in xhand.FINGERS], tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
+        self.touch = Tactile(
+            self.engine,
+            xhand_layout(),
+            touch_shapes,
+            OBJECT,
+            cfg["tactile"],
+            pairs=[f"tip_{f}" for f in xhand.FINGERS],
+            tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS],
+        )
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()
@@ -115,7 +153,8 @@ class HandEnv(VecEnv):
         self.setup()
         self.reset_all()
 
-    # -- for the task to fill in -----------------------------------------------------------------------------------------
+    # -- for the task to fill in
+    # -----------------------------------------------------------------------------------------
     def setup(self) -> None:
         """Allocate what the task needs; called once, before the first reset."""
 
@@ -127,7 +166,8 @@ class HandEnv(VecEnv):
         """Commands, pushes: once a control step, before physics."""
 
     def feel(self) -> None:
-        """Sensing after the last physics step of a control step: launches only, since it is recorded in the step's graph."""
+        """Sensing after the last physics step of a control step: launches only, since it is recorded in the step's
+        graph."""
         self.touch.launch()
 
     def terminated(self) -> dict[str, torch.Tensor]:
@@ -161,7 +201,8 @@ class HandEnv(VecEnv):
     def episode_length_buf(self, steps: torch.Tensor) -> None:
         self._episode_length.copy_(steps)
 
-    # -- rsl-rl's interface ------------------------------------------------------------------------------------------------
+    # -- rsl-rl's interface
+    # ------------------------------------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
 
@@ -206,8 +247,8 @@ class HandEnv(VecEnv):
         self._log(terms, ends, reward)
 
     def _judge(self, terms: dict[str, torch.Tensor], reward: torch.Tensor) -> None:
-        """A world of which a reward [T, N] or the last observation is not finite begins anew as one whose state is not; counts
-        by state, term and group for `check`."""
+        """A world of which a reward [T, N] or the last observation is not finite begins anew as one whose state is not;
+        counts by state, term and group for `check`."""
         wrong = ~reward.isfinite() & ~self.nan
         if self._wrong is None:
             self._sources = ("state", *(f"reward {k}" for k in terms), "observations")
@@ -287,8 +328,14 @@ class HandEnv(VecEnv):
             self._blind |= ~good
             self.obs[group].copy_(torch.where(good[:, None], value, torch.zeros_like(value)))
 
-    def place(self, mask: torch.Tensor, hand_q: torch.Tensor, object_pose: torch.Tensor, object_velocity: torch.Tensor,
-              target: torch.Tensor | None = None) -> None:
+    def place(
+        self,
+        mask: torch.Tensor,
+        hand_q: torch.Tensor,
+        object_pose: torch.Tensor,
+        object_velocity: torch.Tensor,
+        target: torch.Tensor | None = None,
+    ) -> None:
         """Where mask holds: hand at rest at hand_q [N, 12], sent to target [N, 12] (hand_q without one); object at pose
         [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own)."""
         e, target = self.engine, hand_q if target is None else target
@@ -313,9 +360,11 @@ class HandEnv(VecEnv):
             if raw is not None:
                 raw.masked_fill_(mask.view(-1, *(1,) * (raw.dim() - 1)), 0.0)
 
-    # -- state ---------------------------------------------------------------------------------------------------------------
+    # -- state
+    # ---------------------------------------------------------------------------------------------------------------
     def read_state(self) -> None:
-        """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan` [N]."""
+        """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan`
+        [N]."""
         t = self.engine.t
         self.nan.copy_((t.flags & FLAG_NAN) != 0)
         ok = ~self.nan[:, None]
@@ -385,20 +434,25 @@ class HandEnv(VecEnv):
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
         self.graphs, self.keep_final_obs = True, False
-        # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step. (The
-        # random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
+        # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step.
+        # (The random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
         self.skip_idle_resets = self.engine.kind == "mujoco"
         self._runs: dict[str, int] = {}
         self._recorded: dict[str, torch.cuda.CUDAGraph] = {}
         self.obs: dict[str, torch.Tensor] = {}
         self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
 
-    # -- bookkeeping -----------------------------------------------------------------------------------------------------------
+    # -- bookkeeping
+    # -----------------------------------------------------------------------------------------------------------
     def _log(self, terms: dict, ends: dict, reward: torch.Tensor) -> None:
         self.nan_count += self.nan.sum()
         rates = torch.stack([*ends.values(), self.time_out]).float().mean(1)
         metrics = self.metrics()
-        values = torch.cat([reward.mean(1), rates, torch.stack(list(metrics.values()))]) if metrics else torch.cat([reward.mean(1), rates])
+        values = (
+            torch.cat([reward.mean(1), rates, torch.stack(list(metrics.values()))])
+            if metrics
+            else torch.cat([reward.mean(1), rates])
+        )
         if self._log_values is None:
             self._log_names = (*(f"reward/{k}" for k in terms), *(f"end/{k}" for k in (*ends, "time_out")), *metrics)
             with torch.inference_mode(False):  # it outlives the rollout that happens to come first
@@ -424,12 +478,16 @@ class HandEnv(VecEnv):
         return model
 
     def check(self) -> None:
-        """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not finite; write a world that was not finite to `dump_folder`
-        (a file nan_<k>.npz). Reads from the device: once an iteration."""
+        """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not
+        finite; write a world that was not finite to `dump_folder` (a file nan_<k>.npz). Reads from the device: once an
+        iteration."""
         path = self._nan_dump.write(Path(self.dump_folder))
         if path is not None:
-            print(f"a world was not finite and began anew ({int(self.nan_count)} so far); one is kept in {path}: "
-                  f"dexsim nan-dump {path} repeats the step", flush=True)
+            print(
+                f"a world was not finite and began anew ({int(self.nan_count)} so far); one is kept in {path}: "
+                f"dexsim nan-dump {path} repeats the step",
+                flush=True,
+            )
         self._check_share()
         self.engine.check_overflow()
 
@@ -442,15 +500,20 @@ class HandEnv(VecEnv):
         self._steps_since = 0
         if sum(counts) > MOST_NAN * steps and sum(counts) > 20:
             where = ", ".join(f"{k} {100 * n / steps:.0f} %" for k, n in zip(self._sources, counts, strict=True) if n)
-            raise UserError(f"not finite in so many of the last {steps} world-steps that nothing is learned from them: {where}; allowed"
-                            f" {100 * MOST_NAN:.0f} % in all. Look at what this task's settings of that name are, or lower sim.timestep")
+            raise UserError(
+                f"not finite in so many of the last {steps} world-steps that nothing is learned from them: {where};"
+                " allowed"
+                f" {100 * MOST_NAN:.0f} % in all. Look at what this task's settings of that name are, or lower"
+                " sim.timestep"
+            )
 
     @property
     def action_names(self) -> tuple[str, ...]:
         return tuple(xhand.JOINTS)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """What a resumed run needs to go on as if it had not stopped: counters and random state (episodes begin anew)."""
+        """What a resumed run needs to go on as if it had not stopped: counters and random state (episodes begin
+        anew)."""
         return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
@@ -469,7 +532,10 @@ def _periods(sim: dict, task: dict) -> tuple[int, float]:
         raise UserError(f"sim.timestep={dt}: must lie in [0.0001, 0.02] s")
     k = round(control / dt)
     if k < 1 or not math.isclose(k * dt, control, rel_tol=1e-6):
-        raise UserError(f"sim.control_period={control} s is not a multiple of sim.timestep={dt} s; e.g. sim.control_period={max(k, 1) * dt:.4g}")
+        raise UserError(
+            f"sim.control_period={control} s is not a multiple of sim.timestep={dt} s; e.g."
+            f" sim.control_period={max(k, 1) * dt:.4g}"
+        )
     if task["episode_s"] < control:
         raise UserError(f"task.episode_s={task['episode_s']}: must be at least one control period, {control} s")
     return k, control
@@ -478,7 +544,8 @@ def _periods(sim: dict, task: dict) -> tuple[int, float]:
 def hand(path: str | None) -> mujoco.MjSpec:
     """The xHand, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
 
-    Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the hand."""
+    Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the
+    hand."""
     if path is None:
         return xhand.hand_spec()
     if not Path(path).expanduser().is_file():
@@ -491,7 +558,9 @@ def hand(path: str | None) -> mujoco.MjSpec:
     has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
     missing = [n for n in (*xhand.JOINTS, *xhand.TIP_BODIES, *xhand.TIP_GEOMS) if n not in has]
     if missing:
-        raise UserError(f"model_file={path}: is not the xHand: it lacks {', '.join(missing[:4])}; tasks are for this hand")
+        raise UserError(
+            f"model_file={path}: is not the xHand: it lacks {', '.join(missing[:4])}; tasks are for this hand"
+        )
     return spec
 
 

@@ -29,13 +29,16 @@ INNER, OUTER = [4, 6, 8, 10], [5, 7, 9, 11]
 """First and second flexion joints of the four fingers (SDK order)."""
 
 CENTRE_LENGTH = 0.03
-"""Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward `centre`."""
+"""Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward
+`centre`."""
 
 assert ACTOR_SIZE == 66
 
 PRIVILEGED = (
-    ("joint_velocity", 12), ("object_quaternion", 4), ("object_velocity_full", 6), ("object_size", 3), ("object_kind", 4),
-    ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_stiffness", 1), ("contact_damping", 1), ("push", 3),
+    ("joint_velocity", 12), ("object_quaternion", 4), ("object_velocity_full", 6), ("object_size", 3),
+    ("object_kind", 4),
+    ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_stiffness", 1), ("contact_damping", 1),
+    ("push", 3),
     ("finger_force", 5), ("palm_force", 1), ("kp", 12), ("torque_limit", 12), ("target_error", 12), ("command_time", 1),
 )  # fmt: skip
 
@@ -49,7 +52,8 @@ class GraspEnv(HandEnv):
         for name in ("servo.efficiency", "servo.torque_limit"):
             low, high, _ = self.sampler.range(name)
             drive *= (low + high) / 2
-        believed = self.cfg.get("belief") or {"servo": self.cfg["servo"], "drive": drive}  # another world does not tell its drives
+        # another world does not tell its drives
+        believed = self.cfg.get("belief") or {"servo": self.cfg["servo"], "drive": drive}
         self.f_max = fingertip_press(believed["servo"], stiffness=t["contact"]["stiffness"], drive=believed["drive"])
         # index tensors on the device: a Python list would be copied there at every use
         self.roots, self.inner, self.outer = (torch.tensor(x, device=dev) for x in (FINGER_ROOT, INNER, OUTER))
@@ -57,7 +61,10 @@ class GraspEnv(HandEnv):
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
         train, held = t["objects"]["train"], t["objects"]["held_out"]
         if not held:
-            raise UserError("task.objects.held_out=[]: must name a shape, e.g. [cross]; policies are judged on some that they never met")
+            raise UserError(
+                "task.objects.held_out=[]: must name a shape, e.g. [cross]; policies are judged on some that they never"
+                " met"
+            )
         names = [v.shape.name for v in self.scene.variants]
         self.train_rows = torch.tensor([i for i, s in enumerate(names) if s in train], device=dev)
         self.held_rows = torch.tensor([i for i, s in enumerate(names) if s in held], device=dev)
@@ -66,17 +73,30 @@ class GraspEnv(HandEnv):
         emphasis = t["objects"].get("emphasis", {})
         for name, times in emphasis.items():
             if name not in library() or not 0 < times <= 100:
-                raise UserError(f"task.objects.emphasis: {name}: {times}: must name a shape ({', '.join(library())}) and be above 0, at most 100")
+                raise UserError(
+                    f"task.objects.emphasis: {name}: {times}: must name a shape ({', '.join(library())}) and be above"
+                    " 0, at most 100"
+                )
         self.emphasis = torch.tensor([float(emphasis.get(s, 1.0)) for s in names], device=dev)
         self.draw_from(self.train_rows, self.emphasis)
         self.clearance = Clearance(self.touch)
         self.kinds = torch.nn.functional.one_hot(self.objects.kind, 4).float()
-        for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.scale", 0.3, 3.0),
-                                ("object.com", -0.25, 0.25), ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0),
-                                ("servo.delay", -0.5, 0.5), ("push.weights", 0.0, 20.0)):
+        for name, low, high in (
+            ("object.mass", 1e-3, 5.0),
+            ("object.friction", 0.05, 3.0),
+            ("object.scale", 0.3, 3.0),
+            ("object.com", -0.25, 0.25),
+            ("contact.stiffness", 100.0, 1e5),
+            ("contact.damping_ratio", 0.0, 3.0),
+            ("servo.delay", -0.5, 0.5),
+            ("push.weights", 0.0, 20.0),
+        ):
             self.sampler.check(name, low, high)
         if not 0 <= t["command"]["low"] <= t["command"]["high"] <= 1:
-            raise UserError(f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high <= 1")
+            raise UserError(
+                f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high"
+                " <= 1"
+            )
         if t["critic"] not in ("paper", "privileged"):
             raise UserError(f"task.critic={t['critic']}: must be paper or privileged")
         self.gravity0 = torch.tensor([0.0, 0.0, -9.81], device=dev)
@@ -106,19 +126,27 @@ class GraspEnv(HandEnv):
         self.clearance.launch()
 
     def draw_from(self, rows: torch.Tensor, emphasis: torch.Tensor | None = None) -> None:
-        """Objects of new episodes are drawn from these rows of the scene's table [R]: every shape equally often, or by its
-        emphasis (one number a row of the table)."""
+        """Objects of new episodes are drawn from these rows of the scene's table [R]: every shape equally often, or by
+        its emphasis (one number a row of the table)."""
         weight = self.row_weight[rows] if emphasis is None else (self.row_weight * emphasis)[rows]
         self._rows, self._cumulative = rows, (weight / weight.sum()).cumsum(0)
 
-    # -- episodes ------------------------------------------------------------------------------------------------------------
+    # -- episodes
+    # ------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:
         s, t = self.sampler, self.task
         pick = torch.searchsorted(self._cumulative, s.uniform()).clamp(max=len(self._cumulative) - 1)
         scale = s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
         self.objects.write(
-            mask, self._rows[pick], scale=scale, mass=s.draw("object.mass"), com=s.draw("object.com", 3), friction=s.draw("object.friction"),
-            stiffness=s.draw("contact.stiffness"), damping_ratio=s.draw("contact.damping_ratio"))
+            mask,
+            self._rows[pick],
+            scale=scale,
+            mass=s.draw("object.mass"),
+            com=s.draw("object.com", 3),
+            friction=s.draw("object.friction"),
+            stiffness=s.draw("contact.stiffness"),
+            damping_ratio=s.draw("contact.damping_ratio"),
+        )
         self.touch.shape_id.copy_(self.objects.variant.to(torch.int32))
         self.touch.shape_size.copy_(self.objects.size)
         self.touch.randomize(mask, self.rng)
@@ -132,7 +160,9 @@ class GraspEnv(HandEnv):
         xy = self.centre0 + s.draw("initial.object_xy", 2)
         z = self.objects.radius + s.draw("initial.drop")
         pose = torch.cat([xy, z[:, None], self._orientation()], 1)
-        velocity = torch.cat([s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1)
+        velocity = torch.cat(
+            [s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1
+        )
         self.place(mask, hand, pose, velocity)
         self.first_xy.copy_(torch.where(mask[:, None], xy + s.draw("sensors.vision_xy", 2), self.first_xy))
         self.z_history.copy_(torch.where(mask[:, None], z[:, None].expand_as(self.z_history), self.z_history))
@@ -182,7 +212,8 @@ class GraspEnv(HandEnv):
         self.engine.t.xfrc_applied[:, self.objects.body, :3] = force.to(self.engine.t.xfrc_applied.dtype)
         self._new_push(over)
 
-    # -- terminations --------------------------------------------------------------------------------------------------------
+    # -- terminations
+    # --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
         """Dropped: the object's centre is below the palm or far from it."""
         limit = self.task["termination"]
@@ -191,17 +222,22 @@ class GraspEnv(HandEnv):
         # while a world's gravity is turned, "below" means away from the palm
         return {"dropped": away | (p[:, 2] < limit["below"])}
 
-    # -- rewards ---------------------------------------------------------------------------------------------------------------
+    # -- rewards
+    # ---------------------------------------------------------------------------------------------------------------
     def rewards(self) -> dict[str, torch.Tensor]:
         w, r = self.task["rewards"], self.task["reward"]
         force, contact = self.tip_force, self.tip_force > r["contact_threshold"]
         torque = self.torque[:, self.roots]
         out = {
             # R_force and R_torque: sum over fingers of R_i * contact_i (paper, eqs. for R_force, R_torque)
-            "force": w["force"] * terms.tracking(
-                force, self.command, self.f_max, r["force_sigma"], r["force_low"], r["force_high"], contact),
-            "torque": w["torque"] * terms.tracking(
-                torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact),
+            "force": w["force"]
+            * terms.tracking(
+                force, self.command, self.f_max, r["force_sigma"], r["force_low"], r["force_high"], contact
+            ),
+            "torque": w["torque"]
+            * terms.tracking(
+                torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact
+            ),
             # R_diff: variance of the four fingers' first joints
             "diff": w["diff"] * self.q[:, self.inner].var(dim=1, unbiased=False),
             # R_outter: distance of the second joints from their mid-range, not squared
@@ -211,7 +247,8 @@ class GraspEnv(HandEnv):
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
             "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
-            "force_near": w["force_near"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
+            "force_near": w["force_near"]
+            * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
             # a finger that does not touch has nothing else that says which way the object lies
             "reach": w["reach"] * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r["reach_length"]).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
@@ -219,16 +256,21 @@ class GraspEnv(HandEnv):
         }
         if "worst" in w:  # checkpoints from before have neither of the two
             # the mean hides one finger that presses on nothing
-            out["worst"] = w["worst"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1)).clamp(min=0)
+            out["worst"] = w["worst"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1)).clamp(
+                min=0
+            )
             # an object that lies to one side is out of the reach of the outer fingers
-            out["centre"] = w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(max=2.0)
+            out["centre"] = w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(
+                max=2.0
+            )
         self._measure(contact)
         return out
 
     def _ended(self) -> torch.Tensor:
         return self.terminated()["dropped"].float()
 
-    # -- observations ----------------------------------------------------------------------------------------------------------
+    # -- observations
+    # ----------------------------------------------------------------------------------------------------------
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
         s, sense = self.sampler, self.task["sensors"]
         n = self.num_envs
@@ -241,33 +283,48 @@ class GraspEnv(HandEnv):
         fresh = self.episode_length_buf == 0
         vz = torch.where(fresh, torch.zeros_like(z), self.vz_seen)
         torque_max = self.effort
-        actor = observations.build(observations.Signals(
-            joint_position=self.q + sense["joint_noise"] * s.normal(12),
-            joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
-            object_xy=self.first_xy, object_z=self.z_seen, object_vz=vz,
-            touch_force=self.touch.force, touch_centre=self.touch.centre,
-            fingertip=self.tips + sense["tip_noise"] * s.normal(15).reshape(n, 5, 3),
-            command=self.command), self.f_max)  # the deployed loop builds its own with the same function
+        actor = observations.build(
+            observations.Signals(
+                joint_position=self.q + sense["joint_noise"] * s.normal(12),
+                joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
+                object_xy=self.first_xy,
+                object_z=self.z_seen,
+                object_vz=vz,
+                touch_force=self.touch.force,
+                touch_centre=self.touch.centre,
+                fingertip=self.tips + sense["tip_noise"] * s.normal(15).reshape(n, 5, 3),
+                command=self.command,
+            ),
+            self.f_max,
+        )  # the deployed loop builds its own with the same function
         critic = [
             self.q, self.torque / torque_max, self.object_pose[:, :3], self.object_velocity[:, :3],
-            self.touch.force_clean / self.f_max, self.touch.centre_clean.reshape(n, 15), self.tips.reshape(n, 15), self.command[:, None],
+            self.touch.force_clean / self.f_max, self.touch.centre_clean.reshape(n, 15), self.tips.reshape(n, 15),
+            self.command[:, None],
         ]  # fmt: skip
         if self.task["critic"] == "privileged":
             critic += self._privileged()
         ok = ~self.nan[:, None]
-        return {"actor": torch.where(ok, actor, torch.zeros_like(actor)), "critic": torch.nan_to_num(torch.cat(critic, 1))}
+        return {
+            "actor": torch.where(ok, actor, torch.zeros_like(actor)),
+            "critic": torch.nan_to_num(torch.cat(critic, 1)),
+        }
 
     def _privileged(self) -> list[torch.Tensor]:
         o = self.objects
         kind = self.kinds[o.variant]
         pushing = self.engine.t.xfrc_applied[:, o.body, :3].float()
         return [
-            self.qd, self.object_pose[:, 3:], self.object_velocity, o.size, kind, o.mass[:, None], o.com, o.friction[:, None],
-            o.stiffness[:, None] / 1e4, o.damping_ratio[:, None], pushing, self.finger_force / self.f_max, self.palm_force[:, None] / self.f_max,
-            self.servo.column("kp").float(), self.servo.column("torque_limit").float(), self.target - self.q, self.command_left[:, None],
+            self.qd, self.object_pose[:, 3:], self.object_velocity, o.size, kind, o.mass[:, None], o.com,
+            o.friction[:, None],
+            o.stiffness[:, None] / 1e4, o.damping_ratio[:, None], pushing, self.finger_force / self.f_max,
+            self.palm_force[:, None] / self.f_max,
+            self.servo.column("kp").float(), self.servo.column("torque_limit").float(), self.target - self.q,
+            self.command_left[:, None],
         ]  # fmt: skip
 
-    # -- what the log shows ------------------------------------------------------------------------------------------------------
+    # -- what the log shows
+    # ------------------------------------------------------------------------------------------------------
     def _measure(self, contact: torch.Tensor) -> None:
         late = self.episode_length_buf * self.dt > 2.0
         count = late.sum().clamp(min=1)
@@ -288,11 +345,22 @@ class GraspEnv(HandEnv):
     def describe(self) -> dict:
         """Tables for the first screen."""
         r = self.task["rewards"]
-        notes = {"force": "R_force", "torque": "R_torque", "diff": "R_diff", "outer": "R_outter", "termination": "terminal penalty",
-                 "action": "R_action", "velocity": "R_vel", "grip": "ours: thumb and fingers touch", "still": "ours: object speed",
-                 "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers", "reach": "ours: pads near the object",
-                 "worst": "ours: force_near of the finger that is furthest off", "centre": f"ours: object beside the fingers' middle, over {CENTRE_LENGTH} m",
-                 "self": "ours: tips pressing on the hand"}
+        notes = {
+            "force": "R_force",
+            "torque": "R_torque",
+            "diff": "R_diff",
+            "outer": "R_outter",
+            "termination": "terminal penalty",
+            "action": "R_action",
+            "velocity": "R_vel",
+            "grip": "ours: thumb and fingers touch",
+            "still": "ours: object speed",
+            "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers",
+            "reach": "ours: pads near the object",
+            "worst": "ours: force_near of the finger that is furthest off",
+            "centre": f"ours: object beside the fingers' middle, over {CENTRE_LENGTH} m",
+            "self": "ours: tips pressing on the hand",
+        }
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
         if self.task["critic"] == "privileged":
@@ -301,12 +369,27 @@ class GraspEnv(HandEnv):
         act = self.task["action"]
         return {
             "observations": groups,
-            "action": [(j, float(lo), float(hi), f"rad ({act['mode']})") for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
+            "action": [
+                (j, float(lo), float(hi), f"rad ({act['mode']})")
+                for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)
+            ],
             "rewards": [(k, w, notes[k]) for k, w in r.items()],
-            "terminations": [("dropped", f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m away"),
-                             ("nan", "state not finite"), ("time_out", f"{self.max_episode_length} steps")],
-            "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "") for name, (lo, hi, log) in self.sampler.ranges.items()],
-            "notes": [f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[1].item():.2f} N.m (command 1)"],
+            "terminations": [
+                (
+                    "dropped",
+                    f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m"
+                    " away",
+                ),
+                ("nan", "state not finite"),
+                ("time_out", f"{self.max_episode_length} steps"),
+            ],
+            "randomization": [
+                (name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
+                for name, (lo, hi, log) in self.sampler.ranges.items()
+            ],
+            "notes": [
+                f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[1].item():.2f} N.m (command 1)"
+            ],
             "headline": ["task/held", "task/force_error"],
         }
 
@@ -317,12 +400,14 @@ class GraspEnv(HandEnv):
         return evaluate(self, policy, episodes, seed, progress)
 
     def scripted_policy(self, rate: float = 0.5, wait: float = 0.35):
-        """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then close
-        thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd of its
-        maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
+        """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then
+        close thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd
+        of its maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
         if self.task["action"]["mode"] != "relative":
             raise UserError(f"policy=scripted: moves by task.action.mode=relative, not {self.task['action']['mode']}")
-        start = dict(zip((row[0] for row in OBSERVATION), np.cumsum([0, *(row[1] for row in OBSERVATION)]), strict=False))
+        start = dict(
+            zip((row[0] for row in OBSERVATION), np.cumsum([0, *(row[1] for row in OBSERVATION)]), strict=False)
+        )
         torque, vz, command = start["joint_torque"], start["object_velocity"] + 2, start["force_command"]
         closing = torch.zeros(self.num_actions, device=self.device)
         closing[INNER + OUTER], closing[:3] = rate, torch.tensor([rate, 0.8 * rate, 0.8 * rate], device=self.device)

@@ -1,9 +1,9 @@
 """Evaluation of the grasp task: does the hand hold, under pushes and upside down, and does it press as commanded?
 
-One episode (seconds): the object is dropped at 0; at `SETTLE` its place in the palm frame is noted; for `HOLD` seconds it must
-stay within `RADIUS` of that place, touched at every control step by the thumb and a finger. In every second episode a
-push of twice the object's weight acts for half a second within the hold, in a random direction. Then the hand is
-turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame, slowly enough
+One episode (seconds): the object is dropped at 0; at `SETTLE` its place in the palm frame is noted; for `HOLD` seconds
+it must stay within `RADIUS` of that place, touched at every control step by the thumb and a finger. In every second
+episode a push of twice the object's weight acts for half a second within the hold, in a random direction. Then the hand
+is turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame, slowly enough
 that the turn itself adds nothing.
 
 The command is constant in an episode, uniform in [0, 1] over episodes.
@@ -58,7 +58,9 @@ def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: s
     env.draw_from(rows)
     done = 0
     while done < episodes:
-        parts.append(_play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes))
+        parts.append(
+            _play(env, policy, keep_frames=not parts, progress=progress, label=label, done=done, episodes=episodes)
+        )
         done += env.num_envs
     env._rows, env._cumulative = kept
     out = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
@@ -81,7 +83,9 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     angle = 2 * torch.pi * env.sampler.uniform()
     axis = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)  # in the palm plane
     down = torch.tensor([0.0, 0.0, -1.0], device=dev).expand(n, 3)
-    command, mass, friction, shape = (x.clone() for x in (env.fixed_command, env.objects.mass, env.objects.friction, env.objects.variant))
+    command, mass, friction, shape = (
+        x.clone() for x in (env.fixed_command, env.objects.mass, env.objects.friction, env.objects.variant)
+    )
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
     place = torch.zeros(n, 3, device=dev)
@@ -132,8 +136,10 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     env.fixed_command, env.pushes, env.max_episode_length = None, True, training_length
     samples = samples.clamp(min=1)
     out = {
-        "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held, "held90": held90,
-        "held180": held180, "load": load, "force": force / samples[:, None], "torque": torque / samples[:, None], "alive": alive, "moved": moved, "untouched": untouched,
+        "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held,
+        "held90": held90,
+        "held180": held180, "load": load, "force": force / samples[:, None], "torque": torque / samples[:, None],
+        "alive": alive, "moved": moved, "untouched": untouched,
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
     out["frames"] = None
@@ -141,9 +147,13 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         force_shown, given = np.stack(shown_force, 1), command[shown].cpu().numpy()
         names = [env.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
         out["frames"] = {
-            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": ("thumb", *FINGERS), "full": 1.2 * env.f_max,
-            "label": [f"{name}, {1000 * m:.0f} g, friction {mu:.1f}" for name, m, mu in zip(names, out["mass"][shown], out["friction"][shown], strict=True)],
-            "overlay": [{"force": f, "command": np.full(steps, c * env.f_max)} for f, c in zip(force_shown, given, strict=True)],
+            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": ("thumb", *FINGERS),
+            "full": 1.2 * env.f_max,
+            "label": [f"{name}, {1000 * m:.0f} g, friction"
+                      f" {mu:.1f}" for name, m,
+                      mu in zip(names, out["mass"][shown], out["friction"][shown], strict=True)],
+            "overlay": [{"force": f, "command": np.full(steps, c * env.f_max)} for f,
+                        c in zip(force_shown, given, strict=True)],
         }  # fmt: skip
     return out
 
@@ -162,8 +172,8 @@ def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
 
 
 def must_hold(r: dict, f_max: float) -> np.ndarray:
-    """Episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, summed over the four
-    fingers, a_push in its drawn direction (zero in episodes without a push)."""
+    """Episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, summed over
+    the four fingers, a_push in its drawn direction (zero in episodes without a push)."""
     return 4 * r["command"] * f_max >= 2 * r["load"] / r["friction"]
 
 
@@ -197,7 +207,8 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         "force_command_correlation": _corr(r["command"][held], total[held]),
         "force_max_N": float(f_max),
         # why episodes were not held: they overlap; dropped includes the turned part
-        "share_moved": float(r["moved"].mean()), "share_untouched": float(r["untouched"].mean()), "share_dropped": float(1 - r["alive"].mean()),
+        "share_moved": float(r["moved"].mean()), "share_untouched": float(r["untouched"].mean()),
+        "share_dropped": float(1 - r["alive"].mean()),
     }  # fmt: skip
     for i, name in enumerate(("thumb", *FINGERS)):
         out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])
@@ -206,15 +217,22 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         out["force_slope"], out["force_offset_N"] = float(slope), float(offset)
         out["force_error_N"] = float(np.abs(r["force"][held, 1:] - r["command"][held, None] * f_max).mean())
         out["contact_force_range_N"] = [float(x) for x in np.percentile(r["force"][held].sum(1), [5, 95])]
-        out["joint_torque_range_Nm"] = [float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])]
+        out["joint_torque_range_Nm"] = [
+            float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])
+        ]
         out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
         out["by_command"] = _by_command(r, held)
         rng = np.random.default_rng(0)
         out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held], rng)
-        out["torque_command_correlation_interval"] = _corr_interval(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1), rng)
+        out["torque_command_correlation_interval"] = _corr_interval(
+            r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1), rng
+        )
     rng = np.random.default_rng(1)
-    for name, part, among in (("hold_rate", r, ~pushed & firm), ("hold_rate_pushed", r, pushed & able),
-                              ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k)):
+    for name, part, among in (
+        ("hold_rate", r, ~pushed & firm),
+        ("hold_rate_pushed", r, pushed & able),
+        ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k),
+    ):
         out[f"{name}_interval"] = _rate_interval(part["held"], among, rng)
     return out
 
@@ -222,14 +240,19 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
 def _rate_interval(ok: np.ndarray, among: np.ndarray, rng: np.random.Generator) -> list[float] | None:
     """95 % bootstrap over episodes of `_rate`: resampling yes and no is drawing from a binomial."""
     rate, count = _rate(ok, among), int(among.sum())
-    return None if rate is None else [float(x) for x in np.percentile(rng.binomial(count, rate, RESAMPLES) / count, [2.5, 97.5])]
+    return (
+        None
+        if rate is None
+        else [float(x) for x in np.percentile(rng.binomial(count, rate, RESAMPLES) / count, [2.5, 97.5])]
+    )
 
 
 def _corr_interval(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> list[float] | None:
     """95 % bootstrap over episodes of `_corr`."""
     if _corr(a, b) is None:
         return None
-    weight = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES) / len(a)  # how often each episode is drawn
+    # how often each episode is drawn
+    weight = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES) / len(a)
     ma, mb = (weight @ a)[:, None], (weight @ b)[:, None]
     both = (weight * (a - ma) * (b - mb)).sum(1)
     spread = np.sqrt((weight * (a - ma) ** 2).sum(1) * (weight * (b - mb) ** 2).sum(1))
@@ -244,8 +267,8 @@ def _by_object(r: dict, env) -> dict[str, float | None]:
 
 
 def _by_command(r: dict, held: np.ndarray) -> dict:
-    """Held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95 percentile)
-    and the torque of the four flexion joints [N.m], their mean; empty tenths left out."""
+    """Held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95
+    percentile) and the torque of the four flexion joints [N.m], their mean; empty tenths left out."""
     bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
     total, torque = r["force"].sum(1), r["torque"][:, [4, 6, 8, 10]].mean(1)
     rows: dict = {"command": [], "force_N": [], "force_range_N": [], "torque_Nm": []}
@@ -261,6 +284,7 @@ def _by_command(r: dict, held: np.ndarray) -> dict:
 
 def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
     """What the paper's table of rewards says, of held episodes, and the intervals of what is judged."""
+
     def ends(name: str, digits: int = 3) -> str:
         pair = metrics.get(name)
         return "-" if pair is None else f"{pair[0]:.{digits}g} .. {pair[1]:.{digits}g}"
@@ -268,12 +292,24 @@ def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
     def value(name: str) -> str:
         return "-" if metrics.get(name) is None else f"{metrics[name]:.3f}"
 
-    said = ("hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation", "torque_command_correlation")
+    said = (
+        "hold_rate",
+        "hold_rate_pushed",
+        "hold_rate_kept_out_shapes",
+        "force_command_correlation",
+        "torque_command_correlation",
+    )
     return [
-        ("Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
-         ("contact forces N", "joint torque N m", "force and command", "torque and command"),
-         [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))]),
-        ("95 % intervals (bootstrap over episodes)", ("quantity", "value", "interval"), [(n, value(n), ends(f"{n}_interval", 4)) for n in said]),
+        (
+            "Held episodes, 5 to 95 % (the paper's columns; correlations with the command)",
+            ("contact forces N", "joint torque N m", "force and command", "torque and command"),
+            [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))],
+        ),
+        (
+            "95 % intervals (bootstrap over episodes)",
+            ("quantity", "value", "interval"),
+            [(n, value(n), ends(f"{n}_interval", 4)) for n in said],
+        ),
     ]
 
 
@@ -289,18 +325,41 @@ def _tables(r: dict, k: dict, env) -> list:
         h = m & held
         force = r["force"][h, 1:].sum(1).mean() if h.any() else float("nan")
         error = np.abs(r["force"][h, 1:] - r["command"][h, None] * f_max).mean() if h.any() else float("nan")
-        rows.append((f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}", int(m.sum()), _pct(held, m & ~pushed), _pct(held, m & pushed),
-                     f"{4 * f_max * (b + 0.5) / BINS:.1f}", f"{force:.1f}", f"{error:.2f}"))
-    tables = [("Hold and force by command", ("F_cmd", "episodes", "held %", "held pushed %", "asked N (4 fingers)", "got N", "error N/finger"), rows)]
+        rows.append(
+            (
+                f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}",
+                int(m.sum()),
+                _pct(held, m & ~pushed),
+                _pct(held, m & pushed),
+                f"{4 * f_max * (b + 0.5) / BINS:.1f}",
+                f"{force:.1f}",
+                f"{error:.2f}",
+            )
+        )
+    tables = [
+        (
+            "Hold and force by command",
+            ("F_cmd", "episodes", "held %", "held pushed %", "asked N (4 fingers)", "got N", "error N/finger"),
+            rows,
+        )
+    ]
     mass_edges, mu_edges = [0.03, 0.065, 0.14, 0.31], [0.4, 0.67, 0.93, 1.21]
     grid = []
     able = must_hold(r, f_max)
     for a, b in zip(mass_edges[:-1], mass_edges[1:], strict=True):
         line = [f"{1000 * a:.0f}-{1000 * min(b, 0.3):.0f} g"]
         for c, d in zip(mu_edges[:-1], mu_edges[1:], strict=True):
-            line.append(_pct(held, able & (r["mass"] >= a) & (r["mass"] < b) & (r["friction"] >= c) & (r["friction"] < d)))
+            line.append(
+                _pct(held, able & (r["mass"] >= a) & (r["mass"] < b) & (r["friction"] >= c) & (r["friction"] < d))
+            )
         grid.append(tuple(line))
-    tables.append(("Held % by mass and friction (where the command can carry the load)", ("mass", "mu 0.4-0.67", "mu 0.67-0.93", "mu 0.93-1.2"), grid))
+    tables.append(
+        (
+            "Held % by mass and friction (where the command can carry the load)",
+            ("mass", "mu 0.4-0.67", "mu 0.67-0.93", "mu 0.93-1.2"),
+            grid,
+        )
+    )
     by_shape = []
     for part, label in ((r, ""), (k, " (kept out)")):
         able = must_hold(part, f_max)
@@ -310,9 +369,22 @@ def _tables(r: dict, k: dict, env) -> list:
             p = part["pushed"].astype(bool)
             h = m & part["held"].astype(bool)
             missing = [f"{100 * (part['force'][h, i + 1] < 0.1).mean():.0f}" if h.any() else "-" for i in range(4)]
-            by_shape.append((name + label, int(m.sum()), _pct(part["held"], m & ~p & (part["command"] >= 0.1)), _pct(part["held"], m & p & able), *missing))
-    tables.append(("Held % by object, and % of held episodes in which a finger does not touch",
-                   ("object", "episodes", "held %", "held pushed %", *FINGERS), by_shape))
+            by_shape.append(
+                (
+                    name + label,
+                    int(m.sum()),
+                    _pct(part["held"], m & ~p & (part["command"] >= 0.1)),
+                    _pct(part["held"], m & p & able),
+                    *missing,
+                )
+            )
+    tables.append(
+        (
+            "Held % by object, and % of held episodes in which a finger does not touch",
+            ("object", "episodes", "held %", "held pushed %", *FINGERS),
+            by_shape,
+        )
+    )
     return tables
 
 

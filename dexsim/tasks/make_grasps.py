@@ -57,7 +57,8 @@ def candidates(n: int, sizes: tuple[float, float], rng: torch.Generator) -> Gras
 
 
 def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
-    """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit [N])."""
+    """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit
+    [N])."""
     _begin(env, GraspSet(start.edge, start.hand, start.hand, start.pose))
     _play(env, LAND)
     _play(env, CLOSE, start.target)

@@ -23,8 +23,8 @@ class NanDump:
     """Watches an environment (`tasks/env.py`). `before` and `after` only fill buffers that exist already, so that the
     step that calls them can be recorded; `write` reads from the device.
 
-    Kept: qpos [nq], qvel [nv], applied forces and the servo's state before the step, the action [12], the world, how many
-    control steps its episode had lasted, the servo's columns and every model field that varies by world.
+    Kept: qpos [nq], qvel [nv], applied forces and the servo's state before the step, the action [12], the world, how
+    many control steps its episode had lasted, the servo's columns and every model field that varies by world.
     """
 
     def __init__(self, env):
@@ -34,9 +34,15 @@ class NanDump:
         self._live = live
         self._before = {k: v.clone() for k, v in live.items()}
         # unchanged by a step (joint damping and friction, which the servo writes, it writes again)
-        rows = {**self._before, "xfrc_applied": e.t.xfrc_applied, "action": env.action, "target": env.target,
-                "servo_params": env.servo.params, "episode_step": env.episode_length_buf,
-                **{f"field/{k}": e.field(k) for k in (*e.field_names, "body_subtreemass", "body_invweight0")}}
+        rows = {
+            **self._before,
+            "xfrc_applied": e.t.xfrc_applied,
+            "action": env.action,
+            "target": env.target,
+            "servo_params": env.servo.params,
+            "episode_step": env.episode_length_buf,
+            **{f"field/{k}": e.field(k) for k in (*e.field_names, "body_subtreemass", "body_invweight0")},
+        }
         self._rows = rows
         self._kept = {k: torch.zeros(v.shape[1:], dtype=v.dtype, device=dev) for k, v in rows.items()}
         self._world = torch.zeros(1, dtype=torch.long, device=dev)
@@ -67,7 +73,9 @@ class NanDump:
             path = folder / f"nan_{self._count}.npz"
         self._count += 1
         data = {k.replace("/", "."): v.cpu().numpy() for k, v in self._kept.items()}
-        cfg = {k: v for k, v in self._env.cfg.items() if k in ("choices", "task", "sim", "servo", "tactile", "randomize")}
+        cfg = {
+            k: v for k, v in self._env.cfg.items() if k in ("choices", "task", "sim", "servo", "tactile", "randomize")
+        }
         try:
             np.savez_compressed(path, world=int(self._world), config=json.dumps(cfg), **data)
         except OSError as error:  # a full disk must not end the training over this

@@ -29,14 +29,25 @@ def replay(path: Path, device: str = "cpu", engine: str = "auto"):
 
     def put(own: torch.Tensor, name: str) -> None:
         if own.shape[1:] != data[name].shape:
-            raise UserError(f"{path}: {name} is {data[name].shape} there and {tuple(own.shape[1:])} in this scene: another version of dexsim")
+            raise UserError(
+                f"{path}: {name} is {data[name].shape} there and {tuple(own.shape[1:])} in this scene: another version"
+                " of dexsim"
+            )
         own.copy_(torch.as_tensor(data[name], device=own.device)[None])
 
     for name in [k for k in data if k.startswith("field.")]:
-        put(e.field(name[len("field."):]), name)
-    e.set_state(torch.ones(1, dtype=torch.bool, device=device), torch.as_tensor(data["qpos"], device=device)[None],
-                torch.as_tensor(data["qvel"], device=device)[None])
-    for own, name in ((e.t.time, "time"), (e.t.xfrc_applied, "xfrc_applied"), (env.servo.params, "servo_params"), (env.servo.state, "servo_state")):
+        put(e.field(name[len("field.") :]), name)
+    e.set_state(
+        torch.ones(1, dtype=torch.bool, device=device),
+        torch.as_tensor(data["qpos"], device=device)[None],
+        torch.as_tensor(data["qvel"], device=device)[None],
+    )
+    for own, name in (
+        (e.t.time, "time"),
+        (e.t.xfrc_applied, "xfrc_applied"),
+        (env.servo.params, "servo_params"),
+        (env.servo.state, "servo_state"),
+    ):
         put(own, name)
     e.step(env.decimation, env.servo.before_each)
     env.read_state()
@@ -56,11 +67,17 @@ def main(argv: list[str]) -> int:
     quiet_warp(device)
     data = load(Path(files[0]))
     env = replay(Path(files[0]), device, given.get("engine", "auto"))
-    print(f"{files[0]}: world {int(data['world'])}, control step {int(data['episode_step'])} of its episode, action {np.round(data['action'], 3).tolist()}")
+    print(
+        f"{files[0]}: world {int(data['world'])}, control step {int(data['episode_step'])} of its episode, action"
+        f" {np.round(data['action'], 3).tolist()}"
+    )
     for name in ("qpos", "qvel"):
         before, after = data[name], getattr(env.engine.t, name)[0].cpu().numpy()
-        print(f"{name} before: {int((~np.isfinite(before)).sum())} of {before.size} not finite, largest {_largest(before)}; "
-              f"after: {int((~np.isfinite(after)).sum())} not finite, largest {_largest(after)}")
+        print(
+            f"{name} before: {int((~np.isfinite(before)).sum())} of {before.size} not finite, largest"
+            f" {_largest(before)}; "
+            f"after: {int((~np.isfinite(after)).sum())} not finite, largest {_largest(after)}"
+        )
     print("it fails again here" if bool(env.nan[0]) else f"it stays finite here (engine {env.engine.kind})")
     return 0
 

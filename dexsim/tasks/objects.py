@@ -29,7 +29,9 @@ class Objects:
         self.slots = torch.tensor([engine.geom(s) for s in SLOTS], device=dev)
         self.tips = torch.tensor([engine.geom(g) for g in tip_geoms], device=dev)
         self.tip_bodies = torch.as_tensor(engine.mjm.geom_bodyid[self.tips.cpu().numpy()], device=dev).long()
-        hand = [g for g in range(engine.mjm.ngeom) if engine.mjm.geom_bodyid[g] != self.body and engine.mjm.geom_contype[g]]
+        hand = [
+            g for g in range(engine.mjm.ngeom) if engine.mjm.geom_bodyid[g] != self.body and engine.mjm.geom_contype[g]
+        ]
         self.hand_geoms = torch.tensor(hand, device=dev)
 
         def table(x, dtype=torch.float32):
@@ -41,11 +43,19 @@ class Objects:
         kinds = [v.shape.kind for v in scene.variants]
         self.kind = torch.tensor([{"box": 0, "sphere": 1, "capsule": 2}.get(k, 3) for k in kinds], device=dev)
         self._scale = table([v.scale for v in scene.variants])
-        self._unit_inertia = table([[v.shape.inertia_unit[i, i] * v.scale**2 for i in range(3)] for v in scene.variants])
+        self._unit_inertia = table(
+            [[v.shape.inertia_unit[i, i] * v.scale**2 for i in range(3)] for v in scene.variants]
+        )
         self._base_size = table([v.shape.size for v in scene.variants])
         self._extent = table([max(v.shape.extents) * v.scale for v in scene.variants])
-        self._bound = table([0.0 if v.shape.kind != "grid" else max(float((h**2).sum(1).max()) for h in v.shape.hulls) ** 0.5 * v.scale
-                             for v in scene.variants])
+        self._bound = table(
+            [
+                0.0
+                if v.shape.kind != "grid"
+                else max(float((h**2).sum(1).max()) for h in v.shape.hulls) ** 0.5 * v.scale
+                for v in scene.variants
+            ]
+        )
         self._identity = torch.tensor([1.0, 0, 0, 0], device=dev)
         self.variant = torch.zeros(n, dtype=torch.int64, device=dev)
         self.size = torch.zeros(n, 3, device=dev)
@@ -56,7 +66,8 @@ class Objects:
         self.friction_factor: torch.Tensor | None = None  # [G] of each hand geom over the world's friction
 
     def primitive_size(self, variant: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-        """MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by component)."""
+        """MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by
+        component)."""
         return self._base_size[variant] * scale
 
     def write(
@@ -73,8 +84,8 @@ class Objects:
         """Where mask [N] holds, give the world this object.
 
         variant [N] row of the scene's table; scale [N, 3] of a primitive's sizes (hulls keep their baked scale);
-        mass [N] kg; com [N, 3]: offset of the centre of mass as a fraction of the largest extent; friction [N] (sliding);
-        stiffness [N] N/m, damping_ratio [N] of tip contacts.
+        mass [N] kg; com [N, 3]: offset of the centre of mass as a fraction of the largest extent; friction [N]
+        (sliding); stiffness [N] N/m, damping_ratio [N] of tip contacts.
         """
         kind = self.kind[variant]
         hull = kind == 3
@@ -82,15 +93,24 @@ class Objects:
         size = torch.where(hull[:, None], torch.stack([self._scale[variant], 0 * mass, 0 * mass], 1), prim)
         r, h = prim[:, 0], prim[:, 1]
         half = torch.stack(  # half extents of each primitive kind (box, sphere, capsule)
-            [prim, r[:, None].expand(-1, 3), torch.stack([r, r, r + h], 1)], 1)
+            [prim, r[:, None].expand(-1, 3), torch.stack([r, r, r + h], 1)], 1
+        )
         half = half.gather(1, kind.clamp(max=2)[:, None, None].expand(-1, 1, 3))[:, 0]
         bound = torch.stack([prim.norm(dim=1), r, r + h, self._bound[variant]], 1).gather(1, kind[:, None])[:, 0]
         extent = torch.where(hull, self._extent[variant], 2 * half.amax(1))
-        inertia = torch.where(hull[:, None], self._unit_inertia[variant], _primitive_inertia(kind, prim)) * mass[:, None]
+        inertia = (
+            torch.where(hull[:, None], self._unit_inertia[variant], _primitive_inertia(kind, prim)) * mass[:, None]
+        )
         com = com * extent[:, None]
         m1 = mask[:, None]
-        for own, new in ((self.variant, variant), (self.mass, mass), (self.friction, friction), (self.stiffness, stiffness),
-                         (self.damping_ratio, damping_ratio), (self.radius, bound)):
+        for own, new in (
+            (self.variant, variant),
+            (self.mass, mass),
+            (self.friction, friction),
+            (self.stiffness, stiffness),
+            (self.damping_ratio, damping_ratio),
+            (self.radius, bound),
+        ):
             own.copy_(torch.where(mask, new, own))
         self.size.copy_(torch.where(m1, size, self.size))
         self.com.copy_(torch.where(m1, com, self.com))
@@ -101,12 +121,19 @@ class Objects:
     def _write_geoms(self, mask, variant, kind, prim, half, bound) -> None:
         S = len(SLOTS)
         size, rbound, aabb = self._size[variant].clone(), self._rbound[variant].clone(), self._aabb[variant].clone()
-        own = (torch.arange(S, device=kind.device)[None] == kind[:, None]) & (kind < 3)[:, None]  # the primitive slot in use
+        # the primitive slot in use
+        own = (torch.arange(S, device=kind.device)[None] == kind[:, None]) & (kind < 3)[:, None]
         size = torch.where(own[..., None], prim[:, None], size)
         rbound = torch.where(own, bound[:, None], rbound)
         aabb = torch.where(own[..., None], torch.cat([torch.zeros_like(half), half], 1)[:, None], aabb)
-        rows = (("geom_pos", self._pos[variant]), ("geom_quat", self._quat[variant]), ("geom_size", size),
-                ("geom_dataid", self._dataid[variant]), ("geom_rbound", rbound), ("geom_aabb", aabb))
+        rows = (
+            ("geom_pos", self._pos[variant]),
+            ("geom_quat", self._quat[variant]),
+            ("geom_size", size),
+            ("geom_dataid", self._dataid[variant]),
+            ("geom_rbound", rbound),
+            ("geom_aabb", aabb),
+        )
         for name, value in rows:
             f = self.engine.field(name)
             f = f.view(f.shape[0], f.shape[1], -1) if f.dim() > 2 else f[..., None]
@@ -124,8 +151,12 @@ class Objects:
             f[:, b] = torch.where(mask, value.to(f.dtype), f[:, b])
         world = e.field("body_subtreemass")
         world[:, 0] = world[:, 1:2].sum(1) + world[:, b]  # the world's trees: the hand (body 1) and the object
-        for name, value in (("body_inertia", inertia), ("body_ipos", com), ("body_iquat", self._identity.expand(len(mass), 4)),
-                            ("body_invweight0", weight)):
+        for name, value in (
+            ("body_inertia", inertia),
+            ("body_ipos", com),
+            ("body_iquat", self._identity.expand(len(mass), 4)),
+            ("body_invweight0", weight),
+        ):
             f = e.field(name)
             f[:, b] = torch.where(m1, value.to(f.dtype), f[:, b])
 
@@ -145,7 +176,9 @@ class Objects:
         solref = e.field("geom_solref")
         solref[:, self.tips] = torch.stack([-k, -b], -1).to(solref.dtype)
         friction = e.field("geom_friction")
-        value = self.friction[:, None] if self.friction_factor is None else self.friction[:, None] * self.friction_factor
+        value = (
+            self.friction[:, None] if self.friction_factor is None else self.friction[:, None] * self.friction_factor
+        )
         friction[:, self.hand_geoms, 0] = value.to(friction.dtype)
 
 

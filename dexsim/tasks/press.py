@@ -11,14 +11,17 @@ from dexsim.assets import xhand
 RADIUS = 0.012  # m, of the ball that is pressed
 
 
-def fingertip_press(servo: dict, finger: str = "mid", stiffness: float = 7000.0, flexion: float = 0.2, drive: float = 1.0) -> float:
+def fingertip_press(
+    servo: dict, finger: str = "mid", stiffness: float = 7000.0, flexion: float = 0.2, drive: float = 1.0
+) -> float:
     """Normal force [N] of one fingertip on a fixed ball when its first flexion joint pulls at its torque limit, and the
     second holds with no more than its own.
 
     drive: share of the torque that reaches the joints (the mean efficiency and strength of randomized servos).
 
     The finger is slightly bent (`flexion` rad in both joints), the ball (12 mm radius) lies against the
-    middle of the pad's distal half; the other joints hold. Static: C MuJoCo until at rest. All four fingers share this geometry.
+    middle of the pad's distal half; the other joints hold. Static: C MuJoCo until at rest. All four fingers share this
+    geometry.
     """
     table = ServoTable.from_dict(servo)
     root = xhand.JOINTS[xhand.FLEXION_ROOT[finger]]
@@ -27,7 +30,9 @@ def fingertip_press(servo: dict, finger: str = "mid", stiffness: float = 7000.0,
     spec.option.timestep = 0.001
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_MULTICCD
     anvil = spec.worldbody.add_body(name="anvil", mocap=True)
-    anvil.add_geom(name="anvil", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], contype=1, conaffinity=2, condim=1)
+    anvil.add_geom(
+        name="anvil", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], contype=1, conaffinity=2, condim=1
+    )
     for other in xhand.JOINTS:
         if other != root:  # the rest of the hand holds its pose: too heavy to move
             spec.joint(other).armature = 1e3

@@ -19,7 +19,8 @@ class Sampler:
     def __init__(self, cfg: dict, rng: torch.Generator, n: int, device: str):
         self.cfg, self.rng, self.n, self.device = cfg, rng, n, device
         self.ranges: dict[str, tuple[float, float, bool]] = {}
-        self.width = torch.ones((), device=device)  # share of each range, about its middle, that `draw` uses: a curriculum widens it
+        # share of each range, about its middle, that `draw` uses: a curriculum widens it
+        self.width = torch.ones((), device=device)
         self._read("randomize", cfg)
 
     def _read(self, path: str, node) -> None:
@@ -32,7 +33,9 @@ class Sampler:
             log = isinstance(value, dict)
             pair = value["log"] if log else value
             pair = [pair, pair] if isinstance(pair, (int, float)) else pair
-            if not (isinstance(pair, (list, tuple)) and len(pair) == 2 and all(isinstance(v, (int, float)) for v in pair)):
+            if not (
+                isinstance(pair, (list, tuple)) and len(pair) == 2 and all(isinstance(v, (int, float)) for v in pair)
+            ):
                 raise UserError(f"{here}={value}: must be a number, [low, high], or {{log: [low, high]}}")
             low, high = float(pair[0]), float(pair[1])
             if not (math.isfinite(low) and math.isfinite(high)):

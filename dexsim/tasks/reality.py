@@ -1,13 +1,13 @@
 """Another world to be judged in: `python play.py checkpoint=... reality=bench`.
 
-A policy can only be as good as the world it is judged in is different from the one it was trained in. `dexsim/configs/reality/`
-holds worlds that no training sees (`train.py` refuses them): C MuJoCo with its own step, cone, solver and contact
-softness; one hand whose drives have effects that no randomization contains; encoders and currents in whole counts,
-touch in counts and late; control periods that vary and targets that are late or lost. It stands in for hardware: it is
-not hardware, and what it leaves out (soft pads, bending, cables) stays unjudged.
+A policy can only be as good as the world it is judged in is different from the one it was trained in.
+`dexsim/configs/reality/` holds worlds that no training sees (`train.py` refuses them): C MuJoCo with its own step,
+cone, solver and contact softness; one hand whose drives have effects that no randomization contains; encoders and
+currents in whole counts, touch in counts and late; control periods that vary and targets that are late or lost. It
+stands in for hardware: it is not hardware, and what it leaves out (soft pads, bending, cables) stays unjudged.
 
-The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121 out=dexsim/configs/reality/bench.yaml`. The
-ranges below are ours.
+The numbers of a file are drawn once: `python -m dexsim.tasks.reality seed=20261121
+out=dexsim/configs/reality/bench.yaml`. The ranges below are ours.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
     """The config with the world of `cfg["reality"]` laid over it: physics, servo, touch, and what its task draws.
 
     The world's servo replaces the policy's belief; its ranges replace those of training, name by name; drives are not
-    randomized (it is one hand). What was believed before is kept under "belief". Raises UserError for a file with other keys, or without the task that is played.
+    randomized (it is one hand). What was believed before is kept under "belief". Raises UserError for a file with other
+    keys, or without the task that is played.
     """
     world, cfg = cfg["reality"], copy.deepcopy(cfg)
     for key in world:
@@ -78,8 +79,8 @@ def _middle(cfg: dict[str, Any], column: str) -> float:
 class Reality:
     """What of another world is no setting of the training's: contacts, solver, sensor counts, timing.
 
-    cfg: a file of dexsim/configs/reality. The environment calls `change_model` before it compiles, and at each control step
-    `substeps`, `late` and `read`. Runs on the CPU.
+    cfg: a file of dexsim/configs/reality. The environment calls `change_model` before it compiles, and at each control
+    step `substeps`, `late` and `read`. Runs on the CPU.
     """
 
     def __init__(self, cfg: dict[str, Any], rng: torch.Generator):
@@ -143,7 +144,8 @@ def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
         base = servo["joints"]["*"] | servo["joints"].get(joint, {})
         dry = base["coulomb_friction"] * rng.uniform(1.0, 2.2)
         joints[joint] = {
-            "kp": float(f"{base['kp'] * rng.uniform(0.7, 1.2):.4g}"), "kd": float(f"{base['kd'] * rng.uniform(0.6, 1.4):.4g}"),
+            "kp": float(f"{base['kp'] * rng.uniform(0.7, 1.2):.4g}"),
+            "kd": float(f"{base['kd'] * rng.uniform(0.6, 1.4):.4g}"),
             "torque_limit": float(f"{base['torque_limit'] * rng.uniform(0.8, 1.0):.4g}"),
             "no_load_speed": float(f"{base['no_load_speed'] * rng.uniform(0.75, 1.0):.4g}"),
             "efficiency": u(0.75, 0.95), "deadband": u(0.002, 0.01), "delay": u(0.012, 0.025), "lag": u(0.003, 0.012),
@@ -158,30 +160,39 @@ def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
     size = u(0.049, 0.054, 3)
     return {
         "name": "bench", "seed": seed,
-        "sim": {"timestep": 0.003, "iterations": 60, "ls_iterations": 40, "impratio": u(2.0, 4.0, 3), "noslip_iterations": 0},
+        "sim": {"timestep": 0.003, "iterations": 60, "ls_iterations": 40, "impratio": u(2.0, 4.0, 3),
+                "noslip_iterations": 0},
         "solver": {"cone": "elliptic", "solver": "cg", "tolerance": 1e-7},
         "contact": {
-            "tip_solimp": [u(0.85, 0.92), u(0.975, 0.99), u(0.0008, 0.002), 0.5, 2.0], "hand_solref": [u(0.008, 0.015), u(0.8, 1.2)],
-            "torsional": u(0.002, 0.006), "rolling": u(5e-5, 3e-4), "friction_by_finger": [u(0.8, 1.15) for _ in xhand.FINGERS],
+            "tip_solimp": [u(0.85, 0.92), u(0.975, 0.99), u(0.0008, 0.002), 0.5, 2.0],
+            "hand_solref": [u(0.008, 0.015), u(0.8, 1.2)],
+            "torsional": u(0.002, 0.006), "rolling": u(5e-5, 3e-4),
+            "friction_by_finger": [u(0.8, 1.15) for _ in xhand.FINGERS],
         },
-        "servo": {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint", "position_encoder": "joint"},
+        "servo": {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint",
+                  "position_encoder": "joint"},
         "sensors": {"encoder_bits": 12, "torque_step": 0.01, "torque_scale": u(0.85, 1.15)},
         "timing": {"jitter": 0.15, "late": 0.006, "lost": 0.01},
         "tactile": {
-            "feel_others": True, "stiffness_scale": u(0.7, 1.3), "threshold": u(0.03, 0.07), "noise": u(0.005, 0.015), "gain_spread": u(0.1, 0.25),
-            "dead": u(0.01, 0.04), "lsb": 0.1, "delay": u(0.015, 0.03), "hysteresis": u(0.1, 0.3), "hysteresis_time": u(0.05, 0.4),
+            "feel_others": True, "stiffness_scale": u(0.7, 1.3), "threshold": u(0.03, 0.07), "noise": u(0.005, 0.015),
+            "gain_spread": u(0.1, 0.25),
+            "dead": u(0.01, 0.04), "lsb": 0.1, "delay": u(0.015, 0.03), "hysteresis": u(0.1, 0.3),
+            "hysteresis_time": u(0.05, 0.4),
         },
         "tasks": {
             "rotate": {
                 "randomize": {
-                    "object.size": [round(size, 4), round(size + 0.002, 4)], "object.mass": u(0.06, 0.12, 3), "object.com": [-0.02, 0.02],
-                    "object.friction": friction, "contact.stiffness": u(6000.0, 8500.0), "contact.damping_ratio": u(0.6, 0.9),
+                    "object.size": [round(size, 4), round(size + 0.002, 4)], "object.mass": u(0.06, 0.12, 3),
+                    "object.com": [-0.02, 0.02],
+                    "object.friction": friction, "contact.stiffness": u(6000.0, 8500.0),
+                    "contact.damping_ratio": u(0.6, 0.9),
                     "sensors.joint_bias": 0.0, "imu.delay": u(0.02, 0.05), "imu.tilt": [-0.03, 0.03],
                 },
                 "sensors": {"joint_noise": 0.001},
             },
             "grasp": {
-                "randomize": {"object.friction": [0.5, 1.0], "contact.stiffness": u(6000.0, 8500.0), "contact.damping_ratio": u(0.6, 0.9)},
+                "randomize": {"object.friction": [0.5, 1.0], "contact.stiffness": u(6000.0, 8500.0),
+                              "contact.damping_ratio": u(0.6, 0.9)},
                 "sensors": {"joint_noise": 0.001, "torque_noise": 0.01},
             },
         },

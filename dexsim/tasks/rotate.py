@@ -37,7 +37,8 @@ CRITIC_SIZE = ACTOR_SIZE + sum(row[1] for row in CRITIC)
 assert (ACTOR_SIZE, CRITIC_SIZE) == (65, 149)
 
 PRIVILEGED = (  # with task.critic=privileged, ours
-    ("drift", 3), ("object_size", 1), ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_damping", 1),
+    ("drift", 3), ("object_size", 1), ("object_mass", 1), ("object_com", 3), ("object_friction", 1),
+    ("contact_damping", 1),
     ("finger_force", 5), ("palm_force", 1), ("torque", 12), ("target_error", 12),
 )  # fmt: skip
 
@@ -49,7 +50,9 @@ class RotateEnv(HandEnv):
     successes [N]: goals reached in this episode.
     """
 
-    def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None):
+    def __init__(
+        self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
+    ):
         """grasps: start from these instead of the file `task.initial.poses`."""
         self.grasps, self.in_order = grasps, False
         if not cfg["task"]["observe"]["force_weighted"]:  # the plain mean needs every taxel
@@ -126,17 +129,29 @@ class RotateEnv(HandEnv):
         if not r["epsilon"] > 0:
             raise UserError(f"task.reward.epsilon={r['epsilon']}: must be above 0")
         if not 0 < r["delta_rot"] < math.radians(abs(goal["angle"])):
-            raise UserError(f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "
-                            f"{math.radians(abs(goal['angle'])):.3g} rad, or goals are reached as they are set")
+            raise UserError(
+                f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "
+                f"{math.radians(abs(goal['angle'])):.3g} rad, or goals are reached as they are set"
+            )
         if "box" not in t["objects"]["train"]:
-            raise UserError(f"task.objects.train={t['objects']['train']}: the rotation task needs 'box', "
-                            "whose held poses it starts from")
-        for name, low, high in (("object.mass", 1e-3, 5.0), ("object.friction", 0.05, 3.0), ("object.com", -0.25, 0.25),
-                                ("contact.stiffness", 100.0, 1e5), ("contact.damping_ratio", 0.0, 3.0), ("imu.delay", 0.0, 0.5),
-                                ("imu.heading_rate", -0.2, 0.2), ("imu.tilt", -0.3, 0.3)):
+            raise UserError(
+                f"task.objects.train={t['objects']['train']}: the rotation task needs 'box', "
+                "whose held poses it starts from"
+            )
+        for name, low, high in (
+            ("object.mass", 1e-3, 5.0),
+            ("object.friction", 0.05, 3.0),
+            ("object.com", -0.25, 0.25),
+            ("contact.stiffness", 100.0, 1e5),
+            ("contact.damping_ratio", 0.0, 3.0),
+            ("imu.delay", 0.0, 0.5),
+            ("imu.heading_rate", -0.2, 0.2),
+            ("imu.tilt", -0.3, 0.3),
+        ):
             self.sampler.check(name, low, high)
 
-    # -- randomization, widened as training goes on -------------------------------------------------------------------------
+    # -- randomization, widened as training goes on
+    # -------------------------------------------------------------------------
     def before_physics(self) -> None:
         c = self.task.get("curriculum") or {"steps": 0}
         if c["steps"]:
@@ -155,7 +170,8 @@ class RotateEnv(HandEnv):
         self.learned.copy_(state.get("learned", self.learned))
         super().load_state_dict(state)
 
-    # -- episodes ------------------------------------------------------------------------------------------------------------
+    # -- episodes
+    # ------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:
         s, m1 = self.sampler, mask[:, None]
         self.last_done.copy_(torch.where(mask, self.successes, self.last_done))
@@ -186,8 +202,15 @@ class RotateEnv(HandEnv):
         """Where mask holds: a cube of this edge [N] m, its mass, centre of mass, friction and rubber drawn anew."""
         s = self.sampler
         self.objects.write(
-            mask, self.box_row, scale=edge[:, None] / 2 / self.box_half, mass=s.draw("object.mass"), com=s.draw("object.com", 3),
-            friction=s.draw("object.friction"), stiffness=s.draw("contact.stiffness"), damping_ratio=s.draw("contact.damping_ratio"))
+            mask,
+            self.box_row,
+            scale=edge[:, None] / 2 / self.box_half,
+            mass=s.draw("object.mass"),
+            com=s.draw("object.com", 3),
+            friction=s.draw("object.friction"),
+            stiffness=s.draw("contact.stiffness"),
+            damping_ratio=s.draw("contact.damping_ratio"),
+        )
         self.touch.shape_id.copy_(self.objects.variant.to(torch.int32))
         self.touch.shape_size.copy_(self.objects.size)
 
@@ -196,7 +219,8 @@ class RotateEnv(HandEnv):
         against that axis removed unless `goal.keep_tilt`."""
         return observations.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
 
-    # -- terminations --------------------------------------------------------------------------------------------------------
+    # -- terminations
+    # --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
         """Dropped: the centre is too low or too far from where it began. Tipped: the goal's upper face looks more than
         `tilt` away from the axis."""
@@ -213,13 +237,15 @@ class RotateEnv(HandEnv):
         b = rotation.rotate(rotation.conjugate(self.object_pose[:, 3:]), self.axis.expand(self.num_envs, 3))
         return torch.atan2(torch.linalg.cross(a, b).norm(dim=1), (a * b).sum(1))
 
-    # -- rewards ---------------------------------------------------------------------------------------------------------------
+    # -- rewards
+    # ---------------------------------------------------------------------------------------------------------------
     def rewards(self) -> dict[str, torch.Tensor]:
         w, r = self.task["rewards"], self.task["reward"]
         q = self.object_pose[:, 3:]
         self.d_rot.copy_(rotation.error(q, self.goal))
         self.d_pos.copy_((self.object_pose[:, :3] - self.home).norm(dim=1))
-        # goal: 1 / (|d_rot| + eps) * 1 / (1 + exp(alpha (d_goal - delta_dist))), table "Reward for in-hand object rotation"
+        # goal: 1 / (|d_rot| + eps) * 1 / (1 + exp(alpha (d_goal - delta_dist))), table "Reward for in-hand object
+        # rotation"
         close = 1 / (self.d_rot.abs() + r["epsilon"]) * torch.sigmoid(-r["alpha"] * (self.d_pos - r["delta_dist"]))
         lost = self.dropped | self.tipped  # `terminated` comes first
         self.reached.copy_((self.d_rot < r["delta_rot"]) & (self.d_pos < r["delta_pos"]) & ~self.nan & ~lost)
@@ -254,7 +280,8 @@ class RotateEnv(HandEnv):
         """Angular velocity of the object in the palm frame [N, 3], rad/s (the engine has it in the object's)."""
         return rotation.rotate(self.object_pose[:, 3:], self.object_velocity[:, 3:])
 
-    # -- observations ----------------------------------------------------------------------------------------------------------
+    # -- observations
+    # ----------------------------------------------------------------------------------------------------------
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
         n, t = self.num_envs, self.task
         s, sense = self.sampler, t["sensors"]
@@ -268,11 +295,21 @@ class RotateEnv(HandEnv):
         tips, sent = self.tips.reshape(n, 15), self._last_action()
         imu = t["perception"] == "imu"
         past = tips[:, None, :0] if imu else self.past
-        actor = observations.build(observations.Signals(
-            joint_position=angle, joint_velocity=self.qd if imu else self.qd + sense["velocity_noise"] * s.normal(12),
-            orientation=self.seen, goal=self._goal_seen(), sent=sent, touch_force=self.touch.force, touch_centre=centre,
-            fingertip=tips + sense["tip_noise"] * s.normal(15) if imu else tips,
-            past=past, fresh=fresh), t)  # the deployed loop builds its own with the same function
+        actor = observations.build(
+            observations.Signals(
+                joint_position=angle,
+                joint_velocity=self.qd if imu else self.qd + sense["velocity_noise"] * s.normal(12),
+                orientation=self.seen,
+                goal=self._goal_seen(),
+                sent=sent,
+                touch_force=self.touch.force,
+                touch_centre=centre,
+                fingertip=tips + sense["tip_noise"] * s.normal(15) if imu else tips,
+                past=past,
+                fresh=fresh,
+            ),
+            t,
+        )  # the deployed loop builds its own with the same function
         actor = torch.where(self.nan[:, None], torch.zeros_like(actor), actor)
         if advance and not imu:
             self.past.copy_(actor.view_as(self.past))
@@ -280,18 +317,31 @@ class RotateEnv(HandEnv):
         critic = [
             self.q, rotation.six(rotation.multiply(rotation.conjugate(q), self.goal)), sent,
             self.touch.centre_clean.reshape(n, 15), self.touch.force_clean, tips,
-            rotation.six(q), self.tip_velocity.reshape(n, 30), rotation.six_of_matrix(self.tip_rot).reshape(n, 30), self.qd,
+            rotation.six(q), self.tip_velocity.reshape(n, 30), rotation.six_of_matrix(self.tip_rot).reshape(n, 30),
+            self.qd,
             self.object_velocity[:, :3], self._spin(),
         ]  # fmt: skip
         if t["critic"] == "privileged":
             o = self.objects
-            critic += [self.object_pose[:, :3] - self.home, o.size[:, :1], o.mass[:, None], o.com, o.friction[:, None],
-                       o.damping_ratio[:, None], self.finger_force, self.palm_force[:, None], self.torque, self.target - self.q]
+            critic += [
+                self.object_pose[:, :3] - self.home,
+                o.size[:, :1],
+                o.mass[:, None],
+                o.com,
+                o.friction[:, None],
+                o.damping_ratio[:, None],
+                self.finger_force,
+                self.palm_force[:, None],
+                self.torque,
+                self.target - self.q,
+            ]
         return {"actor": actor, "critic": torch.nan_to_num(torch.cat(critic, 1))}
 
     def _last_action(self) -> torch.Tensor:
         """What was last sent to the drives [N, 12]; see `observations_rotate.sent`."""
-        return observations.sent(self.action, self.target, self.q_mid, self.q_half, self.task["observe"].get("last_action", "step"))
+        return observations.sent(
+            self.action, self.target, self.q_mid, self.q_half, self.task["observe"].get("last_action", "step")
+        )
 
     def _feel_motion(self, fresh: torch.Tensor) -> None:
         """Fingertip velocities over the last control step: linear, and angular from the rotation between the two."""
@@ -301,7 +351,11 @@ class RotateEnv(HandEnv):
         step = rot @ torch.where(new[..., None], rot, self.tip_rot).transpose(-1, -2)
         linear = (self.tips - torch.where(new, self.tips, self.tip_last)) / self.dt
         # half the antisymmetric part is sin(angle) * axis: at 15 rad/s and 25 ms 2 % short of the angle
-        twice = (step[..., 2, 1] - step[..., 1, 2], step[..., 0, 2] - step[..., 2, 0], step[..., 1, 0] - step[..., 0, 1])
+        twice = (
+            step[..., 2, 1] - step[..., 1, 2],
+            step[..., 0, 2] - step[..., 2, 0],
+            step[..., 1, 0] - step[..., 0, 1],
+        )
         turn = torch.stack(twice, -1) / 2
         self.tip_velocity.copy_(torch.cat([linear, turn / self.dt], -1))
         self.tip_rot.copy_(rot)
@@ -322,8 +376,8 @@ class RotateEnv(HandEnv):
         self.seen.copy_(rotation.normalize(self.imu_past.gather(1, pick)[:, 0]))
 
     def _goal_seen(self) -> torch.Tensor:
-        """The goal [N, 4] as the actor has it: set from the IMU, so it carries the heading drift of that moment; what drifted
-        since is error."""
+        """The goal [N, 4] as the actor has it: set from the IMU, so it carries the heading drift of that moment; what
+        drifted since is error."""
         drift = rotation.about(self.up.expand(self.num_envs, 3), self.goal_heading)
         return rotation.multiply(drift, self.goal)
 
@@ -340,7 +394,8 @@ class RotateEnv(HandEnv):
         pos, rot = self.engine.t.xpos[:, self.tip_body].float(), self.engine.t.xmat[:, self.tip_body].float()
         return (pos + (rot @ local[..., None])[..., 0]).reshape(self.num_envs, 15)
 
-    # -- what the log shows ------------------------------------------------------------------------------------------------------
+    # -- what the log shows
+    # ------------------------------------------------------------------------------------------------------
     def _measure(self) -> None:
         touching = (self.touch.force_clean > 0.05).float().sum(1)
         self._metrics = {
@@ -358,8 +413,15 @@ class RotateEnv(HandEnv):
     def describe(self) -> dict:
         """Tables for the first screen."""
         t = self.task
-        notes = {"goal": "w_goal, close to goal", "action": "w_action", "bonus": "C_Bonus", "spin": "ours: turning about the axis",
-                 "lost": "ours: dropped or tipped", "velocity": "ours: joint speed", "torque": "ours: motor torque"}
+        notes = {
+            "goal": "w_goal, close to goal",
+            "action": "w_action",
+            "bonus": "C_Bonus",
+            "spin": "ours: turning about the axis",
+            "lost": "ours: dropped or tipped",
+            "velocity": "ours: joint speed",
+            "torque": "ours: motor torque",
+        }
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in ACTOR] + [row[:3] for row in CRITIC]
         if t["critic"] == "privileged":
             critic += [(name, width, "privileged") for name, width in PRIVILEGED]
@@ -368,16 +430,25 @@ class RotateEnv(HandEnv):
         edge = 1000 * self.grasps.edge
         return {
             "observations": {"actor": actor, "critic": critic},
-            "action": [(j, float(lo), float(hi), f"rad ({t['action']['mode']})")
-                       for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)],
+            "action": [
+                (j, float(lo), float(hi), f"rad ({t['action']['mode']})")
+                for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)
+            ],
             "rewards": [(k, w, notes[k]) for k, w in t["rewards"].items() if w],
-            "terminations": [("dropped", f"centre {limit['distance']} m from its start or below {limit['below']} m"),
-                             ("tipped", f"{limit['tilt']} rad away from lying on its face"), ("nan", "state not finite"),
-                             ("time_out", f"{self.max_episode_length} steps")],
-            "randomization": [(name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
-                              for name, (lo, hi, log) in self.sampler.ranges.items()],
-            "notes": [f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
-                      f"reached: rotation error below {r['delta_rot']} rad and drift below {r['delta_pos']} m"],
+            "terminations": [
+                ("dropped", f"centre {limit['distance']} m from its start or below {limit['below']} m"),
+                ("tipped", f"{limit['tilt']} rad away from lying on its face"),
+                ("nan", "state not finite"),
+                ("time_out", f"{self.max_episode_length} steps"),
+            ],
+            "randomization": [
+                (name, f"[{lo:g}, {hi:g}]" + (" log" if log else ""), "")
+                for name, (lo, hi, log) in self.sampler.ranges.items()
+            ],
+            "notes": [
+                f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
+                f"reached: rotation error below {r['delta_rot']} rad and drift below {r['delta_pos']} m",
+            ],
         }
 
     def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
@@ -385,5 +456,3 @@ class RotateEnv(HandEnv):
         from dexsim.tasks.rotate_eval import evaluate
 
         return evaluate(self, policy, episodes, seed, progress)
-
-

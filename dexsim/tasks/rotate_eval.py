@@ -1,4 +1,5 @@
-"""Evaluation of the rotation task in the paper's words: consecutive successes of each trial, time per success, time to fall.
+"""Evaluation of the rotation task in the paper's words: consecutive successes of each trial, time per success, time to
+fall.
 
 A trial begins in a held pose and ends when the cube is dropped or tips over, or at the cap (`task.evaluation.cap_s`);
 nothing else ends it. The paper's table divides: its seconds per success are the mean time to fall over the mean
@@ -12,8 +13,17 @@ import numpy as np
 import torch
 
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
-HEADER = ("Contact center", "Contact force", "Force weighted", "Orientation", "Cons. success trials (sorted)", "Average",
-          "Median", "Succ. time (Ave.) s", "Time to fall (Ave.) s")
+HEADER = (
+    "Contact center",
+    "Contact force",
+    "Force weighted",
+    "Orientation",
+    "Cons. success trials (sorted)",
+    "Average",
+    "Median",
+    "Succ. time (Ave.) s",
+    "Time to fall (Ave.) s",
+)
 """Columns of the paper's rotation table."""
 ENDS = ("dropped", "tipped", "nan", "capped")
 
@@ -64,7 +74,8 @@ def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: fl
     return {
         "episodes": len(successes),
         "consecutive_successes": {
-            "average": float(successes.mean()), "median": float(np.median(successes)), "all": sorted(int(x) for x in successes),
+            "average": float(successes.mean()), "median": float(np.median(successes)),
+            "all": sorted(int(x) for x in successes),
             "average_interval": _interval(s.mean(1)), "median_interval": _interval(np.median(s, axis=1)),
         },
         "seconds_per_success": float(time.sum() / total) if total else None,
@@ -135,19 +146,24 @@ def row_of(env) -> tuple[str, ...]:
     """The four settings of a row of the paper's table."""
     o = env.task["observe"]
     none = env.task["perception"] == "proprioception"
-    return (*("yes" if o[k] else "-" for k in ("contact_centre", "contact_force")),
-            "yes" if o["contact_centre"] and o["force_weighted"] else "-",
-            {"6d": "6D", "quaternion": "Quaternion", "none": "-"}["none" if none else o["orientation"]])
+    return (
+        *("yes" if o[k] else "-" for k in ("contact_centre", "contact_force")),
+        "yes" if o["contact_centre"] and o["force_weighted"] else "-",
+        {"6d": "6D", "quaternion": "Quaternion", "none": "-"}["none" if none else o["orientation"]],
+    )
 
 
 def _tables(env, m: dict, r: dict) -> list:
     c = m["consecutive_successes"]
-    spread = c["all"] if len(c["all"]) <= 12 else np.percentile(c["all"], np.linspace(5, 95, 10), method="nearest").tolist()
+    spread = (
+        c["all"] if len(c["all"]) <= 12 else np.percentile(c["all"], np.linspace(5, 95, 10), method="nearest").tolist()
+    )
     seconds = "-" if m["seconds_per_success"] is None else f"{m['seconds_per_success']:.2f}"
     listed = ",".join(str(int(x)) for x in spread) + ("" if len(c["all"]) <= 12 else " (5, 15 .. 95 %)")
     line = (*row_of(env), listed, f"{c['average']:.1f}", f"{c['median']:.1f}", seconds, f"{m['seconds_to_fall']:.1f}")
     intervals = [
-        ("average", f"{c['average']:.2f}", _range(c["average_interval"])), ("median", f"{c['median']:.1f}", _range(c["median_interval"])),
+        ("average", f"{c['average']:.2f}", _range(c["average_interval"])),
+        ("median", f"{c['median']:.1f}", _range(c["median_interval"])),
         ("seconds per success", seconds, _range(m["seconds_per_success_interval"])),
         ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
     ]  # fmt: skip

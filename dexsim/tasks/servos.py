@@ -49,8 +49,10 @@ class ServoRandomizer:
         if name == "delay" and self.servo.control_period:
             top = min(top, (self.servo.queue - 3) * self.servo.control_period)  # targets older than that are forgotten
         if least < col.low - 1e-9 or most > top + 1e-9:
-            raise UserError(f"randomize.servo.{name}=[{low:g}, {high:g}] {how} the nominal gives {least:g} to {most:g} {col.unit}: "
-                            f"must lie in [{col.low:g}, {top:g}]")
+            raise UserError(
+                f"randomize.servo.{name}=[{low:g}, {high:g}] {how} the nominal gives {least:g} to {most:g} {col.unit}: "
+                f"must lie in [{col.low:g}, {top:g}]"
+            )
 
     def draw(self, mask: torch.Tensor) -> None:
         """New parameters in the worlds that mask [N] selects; others keep theirs."""

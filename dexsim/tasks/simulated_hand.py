@@ -1,7 +1,9 @@
-"""A simulated xHand behind the SDK's fields: units, signs, rounding, rates and latency of the real one, physics of training.
+"""A simulated xHand behind the SDK's fields: units, signs, rounding, rates and latency of the real one, physics of
+training.
 
 `SimulatedHand` is the hand on its bench, in simulated time. `SimulatedXHand` is the driver: with a real clock the hand
-lives in a process of its own, as a real one does, and the two share memory; with a `VirtualClock` it is advanced in place.
+lives in a process of its own, as a real one does, and the two share memory; with a `VirtualClock` it is advanced in
+place.
 """
 
 from __future__ import annotations
@@ -35,14 +37,21 @@ VISION_PERIOD = 1 / 30
 class SimulatedHand:
     """Hand, object and physics of a bundle's training config, one world, spoken to in the SDK's terms.
 
-    The object hangs in its place until `release`. camera: see the object through a rendered depth image and its mask, else
-    its height is given with the config's noise. grip: a bundle's `grip`, of a task that starts with the object in the hand: the
-    object is out of reach until `present`, and then held there until `release`; an IMU in it says how it is turned, with the
-    config's noise, drift and delay. Deterministic for a seed, in simulated time.
+    The object hangs in its place until `release`. camera: see the object through a rendered depth image and its mask,
+    else its height is given with the config's noise. grip: a bundle's `grip`, of a task that starts with the object in
+    the hand: the object is out of reach until `present`, and then held there until `release`; an IMU in it says how it
+    is turned, with the config's noise, drift and delay. Deterministic for a seed, in simulated time.
     """
 
-    def __init__(self, config: dict[str, Any], calibration: Calibration, seed: int = 0, camera: bool = False, shape: str | None = None,
-                 grip: dict[str, Any] | None = None):
+    def __init__(
+        self,
+        config: dict[str, Any],
+        calibration: Calibration,
+        seed: int = 0,
+        camera: bool = False,
+        shape: str | None = None,
+        grip: dict[str, Any] | None = None,
+    ):
         import copy
 
         import torch
@@ -53,11 +62,14 @@ class SimulatedHand:
         control = float(cfg["sim"]["control_period"])
         self.dt = control / max(1, round(control / TIMESTEP))
         cfg["sim"] |= {"timestep": self.dt, "threads": 1, "engine": "mujoco"}
-        cfg["tactile"] |= {"raw": True, "period": 0.5 * BUS_PERIOD}  # felt once a bus cycle: as many readings are kept as a delay needs
+        # felt once a bus cycle: as many readings are kept as a delay needs
+        cfg["tactile"] |= {"raw": True, "period": 0.5 * BUS_PERIOD}
         cfg["device"], cfg["worlds"] = "cpu", 1
         if shape is not None:
             cfg["task"]["objects"]["train"] = [shape]
-            cfg["task"]["objects"]["held_out"] = [s for s in cfg["task"]["objects"]["held_out"] if s != shape] or ["box"]
+            cfg["task"]["objects"]["held_out"] = [s for s in cfg["task"]["objects"]["held_out"] if s != shape] or [
+                "box"
+            ]
         if grip is not None:
             cfg["task"]["initial"]["poses"] = None  # the file need not be here: the bundle says which pose
         self.env = make_env(cfg, 1, "cpu", seed, "mujoco")
@@ -114,7 +126,9 @@ class SimulatedHand:
         if c.mode == PASSIVE:
             return self.relax()
         if c.mode != POSITION:
-            raise UserError(f"simulated hand: mode {c.mode} is not simulated; use {POSITION} (position) or {PASSIVE} (passive)")
+            raise UserError(
+                f"simulated hand: mode {c.mode} is not simulated; use {POSITION} (position) or {PASSIVE} (passive)"
+            )
         s, torch = self.env.servo, self._torch
         s.state[:, :, s.slots["enabled"]] = 1.0
         limit = np.abs(np.asarray(c.tor_max, float)) * 1e-3 / self.calibration.current_per_torque
@@ -175,7 +189,9 @@ class SimulatedHand:
         env = self.env
         self.sequence += 1
         position = np.round(env.servo.position()[0].double().numpy() / POSITION_LSB) * POSITION_LSB
-        current = np.clip(np.round(1e3 * self.calibration.current(env.torque[0].double().numpy())), -32768, 32767).astype(np.int16)
+        current = np.clip(
+            np.round(1e3 * self.calibration.current(env.torque[0].double().numpy())), -32768, 32767
+        ).astype(np.int16)
         tactile = np.zeros(TAXELS, np.int16)
         if env.touch.raw3 is not None:
             counts = env.touch.raw3[0].double().numpy() / (self.calibration.lsb * self.calibration.axis_sign)
@@ -183,13 +199,14 @@ class SimulatedHand:
         else:
             tactile[..., 2] = np.clip(np.round(env.touch.raw[0].double().numpy() / self.calibration.lsb), 0, 255)
         speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
-        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(12, 30.0), np.zeros(12, np.int64), tactile,
+        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(12, 30.0),
+                         np.zeros(12, np.int64), tactile,
                          np.clip(speed, -32.768, 32.767))  # fmt: skip
 
 
 class SimulatedImu:
-    """An IMU inside the object, 100 readings a second, as training has it: late by `imu.delay`, noisy, a little tilted, its
-    heading drifting (middle of the randomized delay, one draw of the others)."""
+    """An IMU inside the object, 100 readings a second, as training has it: late by `imu.delay`, noisy, a little tilted,
+    its heading drifting (middle of the randomized delay, one draw of the others)."""
 
     def __init__(self, config: dict[str, Any], env: Any, rng: np.random.Generator):
         draw = lambda name: float(rng.uniform(*env.sampler.range(name)[:2]))  # noqa: E731
@@ -210,7 +227,9 @@ class SimulatedImu:
         step = t - self._at
         self._at = t
         self._heading += self._rate * step + self._walk * np.sqrt(max(step, 0.0)) * self._rng.standard_normal()
-        off = rotation.from_vector(torch.as_tensor(self._tilt + self._noise * self._rng.standard_normal(3), dtype=torch.float32))
+        off = rotation.from_vector(
+            torch.as_tensor(self._tilt + self._noise * self._rng.standard_normal(3), dtype=torch.float32)
+        )
         drift = rotation.about(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(self._heading, dtype=torch.float32))
         q = rotation.normalize(rotation.multiply(drift, rotation.multiply(off, self._env.object_pose[0, 3:])))
         self._past.append((t, q.double().numpy()))
@@ -219,7 +238,10 @@ class SimulatedImu:
 
     def newest(self, t: float) -> tuple[np.ndarray, float] | None:
         """The newest reading that has arrived by time t."""
-        at, q = next(((at, q) for at, q in reversed(self._past) if at <= t - self.delay + 1e-9), self._past[0] if self._past else (0.0, None))
+        at, q = next(
+            ((at, q) for at, q in reversed(self._past) if at <= t - self.delay + 1e-9),
+            self._past[0] if self._past else (0.0, None),
+        )
         return None if q is None else (q, at)
 
 
@@ -248,8 +270,11 @@ class SimulatedCamera:
         try:
             self._renderer = mujoco.Renderer(self._model, self.HEIGHT, self.WIDTH)
         except Exception as error:  # whatever a driver raises
-            raise UserError(f"vision=camera: no OpenGL for offscreen rendering ({str(error).splitlines()[0]}); install one: {INSTALL};"
-                            " or use vision=truth") from None
+            raise UserError(
+                f"vision=camera: no OpenGL for offscreen rendering ({str(error).splitlines()[0]}); install one:"
+                f" {INSTALL};"
+                " or use vision=truth"
+            ) from None
         self._view = mujoco.MjvCamera()
         self._view.lookat[:] = [0.05, 0.0, 0.05]
         self._view.distance, self._view.azimuth, self._view.elevation = 0.45, 200.0, -12.0
@@ -293,8 +318,8 @@ class SimulatedCamera:
 
 
 def choose_gl() -> str:
-    """The OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start: each is tried in a process
-    of its own, since a driver may crash. Raises UserError where there is none."""
+    """The OpenGL that renders without a screen here, put into MUJOCO_GL for processes yet to start: each is tried in a
+    process of its own, since a driver may crash. Raises UserError where there is none."""
     import subprocess
     import sys
 
@@ -310,8 +335,10 @@ def choose_gl() -> str:
     raise UserError(f"vision=camera: no OpenGL for offscreen rendering; install one: {INSTALL}; or use vision=truth")
 
 
-# -- the driver -----------------------------------------------------------------------------------------------------------------
-_STATE = 2 + 12 * 5 + 4 + 5  # time, sequence, position, current, temperature, error, speed; place, its time; orientation, its time
+# -- the driver
+# -----------------------------------------------------------------------------------------------------------------
+# time, sequence, position, current, temperature, error, speed; place, its time; orientation, its time
+_STATE = 2 + 12 * 5 + 4 + 5
 _PLACE, _TURNED = slice(62, 66), slice(66, 71)
 _COMMAND = 2 + 12 * 2 + 2  # number, mode, position, tor_max, kp, what is done with the object
 _PRESENT, _RELEASE = 1.0, 2.0
@@ -320,8 +347,10 @@ _PRESENT, _RELEASE = 1.0, 2.0
 def _shared(context: Any) -> tuple:
     """Two slots of state (the newest by its count) and two of commands: one writer each, no locks."""
     touch = int(np.prod(TAXELS))
-    return (context.RawArray(ctypes.c_double, 2 * _STATE), context.RawArray(ctypes.c_int16, 2 * touch), context.RawValue(ctypes.c_int64, -1),
-            context.RawArray(ctypes.c_double, 2 * _COMMAND), context.RawValue(ctypes.c_int64, -1), context.RawValue(ctypes.c_int, 0))  # fmt: skip
+    return (context.RawArray(ctypes.c_double, 2 * _STATE), context.RawArray(ctypes.c_int16, 2 * touch),
+            context.RawValue(ctypes.c_int64, -1),
+            context.RawArray(ctypes.c_double, 2 * _COMMAND), context.RawValue(ctypes.c_int64, -1),
+            context.RawValue(ctypes.c_int, 0))  # fmt: skip
 
 
 class SimulatedXHand:
@@ -332,8 +361,17 @@ class SimulatedXHand:
 
     name = "simulated xHand"
 
-    def __init__(self, config: dict[str, Any], calibration: Calibration, clock: Clock | None = None, seed: int = 0,
-                 camera: bool = False, shape: str | None = None, latency: float = 0.002, grip: dict[str, Any] | None = None):
+    def __init__(
+        self,
+        config: dict[str, Any],
+        calibration: Calibration,
+        clock: Clock | None = None,
+        seed: int = 0,
+        camera: bool = False,
+        shape: str | None = None,
+        latency: float = 0.002,
+        grip: dict[str, Any] | None = None,
+    ):
         self.clock, self.latency = clock or Clock(), latency
         self._args = (config, calibration, seed, camera, shape, grip)
         self._process = None
@@ -341,7 +379,12 @@ class SimulatedXHand:
         self._queue: list[tuple[float, Any]] = []
 
     def open(self) -> dict[str, str]:
-        info = {"driver": "simulated", "serial": "sim", "bus": f"{1 / BUS_PERIOD:g} Hz", "latency_s": f"{self.latency:g}"}
+        info = {
+            "driver": "simulated",
+            "serial": "sim",
+            "bus": f"{1 / BUS_PERIOD:g} Hz",
+            "latency_s": f"{self.latency:g}",
+        }
         if type(self.clock) is not Clock:
             self.hand = SimulatedHand(*self._args)
             self._zero, self._cycle = self.clock.now(), 0
@@ -378,7 +421,8 @@ class SimulatedXHand:
             if v["newest"].value - k < 2:
                 break  # else the slot was written over while it was copied
         part = row[2:62].reshape(5, 12)
-        return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2], part[3].astype(np.int64),
+        return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2],
+                         part[3].astype(np.int64),
                          touch.reshape(TAXELS), part[4])  # fmt: skip
 
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
@@ -437,7 +481,14 @@ class SimulatedXHand:
         v = self._views
         self._number += 1
         row = v["command"][self._number % 2]
-        row[0], row[1], row[2:14], row[14:26], row[26], row[27] = self._number, mode, position, tor_max, kp, self._object
+        row[0], row[1], row[2:14], row[14:26], row[26], row[27] = (
+            self._number,
+            mode,
+            position,
+            tor_max,
+            kp,
+            self._object,
+        )
         v["sent"].value = self._number
 
     def _step(self) -> HandState | None:
@@ -457,7 +508,8 @@ class SimulatedXHand:
 def _views(raw: tuple) -> dict[str, Any]:
     states, touches, newest, commands, sent, stop = raw
     return {
-        "state": np.frombuffer(states, np.float64).reshape(2, -1), "touch": np.frombuffer(touches, np.int16).reshape(2, -1), "newest": newest,
+        "state": np.frombuffer(states, np.float64).reshape(2, -1),
+        "touch": np.frombuffer(touches, np.int16).reshape(2, -1), "newest": newest,
         "command": np.frombuffer(commands, np.float64).reshape(2, -1), "sent": sent, "stop": stop,
     }  # fmt: skip
 

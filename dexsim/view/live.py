@@ -1,8 +1,8 @@
 """A live view of a policy in a browser: the hand, the object, what the fingertips feel, rewards, and controls.
 
-`dexsim play checkpoint=PATH view=true` serves one web page (viser, the extra `view`), on this machine only unless `view_host` says
-otherwise; nothing here needs a display. The environment steps in the main thread, in real time where it can; the page's controls
-only set what the loop reads next.
+`dexsim play checkpoint=PATH view=true` serves one web page (viser, the extra `view`), on this machine only unless
+`view_host` says otherwise; nothing here needs a display. The environment steps in the main thread, in real time where
+it can; the page's controls only set what the loop reads next.
 """
 
 from __future__ import annotations
@@ -62,14 +62,27 @@ class LiveView:
         host, port: where to serve. Raises UserError where that cannot be, or viser is not installed.
     """
 
-    def __init__(self, env: Any, policy: Policy, name: str, choices: list[str], load: Callable[[str], Policy], host: str, port: int) -> None:
+    def __init__(
+        self,
+        env: Any,
+        policy: Policy,
+        name: str,
+        choices: list[str],
+        load: Callable[[str], Policy],
+        host: str,
+        port: int,
+    ) -> None:
         viser = _viser()
         _check_free(host, port)
         self.env, self.policy, self.name, self._load = env, policy, name, load
         self.wishes = Wishes()
         self.fingers = list(xhand.FINGERS)
         self._map = panels.TaxelMap(env.touch.layout)
-        self._full_taxel, self._full_force, self._full_reward = FULL_TAXEL, float(np.ceil(getattr(env, "f_max", 10.0))), 0.5
+        self._full_taxel, self._full_force, self._full_reward = (
+            FULL_TAXEL,
+            float(np.ceil(getattr(env, "f_max", 10.0))),
+            0.5,
+        )
         self._terms: dict[str, torch.Tensor] = {}
         self._totals: dict[str, float] = {}
         self._rewards = env.rewards
@@ -80,7 +93,8 @@ class LiveView:
         self._command: float | None = None
         self.gate = live_gate.Gate(host)
         self._failed_draws = 0
-        with contextlib.redirect_stdout(io.StringIO()), live_gate.gated(self.gate):  # its banner; the address is ours to say
+        # its banner; the address is ours to say
+        with contextlib.redirect_stdout(io.StringIO()), live_gate.gated(self.gate):
             self.server = viser.ViserServer(host=host, port=port, label="dexsim", verbose=False)
         self._nodes: dict[int, Any] = {}
         self._object: list[Any] = []
@@ -98,7 +112,8 @@ class LiveView:
         """What the address must carry as ?token=..., '' where it is served on this machine only."""
         return self.gate.token
 
-    # -- the page --------------------------------------------------------------------------------------------------------------
+    # -- the page
+    # --------------------------------------------------------------------------------------------------------------
     def _lay_out(self, choices: list[str]) -> None:
         server, gui, w = self.server, self.server.gui, self.wishes
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -119,10 +134,25 @@ class LiveView:
             pause = gui.add_checkbox("pause", initial_value=False)
             buttons = gui.add_button_group("", tuple(BUTTONS))
             speed = gui.add_button_group("speed", tuple(SPEEDS))
-            world = gui.add_slider("world", min=0, max=max(self.env.num_envs - 1, 1), step=1, initial_value=0, disabled=self.env.num_envs == 1)
+            world = gui.add_slider(
+                "world",
+                min=0,
+                max=max(self.env.num_envs - 1, 1),
+                step=1,
+                initial_value=0,
+                disabled=self.env.num_envs == 1,
+            )
             policy = gui.add_dropdown("policy", choices, initial_value=self.name)
             own = gui.add_checkbox("own command", initial_value=False, visible=hasattr(self.env, "fixed_command"))
-            command = gui.add_slider("command", min=0.0, max=1.0, step=0.05, initial_value=0.5, disabled=True, visible=hasattr(self.env, "fixed_command"))
+            command = gui.add_slider(
+                "command",
+                min=0.0,
+                max=1.0,
+                step=0.05,
+                initial_value=0.5,
+                disabled=True,
+                visible=hasattr(self.env, "fixed_command"),
+            )
         self._facts = gui.add_html("")
         with gui.add_folder("Touch"):
             self._labels = gui.add_html(panels.pad_labels(self.fingers))
@@ -131,9 +161,21 @@ class LiveView:
         with gui.add_folder("Rewards"):
             self._reward_html = gui.add_html("")
         self._pause = pause
-        live_gate.only_known(server, {h._impl.uuid: check for h, check in (
-            (pause, live_gate.truth), (own, live_gate.truth), (buttons, live_gate.one_of(BUTTONS)), (speed, live_gate.one_of(SPEEDS)),
-            (world, live_gate.number(0, max(self.env.num_envs - 1, 1))), (policy, live_gate.one_of(choices)), (command, live_gate.number(0, 1)))})
+        live_gate.only_known(
+            server,
+            {
+                h._impl.uuid: check
+                for h, check in (
+                    (pause, live_gate.truth),
+                    (own, live_gate.truth),
+                    (buttons, live_gate.one_of(BUTTONS)),
+                    (speed, live_gate.one_of(SPEEDS)),
+                    (world, live_gate.number(0, max(self.env.num_envs - 1, 1))),
+                    (policy, live_gate.one_of(choices)),
+                    (command, live_gate.number(0, 1)),
+                )
+            },
+        )
 
         @pause.on_update
         def _(_: Any) -> None:
@@ -182,23 +224,45 @@ class LiveView:
             for body in range(model.nbody):
                 self._nodes[body] = scene.add_frame(f"/bodies/{body}", show_axes=False)
                 for k, mesh in enumerate(meshes.get(body, []) if body != thing else []):
-                    scene.add_mesh_simple(f"/bodies/{body}/{k}", mesh.vertices.astype(np.float32), mesh.faces, color=_lighter(mesh.rgba),
-                                          opacity=None if mesh.rgba[3] >= 1 else mesh.rgba[3], flat_shading=True)
+                    scene.add_mesh_simple(
+                        f"/bodies/{body}/{k}",
+                        mesh.vertices.astype(np.float32),
+                        mesh.faces,
+                        color=_lighter(mesh.rgba),
+                        opacity=None if mesh.rgba[3] >= 1 else mesh.rgba[3],
+                        flat_shading=True,
+                    )
             layout = self.env.touch.layout
             self._points = []
             for f, name in enumerate(layout.bodies):
                 count = int(layout.count[f])
-                self._points.append(scene.add_point_cloud(
-                    f"/bodies/{model.body(name).id}/taxels", (layout.point[f, :count] + LIFT * layout.normal[f, :count]).astype(np.float32),
-                    np.full((count, 3), 210, np.uint8), point_size=0.0011, point_shape="circle", precision="float32", point_shading="flat"))
+                self._points.append(
+                    scene.add_point_cloud(
+                        f"/bodies/{model.body(name).id}/taxels",
+                        (layout.point[f, :count] + LIFT * layout.normal[f, :count]).astype(np.float32),
+                        np.full((count, 3), 210, np.uint8),
+                        point_size=0.0011,
+                        point_shape="circle",
+                        precision="float32",
+                        point_shading="flat",
+                    )
+                )
         for old in self._object:
             old.remove()
-        self._object = [scene.add_mesh_simple(f"/bodies/{thing}/object{k}", m.vertices.astype(np.float32), m.faces, color=_lighter(m.rgba), flat_shading=True)
-                        for k, m in enumerate(meshes.get(thing, []))]
+        self._object = [
+            scene.add_mesh_simple(
+                f"/bodies/{thing}/object{k}",
+                m.vertices.astype(np.float32),
+                m.faces,
+                color=_lighter(m.rgba),
+                flat_shading=True,
+            )
+            for k, m in enumerate(meshes.get(thing, []))
+        ]
 
     def draw(self, panels_too: bool) -> None:
-        """Bring the page to the present state of the chosen world; reads from the device. What fails between here and a page costs a
-        picture, not the run, unless it fails again and again."""
+        """Bring the page to the present state of the chosen world; reads from the device. What fails between here and a
+        page costs a picture, not the run, unless it fails again and again."""
         try:
             self._draw(panels_too)
             self._failed_draws = 0
@@ -242,13 +306,20 @@ class LiveView:
     def _about(self, world: int) -> dict[str, object]:
         env = self.env
         variant = env.scene.variants[int(env.objects.variant[world])]
-        rows = {"time": f"{int(env.episode_length_buf[world]) * env.dt:.2f} s of the episode", "step": self.steps,
-                "state": "paused" if self.wishes.pause else "running", "world": f"{world} of {env.num_envs}", "policy": self.name,
-                "object": f"{variant.shape.name}, {1e3 * float(env.objects.mass[world]):.0f} g, friction {float(env.objects.friction[world]):.2f}",
-                "last episode": f"{self.ended} ({self.episodes} ended)"}
+        rows = {
+            "time": f"{int(env.episode_length_buf[world]) * env.dt:.2f} s of the episode",
+            "step": self.steps,
+            "state": "paused" if self.wishes.pause else "running",
+            "world": f"{world} of {env.num_envs}",
+            "policy": self.name,
+            "object": f"{variant.shape.name}, {1e3 * float(env.objects.mass[world]):.0f} g, friction"
+            f" {float(env.objects.friction[world]):.2f}",
+            "last episode": f"{self.ended} ({self.episodes} ended)",
+        }
         return rows | ({"": self._message} if self._message else {})
 
-    # -- the loop ----------------------------------------------------------------------------------------------------------------
+    # -- the loop
+    # ----------------------------------------------------------------------------------------------------------------
     def _keep_rewards(self) -> dict[str, torch.Tensor]:
         self._terms = self._rewards()
         return self._terms
@@ -355,4 +426,7 @@ def _check_free(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
-        raise UserError(f"view_host={host} view_port={port}: cannot serve there ({error.strerror or error}); choose another view_port=") from None
+        raise UserError(
+            f"view_host={host} view_port={port}: cannot serve there ({error.strerror or error}); choose another"
+            " view_port="
+        ) from None

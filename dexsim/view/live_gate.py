@@ -1,5 +1,5 @@
-"""Who may talk to the live view, and what they may say: the address a request is for, the page it comes from, a token where the view
-is served beyond this machine, how many at once, and which messages are passed on."""
+"""Who may talk to the live view, and what they may say: the address a request is for, the page it comes from, a token
+where the view is served beyond this machine, how many at once, and which messages are passed on."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 class Gate:
     """Decides about each request before viser sees it.
 
-    host: where the view is served. On loopback a request must be for a name of loopback (another's name that was made to point here
-    is not one); beyond it, it must carry `token`, once in the address and then in a cookie. A WebSocket must come from the page that
-    is served here: its Origin names the same host and port as the request itself.
+    host: where the view is served. On loopback a request must be for a name of loopback (another's name that was made
+    to point here is not one); beyond it, it must carry `token`, once in the address and then in a cookie. A WebSocket
+    must come from the page that is served here: its Origin names the same host and port as the request itself.
     """
 
     def __init__(self, host: str) -> None:
@@ -98,7 +98,9 @@ def gated(gate: Gate) -> Iterator[None]:
     def answer(status: int, text: str) -> Response:
         gate.refused += 1
         body = f"{text}\n".encode()
-        head = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"})
+        head = Headers(
+            {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+        )
         return Response(status, http.HTTPStatus(status).phrase, head, body)
 
     def with_gate(handler: Callable[..., Any], *args: Any, process_request: Any = None, **kw: Any) -> Any:
@@ -132,8 +134,8 @@ def gated(gate: Gate) -> Iterator[None]:
 
 
 def only_known(server: Any, checks: dict[str, Callable[[Any], bool]]) -> None:
-    """From now on viser's server passes on no message but where its page looks from, and new values of the controls in `checks` (viser's
-    id -> whether a value is one that the control can have). All else a page may send is dropped."""
+    """From now on viser's server passes on no message but where its page looks from, and new values of the controls in
+    `checks` (viser's id -> whether a value is one that the control can have). All else a page may send is dropped."""
     from viser import _messages
 
     sockets = server._websock_server
@@ -143,7 +145,12 @@ def only_known(server: Any, checks: dict[str, Callable[[Any], bool]]) -> None:
         if isinstance(message, _messages.GuiUpdateMessage):
             updates = message.updates
             known = checks.get(message.uuid) if isinstance(message.uuid, str) else None
-            if known is None or not isinstance(updates, dict) or set(updates) != {"value"} or not known(updates["value"]):
+            if (
+                known is None
+                or not isinstance(updates, dict)
+                or set(updates) != {"value"}
+                or not known(updates["value"])
+            ):
                 return
             await handle(client, message)
 

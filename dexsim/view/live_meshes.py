@@ -21,8 +21,8 @@ class BodyMesh:
 
 
 def body_meshes(model: mujoco.MjModel) -> dict[int, list[BodyMesh]]:
-    """Meshes of each body, geoms of one colour merged; geoms of groups 0 to 2 as MuJoCo's own viewer shows them, parked ones and planes
-    left out."""
+    """Meshes of each body, geoms of one colour merged; geoms of groups 0 to 2 as MuJoCo's own viewer shows them, parked
+    ones and planes left out."""
     parts: dict[tuple[int, tuple], list[tuple[np.ndarray, np.ndarray]]] = {}
     for g in range(model.ngeom):
         rgba = model.mat_rgba[model.geom_matid[g]] if model.geom_matid[g] >= 0 else model.geom_rgba[g]
@@ -33,7 +33,9 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, list[BodyMesh]]:
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
             vertices = shape[0] @ rotation.reshape(3, 3).T + model.geom_pos[g]
-            parts.setdefault((int(model.geom_bodyid[g]), tuple(round(float(c), 3) for c in rgba)), []).append((vertices, shape[1]))
+            parts.setdefault((int(model.geom_bodyid[g]), tuple(round(float(c), 3) for c in rgba)), []).append(
+                (vertices, shape[1])
+            )
     found: dict[int, list[BodyMesh]] = {}
     for (body, rgba), shapes in parts.items():
         offsets = np.cumsum([0, *(len(v) for v, _ in shapes)])
@@ -48,8 +50,10 @@ def _shape(model: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray] | Non
     t = mujoco.mjtGeom
     if kind == t.mjGEOM_MESH:
         m = model.geom_dataid[g]
-        vertices = model.mesh_vert[model.mesh_vertadr[m]: model.mesh_vertadr[m] + model.mesh_vertnum[m]]
-        return vertices.astype(float), model.mesh_face[model.mesh_faceadr[m]: model.mesh_faceadr[m] + model.mesh_facenum[m]].astype(int)
+        vertices = model.mesh_vert[model.mesh_vertadr[m] : model.mesh_vertadr[m] + model.mesh_vertnum[m]]
+        return vertices.astype(float), model.mesh_face[
+            model.mesh_faceadr[m] : model.mesh_faceadr[m] + model.mesh_facenum[m]
+        ].astype(int)
     if kind == t.mjGEOM_BOX:
         return _box(size)
     if kind == t.mjGEOM_SPHERE:
@@ -83,7 +87,9 @@ def _arc(radius: float, half: float) -> tuple[np.ndarray, np.ndarray]:
 def _turned(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Surface of revolution about z of a profile [P]."""
     angle = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)
-    vertices = np.stack([radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle), np.repeat(height[:, None], SIDES, 1)], -1).reshape(-1, 3)
+    vertices = np.stack(
+        [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle), np.repeat(height[:, None], SIDES, 1)], -1
+    ).reshape(-1, 3)
     faces = []
     for p in range(len(radius) - 1):
         for k in range(SIDES):

@@ -1,4 +1,5 @@
-"""What the live view shows beside the scene: taxel maps as an image, forces, rewards and facts as HTML. No server in here."""
+"""What the live view shows beside the scene: taxel maps as an image, forces, rewards and facts as HTML. No server in
+here."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ BAR, COMMAND, PLUS, MINUS = "#1f5fa8", "#e08a00", "#2e8b57", "#c0392b"
 
 
 def colours(values: np.ndarray, full: float) -> np.ndarray:
-    """RGB [..., 3] uint8 of forces (N): pale where nothing presses, through red to black-red at `full`; the square root, so
-    that a light touch shows."""
+    """RGB [..., 3] uint8 of forces (N): pale where nothing presses, through red to black-red at `full`; the square
+    root, so that a light touch shows."""
     x = np.sqrt(np.clip(values / max(full, 1e-9), 0.0, 1.0))[..., None]
     stops = np.array([[214, 222, 232], [255, 214, 102], [240, 80, 40], [90, 0, 20]], float)
     position = x * (len(stops) - 1)
@@ -28,8 +29,9 @@ def colours(values: np.ndarray, full: float) -> np.ndarray:
 class TaxelMap:
     """Fingertips side by side, seen onto their pads: each pixel takes the colour of its nearest taxel.
 
-    A pad wraps around its finger, so it is unrolled: across is the angle of a taxel's normal about the finger's axis times the pad's
-    radius, along is the height plus, at the rounded end, the same for the angle towards the axis. The end of the finger is up.
+    A pad wraps around its finger, so it is unrolled: across is the angle of a taxel's normal about the finger's axis
+    times the pad's radius, along is the height plus, at the rounded end, the same for the angle towards the axis. The
+    end of the finger is up.
     """
 
     def __init__(self, layout: TaxelLayout) -> None:
@@ -70,42 +72,70 @@ class TaxelMap:
 
 
 def force_bars(names: Sequence[str], force: np.ndarray, command: np.ndarray | None, full: float) -> str:
-    """One bar a finger: measured force (N), with a line at the commanded one. command [F] (NaN: none for this finger)."""
+    """One bar a finger: measured force (N), with a line at the commanded one. command [F] (NaN: none for this
+    finger)."""
     rows = []
     for k, name in enumerate(names):
         want = None if command is None or not np.isfinite(command[k]) else float(command[k])
-        line = "" if want is None else (f'<div style="position:absolute;top:-2px;bottom:-2px;width:3px;background:{COMMAND};'
-                                        f'left:calc({100 * min(want / full, 1.0):.1f}% - 1px)"></div>')
+        line = (
+            ""
+            if want is None
+            else (
+                f'<div style="position:absolute;top:-2px;bottom:-2px;width:3px;background:{COMMAND};'
+                f'left:calc({100 * min(want / full, 1.0):.1f}% - 1px)"></div>'
+            )
+        )
         value = f"{force[k]:.1f}" + ("" if want is None else f" / {want:.1f}")
-        rows.append(_row(name, f'<div style="height:100%;width:{100 * min(max(force[k], 0) / full, 1):.1f}%;background:{BAR}"></div>{line}', value))
+        rows.append(
+            _row(
+                name,
+                f'<div style="height:100%;width:{100 * min(max(force[k], 0) / full, 1):.1f}%;'
+            f'background:{BAR}"></div>{line}',
+                value,
+            )
+        )
     key = "" if command is None else f' <span style="color:{COMMAND}">| command</span>'
     return _block("force-bars", f'<span style="color:{BAR}">■ measured</span>{key}, N (full bar {full:.0f})', rows)
 
 
 def reward_bars(terms: Mapping[str, float], totals: Mapping[str, float], full: float) -> str:
-    """One bar a term: the reward of this step to the right (green) or left (red) of the middle; behind it the episode's sum."""
+    """One bar a term: the reward of this step to the right (green) or left (red) of the middle; behind it the episode's
+    sum."""
     rows = []
     for name, value in terms.items():
         width = 50 * min(abs(value) / full, 1.0)
         side = f"left:50%;background:{PLUS}" if value >= 0 else f"right:50%;background:{MINUS}"
-        bar = (f'<div style="position:absolute;top:0;bottom:0;width:{width:.1f}%;{side}"></div>'
-               '<div style="position:absolute;left:50%;top:0;bottom:0;width:1px;background:#888"></div>')
+        bar = (
+            f'<div style="position:absolute;top:0;bottom:0;width:{width:.1f}%;{side}"></div>'
+            '<div style="position:absolute;left:50%;top:0;bottom:0;width:1px;background:#888"></div>'
+        )
         rows.append(_row(name, bar, f"{_signed(value, 3)}  ({_signed(totals.get(name, 0.0), 1)})"))
     step, total = sum(terms.values()), sum(totals.values())
-    return _block("rewards", f"this step {_signed(step, 3)}, this episode {_signed(total, 1)}; by term: step (episode)", rows)
+    return _block(
+        "rewards", f"this step {_signed(step, 3)}, this episode {_signed(total, 1)}; by term: step (episode)", rows
+    )
 
 
 def facts(rows: Mapping[str, object]) -> str:
     """Names and values, two columns."""
-    cells = "".join(f'<div style="color:#667">{html.escape(str(k))}</div><div data-fact="{html.escape(str(k))}">{html.escape(str(v))}</div>'
-                    for k, v in rows.items())
-    return f'<div style="display:grid;grid-template-columns:7.5em 1fr;gap:1px 8px;font-size:12px;padding:2px 12px">{cells}</div>'
+    cells = "".join(
+        f'<div style="color:#667">{html.escape(str(k))}</div><div'
+        f' data-fact="{html.escape(str(k))}">{html.escape(str(v))}</div>'
+        for k, v in rows.items()
+    )
+    return (
+        f'<div style="display:grid;grid-template-columns:7.5em 1fr;gap:1px 8px;'
+        f'font-size:12px;padding:2px 12px">{cells}</div>'
+    )
 
 
 def pad_labels(names: Sequence[str]) -> str:
     """Names over the columns of :meth:`TaxelMap.image`."""
     cells = "".join(f'<div style="text-align:center">{html.escape(n)}</div>' for n in names)
-    return f'<div style="display:grid;grid-template-columns:repeat({len(names)},1fr);font-size:11px;color:#445;padding:4px 12px 0">{cells}</div>'
+    return (
+        f'<div style="display:grid;grid-template-columns:repeat({len(names)},1fr);'
+        f'font-size:11px;color:#445;padding:4px 12px 0">{cells}</div>'
+    )
 
 
 def _signed(value: float, digits: int) -> str:
@@ -114,11 +144,16 @@ def _signed(value: float, digits: int) -> str:
 
 
 def _row(name: str, bar: str, value: str) -> str:
-    return (f'<div style="width:6.2em;overflow:hidden">{html.escape(name)}</div>'
-            f'<div style="position:relative;height:11px;background:#e3e7ec;align-self:center">{bar}</div>'
-            f'<div style="text-align:right;white-space:pre;font-variant-numeric:tabular-nums">{value}</div>')
+    return (
+        f'<div style="width:6.2em;overflow:hidden">{html.escape(name)}</div>'
+        f'<div style="position:relative;height:11px;background:#e3e7ec;align-self:center">{bar}</div>'
+        f'<div style="text-align:right;white-space:pre;font-variant-numeric:tabular-nums">{value}</div>'
+    )
 
 
 def _block(name: str, title: str, rows: Sequence[str]) -> str:
-    return (f'<div data-panel="{name}" style="font-size:11px;padding:2px 12px"><div style="color:#445;margin-bottom:2px">{title}</div>'
-            f'<div style="display:grid;grid-template-columns:auto 1fr auto;gap:2px 8px">{"".join(rows)}</div></div>')
+    return (
+        f'<div data-panel="{name}" style="font-size:11px;padding:2px 12px"><div'
+        f' style="color:#445;margin-bottom:2px">{title}</div>'
+        f'<div style="display:grid;grid-template-columns:auto 1fr auto;gap:2px 8px">{"".join(rows)}</div></div>'
+    )

@@ -213,7 +213,9 @@ def build() -> str:
         f'    <material name="xhand_{name}" rgba="{rgba}" specular="{specular}" shininess="{shininess}"/>'
         for name, (rgba, specular, shininess) in MATERIALS.items()
     ]
-    text = _TEMPLATE.format(assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SOLREF, margin=TIP_MARGIN)
+    text = _TEMPLATE.format(
+        assets="\n".join(materials + assets), bodies="\n".join(lines), solref=SOLREF, margin=TIP_MARGIN
+    )
     xhand.xml_path().write_text(text, encoding="ascii")
     return text
 
@@ -239,8 +241,8 @@ def _bits(body: str) -> tuple[int, int]:
     return contype, conaffinity
 
 
-# Fingertips meet the hand itself through capsules inside them (within 2 mm of the skin): convex meshes against each other
-# cost more than everything else in a closed grasp. They meet the object through the mesh alone.
+# Fingertips meet the hand itself through capsules inside them (within 2 mm of the skin): convex meshes against each
+# other cost more than everything else in a closed grasp. They meet the object through the mesh alone.
 PROXIES = {
     "thumb": [((x, 0.017, 0.0015), (x, 0.0415, -0.001), 0.0085) for x in (-0.006, 0.006)],
     "finger": [((0.002, 0, 0.013), (0.0005, 0, 0.0335), 0.008)],

@@ -195,14 +195,14 @@ def hull_distance(points: np.ndarray, hull: ConvexHull) -> np.ndarray:
 
 
 TIP_MARGIN = 0.0015
-"""Rounding of the fingertips [m]: the collision mesh is the tip shrunk by this, and its geom's `margin` adds it back. The
-mesh itself then never overlaps an object (rubber yields about 1 mm), so that the collision of convex shapes stays a
+"""Rounding of the fingertips [m]: the collision mesh is the tip shrunk by this, and its geom's `margin` adds it back.
+The mesh itself then never overlaps an object (rubber yields about 1 mm), so that the collision of convex shapes stays a
 distance query, several times cheaper than a penetration query, and the edges of its facets are rounded."""
 
 
 def tip_hull(lattice: Lattice, pad: PadShape, vertices: int = 64, raise_by: float = 1.5e-4) -> np.ndarray:
-    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the points
-    at least TIP_MARGIN inside the tip.
+    """Vertices [<= vertices, 3] (sensor axes) of the convex core of the fingertip, mirror symmetric about a = 0: the
+    points at least TIP_MARGIN inside the tip.
 
     Greedy: add the dense point farthest outside the present hull, and its mirror image. Skin points are raised by
     `raise_by` along the normal first, so that the facets' sagging is spread to both sides of the skin; points
