@@ -243,10 +243,6 @@ def main(argv: list[str]) -> dict:
         run.part("measure mujoco", lambda: run.measure("mujoco"))
         run.part("stages mujoco", lambda: run.stages("mujoco"))
         run.part("kernels mujoco", lambda: run.kernels("mujoco"))
-    if "variants" in run.parts:
-        run.part("variants", run.variants, 10)
-        run.part("sparse", run.sparse, 30)
-    run.envs.clear()
     if "play" in run.parts:
         for task in ("grasp", "rotate"):
             for setting in SETTINGS:
@@ -254,6 +250,9 @@ def main(argv: list[str]) -> dict:
     if "exact" in run.parts:
         for kind in narrow_phase.KINDS:
             run.part(f"exact {kind}", lambda kind=kind: narrow_phase.kind_of_pair(kind, run.poses, run.device, min(run.poses, 8192)), 8)
+    if "variants" in run.parts:
+        run.part("variants", run.variants, 10)
+        run.part("sparse", run.sparse, 30)
     if {f"measure {s}" for s in SETTINGS} <= set(run.out):
         hand, theirs = (run.out[f"measure {s}"] for s in SETTINGS)
         if "error" not in hand | theirs:
