@@ -30,6 +30,7 @@ from dexsim.cli import build, folder, machine
 from dexsim.cli import start as start_up
 from dexsim.cli import train as training
 from dexsim.console.ending import guard
+from dexsim.console.stop import Stop
 from dexsim.errors import UserError
 from dexsim.learning.runner import Runner
 from dexsim.paths import CONFIGS
@@ -133,7 +134,7 @@ def main(argv: list[str]) -> int:
     log = training.Log(runner, where, start)
     rows: list[tuple[float, ...]] = []
     began = time.perf_counter()
-    with training.Stop() as stop, open(out / "soak.csv", "w", newline="") as file:
+    with Stop() as stop, open(out / "soak.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         stop.gently = True

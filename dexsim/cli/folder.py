@@ -3,33 +3,74 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from dexsim.console.folders import make
+from dexsim.errors import UserError
+from dexsim.learning import checkpoint
+
+CONFIG = "config.yaml"
 
 
 def for_run(cfg: dict[str, Any]) -> Path:
-    """The new run's folder: ``out``, else ``runs/<task>/<run>`` with date and time for a nameless run."""
+    """The new run's folder: ``out``, else ``runs/<task>/<run>`` with date and time for a nameless run.
+
+    No two starts get one folder, however close they are. What killed runs left unfinished beside it is removed.
+    """
     if cfg["out"] is not None:
-        return make(Path(str(cfg["out"])).expanduser(), "out=", empty=True)
+        return _claim(make(Path(str(cfg["out"])).expanduser(), "out=", empty=True), "out=")
     parent = Path("runs") / cfg["choices"]["task"]
     if cfg["run"] is not None:
-        return make(parent / str(cfg["run"]), "run=", empty=True)
-    name = stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
-    k = 2
-    while (parent / name).exists():
-        name, k = f"{stamp}_{k}", k + 1
-    return make(parent / name, "out=", empty=True)
+        folder = _claim(make(parent / str(cfg["run"]), "run=", empty=True), "run=")
+    else:
+        make(parent, "out=")
+        folder = _new(parent, time.strftime("%Y-%m-%d_%H-%M-%S"))
+    tidy([p for p in parent.iterdir() if p.is_dir()])
+    return folder
+
+
+def _new(parent: Path, stamp: str) -> Path:
+    """A folder that was not there before: making it is what claims it."""
+    for k in itertools.count(1):
+        folder = parent / (stamp if k == 1 else f"{stamp}_{k}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise UserError(f"cannot write into {parent}: {error.strerror}; choose another place with out=") from None
+        return _claim(folder, "out=")
+    raise AssertionError("unreachable")
+
+
+def _claim(folder: Path, setting: str) -> Path:
+    """Take an empty folder: of those who find it empty at once, one makes its config.yaml."""
+    try:
+        (folder / CONFIG).touch(exist_ok=False)
+    except FileExistsError:
+        raise UserError(f"{folder} was taken by another run that started just now: choose another {setting}") from None
+    except OSError as error:
+        raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
+    return folder
+
+
+def tidy(folders: Iterable[Path]) -> None:
+    """Remove what killed processes left unfinished in these folders, and say so."""
+    removed = [size for folder in folders for size in checkpoint.sweep(folder)]
+    if removed:
+        print(f"tidied   {len(removed)} unfinished file(s) of killed runs, {sum(removed) / 2**20:.1f} MiB")
 
 
 def write_config(folder: Path, cfg: dict[str, Any]) -> None:
     """Save the resolved config as ``config.yaml``."""
-    (folder / "config.yaml").write_text(yaml.safe_dump(cfg, sort_keys=False))
+    checkpoint.write(folder / CONFIG, yaml.safe_dump(cfg, sort_keys=False).encode())
 
 
 class ProgressFile:

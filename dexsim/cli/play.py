@@ -7,6 +7,7 @@ from pathlib import Path
 from dexsim.cli import build, folder, machine
 from dexsim.cli.replay import replay
 from dexsim.cli.start import Start
+from dexsim.console.stop import Stop
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import load_policy, plain_policy
 
@@ -46,13 +47,20 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
 
         PlayRecorder.place(play["record"])  # a place that cannot be written is answered before the play
         recorder = PlayRecorder(env, play["record_worlds"], cfg)
-    try:
-        replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
-    finally:  # what was recorded until a Ctrl-C is kept
-        if recorder is not None:
-            for path in recorder.save(play["record"], bool(play["realistic"]), play["seed"]):
-                print(f"mcap     {path}")
-    return 0
+    with Stop() as stop:
+        try:
+            replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
+        except KeyboardInterrupt:
+            kept = "; what was recorded until now is kept" if recorder is not None else ""
+            print(f"\nbroken off{kept}", flush=True)
+        else:
+            stop.status = 0
+        finally:
+            stop.gently = True  # a second signal does not cut the recording
+            if recorder is not None:
+                for path in recorder.save(play["record"], bool(play["realistic"]), play["seed"]):
+                    print(f"mcap     {path}", flush=True)
+        return stop.status
 
 
 def results(start: Start) -> Path:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
-import signal
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from dexsim.cli import build, folder, machine
@@ -15,6 +13,7 @@ from dexsim.cli.console import TrainingLines
 from dexsim.cli.replay import replay
 from dexsim.cli.start import Start
 from dexsim.console import program
+from dexsim.console.stop import Stop
 from dexsim.console.tables import count, duration
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -22,7 +21,6 @@ from dexsim.learning.ranks import Ranks
 from dexsim.learning.runner import Runner
 
 SAVE_EVERY_S = 60.0  # last.pt and policy.pt, besides what save_interval keeps
-SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to every process already
 TAGS = {
     "reward": "Train/mean_reward",
     "length": "Train/mean_episode_length",
@@ -34,12 +32,14 @@ TAGS = {
 
 
 def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
-    """Train; returns the exit status: 0, 130 after Ctrl-C, 143 after SIGTERM. Raises UserError.
+    """Train; returns the exit status: 0, 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP. Raises UserError.
 
     Under torchrun this runs in every process (rank): all learn, rank 0 alone prints and writes.
     """
     ranks = Ranks()
     _check_resume(start)
+    if start.source and ranks.leader:
+        folder.tidy([Path(start.source).expanduser().parent])
     with ranks.only_leader_prints(), Stop(together=ranks.size > 1) as stop, ranks.joined(start.cfg["device"]):
         return _run(start, make_env, ranks, stop)
 
@@ -168,41 +168,3 @@ class Log:
             drawn = curves(read_progress(self._where / "progress.csv"), self._where / "curves.png", self._title)
             print(f"curves   {drawn}")
         print(f"run      {self._where}")
-
-
-class Stop:
-    """Ctrl-C and SIGTERM: at once by default; while ``gently`` is set, the first only asks the loop to end.
-
-    together: one of several processes: signals within SAME_SIGNAL_S count as one.
-    """
-
-    def __init__(self, together: bool = False) -> None:
-        self.gently, self.status = False, 130
-        self._asked, self._together, self._last = False, together, -math.inf
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Stop:
-        try:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._handle)
-        except ValueError:  # not in the main thread: whoever runs us handles signals
-            pass
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, _frame: FrameType | None) -> None:
-        before, self._last = self._last, time.monotonic()
-        if self._together and self._last - before < SAME_SIGNAL_S:
-            return
-        self.status = 128 + number
-        if not self.gently or self._asked:
-            raise KeyboardInterrupt
-        self._asked = True
-        print("\nstopping and saving (Ctrl-C again: stop at once, without saving)", flush=True)
-
-    def asked(self) -> bool:
-        """Whether someone asked to stop."""
-        return self._asked

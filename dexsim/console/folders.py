@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from dexsim.errors import UserError
@@ -16,10 +17,10 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable.tmp"
+        probe = folder / f".writable.{os.getpid()}.tmp"  # several may try at once
         probe.write_bytes(b"x")
         probe.unlink()
-        if empty and any(folder.iterdir()):
+        if empty and any(not (p.name.startswith(".writable.") and p.suffix == ".tmp") for p in folder.iterdir()):
             raise UserError(
                 f"{folder} already holds a run: choose another {setting}, or continue it with"
                 f" resume={folder / 'last.pt'}"

@@ -1,0 +1,69 @@
+"""Ctrl-C, SIGTERM and SIGHUP, for commands that have something to save before they end."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to every process already
+
+
+class Stop:
+    """At once by default; while ``gently`` is set, the first signal only asks the work to end. A SIGHUP that was ignored
+    before (nohup) still is. ``status``: the exit status then, 128 + the signal's number.
+
+    together: one of several processes: signals within SAME_SIGNAL_S count as one.
+    """
+
+    def __init__(self, together: bool = False) -> None:
+        self.gently, self.status = False, 130
+        self._asked, self._together, self._last = False, together, -math.inf
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Stop:
+        try:
+            for number in SIGNALS:
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._handle)
+        except ValueError:  # not in the main thread: whoever runs us handles signals
+            pass
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        before, self._last = self._last, time.monotonic()
+        if self._together and self._last - before < SAME_SIGNAL_S:
+            return
+        self.status = 128 + number
+        if number == signal.SIGHUP:
+            without_terminal()
+        if not self.gently or self._asked:
+            raise KeyboardInterrupt
+        self._asked = True
+        print("\nstopping and saving (Ctrl-C again: stop at once, without saving)", flush=True)
+
+    def asked(self) -> bool:
+        """Whether someone asked to stop."""
+        return self._asked
+
+
+def without_terminal() -> None:
+    """Where the terminal is gone, send what is still printed nowhere: an error of ``print`` must not keep anything from
+    being saved."""
+    for stream, number in ((sys.stdout, 1), (sys.stderr, 2)):
+        try:
+            stream.write("\n")
+            stream.flush()
+        except (OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, number)
+            os.close(nowhere)
