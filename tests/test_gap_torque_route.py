@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dexsim.gap.search import inverse_dynamics
+from dexsim.gap.search import torque_told
 from dexsim.gap.search.body_torque import body, motion
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" armature="0.02" damping="0.05"/>
@@ -51,7 +51,7 @@ def cases() -> list[SimpleNamespace]:
 def test_friction_of_coupled_joints_under_gravity_is_read_off_at_100_hz():
     model = arm()
     runs = [run(model, 0), run(model, 1)]
-    given = inverse_dynamics.found(cases(), runs, [0], [1], model=model)
+    given = torque_told.found(cases(), runs, [0], [1], model=model)
     assert [c.joint for c, *_ in given] == list(JOINTS) and given[0][2] == ["run1.mcap"]
     for (_, x, _), coulomb, viscous in zip(given, COULOMB, VISCOUS, strict=True):
         assert x.value["coulomb_friction"] == pytest.approx(coulomb, rel=0.05)
@@ -69,7 +69,7 @@ def test_a_heavier_arm_is_not_taken_for_friction():
     model, heavy = arm(), arm()
     heavy.body_mass[:] *= 1.1
     heavy.body_inertia[:] *= 1.1
-    x = inverse_dynamics.found(cases(), [run(heavy, 0)], [0], [], model=model)[0][1]
+    x = torque_told.found(cases(), [run(heavy, 0)], [0], [], model=model)[0][1]
     assert x.value["gravity"] == pytest.approx(0.1, abs=0.02)
     assert x.value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
@@ -78,21 +78,21 @@ def test_what_is_kept_out_takes_no_part():
     model = arm()
     r = run(model, 0, 40.0)
     r.torque[r.t > 30, 0] += 5.0
-    given = inverse_dynamics.found(cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)})
+    given = torque_told.found(cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)})
     assert given[0][1].value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
 
 def test_a_negative_friction_is_a_refusal_with_a_reason():
     model = arm()
     r = run(model, 0, friction=(0.5, -0.2))
-    given = inverse_dynamics.found(cases(), [r], [0], [], model=model)
+    given = torque_told.found(cases(), [r], [0], [], model=model)
     x = given[1][1]
     assert x.value["coulomb_friction"] == 0.0 and "negative coulomb friction" in x.refused["coulomb_friction"]
-    assert "negative coulomb friction" in inverse_dynamics.texts(given)[1] and not given[0][1].refused
+    assert "negative coulomb friction" in torque_told.texts(given)[1] and not given[0][1].refused
     for c in cases():
         c.unknown, c.told, c.ranges = ("coulomb_friction",), False, {}
     given[1][0].unknown, given[1][0].told = ("coulomb_friction",), False
-    said = inverse_dynamics.believe(given[1:])
+    said = torque_told.believe(given[1:])
     assert len(said) == 1 and "no coulomb friction is taken" in said[0] and not given[1][0].told
 
 
@@ -100,5 +100,5 @@ def test_readings_too_slow_or_in_no_unit_of_torque_say_nothing():
     model = arm()
     slow, amperes = run(model, 0, rate=50.0), run(model, 0)
     amperes.torque_unit = "A"
-    assert inverse_dynamics.found(cases(), [slow], [0], [], model=model) == []
-    assert inverse_dynamics.found(cases(), [amperes], [0], [], model=model) == []
+    assert torque_told.found(cases(), [slow], [0], [], model=model) == []
+    assert torque_told.found(cases(), [amperes], [0], [], model=model) == []

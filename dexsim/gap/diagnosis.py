@@ -23,7 +23,7 @@ from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_experiment import rival_of
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Clock, Diagnosis, Settings, empty
-from dexsim.gap.search import baseline, external_force, inverse_dynamics
+from dexsim.gap.search import baseline, external_force, torque_told
 from dexsim.gap.search.parallel import together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch import handed_on as touch_handed
@@ -192,10 +192,10 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     stages = stage_tests.tests(cases, runs, train, s.seed)
     for x in stages[:4]:
         say(f"  {x.text}")
-    by_torque = inverse_dynamics.found(cases, runs, train, test, s.seed, model, span_train, span_test)
-    behind = inverse_dynamics.texts(by_torque)
+    by_torque = torque_told.found(cases, runs, train, test, s.seed, model, span_train, span_test)
+    behind = torque_told.texts(by_torque)
     nothing_believed = [c.joint for c, _, _ in by_torque if "coulomb_friction" in c.unknown]
-    notes += inverse_dynamics.believe(by_torque)
+    notes += torque_told.believe(by_torque)
     for x in behind[:4]:
         say(f"  {x}")
     clock.lap("stage tests")
@@ -220,8 +220,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     clock.lap("plain model")
     result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes, plains)
     result.stages = [x.text for x in stages] + behind
-    add_behind(result, inverse_dynamics.findings(by_torque, nothing_believed, runs, train), by_torque)
-    inverse_dynamics.hand_on(by_torque, result, outcomes, test, span_test)
+    add_behind(result, torque_told.findings(by_torque, nothing_believed, runs, train), by_torque)
+    torque_told.hand_on(by_torque, result, outcomes, test, span_test)
     external_force.claim(result, pushes)
     result.data["unexplained"]["not_considered"] = left_out
     add_touch(result, felt)

@@ -16,7 +16,7 @@ import numpy as np
 
 from dexsim.gap.read.runs import Run
 from dexsim.gap.search import body_torque
-from dexsim.gap.search.inverse_dynamics import _columns, _Columns, _moved, _readable, _solved, _sums, _unphysical
+from dexsim.gap.search.torque_columns import Columns, columns_of, moved, readable, solved, sums, unphysical
 
 EXTERNAL = "external_force"
 MUCH = 0.3  # of the torque's variance: what a plain fit leaves where something else pushes
@@ -71,22 +71,22 @@ def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed
     out, motions = [], {}
     rng = np.random.default_rng(seed)
     for j, joint in enumerate(runs[0].joints):
-        use = [r for r in range(len(runs)) if _readable(runs[r], j)]
+        use = [r for r in range(len(runs)) if readable(runs[r], j)]
         own = [r for r in use if r in fitted]
         if not own:
             continue
         cutoff = min(min(body_torque.highest(runs[r].t) for r in use), 20.0)
         for r in use:
             if r not in motions:
-                motions[r] = _moved(runs[r], model, cutoff)
-        push = _of_joint(joint, [_columns([motions[r]], j) for r in use], [r in own for r in use], rng)
+                motions[r] = moved(runs[r], model, cutoff)
+        push = _of_joint(joint, [columns_of([motions[r]], j) for r in use], [r in own for r in use], rng)
         if push is not None:
             spans, slide = _spans(push[0], [runs[r] for r in use]), int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
     return out
 
 
-def _of_joint(joint: str, pieces: Sequence[_Columns], own: Sequence[bool], rng: np.random.Generator):
+def _of_joint(joint: str, pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator):
     """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest fits); None where little is left."""
     names = [n for n in pieces[0].names if all(n in p.names for p in pieces)]
     X = [p.X[:, [p.names.index(n) for n in names]] for p in pieces]
@@ -96,7 +96,7 @@ def _of_joint(joint: str, pieces: Sequence[_Columns], own: Sequence[bool], rng: 
     A, u = np.concatenate([X[k] for k in mine]), np.concatenate([pieces[k].u for k in mine])
     torque = np.concatenate([pieces[k].torque for k in mine])
     total = float(np.var(torque))
-    plain = _solved(A.T @ A, A.T @ u)
+    plain = solved(A.T @ A, A.T @ u)
     left = float(np.var(u - A @ plain)) / max(total, 1e-30)
     if left < MUCH:
         return None
@@ -105,7 +105,7 @@ def _of_joint(joint: str, pieces: Sequence[_Columns], own: Sequence[bool], rng: 
     x, quiet = _trimmed(A, u, block, int(ends[-1]), rng)
     on = quiet[block]
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
-    clear = noise**2 < QUIET * float(np.var(torque[on])) and not _unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
+    clear = noise**2 < QUIET * float(np.var(torque[on])) and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
     least = max(FAR * noise, LEAST * float(np.sqrt(np.mean(torque**2))))
     residual = [p.u - a @ x for p, a in zip(pieces, X, strict=True)]
     pushed = [np.abs(r) > least for r in residual]
@@ -116,21 +116,21 @@ def _of_joint(joint: str, pieces: Sequence[_Columns], own: Sequence[bool], rng: 
     return list(zip(times, pushed, strict=True)), -top, noise, left, clear  # what the motor gives less, something else gives
 
 
-def _part(of: _Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> _Columns:
+def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Columns:
     """Other rows in the place of a piece's, for the look whether their figures can be."""
     return replace(of, names=tuple(names), X=A, u=u)
 
 
 def _trimmed(A: np.ndarray, u: np.ndarray, block: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """(coefficients [K], fitted blocks [count] bool) of the least trimmed squares by blocks (P. Rousseeuw, K. Van Driessen 2006)."""
-    grams, sides = _sums(A, u, block, count)
+    grams, sides = sums(A, u, block, count)
     squares, n = np.bincount(block, u * u, count), np.maximum(np.bincount(block, minlength=count), 1)
     keep, best = max(int(HALF * count), 4), (np.inf, None, None)
     for _ in range(STARTS):
         on = np.zeros(count, bool)
         on[rng.choice(count, min(max(A.shape[1], 4), count), replace=False)] = True
         for _ in range(STEPS):
-            x = _solved(grams[on].sum(0), sides[on].sum(0))
+            x = solved(grams[on].sum(0), sides[on].sum(0))
             energy = (squares - 2 * sides @ x + np.einsum("k,bkl,l->b", x, grams, x)) / n
             now = np.zeros(count, bool)
             now[np.argsort(energy)[:keep]] = True
