@@ -32,7 +32,7 @@ def test_pushes_are_told_with_when_and_how_hard():
     finding = push.finding()
     assert finding["effect"] == "external_force" and finding["confidence"] >= 0.8 and len(finding["when"]) == 3
     assert finding["parameters"]["torque"]["low"] < 6.0 < finding["parameters"]["torque"]["high"] * 1.05
-    assert "pushes on elbow" in push.text
+    assert "in 3 stretches of time, forwards" in finding["regime"]
 
 
 def test_nothing_is_told_where_nothing_pushes():
@@ -46,8 +46,13 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     r.torque[:, 1] = np.random.default_rng(0).standard_normal(len(r.t) // 20 + 1).repeat(20)[: len(r.t)]
     (push,) = external_force.find(model, [r], [0])
     assert not push.clear and push.finding()["confidence"] < 0.5
-    of = lambda effect, joint: {"effect": effect, "where": {"joints": [joint]}, "confidence": 0.7}  # noqa: E731
-    d = SimpleNamespace(data={"findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")], "verdict": "explained"}, notes=[], sentence="It does.")
+    size = {"torque": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}}
+    held = {"before": 0.02, "after": 0.01}
+    of = lambda effect, joint: {"effect": effect, "where": {"joints": [joint]}, "confidence": 0.7, "held_out": held, "parameters": size, "indistinguishable": []}  # noqa: E731
+    data = {"findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")], "verdict": "explained", "noise_floor": {"position_rad": 0.01},
+            "held_out": held | {"error": "position_rmse_rad"}, "unexplained": {"depends_on": []}}  # fmt: skip
+    d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={})
     external_force.claim(d, [push])
-    assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"] and "does not fit its body" in d.sentence
+    assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
+    assert d.sentence.startswith("Joint elbow is pushed by something outside")
     assert d.data["verdict"] == "explained" and len(d.notes) == 1

@@ -200,7 +200,7 @@ def _lost(f: dict, d: Diagnosis) -> str:
     if f["indistinguishable"]:
         names = _t(" and ".join(_name(x) for x in f["indistinguishable"]))
         return f"<p><b>These recordings cannot tell {names} apart.</b> To separate them: {_t(f['separating_experiment'])}.</p>"
-    if entry(f) is None:  # not of the catalogue: a signal, or a push from outside
+    if not f["held_out"]:  # found before any fit: a signal, or a push from outside
         return ""
     rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
     if not rivals:

@@ -14,11 +14,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.read.runs import Run
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.torque_columns import Columns, columns_of, moved, readable, solved, sums, unphysical
 
-EXTERNAL = "external_force"
 MUCH = 0.3  # of the torque's variance: what a plain fit leaves where something else pushes
 QUIET = 0.3  # of the variance of the quiet torque: what the trimmed fit may leave there to be believed
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
@@ -47,23 +47,14 @@ class Push:
         """As `diagnosis.json` has it."""
         half, unit = 3.0 * self.noise, "N" if self.slide else "N.m"
         count = sum(map(len, self.spans.values()))
-        said = (f"something outside pushes on it in {count} stretch{'es' * (count != 1)} (contact, a person, a cable), {'forwards' if self.torque > 0 else 'backwards'} at its largest; elsewhere its torque fits its body" if self.clear else
-                f"its recorded torque does not fit its body: {100 * self.left:.0f} % of the variance is left, all the time (something outside, or not this joint's torque)")  # fmt: skip
+        said = (f"in {count} stretch{'es' * (count != 1)} of time, {'forwards' if self.torque > 0 else 'backwards'} at its largest; elsewhere the joint's torque fits its body" if self.clear else
+                f"all the time: {100 * self.left:.0f} % of the torque's variance fits no inertia, gravity or friction (or it is not this joint's torque)")  # fmt: skip
         return {
-            "effect": EXTERNAL, "confidence": SURE if self.clear else HINT, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
+            "effect": ExternalForce.id, "confidence": SURE if self.clear else HINT, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
             "where": {"joints": [self.joint], "taxels": [], "topics": []}, "regime": said,
             "when": [{"recording": name, "start": round(a, 3), "end": round(b, 3)} for name, spans in self.spans.items() for a, b in spans],
             "parameters": {"torque": {"value": abs(self.torque), "low": max(abs(self.torque) - half, 0.0), "high": abs(self.torque) + half, "unit": unit}}, "held_out": None,
         }  # fmt: skip
-
-    @property
-    def text(self) -> str:
-        """In a sentence."""
-        unit = "N" if self.slide else "N.m"
-        if not self.clear:
-            return f"The recorded torque of {self.joint} does not fit its body ({100 * self.left:.0f} % of its variance is left): nothing is claimed of that joint. "
-        seconds = sum(b - a for spans in self.spans.values() for a, b in spans)
-        return f"Something outside pushes on {self.joint} for {seconds:.1f} s, with up to {abs(self.torque):.2g} {unit}. "
 
 
 def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:
@@ -185,11 +176,12 @@ def claim(d, pushes: Sequence[Push]) -> None:
     if not pushes:
         return
     from dexsim.gap.effects.catalogue import EFFECTS
+    from dexsim.gap.report.sentence import sentence
 
     joints = {p.joint for p in pushes if not p.cut}
     kept = [f for f in d.data["findings"] if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])]
     d.notes += [f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or its recorded torque is not its own" for f in d.data["findings"] if f not in kept]
     d.data["findings"] = [p.finding() for p in pushes] + kept
-    if not any(f["effect"] in EFFECTS for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
+    if not any(f["held_out"] for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
         d.data["verdict"] = "unknown"
-    d.sentence = "".join(p.text for p in pushes) + d.sentence
+    d.sentence = sentence(d.data, d, d.data["noise_floor"]["position_rad"])
