@@ -270,7 +270,7 @@ def train(
     begun = _start(task, worlds, device, seed, [*settings, *own])
     where = folder.for_run(begun.cfg)
     begun.cfg["out"] = str(where)
-    if training.run(begun) != 0:
+    if training.run(begun, where=where) != 0:
         raise KeyboardInterrupt(f"the training was stopped; {where / 'last.pt'} holds it")
     return where
 

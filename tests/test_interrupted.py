@@ -157,3 +157,16 @@ def test_a_signal_in_play_keeps_what_was_recorded(place, configs, monkeypatch, c
     monkeypatch.setattr(play, "replay", lambda *_: os.kill(os.getpid(), number))
     code = shell.call("play", configs, "policy=zero", "task=dummy", "device=cpu", "record=x.mcap", f"out={place / 'out'}")
     assert code == 128 + number and saved == ["x.mcap"] and "mcap     x.mcap" in capfd.readouterr().out
+
+
+def test_the_python_api_trains_in_the_folder_that_it_claimed(place, monkeypatch):
+    """`dexsim.train` claims the folder before the run does: once, not twice."""
+    import dexsim
+    from dexsim.cli import train as training
+
+    ran = []
+    monkeypatch.setattr(training, "_run", lambda start, make_env, ranks, stop, where: ran.append(where) or 0)
+    where = dexsim.train(worlds=2, iterations=1, device="cpu", out=place / "mine")
+    assert ran == [where] == [place / "mine"]
+    with pytest.raises(UserError, match="already holds a run"):
+        dexsim.train(worlds=2, iterations=1, device="cpu", out=place / "mine")

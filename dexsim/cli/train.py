@@ -31,8 +31,10 @@ TAGS = {
 }
 
 
-def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
+def run(start: Start, make_env: build.MakeEnv | None = None, where: Path | None = None) -> int:
     """Train; returns the exit status: 0, 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP. Raises UserError.
+
+    where: the run's folder, already claimed (:func:`dexsim.cli.folder.for_run`); None: claim one.
 
     Under torchrun this runs in every process (rank): all learn, rank 0 alone prints and writes.
     """
@@ -41,12 +43,14 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if start.source and ranks.leader:
         folder.tidy([Path(start.source).expanduser().parent])
     with ranks.only_leader_prints(), Stop(together=ranks.size > 1) as stop, ranks.joined(start.cfg["device"]):
-        return _run(start, make_env, ranks, stop)
+        return _run(start, make_env, ranks, stop, where)
 
 
-def _run(start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop) -> int:
+def _run(
+    start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop, where: Path | None = None
+) -> int:
     cfg = start.cfg
-    where = Path(ranks.tell(str(folder.for_run(cfg)) if ranks.leader else None))
+    where = Path(ranks.tell(str(where or folder.for_run(cfg)) if ranks.leader else None))
     if ranks.leader:
         folder.write_config(where, cfg)
     ranks.on_loss("")
