@@ -1,12 +1,17 @@
-"""sim.collision=hand beside sim.collision=mujoco, in one process on one device: start, physics, full step, profile, play.
+"""sim.collision=hand beside sim.collision=mujoco, in one process on one device: start, physics, full step, profile,
+play.
 
-    python -m benchmarks.collision [out=out/collision.json] [worlds=8192] [steps=40] [rounds=3] [episodes=512] [limit_s=330]
+    python -m benchmarks.collision [out=out/collision.json] [worlds=8192] [steps=40] [rounds=3] [episodes=512]
+    [limit_s=330]
                                    [parts=measure,variants,play,exact] [any setting of train.py]
 
-The grasp of benchmarks.step is made once, with `hand`, and handed to the other setting, so that both step the same worlds.
-  start     seconds until the first control steps are done, and the modules compiled until then (with an empty kernel cache: a
+The grasp of benchmarks.step is made once, with `hand`, and handed to the other setting, so that both step the same
+worlds.
+  start     seconds until the first control steps are done, and the modules compiled until then (with an empty kernel
+  cache: a
             cold start); what the other setting compiles in addition is listed beside it
-  measure   for both settings: times as benchmarks.step, stages as benchmarks.trace, microseconds of each kernel of one physics
+  measure   for both settings: times as benchmarks.step, stages as benchmarks.trace, microseconds of each kernel of one
+  physics
             step launched one by one, Newton iterations, contacts, pairs tested and overlapping
   variants  bare physics under other launch sizes and solver options, one at a time, with `hand`
   play      metrics of checkpoints/grasp.pt and rotate.pt under both
@@ -66,16 +71,33 @@ def compiled() -> Iterator[list[tuple[str, float]]]:
 
 class Run:
     def __init__(self, argv: list[str]):
-        own, rest = tools.split(argv, {"out": "out/collision.json", "steps": "40", "rounds": "3", "episodes": "512", "limit_s": "330",
-                                       "parts": ",".join(PARTS), "poses": "20000"})
+        own, rest = tools.split(
+            argv,
+            {
+                "out": "out/collision.json",
+                "steps": "40",
+                "rounds": "3",
+                "episodes": "512",
+                "limit_s": "330",
+                "parts": ",".join(PARTS),
+                "poses": "20000",
+            },
+        )
         self.begin, self.limit = time.perf_counter(), float(own["limit_s"])
-        self.steps, self.rounds, self.episodes, self.poses = (tools.numbers(own[k], k)[0] for k in ("steps", "rounds", "episodes", "poses"))
+        self.steps, self.rounds, self.episodes, self.poses = (
+            tools.numbers(own[k], k)[0] for k in ("steps", "rounds", "episodes", "poses")
+        )
         self.parts = own["parts"].split(",")
         self.path = Path(own["out"])
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.cfg = tools.config([*rest, "sim.engine=warp"])
         self.device = self.cfg["device"]
-        self.out: dict[str, Any] = {"benchmark": "collision", **tools.about(self.device), "worlds": self.cfg["worlds"], "left_out": []}
+        self.out: dict[str, Any] = {
+            "benchmark": "collision",
+            **tools.about(self.device),
+            "worlds": self.cfg["worlds"],
+            "left_out": [],
+        }
         self.envs: dict[str, Any] = {}
 
     def part(self, name: str, call: Callable[[], Any], need_s: float = 0.0) -> None:
@@ -88,7 +110,10 @@ class Run:
                 self.out[name] = call()
             except Exception as error:  # one part's trouble must not cost the others' figures
                 self.out[name] = {"error": f"{type(error).__name__}: {error}"}
-            print(f"  {name:24s}{time.perf_counter() - self.begin - spent:7.1f} s  {json.dumps(self.out[name])[:160]}", flush=True)
+            print(
+                f"  {name:24s}{time.perf_counter() - self.begin - spent:7.1f} s  {json.dumps(self.out[name])[:160]}",
+                flush=True,
+            )
         self.out["total_s"] = round(time.perf_counter() - self.begin, 1)
         self.path.write_text(json.dumps(self.out, indent=1) + "\n")
 
@@ -108,7 +133,8 @@ class Run:
             for _ in range(3):
                 env.step(torch.zeros(env.num_envs, env.num_actions, device=self.device))
             tools.wait(self.device)
-        return {"make_s": made - begin, "steps_s": time.perf_counter() - made, "modules": len(built), "compile_s": sum(s for _, s in built),
+        return {"make_s": made - begin, "steps_s": time.perf_counter() - made, "modules": len(built),
+                "compile_s": sum(s for _, s in built),
                 "longest": sorted(built, key=lambda x: -x[1])[:12]}  # fmt: skip
 
     def grasp(self) -> dict:
@@ -126,7 +152,8 @@ class Run:
         times = step_benchmark.measure(env, self.steps, self.rounds)
         bare, driven, touched, full = (1e3 * statistics.median(t) for t in times.values())
         return {"bare_ms": bare, "servo_ms": driven, "touch_ms": touched, "full_ms": full, "overhead": full / bare - 1,
-                "env_steps_per_s": 1e3 * env.num_envs / full, "physics_steps_per_s": 1e3 * env.num_envs * env.decimation / bare,
+                "env_steps_per_s": 1e3 * env.num_envs / full,
+                "physics_steps_per_s": 1e3 * env.num_envs * env.decimation / bare,
                 "rounds_ms": {k: [round(1e3 * x, 3) for x in t] for k, t in times.items()}}  # fmt: skip
 
     def stages(self, setting: str) -> dict:
@@ -141,9 +168,11 @@ class Run:
         narrow = env.engine.narrow
         return {"us": found, "contacts": n / env.num_envs, "pairs": int(d.ncollision.numpy()[0]) / env.num_envs,
                 "overlapping": int(narrow.deep_number.numpy()[0]) / env.num_envs if narrow is not None else None,
-                "rows_mean_p99_max": trace._spread(d.nefc.numpy()), "newton_mean_p99_max": trace._spread(d.solver_niter.numpy()),
+                "rows_mean_p99_max": trace._spread(d.nefc.numpy()),
+                "newton_mean_p99_max": trace._spread(d.solver_niter.numpy()),
                 "newton_histogram": np.bincount(d.solver_niter.numpy()).tolist(),
-                "by_types": {f"{a}-{b}": round(int(c) / env.num_envs, 3) for (a, b), c in zip(pairs, counts, strict=True)}}  # fmt: skip
+                "by_types": {f"{a}-{b}": round(int(c) / env.num_envs, 3) for (a, b),
+                             c in zip(pairs, counts, strict=True)}}  # fmt: skip
 
     def kernels(self, setting: str) -> dict:
         """Microseconds of each kernel of a physics step, and how often it is launched; means of five steps."""
@@ -166,7 +195,11 @@ class Run:
             entry[0] += 1e3 * r.elapsed / 5
             entry[1] += 1
         rows = sorted(((k, round(us, 1), n / 5) for k, (us, n) in sums.items()), key=lambda row: -row[1])
-        return {"total_us": round(sum(us for _, us, _ in rows), 1), "launches": sum(n for *_, n in rows), "kernels": rows[:45]}
+        return {
+            "total_us": round(sum(us for _, us, _ in rows), 1),
+            "launches": sum(n for *_, n in rows),
+            "kernels": rows[:45],
+        }
 
     def bare(self, env: Any, steps: int = 20) -> float:
         """Milliseconds a control step of bare physics from the grasp, recorded anew."""
@@ -188,8 +221,16 @@ class Run:
         dims = m.block_dim
         out = {"as it is": self.bare(env)}
         trials = [(narrow, "block_dim", x) for x in (32, 64, 256)] if narrow is not None else []
-        trials += [(dims, name, x) for name, values in (("update_gradient_JTDAJ_dense", (32, 64, 256)), ("update_gradient_cholesky", (32, 128)),
-                                                        ("linesearch_iterative", (64,)), ("contact_jac_tiled", (64,))) for x in values]
+        trials += [
+            (dims, name, x)
+            for name, values in (
+                ("update_gradient_JTDAJ_dense", (32, 64, 256)),
+                ("update_gradient_cholesky", (32, 128)),
+                ("linesearch_iterative", (64,)),
+                ("contact_jac_tiled", (64,)),
+            )
+            for x in values
+        ]
         trials += [(m.opt, "iterations", x) for x in (4, 6)] + [(m.opt, "ls_iterations", 10)]
         for owner, name, value in trials:
             if time.perf_counter() - self.begin > self.limit:
@@ -211,15 +252,27 @@ class Run:
             spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
 
         with edited(edit), compiled() as built:
-            env = make_env({**self.cfg, "sim": {**self.cfg["sim"], "collision": "hand"}}, self.cfg["worlds"], self.device, 0, "warp")
+            env = make_env(
+                {**self.cfg, "sim": {**self.cfg["sim"], "collision": "hand"}},
+                self.cfg["worlds"],
+                self.device,
+                0,
+                "warp",
+            )
             out = {"bare_ms": self.bare(env)}
         self.envs["sparse"] = env
         return out | {"compile_s": sum(s for _, s in built), "kernels": self.kernels("sparse")}
 
     def play(self, task: str, setting: str) -> dict:
         worlds = min(self.episodes, 2048)
-        argv = [f"checkpoint={tools.ROOT / 'checkpoints' / task}.pt", f"device={self.device}", f"episodes={self.episodes}", f"worlds={worlds}",
-                "sim.engine=warp", *(["task.evaluation.cap_s=30"] if task == "rotate" else [])]
+        argv = [
+            f"checkpoint={tools.ROOT / 'checkpoints' / task}.pt",
+            f"device={self.device}",
+            f"episodes={self.episodes}",
+            f"worlds={worlds}",
+            "sim.engine=warp",
+            *(["task.evaluation.cap_s=30"] if task == "rotate" else []),
+        ]
         begun = start_up.for_play(argv, CONFIGS)
         cfg = {**begun.cfg, "sim": {**begun.cfg["sim"], "collision": setting}}
         env = make_env(cfg, cfg["worlds"], self.device, cfg["seed"], "warp")
@@ -249,7 +302,11 @@ def main(argv: list[str]) -> dict:
                 run.part(f"play {task} {setting}", lambda task=task, setting=setting: run.play(task, setting), 15)
     if "exact" in run.parts:
         for kind in narrow_phase.KINDS:
-            run.part(f"exact {kind}", lambda kind=kind: narrow_phase.kind_of_pair(kind, run.poses, run.device, min(run.poses, 8192)), 8)
+            run.part(
+                f"exact {kind}",
+                lambda kind=kind: narrow_phase.kind_of_pair(kind, run.poses, run.device, min(run.poses, 8192)),
+                8,
+            )
     if "variants" in run.parts:
         run.part("variants", run.variants, 10)
         run.part("sparse", run.sparse, 30)

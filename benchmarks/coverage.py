@@ -1,18 +1,20 @@
-"""Do the touch signals met in training envelop those met elsewhere? Contact force F_i and contact centre mu_i, finger by finger.
+"""Do the touch signals met in training envelop those met elsewhere? Contact force F_i and contact centre mu_i, finger
+by finger.
 
-    python -m benchmarks.coverage checkpoint=checkpoints/rotate.pt reality=bench [worlds=48] [seconds=20] [other_worlds=48] [other_seconds=20]
+    python -m benchmarks.coverage checkpoint=checkpoints/rotate.pt reality=bench [worlds=48] [seconds=20]
+    [other_worlds=48] [other_seconds=20]
                                   [out=out/coverage]
     python -m benchmarks.coverage checkpoint=checkpoints/rotate.pt recording=hand.mcap [meta.KEY=VALUE]
 
 The policy plays with the physics and ranges of its training, then in the other world, or the other side is a recording.
-F_i is a pad's summed normal force, mu_i the force-weighted mean of its taxels' positions, here in the pad's own plane; both as
-measured, while F_i exceeds CONTACT. Training's region: for F_i the middle 99.8 % of its samples; for mu_i the cells of CELL
-that hold at least SHARE of them. A finger's figure is the share of the other side's samples within that region (100 %:
-enveloped), and the share of the region that the other side visits; in brackets the 95 % bootstrap over the other side's worlds (of
-a recording: its seconds), the region taken as found. Beside it what training's own samples score, one half of its worlds in the
-region of the other half: much less than 100 % says that the finger touched too seldom for its region to be known. A finger that
-touches seldom needs more worlds and seconds (on a GPU: device=cuda; the other world runs on the CPU all the same).
-Writes coverage.png and coverage.json; prints one JSON line.
+F_i is a pad's summed normal force, mu_i the force-weighted mean of its taxels' positions, here in the pad's own plane;
+both as measured, while F_i exceeds CONTACT. Training's region: for F_i the middle 99.8 % of its samples; for mu_i the
+cells of CELL that hold at least SHARE of them. A finger's figure is the share of the other side's samples within that
+region (100 %: enveloped), and the share of the region that the other side visits; in brackets the 95 % bootstrap over
+the other side's worlds (of a recording: its seconds), the region taken as found. Beside it what training's own samples
+score, one half of its worlds in the region of the other half: much less than 100 % says that the finger touched too
+seldom for its region to be known. A finger that touches seldom needs more worlds and seconds (on a GPU: device=cuda;
+the other world runs on the CPU all the same). Writes coverage.png and coverage.json; prints one JSON line.
 """
 
 from __future__ import annotations
@@ -39,13 +41,14 @@ SHARE = 2e-4  # of training's samples in a cell that counts as visited
 TAILS = (0.1, 99.9)  # percentiles of F_i
 FEWEST = (200, 20)  # samples of training and of the other side, to say anything
 RESAMPLES = 1000
-OWN = {"checkpoint": "", "reality": "null", "recording": "null", "worlds": "48", "seconds": "20", "other_worlds": "null", "other_seconds": "null",
+OWN = {"checkpoint": "", "reality": "null", "recording": "null", "worlds": "48", "seconds": "20",
+       "other_worlds": "null", "other_seconds": "null",
        "seed": "0", "out": "out/coverage"}  # fmt: skip
 
 
 class Contacts(NamedTuple):
-    """One finger's samples in contact: force [T] N, centre [T, 2] m in the pad's plane, block [T] (world, or second of a recording:
-    samples of one are not independent)."""
+    """One finger's samples in contact: force [T] N, centre [T, 2] m in the pad's plane, block [T] (world, or second of
+    a recording: samples of one are not independent)."""
 
     force: np.ndarray
     centre: np.ndarray
@@ -155,7 +158,8 @@ def interval(within: np.ndarray, block: np.ndarray, rng: np.random.Generator) ->
 
 
 def halves(ours: Contacts, rng: np.random.Generator) -> tuple[float, float] | None:
-    """Shares (force, centre) of one half of the blocks within the region of the other half, both ways; None where one is empty."""
+    """Shares (force, centre) of one half of the blocks within the region of the other half, both ways; None where one
+    is empty."""
     blocks = rng.permutation(np.unique(ours.block))
     first = np.isin(ours.block, blocks[: len(blocks) // 2])
     if first.all() or not first.any():
@@ -175,8 +179,10 @@ def envelope(ours: Contacts, theirs: Contacts) -> dict[str, Any]:
     force, centre = region.holds(theirs)
     own = halves(ours, rng) or (None, None)
     return out | {
-        "force_covered": float(force.mean()), "force_interval": interval(force, theirs.block, rng), "force_training_halves": own[0],
-        "centre_covered": float(centre.mean()), "centre_interval": interval(centre, theirs.block, rng), "centre_training_halves": own[1],
+        "force_covered": float(force.mean()), "force_interval": interval(force, theirs.block, rng),
+        "force_training_halves": own[0],
+        "centre_covered": float(centre.mean()), "centre_interval": interval(centre, theirs.block, rng),
+        "centre_training_halves": own[1],
         "region_visited": region.visited(theirs), "force_high_training_N": float(region.high),
         "force_high_other_N": float(np.percentile(theirs.force, TAILS[1])),
     }  # fmt: skip
@@ -198,7 +204,11 @@ def draw(ours: list, theirs: list, label: str, found: dict, path: Path) -> None:
             if len(force):
                 bottom.hist(force, bins=np.linspace(0, 15, 60), density=True, color=color, alpha=0.6, label=name)
         say = found[finger]
-        covered = "too few contacts" if say["force_covered"] is None else f"mu {100 * say['centre_covered']:.1f} %, F {100 * say['force_covered']:.1f} %"
+        covered = (
+            "too few contacts"
+            if say["force_covered"] is None
+            else f"mu {100 * say['centre_covered']:.1f} %, F {100 * say['force_covered']:.1f} %"
+        )
         top.set_title(f"{finger}: {covered}", fontsize=9)
         top.set_aspect("equal")
         top.set_xlabel("mm", fontsize=8)
@@ -220,8 +230,10 @@ def main(argv: list[str]) -> int:
     try:
         seconds, other_seconds, seed = float(own["seconds"]), float(own["other_seconds"]), int(own["seed"])
     except ValueError:
-        raise UserError(f"seconds={own['seconds']} other_seconds={own['other_seconds']} seed={own['seed']}: "
-                        "must be numbers, the seed a whole one") from None
+        raise UserError(
+            f"seconds={own['seconds']} other_seconds={own['other_seconds']} seed={own['seed']}: "
+            "must be numbers, the seed a whole one"
+        ) from None
     for key, value in (("seconds", seconds), ("other_seconds", other_seconds)):
         if not 0.1 <= value <= 1e5:
             raise UserError(f"{key}={value:g}: must lie in [0.1, 100000]")
@@ -242,15 +254,23 @@ def main(argv: list[str]) -> int:
         if e[f"{name}_covered"] is None:
             return "-"
         ends = e[f"{name}_interval"]
-        return f"{100 * e[f'{name}_covered']:.1f}" + ("" if ends is None else f" ({100 * ends[0]:.1f}-{100 * ends[1]:.1f})") + " %"
+        return (
+            f"{100 * e[f'{name}_covered']:.1f}"
+            + ("" if ends is None else f" ({100 * ends[0]:.1f}-{100 * ends[1]:.1f})")
+            + " %"
+        )
 
     def share(v: float | None) -> str:
         return "-" if v is None else f"{100 * v:.1f} %"
 
-    print(f"{'finger':8}{'F within (95 %)':>24}{'mu within (95 %)':>24}{'mu, own halves':>16}{'region visited':>16}{'samples':>18}   (training | {label})")
+    print(
+        f"{'finger':8}{'F within (95 %)':>24}{'mu within (95 %)':>24}{'mu, own halves':>16}{'region visited':>16}{'samples':>18}   (training | {label})"
+    )
     for finger, e in found.items():
-        print(f"{finger:8}{say(e, 'force'):>24}{say(e, 'centre'):>24}{share(e.get('centre_training_halves')):>16}{share(e['region_visited']):>16}"
-              f"{e['samples_training']:>10}|{e['samples_other']}")
+        print(
+            f"{finger:8}{say(e, 'force'):>24}{say(e, 'centre'):>24}{share(e.get('centre_training_halves')):>16}{share(e['region_visited']):>16}"
+            f"{e['samples_training']:>10}|{e['samples_other']}"
+        )
     result = {"benchmark": "coverage", "other": label, "fingers": found, "plot": str(out / "coverage.png")}
     (out / "coverage.json").write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result))

@@ -1,9 +1,11 @@
-"""How long a diagnosis takes, and on what: python -m benchmarks.diagnose [joints=12] [seconds=60] [device=cpu] [hidden=true] [replay=mujoco].
+"""How long a diagnosis takes, and on what: python -m benchmarks.diagnose [joints=12] [seconds=60] [device=cpu]
+[hidden=true] [replay=mujoco].
 
-Recordings of the xHand are made in simulation (C MuJoCo, sampled as the hardware samples) with one hidden effect, read back and
-diagnosed with the whole catalogue. Kernels are compiled before the clock starts. One JSON line at the end. With several devices
-(device=cuda,cuda,cpu) the same recordings are diagnosed on one after the other, a JSON line each, and one that says whether the
-answers agree: the same effects on the same joints, and the size of each inside the other's interval.
+Recordings of the xHand are made in simulation (C MuJoCo, sampled as the hardware samples) with one hidden effect, read
+back and diagnosed with the whole catalogue. Kernels are compiled before the clock starts. One JSON line at the end.
+With several devices (device=cuda,cuda,cpu) the same recordings are diagnosed on one after the other, a JSON line each,
+and one that says whether the answers agree: the same effects on the same joints, and the size of each inside the
+other's interval.
 """
 
 from __future__ import annotations
@@ -21,7 +23,17 @@ import numpy as np
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
-DEFAULTS = {"joints": "12", "seconds": "60", "device": "cpu", "hidden": "true", "recordings": "4", "seed": "0", "next": "false", "replay": "mujoco", "out": ""}
+DEFAULTS = {
+    "joints": "12",
+    "seconds": "60",
+    "device": "cpu",
+    "hidden": "true",
+    "recordings": "4",
+    "seed": "0",
+    "next": "false",
+    "replay": "mujoco",
+    "out": "",
+}
 
 
 def settings(argv: list[str]) -> dict[str, str]:
@@ -30,7 +42,9 @@ def settings(argv: list[str]) -> dict[str, str]:
     for a in argv:
         key, equals, value = a.partition("=")
         if not equals or key not in out:
-            raise UserError(f"'{a}' is not a setting of this benchmark: {', '.join(f'{k}={v}' for k, v in DEFAULTS.items())}")
+            raise UserError(
+                f"'{a}' is not a setting of this benchmark: {', '.join(f'{k}={v}' for k, v in DEFAULTS.items())}"
+            )
         out[key] = value
     for key in ("joints", "recordings", "seed"):
         if not out[key].isdigit():
@@ -39,7 +53,8 @@ def settings(argv: list[str]) -> dict[str, str]:
 
 
 def make(folder: Path, count: int, seconds: float, recordings: int, hidden: bool, seed: int) -> tuple[list[Path], str]:
-    """`recordings` recordings of `count` joints, `seconds` in all; returns their paths and the joint that hides something."""
+    """`recordings` recordings of `count` joints, `seconds` in all; returns their paths and the joint that hides
+    something."""
     from dexsim.assets import xhand
     from dexsim.recording import write
     from dexsim.recording.mechanism import drive, mechanism, recorded
@@ -98,7 +113,12 @@ def disagreements(a: dict, b: dict) -> list[str]:
                 if q is None or q["value"] != p["value"]:
                     out.append(f"{' '.join(name)} {key}: {p['value']}, {q and q['value']}")
                 continue
-            inside = [np.all((np.asarray(x["low"]) <= np.asarray(y["value"])) & (np.asarray(y["value"]) <= np.asarray(x["high"]))) for x, y in ((p, q), (q, p))]
+            inside = [
+                np.all(
+                    (np.asarray(x["low"]) <= np.asarray(y["value"])) & (np.asarray(y["value"]) <= np.asarray(x["high"]))
+                )
+                for x, y in ((p, q), (q, p))
+            ]
             if not all(inside):
                 out.append(f"{' '.join(name)} {key}: {p['value']}, {q['value']}")
     h, g = a["held_out"], b["held_out"]
@@ -126,16 +146,41 @@ def main(argv: list[str]) -> int:
         folder = Path(s["out"] or scratch)
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
-        paths, where = make(folder, int(s["joints"]), float(s["seconds"]), int(s["recordings"]), s["hidden"] == "true", int(s["seed"]))
+        paths, where = make(
+            folder, int(s["joints"]), float(s["seconds"]), int(s["recordings"]), s["hidden"] == "true", int(s["seed"])
+        )
         print(f"recordings made in {time.perf_counter() - start:.1f} s", flush=True)
         small, model, servo, _ = demo.make(folder / "warm", seconds=2.0)
         for device in dict.fromkeys(devices):  # compiles what is compiled once
             start = time.perf_counter()
-            diagnose(Settings(small[:2], folder / "warm", None, str(model), str(servo), device=device, next_recording=False, allowed={"lag"}, replay=s["replay"]), say=lambda _: None)
+            diagnose(
+                Settings(
+                    small[:2],
+                    folder / "warm",
+                    None,
+                    str(model),
+                    str(servo),
+                    device=device,
+                    next_recording=False,
+                    allowed={"lag"},
+                    replay=s["replay"],
+                ),
+                say=lambda _: None,
+            )
             print(f"{device}: kernels ready in {time.perf_counter() - start:.1f} s", flush=True)
         for k, device in enumerate(devices):
             start = time.perf_counter()
-            d = diagnose(Settings(paths, folder / f"out{k}", None, device=device, next_recording=s["next"] == "true", replay=s["replay"]), say=lambda text: print(text, flush=True))
+            d = diagnose(
+                Settings(
+                    paths,
+                    folder / f"out{k}",
+                    None,
+                    device=device,
+                    next_recording=s["next"] == "true",
+                    replay=s["replay"],
+                ),
+                say=lambda text: print(text, flush=True),
+            )
             save(d, folder / f"out{k}")
             took = time.perf_counter() - start
             total = sum(d.shares.values())
@@ -143,15 +188,20 @@ def main(argv: list[str]) -> int:
                 print(f"{stage:<28}{seconds:8.2f} s {100 * seconds / total:6.1f} %")
             found = [(f["effect"], f["where"]["joints"], f["confidence"]) for f in d.data["findings"]]
             print(json.dumps({
-                "benchmark": "diagnose", "joints": int(s["joints"]), "recorded_s": float(s["seconds"]), "device": device, "seconds": round(took, 2),
-                "shares": {k: round(v / total, 4) for k, v in d.shares.items()}, "verdict": d.data["verdict"], "found": found,
-                "hidden": ["coulomb_friction", where] if s["hidden"] == "true" else None, "cpu": platform.processor() or platform.machine(), "cores": cores(),
+                "benchmark": "diagnose", "joints": int(s["joints"]), "recorded_s": float(s["seconds"]),
+                "device": device, "seconds": round(took, 2),
+                "shares": {k: round(v / total, 4) for k, v in d.shares.items()}, "verdict": d.data["verdict"],
+                "found": found,
+                "hidden": ["coulomb_friction", where] if s["hidden"] == "true" else None,
+                "cpu": platform.processor() or platform.machine(), "cores": cores(),
             }), flush=True)  # fmt: skip
             answers.append({"device": device, "seconds": took, "data": d.data})
     if len(answers) > 1:
-        print(json.dumps({"benchmark": "diagnose", "compared": [a["device"] for a in answers], "seconds": [round(a["seconds"], 2) for a in answers],
+        print(json.dumps({"benchmark": "diagnose", "compared": [a["device"] for a in answers],
+                          "seconds": [round(a["seconds"], 2) for a in answers],
                           "of_the_last": [round(a["seconds"] / answers[-1]["seconds"], 3) for a in answers],
-                          "agree": [disagreements(a["data"], answers[-1]["data"]) or True for a in answers[:-1]]}))  # fmt: skip
+                          "agree": [disagreements(a["data"],
+                                                  answers[-1]["data"]) or True for a in answers[:-1]]}))  # fmt: skip
     return 0
 
 

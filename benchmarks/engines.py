@@ -3,10 +3,11 @@
     python -m benchmarks.engines [worlds=64,128] [seconds=30] [any other setting of train.py]
 
 Same scene, same worlds, same actions: each engine is driven into a closed grasp, then timed in turns, a block of bare
-physics (torques frozen) and a block of full control steps (servo, touch, rewards, resets, observations) at a time, so that
-what else runs on the machine meets both alike; medians over blocks, of two clocks: the wall's, and the processor time of
-this process (all its threads), which other programs hardly touch. C MuJoCo steps on all cores, MuJoCo-Warp's CPU backend
-and torch on one: on an idle machine its physics gains by the wall clock as many times more as there are cores.
+physics (torques frozen) and a block of full control steps (servo, touch, rewards, resets, observations) at a time, so
+that what else runs on the machine meets both alike; medians over blocks, of two clocks: the wall's, and the processor
+time of this process (all its threads), which other programs hardly touch. C MuJoCo steps on all cores, MuJoCo-Warp's
+CPU backend and torch on one: on an idle machine its physics gains by the wall clock as many times more as there are
+cores.
 Aim: C MuJoCo at least 8 times as fast in physics and 5 times in the full step.
 """
 
@@ -77,7 +78,8 @@ def main(argv: list[str]) -> dict:
     cfg = tools.config([*rest, "device=cpu"])
     out: dict = {"benchmark": "engines", **tools.about("cpu"), "load": tools.load()}
     rows = [measure({**cfg, "worlds": n}, seconds) for n in counts]
-    print(f"  {'worlds':>6s} {'':8s} {'C MuJoCo':>12s} {'Warp':>10s} {'ratio':>7s}   {'by processor time':>24s} {'ratio':>7s}")
+    print(f"  {'worlds':>6s} {'':8s} {'C MuJoCo':>12s} {'Warp':>10s} {'ratio':>7s}   {'by processor time':>24s}"
+          f" {'ratio':>7s}")
     for row in rows:
         for part, what in (("physics", "physics"), ("env", "full")):
             w, c = (tuple(row[f"{n}_{part}_per_{clock}_s"] for n in ENGINES) for clock in ("wall", "cpu"))

@@ -177,9 +177,11 @@ def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, v
     bare = _timed(_runner(bare_env, cfg, actor), bare_env, iterations)
     steps = worlds * length
     row = {
-        "worlds": worlds, "steps_per_s": steps / full["all"], "bare_steps_per_s": steps / bare["all"], "ratio": bare["all"] / full["all"],
+        "worlds": worlds, "steps_per_s": steps / full["all"], "bare_steps_per_s": steps / bare["all"],
+        "ratio": bare["all"] / full["all"],
         "iteration_s": full["all"], "physics_s": bare["step"], "rest_of_step_s": full["step"] - bare["step"],
-        "inference_s": full["all"] - full["step"] - full["update"], "update_s": full["update"], "env_steps_per_s": steps / full["step"],
+        "inference_s": full["all"] - full["step"] - full["update"], "update_s": full["update"],
+        "env_steps_per_s": steps / full["step"],
         "contacts": env.engine.peaks()["contacts"], "bare": bare,
     }  # fmt: skip
     for name, changes in variants.items():
@@ -193,9 +195,16 @@ def measure(cfg: dict, worlds: int, iterations: int, settle: int, actor: dict, v
 
 def main(argv: list[str]) -> dict:
     cuda = torch.cuda.is_available() and "device=cpu" not in argv
-    own, rest = tools.split(argv, {
-        "worlds": "4096,8192,16384,32768" if cuda else "64,128", "iterations": "6" if cuda else "3",
-        "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"), "settle": "120" if cuda else "40", "variants": "false"})
+    own, rest = tools.split(
+        argv,
+        {
+            "worlds": "4096,8192,16384,32768" if cuda else "64,128",
+            "iterations": "6" if cuda else "3",
+            "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"),
+            "settle": "120" if cuda else "40",
+            "variants": "false",
+        },
+    )
     cfg = tools.config(rest)
     data = checkpoint.load(own["policy"], cfg["device"])
     variants = VARIANTS if own["variants"] == "true" else {}
@@ -205,10 +214,17 @@ def main(argv: list[str]) -> dict:
         row = measure(cfg, worlds, iterations, settle, data["actor"], variants)
         out["rows"].append(row)
         share = {k: row[f"{k}_s"] / row["iteration_s"] for k in ("physics", "rest_of_step", "inference", "update")}
-        print(f"  {worlds:6d} worlds  {row['steps_per_s']:9.0f} steps/s with PPO, {row['ratio']:.3f} of bare physics + PPO "
-              f"({row['bare_steps_per_s']:.0f}); " + ", ".join(f"{k} {100 * v:.1f} %" for k, v in share.items()), flush=True)
+        print(
+            f"  {worlds:6d} worlds  {row['steps_per_s']:9.0f} steps/s with PPO, {row['ratio']:.3f} of bare physics +"
+            " PPO "
+            f"({row['bare_steps_per_s']:.0f}); " + ", ".join(f"{k} {100 * v:.1f} %" for k, v in share.items()),
+            flush=True,
+        )
         for name in variants:
-            said = row.get(f"{name}_failed") or f"{row[f'{name}_steps_per_s']:.0f} steps/s, update {row[f'{name}_update_s']:.3f} s"
+            said = (
+                row.get(f"{name}_failed")
+                or f"{row[f'{name}_steps_per_s']:.0f} steps/s, update {row[f'{name}_update_s']:.3f} s"
+            )
             print(f"         {name}: {said}", flush=True)
         gc.collect()
         if cfg["device"].startswith("cuda"):

@@ -1,14 +1,16 @@
 """Training on 1, 2, 4 and 8 GPUs of one machine: weak scaling, and the time to the same share of held episodes.
 
-    python -m benchmarks.multi_gpu [gpus=1,2,4,8] [learn_s=120] [until=0.97] [seconds=600] [fixed=false] [parallel=false] [out=FOLDER]
+    python -m benchmarks.multi_gpu [gpus=1,2,4,8] [learn_s=120] [until=0.97] [seconds=600] [fixed=false]
+    [parallel=false] [out=FOLDER]
                                    [any setting of train.py]
 
-Every count is one run of train.py under torchrun, with `worlds` for each GPU (8,192 unless told otherwise), for `learn_s` seconds of
-learning or until the share of held episodes has reached `until`. The share is of episodes that ended in the last ten iterations:
-those that lasted to the time limit. Rates are medians over iterations, the first five left out; efficiency is the rate of a GPU over that
-of the smallest count. `fixed=true` adds the largest count with the same number of worlds in all as one GPU has. `parallel=true` runs
-counts side by side where the GPUs suffice. On a CPU (`device=cpu`) counts are processes: a rehearsal. Written: multi_gpu.json (after each run),
-multi_gpu.png, and each run's progress.csv; the last line printed is the JSON without the curves.
+Every count is one run of train.py under torchrun, with `worlds` for each GPU (8,192 unless told otherwise), for
+`learn_s` seconds of learning or until the share of held episodes has reached `until`. The share is of episodes that
+ended in the last ten iterations: those that lasted to the time limit. Rates are medians over iterations, the first five
+left out; efficiency is the rate of a GPU over that of the smallest count. `fixed=true` adds the largest count with the
+same number of worlds in all as one GPU has. `parallel=true` runs counts side by side where the GPUs suffice. On a CPU
+(`device=cpu`) counts are processes: a rehearsal. Written: multi_gpu.json (after each run), multi_gpu.png, and each
+run's progress.csv; the last line printed is the JSON without the curves.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[1]
-DEFAULTS = {"gpus": "1,2,4,8", "learn_s": "120", "until": "0.97", "seconds": "600", "fixed": "false", "parallel": "false", "out": "out/multi_gpu"}
+DEFAULTS = {"gpus": "1,2,4,8", "learn_s": "120", "until": "0.97", "seconds": "600", "fixed": "false",
+            "parallel": "false", "out": "out/multi_gpu"}
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.925, 0.95, 0.96, 0.97)
 WINDOW = 10  # iterations that the share of held episodes is taken over
 SKIPPED = 5  # iterations left out of the rates: kernels load, graphs are recorded
@@ -42,14 +45,16 @@ class Job:
     def __init__(self, name: str, devices: list[str], settings: list[str], out: Path) -> None:
         self.name, self.count, self.folder = name, len(devices), out / name
         shutil.rmtree(self.folder, ignore_errors=True)
-        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={self.count}"] if self.count > 1 else [sys.executable]
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone",
+                   f"--nproc_per_node={self.count}"] if self.count > 1 else [sys.executable]
         settings = [*settings, "iterations=1000000", "save_interval=1000000", "final_episodes=0", f"out={self.folder}"]
         env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         if not any(s == "device=cpu" for s in settings):
             env["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
         self._log = open(out / f"{name}.log", "w")
         self.began = time.perf_counter()
-        self.process = subprocess.Popen([*command, str(ROOT / "train.py"), *settings], env=env, stdout=self._log, stderr=subprocess.STDOUT)
+        self.process = subprocess.Popen([*command, str(ROOT / "train.py"), *settings], env=env, stdout=self._log,
+                                        stderr=subprocess.STDOUT)
         self.first_row_s: float | None = None
         self.stopped = False
 
@@ -77,7 +82,8 @@ class Job:
         """Rates and times of a run that has ended."""
         self._log.close()
         rows = self.rows()
-        found = {"name": self.name, "gpus": self.count, "iterations": len(rows), "status": self.process.returncode, "start_s": self.first_row_s}
+        found = {"name": self.name, "gpus": self.count, "iterations": len(rows), "status": self.process.returncode,
+                 "start_s": self.first_row_s}
         if len(rows) <= SKIPPED:
             return found | {"error": "too few iterations: see its log"}
         times = series(rows)
@@ -86,28 +92,34 @@ class Job:
         for level in LEVELS:
             hit = np.flatnonzero(times["share"] >= level)
             if len(hit):
-                reached[str(level)] = {"learn_s": float(times["time_s"][hit[0]]), "steps": float(times["steps"][hit[0]]), "iterations": int(hit[0]) + 1}
+                reached[str(level)] = {"learn_s": float(times["time_s"][hit[0]]),
+                                       "steps": float(times["steps"][hit[0]]), "iterations": int(hit[0]) + 1}
         keep = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), 300)).astype(int))
         return found | {
             "steps_per_s": float(np.median([float(r["rate"]) for r in late])),
-            "collect_s": float(np.median([float(r["collect_s"]) for r in late])), "learn_s": float(np.median([float(r["learn_s"]) for r in late])),
+            "collect_s": float(np.median([float(r["collect_s"]) for r in late])),
+            "learn_s": float(np.median([float(r["learn_s"]) for r in late])),
             "reached": reached, "curve": {k: [round(float(x), 4) for x in v[keep]] for k, v in times.items()},
         }
 
 
 def series(rows: list[dict[str, str]]) -> dict[str, np.ndarray]:
-    """By iteration: seconds of learning, steps, share of held episodes among those that ended in the last WINDOW iterations."""
+    """By iteration: seconds of learning, steps, share of held episodes among those that ended in the last WINDOW
+    iterations."""
     def column(name: str) -> np.ndarray:
         return np.array([float(r.get(name) or 0.0) for r in rows])
 
-    kept, ended = column("end/time_out"), sum((column(k) for k in (rows[0] if rows else ()) if k.startswith("end/")), np.zeros(len(rows)))
+    kept, ended = column("end/time_out"), sum((column(k) for k in (rows[0] if rows else ()) if k.startswith("end/")),
+                                              np.zeros(len(rows)))
     window = np.ones(WINDOW)
     kept, ended = (np.convolve(x, window)[: len(rows)] if len(rows) else x for x in (kept, ended))
     share = np.where((ended > 0) & (np.arange(len(rows)) >= WINDOW - 1), kept / np.maximum(ended, 1e-12), 0.0)
-    # the first episodes begin at random ages (init_at_random_ep_len) and end early by the time limit: leave one length out
+    # the first episodes begin at random ages (init_at_random_ep_len) and end early by the time limit: leave one length
+    # out
     lengths = column("length")
     young = np.cumsum(np.ones(len(rows)) * 24) < (lengths.max() if len(rows) else 0)
-    return {"time_s": np.cumsum(column("collect_s") + column("learn_s")), "steps": column("steps"), "share": np.where(young, 0.0, share)}
+    return {"time_s": np.cumsum(column("collect_s") + column("learn_s")), "steps": column("steps"),
+            "share": np.where(young, 0.0, share)}
 
 
 def efficiency(results: list[dict]) -> dict[str, float]:
@@ -136,7 +148,8 @@ def draw(results: list[dict], path: Path) -> Path:
     left, right = figure.subplots(1, 2)
     good = sorted((r for r in results if "curve" in r), key=lambda r: (r["gpus"], r["name"]))
     for r in good:
-        left.plot(r["curve"]["time_s"], r["curve"]["share"], label=r["name"], linestyle="--" if r["name"].startswith("fixed") else "-")
+        left.plot(r["curve"]["time_s"], r["curve"]["share"], label=r["name"],
+                  linestyle="--" if r["name"].startswith("fixed") else "-")
     left.set(xlabel="seconds of learning", ylabel="share of episodes held to the end", ylim=(0.5, 1))
     if good:
         left.legend(fontsize=8)
@@ -174,13 +187,15 @@ def main(argv: list[str]) -> int:
     out = folder.make(Path(own["out"]), "out=")
     end = time.perf_counter() + float(own["seconds"])
     settings = [a for a in rest if not a.startswith("device=") or a == "device=cpu"]
-    batches = [[(f"{n}_gpu", n, settings) for n in batch] for batch in pack(counts, len(devices), own["parallel"] == "true")]
+    batches = [[(f"{n}_gpu", n, settings) for n in batch] for batch in pack(counts, len(devices),
+                                                                            own["parallel"] == "true")]
     if own["fixed"] == "true":
         most = max(counts)
         each = [*[a for a in settings if not a.startswith("worlds=")], f"worlds={max(cfg['worlds'] // most, 1)}"]
         batches.append([(f"fixed_{most}_gpu", most, each)])
     results: list[dict] = []
-    about = {"benchmark": "multi_gpu", "device": machine.describe(cfg["device"]), "worlds_per_gpu": cfg["worlds"], "versions": machine.versions(),
+    about = {"benchmark": "multi_gpu", "device": machine.describe(cfg["device"]), "worlds_per_gpu": cfg["worlds"],
+             "versions": machine.versions(),
              "parallel": own["parallel"] == "true"}
     for batch in batches:
         if end - time.perf_counter() < 45 and results:
@@ -199,18 +214,22 @@ def main(argv: list[str]) -> int:
                         job.process.kill()
         for job in jobs:
             results.append(job.result())
-            shutil.copy(job.folder / "progress.csv", out / f"{job.name}.csv") if (job.folder / "progress.csv").exists() else None
-        (out / "multi_gpu.json").write_text(json.dumps(about | {"efficiency": efficiency(results), "runs": results}, indent=1))
+            shutil.copy(job.folder / "progress.csv",
+                        out / f"{job.name}.csv") if (job.folder / "progress.csv").exists() else None
+        (out / "multi_gpu.json").write_text(json.dumps(about | {"efficiency": efficiency(results), "runs": results},
+                                                       indent=1))
     ratio = efficiency(results)
     for r in sorted(results, key=lambda r: r["gpus"]):
         if "error" in r:
             print(f"  {r['name']:12s} {r['error']} (status {r['status']})")
             continue
         levels = "  ".join(f"{k}: {v['learn_s']:.0f} s" for k, v in r["reached"].items() if float(k) >= 0.8)
-        print(f"  {r['name']:12s} {r['steps_per_s']:>10,.0f} steps/s  efficiency {ratio.get(r['name'], float('nan')):.3f}  collect {r['collect_s']:.3f} s"
+        print(f"  {r['name']:12s} {r['steps_per_s']:>10,.0f} steps/s  efficiency"
+              f" {ratio.get(r['name'], float('nan')):.3f}  collect {r['collect_s']:.3f} s"
               f"  learn {r['learn_s']:.3f} s  ready {r['start_s']:.0f} s  held {levels}")
     print(f"  figure   {draw(results, out / 'multi_gpu.png')}\n  data     {out / 'multi_gpu.json'}")
-    print(json.dumps(about | {"efficiency": ratio, "runs": [{k: v for k, v in r.items() if k != "curve"} for r in results]}), flush=True)
+    print(json.dumps(about | {"efficiency": ratio,
+                              "runs": [{k: v for k, v in r.items() if k != "curve"} for r in results]}), flush=True)
     return 0 if all("error" not in r for r in results) else 1
 
 

@@ -2,15 +2,15 @@
 
     python -m benchmarks.narrow_phase [poses=100000] [device=cuda:0] [worlds=8192] [out=narrow_phase.json]
 
-Random poses of every pair of types that a hand has with a hull: a sphere, a capsule, a box, a fingertip, and another hull,
-against hulls of the object library; surfaces from 2 mm deep to 1.5 mm (the margin) apart. The reference is C MuJoCo's
-`mj_geomDistance` in float64 with a tolerance of 1e-10 m. Printed for each pair of types and both settings: percentiles of the error
-of the distance, of the angle of the normal and of the contact's place, and microseconds a pair of the narrow phase alone (of all
-worlds at once, cold: no pair has been there before).
+Random poses of every pair of types that a hand has with a hull: a sphere, a capsule, a box, a fingertip, and another
+hull, against hulls of the object library; surfaces from 2 mm deep to 1.5 mm (the margin) apart. The reference is C
+MuJoCo's `mj_geomDistance` in float64 with a tolerance of 1e-10 m. Printed for each pair of types and both settings:
+percentiles of the error of the distance, of the angle of the normal and of the contact's place, and microseconds a pair
+of the narrow phase alone (of all worlds at once, cold: no pair has been there before).
 
-Normals and places are compared where the reference is well-posed: not where two features are equally near (a second facet less
-than 2 um further, or a gap below 10 um, where a normal is a quotient of two roundings), and the places not on parallel faces or
-edges. What was left out is printed too.
+Normals and places are compared where the reference is well-posed: not where two features are equally near (a second
+facet less than 2 um further, or a gap below 10 um, where a normal is a quotient of two roundings), and the places not
+on parallel faces or edges. What was left out is printed too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,11 @@ from dexsim.sim.collision.shapes import hull_corners
 MARGIN = 0.0015
 KINDS = ("sphere", "capsule", "box", "fingertip", "hull")
 SETTINGS = ("hand", "mujoco")
-GEOM = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE, "box": mujoco.mjtGeom.mjGEOM_BOX}
+GEOM = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+}
 
 
 def scene(kind: str) -> tuple[mujoco.MjModel, list[int], list[int]]:
@@ -91,7 +95,8 @@ class Poses:
 
 
 def draw(model: mujoco.MjModel, kind: str, a: list[int], b: list[int], n: int, rng: np.random.Generator) -> Poses:
-    """Turned at random, moved along a random direction until the gap along it is -2 to 1.5 mm; a tenth with faces parallel."""
+    """Turned at random, moved along a random direction until the gap along it is -2 to 1.5 mm; a tenth with faces
+    parallel."""
     q = rng.normal(size=(n, 2, 4))
     q /= np.linalg.norm(q, axis=-1, keepdims=True)
     rot = np.empty((n, 2, 9))
@@ -110,13 +115,17 @@ def draw(model: mujoco.MjModel, kind: str, a: list[int], b: list[int], n: int, r
     if kind in ("sphere", "capsule"):
         size[:, 0, 0] = rng.uniform(0.006, 0.014, n)
     pos = rng.uniform(-0.05, 0.05, (n, 2, 3))
-    reach = _reach(model, kind, mesh[:, 0], size[:, 0], rot[:, 0], u) + _reach(model, "hull", mesh[:, 1], size[:, 1], rot[:, 1], -u)
+    reach = _reach(model, kind, mesh[:, 0], size[:, 0], rot[:, 0], u) + _reach(
+        model, "hull", mesh[:, 1], size[:, 1], rot[:, 1], -u
+    )
     pos[:, 1] = pos[:, 0] + u * (reach + rng.uniform(-0.002, MARGIN, n))[:, None]
     f = np.float32  # what both are given
     return Poses(pos.astype(f).astype(float), rot.astype(f).astype(float), mesh, size.astype(f).astype(float))
 
 
-def _reach(model: mujoco.MjModel, kind: str, mesh: np.ndarray, size: np.ndarray, rot: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _reach(
+    model: mujoco.MjModel, kind: str, mesh: np.ndarray, size: np.ndarray, rot: np.ndarray, u: np.ndarray
+) -> np.ndarray:
     d = np.einsum("nji,nj->ni", rot, u)
     if kind == "sphere":
         return size[:, 0]
@@ -144,7 +153,11 @@ def reference(model: mujoco.MjModel, poses: Poses) -> tuple[np.ndarray, np.ndarr
         model.geom_size[:] = poses.size[i]
         dist[i] = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, ends[i])
     along = (ends[:, 3:] - ends[:, :3]) * np.sign(dist)[:, None]
-    return dist, along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300), 0.5 * (ends[:, :3] + ends[:, 3:])
+    return (
+        dist,
+        along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300),
+        0.5 * (ends[:, :3] + ends[:, 3:]),
+    )
 
 
 class Worlds:
@@ -213,7 +226,9 @@ def compare(model: mujoco.MjModel, poses: Poses, want, got) -> dict[str, np.ndar
 def well_posed(model: mujoco.MjModel, poses: Poses, want) -> tuple[np.ndarray, np.ndarray]:
     """Of each pose: whether its normal, and whether its nearest points are determined to the accuracy of float32."""
     dist, normal, _ = want
-    core = dist + poses.size[:, 0, 0] * np.isin(model.geom_type[0], (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))
+    core = dist + poses.size[:, 0, 0] * np.isin(
+        model.geom_type[0], (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+    )
     sound = np.abs(core) > 1e-5
     rivals = np.ones(len(dist), int)
     for k, sign in ((0, 1.0), (1, -1.0)):
@@ -241,18 +256,24 @@ def _rivals(model: mujoco.MjModel, k: int, poses: Poses, u: np.ndarray) -> np.nd
 
 
 def confirmed(model: mujoco.MjModel, poses: Poses, normal: np.ndarray) -> np.ndarray:
-    """Depth [m] along a direction from A to B, in float64: how far A must move against it to be free of B. The true depth is the
-    least over all directions, so that this never is too small."""
-    kinds = ["hull" if t == mujoco.mjtGeom.mjGEOM_MESH else next(k for k, g in GEOM.items() if int(g) == t) for t in model.geom_type]
-    reach = sum(_reach(model, kinds[k], poses.mesh[:, k], poses.size[:, k], poses.rot[:, k], s * normal) for k, s in ((0, 1.0), (1, -1.0)))
+    """Depth [m] along a direction from A to B, in float64: how far A must move against it to be free of B. The true
+    depth is the least over all directions, so that this never is too small."""
+    kinds = [
+        "hull" if t == mujoco.mjtGeom.mjGEOM_MESH else next(k for k, g in GEOM.items() if int(g) == t)
+        for t in model.geom_type
+    ]
+    reach = sum(
+        _reach(model, kinds[k], poses.mesh[:, k], poses.size[:, k], poses.rot[:, k], s * normal)
+        for k, s in ((0, 1.0), (1, -1.0))
+    )
     return reach - ((poses.pos[:, 1] - poses.pos[:, 0]) * normal).sum(1)
 
 
 def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """(what is compared with, where C MuJoCo itself was wrong [n]).
 
-    EPA of C MuJoCo ends at a facet that is not the nearest in one of some thousand overlapping poses. Any direction's depth
-    can be confirmed in float64, so there the least of all the answers' confirmed depths counts.
+    EPA of C MuJoCo ends at a facet that is not the nearest in one of some thousand overlapping poses. Any direction's
+    depth can be confirmed in float64, so there the least of all the answers' confirmed depths counts.
     """
     dist, normal, pos = (x.copy() for x in answers[0])
     least = -dist
@@ -294,7 +315,8 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
     out: dict = {"poses": worlds * len(errors["hand"]), "reference_wrong": wrong}
     for setting, parts in errors.items():
         r = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-        out[setting] = {"contacts": int(np.isfinite(r["dist"]).sum()), "missed": int(r["missed"].sum()), "extra": int(r["extra"].sum()),
+        out[setting] = {"contacts": int(np.isfinite(r["dist"]).sum()), "missed": int(r["missed"].sum()),
+                        "extra": int(r["extra"].sum()),
                         "dist_m": spread(r["dist"]), "normal_rad": spread(r["angle"]), "point_m": spread(r["pos"]),
                         "us_a_pair": round(float(np.median(times[setting])), 4)}  # fmt: skip
     return out
@@ -305,7 +327,10 @@ def spread(x: np.ndarray) -> dict[str, float]:
     x = np.abs(x[np.isfinite(x)])
     if not len(x):
         return {"number": 0}
-    return {"number": len(x)} | {k: float(f"{np.percentile(x, q):.3g}") for k, q in (("median", 50), ("p99", 99), ("p99_99", 99.99), ("worst", 100))}
+    return {"number": len(x)} | {
+        k: float(f"{np.percentile(x, q):.3g}")
+        for k, q in (("median", 50), ("p99", 99), ("p99_99", 99.99), ("worst", 100))
+    }
 
 
 def main(argv: list[str]) -> dict:
@@ -318,10 +343,16 @@ def main(argv: list[str]) -> dict:
     out: dict = {"benchmark": "narrow_phase", **tools.about(cfg["device"])}
     for kind in kinds:
         r = out[kind] = kind_of_pair(kind, n, cfg["device"], min(n, cfg["worlds"]))
-        print(f"{kind} against hull: {r['poses']} poses, in {r['reference_wrong']} of them C MuJoCo's depth is not the least")
+        print(
+            f"{kind} against hull: {r['poses']} poses, in {r['reference_wrong']} of them C MuJoCo's depth is not the"
+            " least"
+        )
         for setting in SETTINGS:
             s = r[setting]
-            print(f"  {setting:8s}{s['contacts']} contacts, {s['missed']} missed, {s['extra']} too many, {s['us_a_pair']:.3f} us a pair")
+            print(
+                f"  {setting:8s}{s['contacts']} contacts, {s['missed']} missed, {s['extra']} too many,"
+                f" {s['us_a_pair']:.3f} us a pair"
+            )
             for name in ("dist_m", "normal_rad", "point_m"):
                 print(f"    {name:12s}" + "  ".join(f"{k} {v:g}" for k, v in s[name].items()))
         sys.stdout.flush()

@@ -3,14 +3,15 @@
     python -m benchmarks.physics [worlds=8192] [only=chosen,pyramidal] [minutes=20] [out=out/physics] [device=cuda:0]
                                  [policy=checkpoints/grasp.pt] [any other setting of train.py]
 
-A trained policy grasps in all worlds at the chosen settings (palm up, command 0.6, no pushes). That moment is put into an
-environment of each of the settings below, one changed at a time, and the joint targets are held for 5 s: 0.5 s to settle,
-then the palm is turned face down within 0.5 s, so that friction carries the object. Of the worlds that held at the start:
+A trained policy grasps in all worlds at the chosen settings (palm up, command 0.6, no pushes). That moment is put into
+an environment of each of the settings below, one changed at a time, and the joint targets are held for 5 s: 0.5 s to
+settle, then the palm is turned face down within 0.5 s, so that friction carries the object. Of the worlds that held at
+the start:
   held       share whose object is within 30 mm of its place at the end; hold_s: mean time until it left
   creep      mm/s of the object in the last 2 s, of those that hold: median, 95th percentile
-  depth      mm of penetration at the end: 95th percentile of fingertips (whose rubber is meant to yield) and of all else
-  K          force over depth of fingertips over the stiffness set, median: 1 means that the rubber is as soft as asked
-  contacts, rows a world; newton: mean iterations
+  depth      mm of penetration at the end: 95th percentile of fingertips (whose rubber is meant to yield) and of all
+  else K          force over depth of fingertips over the stiffness set, median: 1 means that the rubber is as soft as
+  asked contacts, rows a world; newton: mean iterations
   steps/s    environment steps a second that physics and servo alone would allow, from the settled grasp
 Writes physics.md, physics.json and physics.png to `out`; join=a/physics.json,b/physics.json puts several runs into one.
 """
@@ -157,7 +158,8 @@ def _grasp(cfg: dict, policy_file: str) -> tuple[Any, tools.Snapshot]:
 
 
 def _contacts(env: Any, worlds: int = 64) -> dict[str, np.ndarray]:
-    """Present contacts of a few worlds: depth [mm], whether of a fingertip on the object, normal force where it is one [N]."""
+    """Present contacts of a few worlds: depth [mm], whether of a fingertip on the object, normal force where it is one
+    [N]."""
     e = env.engine
     tips = [e.geom(g) for g in xhand.TIP_GEOMS]
     body = e.body(OBJECT)
@@ -188,7 +190,8 @@ def _contacts(env: Any, worlds: int = 64) -> dict[str, np.ndarray]:
     stiffness = env.objects.stiffness.cpu().numpy()[world[index]]
     firm = force > 0.5
     return {
-        "world": world[touching], "tip": 1e3 * depth[tip & touching], "other": 1e3 * depth[touching & ~tip & touches_object],
+        "world": world[touching], "tip": 1e3 * depth[tip & touching],
+        "other": 1e3 * depth[touching & ~tip & touches_object],
         "k": (force / np.maximum(depth[index], 1e-9) / stiffness)[firm],
     }  # fmt: skip
 
@@ -220,7 +223,9 @@ def _hold(env: Any, grasp: tools.Snapshot, stiffness: torch.Tensor) -> dict[str,
             start = p.clone()
     peaks = e.peaks()
     warp = e.kind == "warp"
-    newton, rows = (float(x.numpy().mean()) for x in (e.d.solver_niter, e.d.nefc)) if warp else (float("nan"), float("nan"))
+    newton, rows = (
+        (float(x.numpy().mean()) for x in (e.d.solver_niter, e.d.nefc)) if warp else (float("nan"), float("nan"))
+    )
     creep = 1e3 * (p - start).norm(dim=1)[alive & inside] / CREEP_S
     found = _contacts(env)
     seen = max(len(np.unique(found["world"])), 1)
@@ -232,8 +237,10 @@ def _hold(env: Any, grasp: tools.Snapshot, stiffness: torch.Tensor) -> dict[str,
     return {
         "worlds_judged": int(inside.sum()), "held": float((alive & inside).sum() / inside.sum().clamp(min=1)),
         "hold_s": float(time_held[inside].mean()), "creep_mm_s": part(creep, 50), "creep_p95_mm_s": part(creep, 95),
-        "tip_depth_p95_mm": part(found["tip"], 95), "other_depth_p95_mm": part(found["other"], 95), "k_ratio": part(found["k"], 50),
-        "contacts": len(found["world"]) / seen, "contacts_peak": peaks["contacts"], "rows": rows, "rows_peak": peaks["rows"],
+        "tip_depth_p95_mm": part(found["tip"], 95), "other_depth_p95_mm": part(found["other"], 95),
+        "k_ratio": part(found["k"], 50),
+        "contacts": len(found["world"]) / seen, "contacts_peak": peaks["contacts"], "rows": rows,
+        "rows_peak": peaks["rows"],
         "newton": newton, "worlds_losing_contacts": int(((e.t.overflow & OVERFLOW_BITS) != 0).sum()) if warp else 0,
     }  # fmt: skip
 
@@ -247,16 +254,29 @@ def _speed(env: Any, grasp: tools.Snapshot, steps: int) -> float:
     return float(np.median(times))
 
 
-COLUMNS = (("steps_per_s", "steps/s", "{:,.0f}"), ("held", "held", "{:.1%}"), ("hold_s", "hold s", "{:.2f}"), ("creep_mm_s", "creep mm/s", "{:.3f}"),
-           ("creep_p95_mm_s", "95 %", "{:.2f}"), ("tip_depth_p95_mm", "tip depth mm", "{:.2f}"), ("other_depth_p95_mm", "other mm", "{:.2f}"),
-           ("k_ratio", "K", "{:.3f}"), ("contacts", "contacts", "{:.1f}"), ("rows", "rows", "{:.0f}"), ("newton", "newton", "{:.1f}"))
+COLUMNS = (
+    ("steps_per_s", "steps/s", "{:,.0f}"),
+    ("held", "held", "{:.1%}"),
+    ("hold_s", "hold s", "{:.2f}"),
+    ("creep_mm_s", "creep mm/s", "{:.3f}"),
+    ("creep_p95_mm_s", "95 %", "{:.2f}"),
+    ("tip_depth_p95_mm", "tip depth mm", "{:.2f}"),
+    ("other_depth_p95_mm", "other mm", "{:.2f}"),
+    ("k_ratio", "K", "{:.3f}"),
+    ("contacts", "contacts", "{:.1f}"),
+    ("rows", "rows", "{:.0f}"),
+    ("newton", "newton", "{:.1f}"),
+)
 
 
 def table(rows: dict[str, dict]) -> str:
     """Markdown."""
     lines = ["| setting | " + " | ".join(c[1] for c in COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
     for name, row in rows.items():
-        cells = [form.format(row[key]) if row.get(key) is not None and np.isfinite(row[key]) else "" for key, _, form in COLUMNS]
+        cells = [
+            form.format(row[key]) if row.get(key) is not None and np.isfinite(row[key]) else ""
+            for key, _, form in COLUMNS
+        ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -270,12 +290,19 @@ def figure(rows: dict[str, dict], path: Path, about: str) -> None:
 
     names = list(rows)[::-1]
     fig, axes = plt.subplots(1, 4, figsize=(13, 1.2 + 0.24 * len(names)), sharey=True)
-    panels = (("steps_per_s", 1e-3, "thousand steps/s that physics\nand servo allow"), ("held", 100.0, "held, palm down (%)"),
-              ("creep_mm_s", 1.0, "creep under load (mm/s):\nfilled: median, hollow: 95 %"), ("other_depth_p95_mm", 1.0, "penetration, 95 % (mm):\nfilled: fingertips, hollow: all else"))
+    panels = (
+        ("steps_per_s", 1e-3, "thousand steps/s that physics\nand servo allow"),
+        ("held", 100.0, "held, palm down (%)"),
+        ("creep_mm_s", 1.0, "creep under load (mm/s):\nfilled: median, hollow: 95 %"),
+        ("other_depth_p95_mm", 1.0, "penetration, 95 % (mm):\nfilled: fingertips, hollow: all else"),
+    )
     for ax, (key, unit, label) in zip(axes, panels, strict=True):
         for y, name in enumerate(names):
             colour = "C3" if name == "chosen" else "C0"
-            points = {"creep_mm_s": ("creep_mm_s", "creep_p95_mm_s"), "other_depth_p95_mm": ("tip_depth_p95_mm", key)}.get(key, (key,))
+            points = {
+                "creep_mm_s": ("creep_mm_s", "creep_p95_mm_s"),
+                "other_depth_p95_mm": ("tip_depth_p95_mm", key),
+            }.get(key, (key,))
             x = [unit * rows[name][k] for k in points if rows[name].get(k) is not None]
             if x:
                 ax.plot(x, [y] * len(x), "-", color=colour, lw=1)
@@ -311,7 +338,17 @@ def join(files: str, out: Path) -> dict:
 
 
 def main(argv: list[str]) -> dict:
-    own, rest = tools.split(argv, {"only": "", "minutes": "20", "out": "out/physics", "steps": "", "join": "", "policy": str(tools.ROOT / "checkpoints" / "grasp.pt")})
+    own, rest = tools.split(
+        argv,
+        {
+            "only": "",
+            "minutes": "20",
+            "out": "out/physics",
+            "steps": "",
+            "join": "",
+            "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"),
+        },
+    )
     if own["join"]:
         return join(own["join"], Path(own["out"]))
     cfg = tools.config(rest)
@@ -329,7 +366,7 @@ def main(argv: list[str]) -> dict:
     result: dict = {"benchmark": "physics", **tools.about(device), "engine": env.engine.kind, "worlds": env.num_envs}
     for name in names:
         if time.monotonic() > until:
-            print(f"  minutes={own['minutes']} are over; not measured: {', '.join(names[len(rows):])}")
+            print(f"  minutes={own['minutes']} are over; not measured: {', '.join(names[len(rows) :])}")
             break
         begin = time.monotonic()
         setting = SETTINGS[name]
@@ -337,15 +374,25 @@ def main(argv: list[str]) -> dict:
             env = None
             gc.collect()
             with edited(setting.edit):
-                env = make_env({**cfg, "sim": {**cfg["sim"], **setting.sim}}, cfg["worlds"], device, 0, cfg["sim"]["engine"])
+                env = make_env(
+                    {**cfg, "sim": {**cfg["sim"], **setting.sim}}, cfg["worlds"], device, 0, cfg["sim"]["engine"]
+                )
         with torch.no_grad():
             seconds = _speed(env, grasp, steps)
-            row = {"steps_per_s": env.num_envs / seconds, "control_step_ms": 1e3 * seconds, **_hold(env, grasp, stiffness)}
+            row = {
+                "steps_per_s": env.num_envs / seconds,
+                "control_step_ms": 1e3 * seconds,
+                **_hold(env, grasp, stiffness),
+            }
         rows[name] = {k: None if v != v else float(f"{v:.5g}") for k, v in row.items()}
         rows[name]["measured_in_s"] = round(time.monotonic() - begin, 1)
         r = {k: float("nan") if v is None else v for k, v in rows[name].items()}
-        print(f"  {name:36s} {r['steps_per_s']:9.0f} steps/s  held {r['held']:.3f}  creep {r['creep_mm_s']:.3f} mm/s (95 %: {r['creep_p95_mm_s']:.2f})  "
-              f"tip {r['tip_depth_p95_mm']:.2f} mm  K {r['k_ratio']:.3f}  ({r['measured_in_s']:.0f} s)", flush=True)
+        print(
+            f"  {name:36s} {r['steps_per_s']:9.0f} steps/s  held {r['held']:.3f}  creep {r['creep_mm_s']:.3f} mm/s"
+            f" (95 %: {r['creep_p95_mm_s']:.2f})  "
+            f"tip {r['tip_depth_p95_mm']:.2f} mm  K {r['k_ratio']:.3f}  ({r['measured_in_s']:.0f} s)",
+            flush=True,
+        )
         result["rows"] = rows
         write(result, out)
     print(json.dumps(result), flush=True)

@@ -2,9 +2,9 @@
 
     python -m benchmarks.record [worlds=8192] [record_worlds=1] [steps=64] [rounds=6] [device=cuda:0] [tactile=raw]
 
-The grasp task under random actions. Rounds with and without recording take turns in one process, each on an environment of
-its own, so that neither is always the first; the median round of each is compared. Recording ends by itself with its episode:
-the figure is of the time while it lasts.
+The grasp task under random actions. Rounds with and without recording take turns in one process, each on an environment
+of its own, so that neither is always the first; the median round of each is compared. Recording ends by itself with its
+episode: the figure is of the time while it lasts.
 """
 
 from __future__ import annotations
@@ -35,14 +35,16 @@ def main(argv: list[str]) -> dict:
     tap = PlayRecorder(recorded[0], chosen, recorded[1], least=1e9)  # it goes on recording as long as it is asked
     times: dict[str, list[float]] = {"plain": [], "recorded": []}
     for k in range(rounds + 1):  # the first round warms up
-        for name, (env, _) in (("plain", plain), ("recorded", recorded)) if k % 2 else (("recorded", recorded), ("plain", plain)):
+        for name, (env, _) in (("plain", plain), ("recorded", recorded)) if k % 2 else (("recorded", recorded),
+                                                                                        ("plain", plain)):
             took = run(env, steps, device, k)
             if k:
                 times[name].append(took)
                 print(f"round {k}: {name:<9} {took:8.2f} ms a control step", flush=True)
     a, b = (float(np.median(times[n])) for n in ("plain", "recorded"))
     kept = sum(len(t.episode.times) + len(t._now.times) for t in tap.tracks)
-    found = {"benchmark": "record", "worlds": worlds, "record_worlds": chosen, "plain_ms": round(a, 3), "recorded_ms": round(b, 3), "slower": round(b / a - 1, 4)}
+    found = {"benchmark": "record", "worlds": worlds, "record_worlds": chosen, "plain_ms": round(a, 3),
+             "recorded_ms": round(b, 3), "slower": round(b / a - 1, 4)}
     found |= {"steps_kept": kept} | tools.about(device)
     print(json.dumps(found), flush=True)
     return found
@@ -56,7 +58,8 @@ def environment(worlds: int, device: str, tactile: str) -> tuple:
 
     quiet_warp(device)
     kind = "cuda" if device.startswith("cuda") else "cpu"
-    cfg = start.for_train(["task=grasp", "preset=none", f"worlds={worlds}", f"device={kind}", f"tactile={tactile}"], CONFIGS).cfg
+    cfg = start.for_train(["task=grasp", "preset=none", f"worlds={worlds}", f"device={kind}", f"tactile={tactile}"],
+                          CONFIGS).cfg
     env = make_env(cfg, worlds, device, 0)
     env.reset_all()
     return env, cfg

@@ -1,14 +1,16 @@
 """Memory and time by number of worlds, up to what the device holds.
 
-    python -m benchmarks.scale [counts=1,64,1024,8192] [seconds=400] [limit=true] [modes=simulate,train] [out=FOLDER] [any setting of train.py]
+    python -m benchmarks.scale [counts=1,64,1024,8192] [seconds=400] [limit=true] [modes=simulate,train] [out=FOLDER]
+    [any setting of train.py]
 
-Each count runs in a process of its own (a full device leaves nothing behind): the environment of train.py is built, its hands close
-for a second and then hold, a few control steps are timed, then PPO learns one iteration. Memory is what the process adds to the
-device beyond its empty context (CUDA: of the driver's count; CPU: anonymous resident memory); bytes a world are the
-slope of a straight line through all counts of 1,024 and more. `limit=true` (the default on CUDA) then looks for the largest count that
-can be simulated and the largest that can be trained (`modes`), in steps of 7 %: a count fits when it runs and all worlds are finite.
-`prior=scale.json` goes on from an earlier run.
-Written after each process: scale.json; at the end scale.png and, as one line, the JSON. It stops after `seconds`, with what it has.
+Each count runs in a process of its own (a full device leaves nothing behind): the environment of train.py is built, its
+hands close for a second and then hold, a few control steps are timed, then PPO learns one iteration. Memory is what the
+process adds to the device beyond its empty context (CUDA: of the driver's count; CPU: anonymous resident memory); bytes
+a world are the slope of a straight line through all counts of 1,024 and more. `limit=true` (the default on CUDA) then
+looks for the largest count that can be simulated and the largest that can be trained (`modes`), in steps of 7 %: a
+count fits when it runs and all worlds are finite. `prior=scale.json` goes on from an earlier run.
+Written after each process: scale.json; at the end scale.png and, as one line, the JSON. It stops after `seconds`, with
+what it has.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ CLOSING = 48  # control steps in which the hands close, one second
 STEEP = 1024  # counts from which memory grows in proportion
 
 
-# -- one count, in a process of its own -------------------------------------------------------------------------------------
+# -- one count, in a process of its own
+# -------------------------------------------------------------------------------------
 def used(device: str) -> int:
     """Bytes in use: of the whole CUDA device, or this process's anonymous memory on a CPU."""
     import torch
@@ -68,7 +71,8 @@ def measure(cfg: dict, mode: str) -> dict:
     close[:, 4:], close[:, :3] = 0.5, 0.4
     for _ in range(3):  # compiled, recorded, replayed
         env.step(action)
-    found = {"worlds": worlds, "mode": mode, "simulate_bytes": used(device) - empty, "ready_s": time.perf_counter() - start}
+    found = {"worlds": worlds, "mode": mode, "simulate_bytes": used(device) - empty,
+             "ready_s": time.perf_counter() - start}
     _check(env)
 
     def clock(repeats: int) -> float:
@@ -90,7 +94,8 @@ def measure(cfg: dict, mode: str) -> dict:
         runner, rows = Runner(env, cfg, machine.versions()), []
         runner.learn(1, rows.append)
         runner.learn(2, rows.append) if mode == "cost" else None
-        found |= {"train_bytes": used(device) - empty, "collect_s": rows[-1]["collect_s"], "learn_s": rows[-1]["learn_s"],
+        found |= {"train_bytes": used(device) - empty, "collect_s": rows[-1]["collect_s"],
+                  "learn_s": rows[-1]["learn_s"],
                   "iteration_steps": runner.cfg["num_steps_per_env"]}
     _check(env)
     return found
@@ -104,7 +109,8 @@ def _check(env) -> None:
         raise RuntimeError(f"{int(env.nan_count)} of {env.num_envs} worlds were not finite")
 
 
-# -- the loop over counts -----------------------------------------------------------------------------------------------------
+# -- the loop over counts
+# -----------------------------------------------------------------------------------------------------
 class Bench:
     """Runs counts in child processes and keeps what they found in `rows`, saved to out/scale.json after each."""
 
@@ -150,7 +156,8 @@ def reason(stderr: str, status: int) -> str:
 
 
 def search(bench: Bench, mode: str, start: int, guess: int) -> dict:
-    """The limit of one mode: `start` fits, `guess` is what the bytes a world promise. {"fits", "fails" (None: not reached), "why"}."""
+    """The limit of one mode: `start` fits, `guess` is what the bytes a world promise. {"fits", "fails" (None: not
+    reached), "why"}."""
 
     def fits(n: int) -> bool | None:
         if bench.left() < 20:
@@ -172,7 +179,8 @@ def search(bench: Bench, mode: str, start: int, guess: int) -> dict:
             low, n = n, int(1.07 * n) // 256 * 256
             answer = fits(n)
         high = n if answer is not None else None
-    return {"fits": low, "fails": high, "why": next((r["error"] for r in bench.rows if r["worlds"] == high and "error" in r), None)}
+    return {"fits": low, "fails": high,
+            "why": next((r["error"] for r in bench.rows if r["worlds"] == high and "error" in r), None)}
 
 
 def line(rows: list[dict], key: str) -> dict | None:
@@ -184,7 +192,8 @@ def line(rows: list[dict], key: str) -> dict | None:
         return None
     x, y = np.array(points, dtype=float).T
     slope, fixed = np.polyfit(x, y, 1, w=1 / x)  # relative errors alike
-    return {"bytes_per_world": float(slope), "fixed_bytes": float(fixed), "worst_error": float(np.abs(slope * x + fixed - y).max() / y.max())}
+    return {"bytes_per_world": float(slope), "fixed_bytes": float(fixed),
+            "worst_error": float(np.abs(slope * x + fixed - y).max() / y.max())}
 
 
 def draw(rows: list[dict], lines: dict, limits: dict, path: Path) -> Path:
@@ -200,7 +209,8 @@ def draw(rows: list[dict], lines: dict, limits: dict, path: Path) -> Path:
     x = [r["worlds"] for r in cost]
     time_axes.loglog(x, [1e6 * r["step_s"] / r["worlds"] for r in cost], "o-", color=BLUE, label="environment step")
     iteration = [(r["collect_s"] + r["learn_s"]) / (r["iteration_steps"] * r["worlds"]) for r in train]
-    time_axes.loglog([r["worlds"] for r in train], [1e6 * t for t in iteration], "s--", color="#c2571a", label="with PPO")
+    time_axes.loglog([r["worlds"] for r in train], [1e6 * t for t in iteration], "s--", color="#c2571a",
+                     label="with PPO")
     time_axes.set_ylabel("time of a world and control step (us)")
     rate_axes.loglog(x, [r["worlds"] / r["step_s"] for r in cost], "o-", color=BLUE)
     rate_axes.loglog([r["worlds"] for r in train], [1 / t for t in iteration], "s--", color="#c2571a")
@@ -210,7 +220,8 @@ def draw(rows: list[dict], lines: dict, limits: dict, path: Path) -> Path:
         memory_axes.loglog([p[0] for p in points], [p[1] / 2**30 for p in points], style, color=colour)
         if fit := lines.get(key):
             grid = np.geomspace(points[0][0], points[-1][0], 60)
-            memory_axes.loglog(grid, (fit["bytes_per_world"] * grid + max(fit["fixed_bytes"], 0)) / 2**30, color=colour, linewidth=1,
+            memory_axes.loglog(grid, (fit["bytes_per_world"] * grid + max(fit["fixed_bytes"], 0)) / 2**30,
+                               color=colour, linewidth=1,
                                label=f"{key.partition('_')[0]}: {fit['bytes_per_world'] / 1024:.1f} KiB a world")
     for mode, limit in limits.items():
         memory_axes.axvline(limit["fits"], color={"simulate": BLUE, "train": "#c2571a"}[mode], linestyle=":")
@@ -266,12 +277,14 @@ def main(argv: list[str]) -> int:
             key = f"{mode}_bytes"
             good = [r["worlds"] for r in bench.rows if "error" not in r and key in r]
             if good and (fit := line(bench.rows, key)):
-                limits[mode] = search(bench, mode, max(good), int((total - fit["fixed_bytes"]) / fit["bytes_per_world"]))
+                limits[mode] = search(bench, mode, max(good),
+                                      int((total - fit["fixed_bytes"]) / fit["bytes_per_world"]))
                 bench.save({"limits": limits})
     lines = {k: fit for k in keys if (fit := line(bench.rows, k))}
     bench.save({"lines": lines, "limits": limits})
     for key, fit in lines.items():
-        print(f"  {key.partition('_')[0]:9s} {fit['bytes_per_world'] / 1024:8.2f} KiB a world + {fit['fixed_bytes'] / 2**20:.0f} MiB")
+        print(f"  {key.partition('_')[0]:9s} {fit['bytes_per_world'] / 1024:8.2f} KiB a world +"
+              f" {fit['fixed_bytes'] / 2**20:.0f} MiB")
     for mode, limit in limits.items():
         print(f"  {mode:9s} largest count that ran {limit['fits']:,}; did not: {limit['fails']} ({limit.get('why')})")
     print(f"  figure   {draw(bench.rows, lines, limits, out / 'scale.png')}\n  data     {out / 'scale.json'}")

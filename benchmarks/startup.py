@@ -3,9 +3,9 @@
     python -m benchmarks.startup [device=cuda:0] [engines=mujoco,warp] [worlds=64] [any other setting of train.py]
 
 For each engine, two new processes build the environment and do three control steps, with a kernel cache of their own in
-a temporary folder: empty for the first (cold), as the first left it for the second (warm). Seconds are of the whole process,
-imports included. Counts the modules that Warp compiled (each holds a kernel or a few; one compilation each), their seconds
-(the first of a process on a CPU holds LLVM's own start, about 1.5 s), and the longest of them.
+a temporary folder: empty for the first (cold), as the first left it for the second (warm). Seconds are of the whole
+process, imports included. Counts the modules that Warp compiled (each holds a kernel or a few; one compilation each),
+their seconds (the first of a process on a CPU holds LLVM's own start, about 1.5 s), and the longest of them.
 """
 
 from __future__ import annotations
@@ -75,14 +75,18 @@ def main(argv: list[str]) -> dict:
     for engine in engines:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "warm"):
-                command = [sys.executable, "-m", "benchmarks.startup", "--child", str(time.monotonic()), *rest, f"sim.engine={engine}"]
-                done = subprocess.run(command, cwd=tools.ROOT, capture_output=True, text=True, env=os.environ | {"WARP_CACHE_PATH": cache})
+                command = [sys.executable, "-m", "benchmarks.startup", "--child", str(time.monotonic()), *rest,
+                           f"sim.engine={engine}"]
+                done = subprocess.run(command, cwd=tools.ROOT, capture_output=True, text=True,
+                                      env=os.environ | {"WARP_CACHE_PATH": cache})
                 if done.returncode:
-                    raise UserError(f"benchmarks.startup: {engine} did not start: {done.stderr.strip().splitlines()[-1]}")
+                    raise UserError(f"benchmarks.startup: {engine} did not start:"
+                                    f" {done.stderr.strip().splitlines()[-1]}")
                 found = json.loads(done.stdout.splitlines()[-1])
                 out[f"{engine}_{state}"] = found
                 slow = ", ".join(f"{name} {s} s" for name, s in found["longest"][:4])
-                print(f"  {engine:7s}{state:5s} {found['total_s']:7.1f} s, of it {found['modules']:3d} modules compiled in "
+                print(f"  {engine:7s}{state:5s} {found['total_s']:7.1f} s, of it {found['modules']:3d} modules compiled"
+                      " in "
                       f"{found['compile_s']:.1f} s" + (f": {slow}" if slow else ""), flush=True)
     print(json.dumps(out), flush=True)
     return out

@@ -74,8 +74,10 @@ def main(argv: list[str]) -> dict:
     e, k = env.engine, env.decimation
     peaks = e.peaks()
     return tools.report({
-        "benchmark": "step", **tools.about(device), "engine": e.kind, "worlds": worlds, "physics_steps": k, "ready_s": ready,
-        "bare_ms": bare, "servo_ms": driven - bare, "touch_ms": touched - driven, "rest_ms": full - touched, "full_ms": full,
+        "benchmark": "step", **tools.about(device), "engine": e.kind, "worlds": worlds, "physics_steps": k,
+        "ready_s": ready,
+        "bare_ms": bare, "servo_ms": driven - bare, "touch_ms": touched - driven, "rest_ms": full - touched,
+        "full_ms": full,
         "overhead": full / bare - 1, "overhead_over_driven": full / driven - 1, "env_steps_per_s": 1e3 * worlds / full,
         "physics_steps_per_s": 1e3 * worlds * k / bare, "contacts": peaks["contacts"], "rows": peaks["rows"],
         "rounds_ms": {name: [round(1e3 * t, 3) for t in ts] for name, ts in times.items()},

@@ -1,4 +1,5 @@
-"""Physics without its servo, driven all the same: what the servo wrote before each physics step, recorded and played."""
+"""Physics without its servo, driven all the same: what the servo wrote before each physics step, recorded and
+played."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 

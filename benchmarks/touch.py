@@ -1,15 +1,18 @@
-"""Time of the touch kernel over worlds, shapes, grid sizes and outputs, beside bytes, operations and other ways to do it.
+"""Time of the touch kernel over worlds, shapes, grid sizes and outputs, beside bytes, operations and other ways to do
+it.
 
     python -m benchmarks.touch [device=cuda:0] [worlds=1024,4096,8192,16384] [alternatives=true] [variants=false]
 
-The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, dexsim/configs/tactile/default.yaml; launches
-are captured in a graph and replayed, as in training; median microseconds. Rows: shape; `solver` (the contact force spread
-over the taxels, the default) or `spring` (the sum of springs); `raw` if every taxel's force is written; `grid 32` and the
+The xHand half closed on an object (random joint angles and poses), 5 x 120 taxels, dexsim/configs/tactile/default.yaml;
+launches are captured in a graph and replayed, as in training; median microseconds. Rows: shape; `solver` (the contact
+force spread over the taxels, the default) or `spring` (the sum of springs); `raw` if every taxel's force is written;
+`grid 32` and the
 like: the rock baked with so many samples along its longest axis. `others=false`: fingers do not feel each other.
 Behind the times of the largest number of worlds: megabytes and millions of operations that the layout asks for (see
 `touch_cost.py`), and what share of the device's peak that is, where the device is an H200.
 The alternatives find the same taxels' depths of the same object in the same poses (`touch_alternatives.py`); `agree` is
-their summed force over ours. variants=true times the kernel's launch choices (threads a block, registers a thread) instead.
+their summed force over ours. variants=true times the kernel's launch choices (threads a block, registers a thread)
+instead.
 """
 
 from __future__ import annotations
@@ -72,8 +75,8 @@ class Scene:
 
 
 def grasp_poses(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position [U, 6, 3] and rotation [U, 6, 3, 3] of the five distal links and an object between them, and the hand's and
-    the object's qpos [U, 19]."""
+    """Position [U, 6, 3] and rotation [U, 6, 3, 3] of the five distal links and an object between them, and the hand's
+    and the object's qpos [U, 19]."""
     model = mujoco.MjModel.from_xml_path(str(xhand.xml_path()))
     data = mujoco.MjData(model)
     low, high = xhand.joint_limits().T
@@ -155,8 +158,15 @@ def others_ways(scene: Scene, shape: str, default: dict, poses: tuple, repeats: 
 
 
 def arguments(argv: list[str]) -> dict[str, str]:
-    own, rest = tools.split(argv, {
-        "device": "cuda:0" if torch.cuda.is_available() else "cpu", "worlds": "", "alternatives": "true", "variants": "false"})
+    own, rest = tools.split(
+        argv,
+        {
+            "device": "cuda:0" if torch.cuda.is_available() else "cpu",
+            "worlds": "",
+            "alternatives": "true",
+            "variants": "false",
+        },
+    )
     if rest:
         raise UserError(f"benchmarks.touch: '{rest[0]}' is not one of {', '.join(k + '=' for k in own)}")
     return own
@@ -196,22 +206,33 @@ def main(argv: list[str]) -> dict:
                     us.setdefault(name, []).append(round(t, 1))
                     agree[name] = round(ratio, 3)
     h200 = not cpu and "H200" in torch.cuda.get_device_name(device)
-    print(f"{'touch [us], worlds:':52s}" + "".join(f"{n:>9d}" for n in worlds) + "      MB   MFLOP" + ("  of peak" if h200 else ""))
+    print(
+        f"{'touch [us], worlds:':52s}"
+        + "".join(f"{n:>9d}" for n in worlds)
+        + "      MB   MFLOP"
+        + ("  of peak" if h200 else "")
+    )
     for name, times in us.items():
         line = f"{name:52s}" + "".join(f"{t:9.1f}" for t in times)
         if name in costs:
             c = costs[name]
-            line += f"{c.bytes / 1e6:8.1f}{c.flops / 1e6:8.1f}" + (f"{100 * c.floor_us() / times[-1]:7.0f} %" if h200 else "")
+            line += f"{c.bytes / 1e6:8.1f}{c.flops / 1e6:8.1f}" + (
+                f"{100 * c.floor_us() / times[-1]:7.0f} %" if h200 else ""
+            )
         print(line + (f"   agree {agree[name]:.3f}" if name in agree else ""))
-    judged = [t for name, t in us.items() if "raw" in name and "imperfect" not in name and not name.startswith("grid 2")]
+    judged = [
+        t for name, t in us.items() if "raw" in name and "imperfect" not in name and not name.startswith("grid 2")
+    ]
     if variants:
         best = min((name for name in us if name.startswith("grid solver")), key=lambda name: us[name][-1])
         out = {"best": best, "us": us[best]}
     else:
         worst = {n: max(t[i] for t in judged) for i, n in enumerate(worlds)}
-        out = {"lit": lit, "worst_us_raw": worst, "taxels_per_s": {n: round(600 * n / t * 1e6) for n, t in worst.items()},
+        out = {"lit": lit, "worst_us_raw": worst,
+               "taxels_per_s": {n: round(600 * n / t * 1e6) for n, t in worst.items()},
                "ratio_to_target": {n: round(t / TARGET_US[n], 3) for n, t in worst.items() if n in TARGET_US},
-               "us": us, "agree": agree, "bytes": {k: c.bytes for k, c in costs.items()}, "flops": {k: c.flops for k, c in costs.items()}}  # fmt: skip
+               "us": us, "agree": agree, "bytes": {k: c.bytes for k, c in costs.items()},
+               "flops": {k: c.flops for k, c in costs.items()}}  # fmt: skip
     out = {"benchmark": "touch", **tools.about(device), "worlds": worlds, **out}
     print(json.dumps(out))
     return out

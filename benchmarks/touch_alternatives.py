@@ -1,7 +1,8 @@
 """Other ways to the taxels' depths, on the scene of benchmarks.touch: mesh queries, wp.Volume, MuJoCo's tactile sensor.
 
-The first two are one thread a taxel, as one would write them: pose into the object's frame, distance, the same force law,
-raw forces written, nothing reduced. The sensor is MuJoCo-Warp's own; it gives depth and two slip speeds a taxel, no force.
+The first two are one thread a taxel, as one would write them: pose into the object's frame, distance, the same force
+law, raw forces written, nothing reduced. The sensor is MuJoCo-Warp's own; it gives depth and two slip speeds a taxel,
+no force.
 """
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
@@ -121,13 +122,18 @@ class Queries:
 class Sensor:
     """MuJoCo-Warp's tactile sensor on the same hand, poses and taxels; `launch` is its velocity-sensor stage alone.
 
-    Contacts are found once beforehand (the sensor asks which geoms touch the finger's body; the solver needs them anyhow).
+    Contacts are found once beforehand (the sensor asks which geoms touch the finger's body; the solver needs them
+    anyhow).
     """
 
     def __init__(self, scene: Any, touch: Any, name: str, size: np.ndarray, qpos: np.ndarray):
         self.device, n = scene.engine.device, scene.engine.n
         self._points = touch._pads.taxel.numpy()[:, : touch.layout.taxels, :3]
-        self._law, self._area, self.count = touch._law, touch._pads.taxel.numpy()[:, : touch.layout.taxels, 3], touch.layout.taxels
+        self._law, self._area, self.count = (
+            touch._law,
+            touch._pads.taxel.numpy()[:, : touch.layout.taxels, 3],
+            touch.layout.taxels,
+        )
         model, meshes = self._spec(name, size).compile(), [f"taxels_{f}" for f in xhand.FINGERS]
         verts = [int(model.mesh_vertnum[model.mesh(m).id]) for m in meshes]
         if verts != [self.count] * len(meshes):
@@ -136,7 +142,9 @@ class Sensor:
             self._m = mjw.put_model(model)
             self._m.opt.warn_overflow = False
             self._d = mjw.put_data(model, mujoco.MjData(model), nworld=n, nconmax=48, njmax=256)
-            wp.to_torch(self._d.qpos)[:] = torch.as_tensor(qpos, dtype=torch.float32)[torch.arange(n) % len(qpos)].to(self.device)
+            wp.to_torch(self._d.qpos)[:] = torch.as_tensor(qpos, dtype=torch.float32)[torch.arange(n) % len(qpos)].to(
+                self.device
+            )
             mjw.fwd_position(self._m, self._d)
             mjw.fwd_velocity(self._m, self._d)
         self.note = "depth and two slip speeds"
@@ -166,9 +174,16 @@ class Sensor:
         for i, f in enumerate(xhand.FINGERS):
             spec.add_mesh(name=f"taxels_{f}", uservert=self._points[i].astype(float).ravel())
             spec.body(xhand.TIP_BODIES[i]).add_geom(
-                name=f"pad_{f}", type=g.mjGEOM_MESH, meshname=f"taxels_{f}", mass=0, contype=0, conaffinity=0)
-            spec.add_sensor(name=f"touch_{f}", type=mujoco.mjtSensor.mjSENS_TACTILE, objtype=mujoco.mjtObj.mjOBJ_MESH, objname=f"taxels_{f}",
-                            reftype=mujoco.mjtObj.mjOBJ_GEOM, refname=f"pad_{f}")
+                name=f"pad_{f}", type=g.mjGEOM_MESH, meshname=f"taxels_{f}", mass=0, contype=0, conaffinity=0
+            )
+            spec.add_sensor(
+                name=f"touch_{f}",
+                type=mujoco.mjtSensor.mjSENS_TACTILE,
+                objtype=mujoco.mjtObj.mjOBJ_MESH,
+                objname=f"taxels_{f}",
+                reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                refname=f"pad_{f}",
+            )
         return spec
 
     def launch(self) -> None:

@@ -1,10 +1,11 @@
-"""Bytes and operations that a touch launch asks for, counted from the layout, and the time below which no H200 can do them.
+"""Bytes and operations that a touch launch asks for, counted from the layout, and the time below which no H200 can do
+them.
 
-Bytes: what must cross the memory bus once. Written: each pad's force, centre and force of other tips, and with `raw` each
-taxel's force. Read: poses of the bodies that occur, contact forces, shape and size. The taxel table, shapes and distance
-grids (a few MB in all) stay in the caches and are not counted. Operations: multiply, add, compare, absolute value, minimum,
-root and quotient as one each, as `sdf.py` and `kernel.py` have them, every taxel of every pad of every world (nothing
-culled); what is done once a pad (poses, boxes, reduction across lanes) is left out.
+Bytes: what must cross the memory bus once. Written: each pad's force, centre and force of other tips, and with `raw`
+each taxel's force. Read: poses of the bodies that occur, contact forces, shape and size. The taxel table, shapes and
+distance grids (a few MB in all) stay in the caches and are not counted. Operations: multiply, add, compare, absolute
+value, minimum, root and quotient as one each, as `sdf.py` and `kernel.py` have them, every taxel of every pad of every
+world (nothing culled); what is done once a pad (poses, boxes, reduction across lanes) is left out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,11 @@
-"""Where a physics step's time goes on a GPU: microseconds of each stage of MuJoCo-Warp, in the closed grasp of benchmarks.step.
+"""Where a physics step's time goes on a GPU: microseconds of each stage of MuJoCo-Warp, in the closed grasp of
+benchmarks.step.
 
-    python -m benchmarks.trace device=cuda:0 [worlds=8192] [steps=30] [setting="ccd_tolerance 1e-5"] [any setting of train.py]
+    python -m benchmarks.trace device=cuda:0 [worlds=8192] [steps=30] [setting="ccd_tolerance 1e-5"] [any setting of
+    train.py]
 
-Stages are MuJoCo-Warp's own marks, timed by events inside the recorded graph; with them the distributions that decide the
+Stages are MuJoCo-Warp's own marks, timed by events inside the recorded graph; with them the distributions that decide
+the
 cost: contacts, constraint rows and Newton iterations of a world. setting: one of those of benchmarks.physics.
 """
 
@@ -55,7 +58,8 @@ def main(argv: list[str]) -> dict:
     cfg = tools.config(rest)
     device = cfg["device"]
     if not device.startswith("cuda"):
-        raise UserError("benchmarks.trace: needs a CUDA device (the marks are CUDA events); on a CPU use benchmarks.step")
+        raise UserError("benchmarks.trace: needs a CUDA device (the marks are CUDA events); on a CPU use"
+                        " benchmarks.step")
     if own["setting"] not in SETTINGS:
         raise UserError(f"benchmarks.trace: setting={own['setting']}: there are: {', '.join(SETTINGS)}")
     chosen = SETTINGS[own["setting"]]
@@ -72,7 +76,8 @@ def main(argv: list[str]) -> dict:
     for name, us in median.items():
         print(f"  {'    ' * name.count('/')}{name.rpartition('/')[2]:32s}{us:10.1f} us")
     out = {
-        "benchmark": "trace", **tools.about(device), "setting": own["setting"], "worlds": e.n, "stages_us": median, "contacts": nacon / e.n,
+        "benchmark": "trace", **tools.about(device), "setting": own["setting"], "worlds": e.n, "stages_us": median,
+        "contacts": nacon / e.n,
         "rows_mean_p99_max": _spread(d.nefc.numpy()), "newton_mean_p99_max": _spread(d.solver_niter.numpy()),
         "contacts_by_geom_types": {f"{a}-{b}": round(int(c) / e.n, 3) for (a, b), c in zip(pairs, counts, strict=True)},
         "collisions_tested": int(d.ncollision.numpy()[0]) / e.n if hasattr(d, "ncollision") else None,

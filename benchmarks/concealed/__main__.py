@@ -1,12 +1,14 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
-    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900] [budget=0] [until=0]
-    python -m benchmarks.concealed ci=true                    # twelve cases of one to three joints
-    python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight of them
+    python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [out=out/concealed] [jobs=1] [limit=900]
+    [budget=0] [until=0] python -m benchmarks.concealed ci=true                    # twelve cases of one to three joints
+    python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight of
+    them
 
-mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take; budget: seconds after which no further
-diagnosis is begun, until: after which those under way are stopped and left out too (0: none). Resumable: what is finished is not
-run again. Writes hashes.txt before any diagnosis, results.json and table.txt; prints the table and one JSON line.
+mix: number of cases by group (see `generate.plan`); limit: seconds a diagnosis may take; budget: seconds after which no
+further diagnosis is begun, until: after which those under way are stopped and left out too (0: none). Resumable: what
+is finished is not run again. Writes hashes.txt before any diagnosis, results.json and table.txt; prints the table and
+one JSON line.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False}
+SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "out": "out/concealed", "jobs": 1, "limit": 900, "budget": 0,
+            "until": 0, "baselines": 0, "ci": False, "one_joint": False}
 CI = {"effect": 6, "none": 2, "pair": 1, "outside": 1, "decoy": 2}
 
 
@@ -69,7 +72,8 @@ class Progress:
         spent = time.perf_counter() - self.start
         if spent - self.last > 5 or self.done == self.total:
             self.last = spent
-            print(f"  {self.what} {self.done}/{self.total}, about {spent / self.done * (self.total - self.done):.0f} s left", flush=True)
+            print(f"  {self.what} {self.done}/{self.total}, about {spent / self.done * (self.total - self.done):.0f} s"
+                  " left", flush=True)
 
 
 def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
@@ -83,11 +87,13 @@ def _diagnose(m: dict, s: dict, root: Path, begun: float) -> None:
     files = [str(case / f"{letter}.mcap") for letter in generate.RECORDINGS]
     fit, held = files[: -generate.HELD], files[-generate.HELD :]
     own = [f"model={case / 'rig.xml'}", f"servo={case / 'servo.yaml'}"] if (case / "rig.xml").is_file() else []
-    argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]", *own, f"out={out}", "next=false"]
+    argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(fit)}]", f"held_out=[{','.join(held)}]",
+            *own, f"out={out}", "next=false"]
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     with open(out / "log.txt", "w", encoding="utf-8") as log:
         try:
-            status = subprocess.run(argv, cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT, timeout=room).returncode
+            status = subprocess.run(argv, cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT,
+                                    timeout=room).returncode
         except subprocess.TimeoutExpired:
             if room < s["limit"]:  # the run ends, not its time: left out
                 return
@@ -131,8 +137,11 @@ def main(argv: list[str]) -> dict:
         for m in pool.map(generate.once, jobs):
             made.append(m)
             tick()
-    (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made, key=lambda m: m["name"])), encoding="utf-8")
-    print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}", flush=True)
+    (root / "hashes.txt").write_text("".join(f"{m['digest']}  {m['name']}\n" for m in sorted(made,
+                                                                                             key=lambda m: m["name"])),
+                                                                                             encoding="utf-8")
+    print(f"{len(made)} cases; SHA-256 of each truth with its salt, before any diagnosis: {root / 'hashes.txt'}",
+          flush=True)
     work = [(_diagnose, m) for m in made]
     compared = baselines.comparable(made, root, s["baselines"])
     for k, m in enumerate(compared):  # among the diagnoses, not after them all: the budget may end before
@@ -154,12 +163,14 @@ def main(argv: list[str]) -> dict:
     others = None
     if compared:
         others = baselines.compare(compared, results, root)
-    (root / "results.json").write_text(json.dumps({"seed": s["seed"], "results": results, "lines": lines, "baselines": others}), encoding="utf-8")
+    (root / "results.json").write_text(json.dumps({"seed": s["seed"], "results": results, "lines": lines,
+                                                   "baselines": others}), encoding="utf-8")
     text = score.show(lines, results) + ("\n\n" + baselines.show(others) if others else "")
     (root / "table.txt").write_text(text + "\n", encoding="utf-8")
     print("\n" + text)
     line = {"benchmark": "concealed", "seed": s["seed"], "cases": len(made), "left_out": len(made) - len(results),
-            "failed": sum(r["verdict"] == "failed" for r in results), "seconds_median": sorted(seconds)[len(seconds) // 2] if seconds else None,
+            "failed": sum(r["verdict"] == "failed" for r in results),
+            "seconds_median": sorted(seconds)[len(seconds) // 2] if seconds else None,
             "wall_s": round(time.perf_counter() - begun), "lines": lines}  # fmt: skip
     print(json.dumps(line))
     return line

@@ -1,10 +1,10 @@
 """What methods without names leave of the held-out error, on a subset of one-joint cases.
 
-`mujoco.sysid` with all its parameters free (gains, torque limit, armature, damping, friction, mass, delay and bias of the sensor);
-a fixed set as in PACE (armature, viscous and dry friction, delay, joint bias) by CMA-ES; a network that corrects the simulated
-position. All see the recordings that `diagnose` may fit, and are judged in free run on the one held out. `mujoco.sysid` needs
-`pip install "mujoco[sysid]"`; without it that line is left out and says so. Where the hidden effect is a number that `mujoco.sysid`
-has too, its error is compared as well, and the time that each takes.
+`mujoco.sysid` with all its parameters free (gains, torque limit, armature, damping, friction, mass, delay and bias of
+the sensor); a fixed set as in PACE (armature, viscous and dry friction, delay, joint bias) by CMA-ES; a network that
+corrects the simulated position. All see the recordings that `diagnose` may fit, and are judged in free run on the one
+held out. `mujoco.sysid` needs `pip install "mujoco[sysid]"`; without it that line is left out and says so. Where the
+hidden effect is a number that `mujoco.sysid` has too, its error is compared as well, and the time that each takes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from benchmarks.concealed import generate, score
 
 DT = 1e-3
 METHODS = ("believed", "pace", "network", "sysid")
-LABELS = {"believed": "simulator as believed", "pace": "fixed set (PACE-like), CMA-ES", "network": "residual network", "sysid": "mujoco.sysid, all free",
+LABELS = {"believed": "simulator as believed", "pace": "fixed set (PACE-like), CMA-ES", "network": "residual network",
+          "sysid": "mujoco.sysid, all free",
           "diagnose": "diagnose"}  # fmt: skip
 
 KINDS = {  # kind of the plant: key in the truth, mujoco.sysid's parameter, what that says about the key
@@ -50,10 +51,16 @@ class Rig:
         self.folder, self.voltage = folder, servo["drive"] == "voltage"
         self.weight = float(model.body_mass[1] * 9.81 * -model.body_ipos[1, 2])
         self.link = float(model.body_mass[1] * model.body_ipos[1, 2] ** 2 + model.body_inertia[1, 1])
-        self.believed = {"kp": j["kp"], "kd": j["kd"], "limit": j["torque_limit"], "speed": j["no_load_speed"], "dry": j["coulomb_friction"],
-                         "viscous": j["viscous_friction"], "armature": float(model.dof_armature[0]), "delay": 0.0, "bias": 0.0}  # fmt: skip
+        self.believed = {"kp": j["kp"], "kd": j["kd"], "limit": j["torque_limit"], "speed": j["no_load_speed"],
+                         "dry": j["coulomb_friction"],
+                         "viscous": j["viscous_friction"], "armature": float(model.dof_armature[0]), "delay": 0.0,
+                         "bias": 0.0}  # fmt: skip
         # as KINDS reads it; mujoco.sysid's kp of a voltage drive is a torque's
-        self.meant = {"armature": self.believed["armature"], "mass": float(model.body_mass[1]), "kp": j["kp"] * (j["torque_limit"] if self.voltage else 1.0)}
+        self.meant = {
+            "armature": self.believed["armature"],
+            "mass": float(model.body_mass[1]),
+            "kp": j["kp"] * (j["torque_limit"] if self.voltage else 1.0),
+        }
         self.runs = []
         for letter in generate.RECORDINGS:
             r = read(folder / f"{letter}.mcap")
@@ -94,11 +101,17 @@ class Rig:
         return np.sqrt(np.mean([np.mean((self.simulate(guess, r)[0] - self.runs[r][1]) ** 2, 1) for r in runs], 0))
 
 
-FIT, HELD = range(len(generate.RECORDINGS) - generate.HELD), range(len(generate.RECORDINGS) - generate.HELD, len(generate.RECORDINGS))
+FIT, HELD = (
+    range(len(generate.RECORDINGS) - generate.HELD),
+    range(len(generate.RECORDINGS) - generate.HELD, len(generate.RECORDINGS)),
+)
 
 
-def cma(objective, low: np.ndarray, high: np.ndarray, start: np.ndarray, generations: int, seed: int, size: int = 12) -> np.ndarray:
-    """Minimises objective([size, n]) within bounds by CMA-ES (Hansen 2016, standard constants); returns the best point."""
+def cma(
+    objective, low: np.ndarray, high: np.ndarray, start: np.ndarray, generations: int, seed: int, size: int = 12
+) -> np.ndarray:
+    """Minimises objective([size, n]) within bounds by CMA-ES (Hansen 2016, standard constants); returns the best
+    point."""
     rng, n = np.random.default_rng(seed), len(low)
     mu = size // 2
     w = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
@@ -144,8 +157,8 @@ def pace(rig: Rig, seed: int = 0, generations: int = 80) -> float:
 
 
 def network(rig: Rig, seed: int = 0, epochs: int = 250) -> float:
-    """Held-out RMSE [rad] of the believed simulator plus a network's correction of its position, from a third of a second of
-    its own motion and of the commands (nothing measured goes in)."""
+    """Held-out RMSE [rad] of the believed simulator plus a network's correction of its position, from a third of a
+    second of its own motion and of the commands (nothing measured goes in)."""
     import torch
 
     torch.manual_seed(seed)
@@ -163,7 +176,9 @@ def network(rig: Rig, seed: int = 0, epochs: int = 250) -> float:
     data = [features(r) for r in (*FIT, *HELD)]
     x, y = np.concatenate([d[0] for d in data[: len(FIT)]]), np.concatenate([d[1] for d in data[: len(FIT)]])
     mean, std, scale = x.mean(0), x.std(0) + 1e-6, y.std() + 1e-9
-    net = torch.nn.Sequential(torch.nn.Linear(x.shape[1], 64), torch.nn.ELU(), torch.nn.Linear(64, 64), torch.nn.ELU(), torch.nn.Linear(64, 1))
+    net = torch.nn.Sequential(
+        torch.nn.Linear(x.shape[1], 64), torch.nn.ELU(), torch.nn.Linear(64, 64), torch.nn.ELU(), torch.nn.Linear(64, 1)
+    )
     tensor = lambda a: torch.as_tensor(a, dtype=torch.float32)  # noqa: E731
     X, Y = tensor((x - mean) / std), tensor(y / scale)[:, None]
     adam = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=1e-2)
@@ -178,8 +193,8 @@ def network(rig: Rig, seed: int = 0, epochs: int = 250) -> float:
 
 
 def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tuple[dict[str, float], float] | None:
-    """What `mujoco.sysid` finds, {name: value} (SI units; kp and kd of a voltage drive times its torque limit), and its held-out
-    RMSE [rad]; None where it is not installed. free: the parameters to fit, all nine where none are named."""
+    """What `mujoco.sysid` finds, {name: value} (SI units; kp and kd of a voltage drive times its torque limit), and its
+    held-out RMSE [rad]; None where it is not installed. free: the parameters to fit, all nine where none are named."""
     import mujoco
 
     try:
@@ -189,15 +204,25 @@ def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tupl
     except ImportError:
         return None
     b = rig.believed
-    kp, kd = (b["kp"] * b["limit"], b["kd"] * b["limit"] + b["limit"] / b["speed"]) if rig.voltage else (b["kp"], b["kd"])
+    kp, kd = (
+        (b["kp"] * b["limit"], b["kd"] * b["limit"] + b["limit"] / b["speed"]) if rig.voltage else (b["kp"], b["kd"])
+    )
     spec = mujoco.MjSpec.from_file(str(rig.folder / "rig.xml"))
     spec.option.timestep, spec.option.integrator = 2 * DT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     joint = spec.joint("joint0")
     joint.damping, joint.frictionloss = [b["viscous"], 0, 0], b["dry"]
-    motor = spec.add_actuator(name="servo", target="joint0", trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE)
+    motor = spec.add_actuator(
+        name="servo",
+        target="joint0",
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+    )
     motor.gainprm[0], motor.biasprm[1], motor.biasprm[2] = kp, -kp, -kd
     motor.forcelimited, motor.forcerange = True, [-b["limit"], b["limit"]]
-    spec.add_sensor(name="position", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname="joint0")
+    spec.add_sensor(
+        name="position", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname="joint0"
+    )
     model = spec.compile()
     mass0 = float(model.body_mass[1])
 
@@ -220,10 +245,14 @@ def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tupl
 
         return change
 
-    ranges = {"armature": (b["armature"], 0.0, 4 * (rig.link + b["armature"])), "damping": (b["viscous"], 0.0, 0.3 * rig.weight), "frictionloss": (b["dry"], 0.0, 1.2 * rig.weight),
-              "mass": (mass0, 0.5 * mass0, 3 * mass0), "kp": (kp, 0.25 * kp, 4 * kp), "kd": (kd, 0.1 * kd, 6 * kd), "limit": (b["limit"], 0.1 * b["limit"], 1.5 * b["limit"])}  # fmt: skip
+    ranges = {"armature": (b["armature"], 0.0, 4 * (rig.link + b["armature"])),
+              "damping": (b["viscous"], 0.0, 0.3 * rig.weight), "frictionloss": (b["dry"], 0.0, 1.2 * rig.weight),
+              "mass": (mass0, 0.5 * mass0, 3 * mass0), "kp": (kp, 0.25 * kp, 4 * kp), "kd": (kd, 0.1 * kd, 6 * kd),
+              "limit": (b["limit"], 0.1 * b["limit"], 1.5 * b["limit"])}  # fmt: skip
     free = free or (*ranges, "delay", "bias")
-    params = s.ParameterDict({k: s.Parameter(k, v, lo, hi, modifier=put(k)) for k, (v, lo, hi) in ranges.items() if k in free})
+    params = s.ParameterDict(
+        {k: s.Parameter(k, v, lo, hi, modifier=put(k)) for k, (v, lo, hi) in ranges.items() if k in free}
+    )
     transform = s.SignalTransform()
     if "delay" in free:
         params.add(s.Parameter("delay", 0.005, 0.0, 0.1))
@@ -255,7 +284,12 @@ def identify(rig: Rig, iterations: int = 30, free: tuple[str, ...] = ()) -> tupl
 def one(folder: Path, kept: Path) -> None:
     """Errors of one case by method, and their times [s]; written to `kept`."""
     rig, out = Rig(folder), {}
-    for name, method in (("believed", lambda r: float(r.error({}, HELD)[0])), ("pace", pace), ("network", network), ("sysid", identify)):
+    for name, method in (
+        ("believed", lambda r: float(r.error({}, HELD)[0])),
+        ("pace", pace),
+        ("network", network),
+        ("sysid", identify),
+    ):
         start = time.perf_counter()
         try:
             out[name] = method(rig)
@@ -270,19 +304,26 @@ def one(folder: Path, kept: Path) -> None:
 
 
 def comparable(made: list[dict], root: Path, count: int) -> list[dict]:
-    """The first `count` one-joint cases whose effect moves the joint and stands out of the floor, of those made ({name, digest})."""
+    """The first `count` one-joint cases whose effect moves the joint and stands out of the floor, of those made ({name,
+    digest})."""
     out = []
     for m in made:
         if len(out) == count:
             break
         truth = generate.reveal(root / "truth" / f"{m['name']}.json", m["digest"])
-        if truth["group"] == "effect" and truth["shape"] == "one" and truth["tier"] in ("easy", "medium") and truth["effects"][0]["effect"] != "current_sensor":
+        if (
+            truth["group"] == "effect"
+            and truth["shape"] == "one"
+            and truth["tier"] in ("easy", "medium")
+            and truth["effects"][0]["effect"] != "current_sensor"
+        ):
             out.append(m)
     return out
 
 
 def compare(compared: list[dict], results: list[dict], root: Path) -> dict:
-    """Errors of all methods on those of the cases `compared` of which the diagnosis and the others' answers are there."""
+    """Errors of all methods on those of the cases `compared` of which the diagnosis and the others' answers are
+    there."""
     kept = {m["name"]: root / "baselines" / f"{m['name']}.json" for m in compared}
     pick = [r for r in results if r["name"] in kept and kept[r["name"]].is_file()]
     found = [json.loads(kept[r["name"]].read_text(encoding="utf-8")) for r in pick]
@@ -290,17 +331,34 @@ def compare(compared: list[dict], results: list[dict], root: Path) -> dict:
     digests = {m["name"]: m["digest"] for m in compared}
     for r, f in zip(pick, found, strict=True):
         truth = generate.reveal(root / "truth" / f"{r['name']}.json", digests[r["name"]])
-        h = json.loads((root / "diagnoses" / r["name"] / "diagnosis.json").read_text(encoding="utf-8")).get("held_out") or {}
+        h = (
+            json.loads((root / "diagnoses" / r["name"] / "diagnosis.json").read_text(encoding="utf-8")).get("held_out")
+            or {}
+        )
         seconds = float((root / "diagnoses" / r["name"] / "seconds").read_text(encoding="utf-8"))
-        rows.append({"name": r["name"], "hidden": r["hidden"][0][0], "floor": truth["floor"], "diagnose": h.get("after"), "diagnose_s": seconds, **f,
-                     "parameter": _parameter(truth["effects"][0], root / "diagnoses" / r["name"] / "diagnosis.json", f)})
+        rows.append(
+            {
+                "name": r["name"],
+                "hidden": r["hidden"][0][0],
+                "floor": truth["floor"],
+                "diagnose": h.get("after"),
+                "diagnose_s": seconds,
+                **f,
+                "parameter": _parameter(truth["effects"][0], root / "diagnoses" / r["name"] / "diagnosis.json", f),
+            }
+        )
     lines = {}
     for method in (*METHODS, "diagnose"):
         ratio = [x[method] / x["floor"] for x in rows if x.get(method)]
         if ratio:
             low, high = score.bootstrap(ratio, np.median)
-            lines[method] = {"value": float(np.median(ratio)), "low": low, "high": high, "n": len(ratio),
-                             "seconds": float(np.median([x.get(f"{method}_s", 0.0) for x in rows if x.get(method)]))}
+            lines[method] = {
+                "value": float(np.median(ratio)),
+                "low": low,
+                "high": high,
+                "n": len(ratio),
+                "seconds": float(np.median([x.get(f"{method}_s", 0.0) for x in rows if x.get(method)])),
+            }
             errors = [x["parameter"][method] for x in rows if x["parameter"] and method in x["parameter"]]
             if errors:
                 lines[method] |= {"parameter": float(np.median(errors)), "parameters": len(errors)}
@@ -308,23 +366,34 @@ def compare(compared: list[dict], results: list[dict], root: Path) -> dict:
 
 
 def _parameter(effect: dict, diagnosis: Path, found: dict) -> dict[str, float] | None:
-    """Relative errors of the hidden number by `diagnose` (1 where it does not name the effect) and by `mujoco.sysid`; None where the
-    latter has no such number or is not there."""
+    """Relative errors of the hidden number by `diagnose` (1 where it does not name the effect) and by `mujoco.sysid`;
+    None where the latter has no such number or is not there."""
     if effect["kind"] not in KINDS or "sysid_values" not in found:
         return None
     key, name, read = KINDS[effect["kind"]]
     value = effect["parameters"][key]
     said = json.loads(diagnosis.read_text(encoding="utf-8"))["findings"]
-    ours, _ = score._parameters(next((f for f in said if f["effect"] == effect["effect"]), None), {"parameters": {key: value}})
-    return {"sysid": abs(read(found["sysid_values"][name], found["meant"]) - value) / abs(value), "diagnose": ours[0] if ours else 1.0}
+    ours, _ = score._parameters(
+        next((f for f in said if f["effect"] == effect["effect"]), None), {"parameters": {key: value}}
+    )
+    return {
+        "sysid": abs(read(found["sysid_values"][name], found["meant"]) - value) / abs(value),
+        "diagnose": ours[0] if ours else 1.0,
+    }
 
 
 def show(others: dict) -> str:
     """The comparison as text."""
-    out = [f"{'held-out error over the floor, median':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}   time   error of the hidden number"]
+    out = [
+        f"{'held-out error over the floor, median':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}   time   error"
+        " of the hidden number"
+    ]
     for k, v in others["lines"].items():
         number = f"   {100 * v['parameter']:.0f} % ({v['parameters']})" if "parameter" in v else ""
-        out.append(f"{LABELS[k]:<44}{v['value']:>8.2f}   {v['low']:.2f} .. {v['high']:<12.2f}{v['n']:>4}{v['seconds']:>6.0f} s{number}")
+        out.append(
+            f"{LABELS[k]:<44}{v['value']:>8.2f}   {v['low']:.2f} .."
+            f" {v['high']:<12.2f}{v['n']:>4}{v['seconds']:>6.0f} s{number}"
+        )
     if others["cases"] and "sysid" not in others["lines"]:
         out.append('mujoco.sysid is not installed: pip install "mujoco[sysid]"')
     return "\n".join(out)

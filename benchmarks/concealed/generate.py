@@ -1,11 +1,13 @@
-"""Draws the cases of the concealed benchmark: a rig, motions, an effect of a chosen size, recordings, and the truth apart.
+"""Draws the cases of the concealed benchmark: a rig, motions, an effect of a chosen size, recordings, and the truth
+apart.
 
-A case folder holds what `diagnose` sees: `a.mcap`, `b.mcap`, `c.mcap` (to fit), `d.mcap` (held out), `rig.xml`, `servo.yaml` (none
-for the xHand). The truth goes to another folder; its SHA-256 with a random salt is published first.
+A case folder holds what `diagnose` sees: `a.mcap`, `b.mcap`, `c.mcap` (to fit), `d.mcap` (held out), `rig.xml`,
+`servo.yaml` (none for the xHand). The truth goes to another folder; its SHA-256 with a random salt is published first.
 
-Size of an effect: d = the held-out change that it makes in its joint, with gains, mass, inertia and friction refitted by up to 5 %
-to hide it; f = the floor: measurement noise and what another friction law leaves of the same rig. sqrt(d^2 + f^2) / f is 10, 3 or
-1.5 at easy, medium and hard: the size is read off one batch in which the same rig carries the effect at many sizes.
+Size of an effect: d = the held-out change that it makes in its joint, with gains, mass, inertia and friction refitted
+by up to 5 % to hide it; f = the floor: measurement noise and what another friction law leaves of the same rig. sqrt(d^2
++ f^2) / f is 10, 3 or 1.5 at easy, medium and hard: the size is read off one batch in which the same rig carries the
+effect at many sizes.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than 
 def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
     """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
-    mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same, noise
-    doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns), touch (a fingertip under a ball: the
-    same). Effects, tiers
+    mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
+    noise doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns),
+    touch (a fingertip under a ball: the same). Effects, tiers
     and shapes take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
@@ -58,24 +60,44 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
                 names = BY_EFFECT[effects[k % len(effects)]]
                 kind = names[turn % len(names)]
                 several = not one_joint and (KINDS[kind].joints > 1 or (k + turn) % 5 in (1, 3))
-                entry |= {"kinds": [kind], "tier": tiers[(k + turn) % 3], "shape": str(rng.choice(SEVERAL)) if several else "one"}
+                entry |= {
+                    "kinds": [kind],
+                    "tier": tiers[(k + turn) % 3],
+                    "shape": str(rng.choice(SEVERAL)) if several else "one",
+                }
             if group == "hand":
-                entry |= {"shape": "hand", "tier": tiers[k % 2]} if k % 3 else {"shape": "hand", "kinds": [], "tier": "none"}
+                entry |= (
+                    {"shape": "hand", "tier": tiers[k % 2]} if k % 3 else {"shape": "hand", "kinds": [], "tier": "none"}
+                )
             elif group == "touch":
                 names = list(touch_cases.KINDS)
                 hidden = k % 4 > 0
-                entry |= {"shape": "touch", "kinds": [names[(k - k // 4) % len(names)]] if hidden else [], "tier": ("easy", "medium")[k // 4 % 2] if hidden else "none"}
+                entry |= {
+                    "shape": "touch",
+                    "kinds": [names[(k - k // 4) % len(names)]] if hidden else [],
+                    "tier": ("easy", "medium")[k // 4 % 2] if hidden else "none",
+                }
             elif group == "none" and not one_joint and k % 10 == 9:
                 entry["shape"] = str(rng.choice(SEVERAL))
             elif group == "pair":
                 two = rng.choice(len(effects), 2, replace=False)
                 kinds = [str(rng.choice(BY_EFFECT[effects[i]])) for i in two]
-                entry |= {"kinds": kinds, "tier": tiers[k % 2], "shape": str(rng.choice(SEVERAL)) if not one_joint and k % 2 or any(KINDS[x].joints > 1 for x in kinds) else "one"}
+                entry |= {
+                    "kinds": kinds,
+                    "tier": tiers[k % 2],
+                    "shape": str(rng.choice(SEVERAL))
+                    if not one_joint and k % 2 or any(KINDS[x].joints > 1 for x in kinds)
+                    else "one",
+                }
             elif group == "outside":
                 entry |= {"kinds": [list(OUTSIDE)[k % len(OUTSIDE)]], "tier": tiers[k // len(OUTSIDE) % 2]}
             elif group == "decoy":
                 what = DECOYS[k % len(DECOYS)]
-                entry |= {"decoy": what, "tier": "poor"} if what == "poor" else {"decoy": what, "kinds": [], "tier": "none", "shape": "one"}
+                entry |= (
+                    {"decoy": what, "tier": "poor"}
+                    if what == "poor"
+                    else {"decoy": what, "kinds": [], "tier": "none", "shape": "one"}
+                )
             out.append(entry)
     return [out[i] for i in rng.permutation(len(out))]
 
@@ -84,7 +106,8 @@ def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
     """Targets of the recordings in every millisecond, [R, J, M]; sent at 100 Hz and held between."""
     M = int(SECONDS * 1000)
     t = np.arange(0, SECONDS, 0.01)
-    calm = 0.6 if d.rig.com.shape[1] > 1 else 1.0  # a chain thrown about is chaotic, and no replay of it can be compared
+    # a chain thrown about is chaotic, and no replay of it can be compared
+    calm = 0.6 if d.rig.com.shape[1] > 1 else 1.0
     out = np.zeros((len(RECORDINGS), d.joints, M))
     for k in range(len(RECORDINGS)):
         for j in range(d.joints):
@@ -93,8 +116,13 @@ def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
             else:
                 knots = np.cumsum(np.r_[0.0, rng.uniform(0.4, 0.9, 60)])
                 levels = np.r_[0.0, calm * rng.uniform(-0.8, 0.8, len(knots) - 1)]
-                rise = rng.uniform(0.15, 0.35) / calm  # steps as a planner sends them: a drive that saturates all the time hides the rest
-                step = np.interp(t, np.sort(np.r_[knots[1:], knots[1:] + rise]), np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]])
+                # steps as a planner sends them: a drive that saturates all the time hides the rest
+                rise = rng.uniform(0.15, 0.35) / calm
+                step = np.interp(
+                    t,
+                    np.sort(np.r_[knots[1:], knots[1:] + rise]),
+                    np.r_[levels[0], np.repeat(levels[1:-1], 2), levels[-1]],
+                )
                 f = np.linspace(rng.uniform(0.15, 0.3), calm * rng.uniform(1.2, 2.5), len(t))
                 chirp = rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * np.cumsum(f) * 0.01) + rng.uniform(-0.3, 0.3)
                 ramp = np.interp(t, knots[::2], levels[::2])
@@ -111,11 +139,16 @@ class Bench:
 
     def __init__(self, d: rigs.Drawn, command: np.ndarray, warm: np.ndarray, noise: float, source: int):
         self.d, self.command, self.warm, self.noise, self.source = d, command, warm, noise, source
-        self.base = {k: np.broadcast_to(d.true.get(k, v), (d.joints,)).astype(float).copy() for k, v in plant.DEFAULTS.items()}
+        self.base = {
+            k: np.broadcast_to(d.true.get(k, v), (d.joints,)).astype(float).copy() for k, v in plant.DEFAULTS.items()
+        }
         self.base["couple_from"][:] = source
 
-    def run(self, variants: list[dict[str, np.ndarray]], commands: list[np.ndarray] | None = None, **kw) -> dict[str, np.ndarray]:
-        """Outputs [V, R, J, M] of parameter sets [J]; position is as the encoder reports it. commands: one [R, J, M] a variant."""
+    def run(
+        self, variants: list[dict[str, np.ndarray]], commands: list[np.ndarray] | None = None, **kw
+    ) -> dict[str, np.ndarray]:
+        """Outputs [V, R, J, M] of parameter sets [J]; position is as the encoder reports it. commands: one [R, J, M] a
+        variant."""
         V, R = len(variants), len(self.command)
         values = {k: np.repeat(np.stack([v[k] for v in variants]), R, 0) for k in plant.DEFAULTS}
         values["warm"] = np.tile(self.warm[:, None] + np.zeros(self.d.joints), (V, 1))
@@ -125,10 +158,14 @@ class Bench:
         out = plant.simulate(self.d.rig, plant.rows(V * R, self.d.joints, **values), command, q0=start, **kw)
         out["link"] = out["position"]
         v = {k: values[k][..., None] for k in ("scale", "offset", "eccentric", "eccentric_at")}
-        out["position"] = v["scale"] * out["link"] + v["offset"] + v["eccentric"] * np.sin(out["link"] + v["eccentric_at"])
+        out["position"] = (
+            v["scale"] * out["link"] + v["offset"] + v["eccentric"] * np.sin(out["link"] + v["eccentric_at"])
+        )
         return {k: x.reshape(V, R, *x.shape[1:]) for k, x in out.items()}
 
-    def changed(self, joint: int, change: dict[str, float], base: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+    def changed(
+        self, joint: int, change: dict[str, float], base: dict[str, np.ndarray] | None = None
+    ) -> dict[str, np.ndarray]:
         """The parameters with one joint's changed."""
         out = {k: v.copy() for k, v in (base or self.base).items()}
         for k, x in change.items():
@@ -136,8 +173,8 @@ class Bench:
         return out
 
     def sized(self, kind: Kind | None, joint: int, ratio: float, seed: int) -> tuple[float, dict, dict]:
-        """(size of the effect, figures, outputs [1, R, J, M] with it): the size at which it changes held-out error in its joint by
-        the ratio."""
+        """(size of the effect, figures, outputs [1, R, J, M] with it): the size at which it changes held-out error in
+        its joint by the ratio."""
         d, true = self.d, {k: float(v[joint]) for k, v in self.base.items()}
         sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
         unit, inertia = float(d.unit[joint]), float(d.inertia[joint])
@@ -181,7 +218,11 @@ class Bench:
             change = np.array([hidden(np.full_like(y[0], s * unit)) for s in sizes])
         reached = np.hypot(change, floor) / floor
         pick = int(np.nanargmin(np.abs(np.log(reached / ratio))))
-        facts |= {"ratio": float(reached[pick]), "before": float(np.hypot(change[pick], floor)), "size": float(sizes[pick])}
+        facts |= {
+            "ratio": float(reached[pick]),
+            "before": float(np.hypot(change[pick], floor)),
+            "size": float(sizes[pick]),
+        }
         return float(sizes[pick]), facts, of(1 + pick if moves else 0)
 
     def stalls(self, size: float, seed: int) -> np.ndarray:
@@ -191,7 +232,8 @@ class Bench:
 
 def metadata(effort: bool, hand: bool) -> dict[str, str]:
     """What every recording states: nothing of it depends on the effect."""
-    return {"source": "real", "robot": "xhand_right" if hand else "rig", "gravity": "0 0 -9.81", "effort_is": "torque_Nm" if effort else "none",
+    return {"source": "real", "robot": "xhand_right" if hand else "rig", "gravity": "0 0 -9.81",
+            "effort_is": "torque_Nm" if effort else "none",
             "effort_sign": "+1"}  # fmt: skip
 
 
@@ -242,7 +284,9 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     if decoy == "touched":  # somebody leans on the link for a while, in one recording
         hand_touch = np.zeros_like(command)
         k, a = int(rng.integers(len(RECORDINGS) - HELD)), int(rng.uniform(0.2, 0.6) * command.shape[2])
-        hand_touch[k, joint, a : a + 1200] = 2.0 * d.unit[joint] * np.sin(np.pi * np.arange(1200) / 1200)[: command.shape[2] - a]
+        hand_touch[k, joint, a : a + 1200] = (
+            2.0 * d.unit[joint] * np.sin(np.pi * np.arange(1200) / 1200)[: command.shape[2] - a]
+        )
     elif decoy == "wrong_mass":
         wrong = {"mass": float(new["mass"][joint])}
         d.believed["mass"][joint] *= 1 + float(rng.choice([-0.3, 0.4]))
@@ -250,7 +294,10 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     if len(kinds) == 2 or hand_touch is not None:
         run = bench.run([new], [sent], external=hand_touch)
     if confounding:  # friction wears up run by run, and the motor happens to be warmer each time
-        parts = [bench.run([bench.changed(joint, {"coulomb": new["coulomb"][joint] * (1 + 1.2 * k)}, new)], [sent]) for k in range(len(RECORDINGS))]
+        parts = [
+            bench.run([bench.changed(joint, {"coulomb": new["coulomb"][joint] * (1 + 1.2 * k)}, new)], [sent])
+            for k in range(len(RECORDINGS))
+        ]
         run = {key: np.stack([parts[k][key][:, k] for k in range(len(RECORDINGS))], 1) for key in run}
     where = seen / name
     where.mkdir(parents=True, exist_ok=True)
@@ -264,51 +311,97 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         n = {k: float(v[at]) for k, v in new.items()} | current
         o = {k: float(v[at]) for k, v in bench.base.items()}
         believed = {k: float(v[at]) for k, v in d.believed.items()}
-        told = {k: float(v) for k, v in kind.report(n, o | {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}).items()}
+        told = {
+            k: float(v)
+            for k, v in kind.report(
+                n, o | {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}
+            ).items()
+        }
         if kind.effect == "payload":
             told = {"mass": n["mass"] + n["extra"] - believed["mass"]}
-        effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told, "facts": fact,
+        effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told,
+                        "facts": fact,
                         "also": _also(kind, d, at, source),
                         "when": _when(kind, run, command, d, at, source, n, o)})  # fmt: skip
     if wrong:
-        effects = [{"effect": "payload", "kind": "payload", "joint": d.rig.names[joint], "parameters": wrong, "facts": facts[0], "also": [], "when": []}]
+        effects = [
+            {
+                "effect": "payload",
+                "kind": "payload",
+                "joint": d.rig.names[joint],
+                "parameters": wrong,
+                "facts": facts[0],
+                "also": [],
+                "when": [],
+            }
+        ]
     tier = entry["tier"]
     if group in ("effect", "hand", "pair", "outside") and kinds:
         tier = min((tier_of(f["ratio"]) for f in facts), key=("silent", "hard", "medium", "easy").index)
-    answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier, "shape": d.shape, "joints": len(d.rig.names),
+    answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier,
+              "shape": d.shape, "joints": len(d.rig.names),
               "voltage": d.voltage, "effort": effort, "floor": facts[0]["floor"], "effects": effects}  # fmt: skip
     return {"name": name, "digest": commit(answer, truth), "settings": settings}
 
 
 def _also(kind: Kind, d: rigs.Drawn, j: int, source: int) -> list[str]:
-    """Other joints at which the effect is just as true: a linkage has two ends, and what a link carries its parents carry."""
+    """Other joints at which the effect is just as true: a linkage has two ends, and what a link carries its parents
+    carry."""
     if kind.effect == "joint_coupling":
         return [d.rig.names[source]]
     chain, depth = d.rig.place[j]
-    return [d.rig.names[i] for i, (c, k) in enumerate(d.rig.place) if c == chain and k < depth] if kind.effect == "payload" else []
+    return (
+        [d.rig.names[i] for i, (c, k) in enumerate(d.rig.place) if c == chain and k < depth]
+        if kind.effect == "payload"
+        else []
+    )
 
 
-def _when(kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, source: int, n: dict, o: dict) -> list[list]:
+def _when(
+    kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, source: int, n: dict, o: dict
+) -> list[list]:
     """True samples in the recordings to fit: [recording, start, end] s where the effect exceeds 25 % of its maximum."""
     strength = []
     for k in range(len(RECORDINGS) - HELD):
         L = {key: x[0, k, j].astype(float) for key, x in run.items()}
         L["position"] = L["link"]
-        L |= {"command": command[k, j], "source": run["link"][0, k, source], "others": np.abs(run["torque"][0, k]).sum(0) - np.abs(run["torque"][0, k, j])}
+        L |= {
+            "command": command[k, j],
+            "source": run["link"][0, k, source],
+            "others": np.abs(run["torque"][0, k]).sum(0) - np.abs(run["torque"][0, k, j]),
+        }
         strength.append(np.asarray(kind.own(L, n, o), float))
     most = max(float(np.percentile(np.concatenate(strength), 99.9)), 1e-12)
     out = []
     for letter, x in zip(RECORDINGS, strength, strict=False):
         edge = np.flatnonzero(np.diff(np.r_[0, (x > 0.25 * most).astype(int), 0]))
-        out += [[letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)] for a, b in zip(edge[::2], edge[1::2], strict=True)]
+        out += [
+            [letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)]
+            for a, b in zip(edge[::2], edge[1::2], strict=True)
+        ]
     return out
 
 
-def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, quantum, extra, effort, current, current_at, joint, bad) -> None:
+def _record(
+    where: Path,
+    d: rigs.Drawn,
+    command: np.ndarray,
+    run: dict,
+    rng,
+    quantum,
+    extra,
+    effort,
+    current,
+    current_at,
+    joint,
+    bad,
+) -> None:
     for k, letter in enumerate(RECORDINGS):
         tau = run["torque"][0, k].copy()
         tau[current_at] = current["current_gain"] * tau[current_at] + current["current_offset"]
-        t, (angle, torque, heat) = plant.log([run["position"][0, k], tau, run["temperature"][0, k].astype(float)], rng, 100.0, 1e-3)
+        t, (angle, torque, heat) = plant.log(
+            [run["position"][0, k], tau, run["temperature"][0, k].astype(float)], rng, 100.0, 1e-3
+        )
         torque = torque + rng.normal(0, 1, torque.shape) * (NOISE_OF_EFFORT * d.unit[:, None])
         angle = np.round((angle + rng.normal(0, extra, angle.shape)) / quantum) * quantum
         torque = np.round(torque / 1e-4) * 1e-4
@@ -321,7 +414,11 @@ def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, qua
             torque[joint] = np.where(torque[joint] < 0, torque[joint] + 6.5536, torque[joint])
         with Writer(where / f"{letter}.mcap", d.rig.names, metadata(effort, d.shape == "hand"), START_NS) as w:
             sent = np.arange(0, command.shape[2], 10)
-            order = [(i * 1e-3, 0, i) for i in sent] + [(x, 1, i) for i, x in enumerate(t)] + [(x, 2, i) for i, x in enumerate(t) if i % 10 == 0]
+            order = (
+                [(i * 1e-3, 0, i) for i in sent]
+                + [(x, 1, i) for i, x in enumerate(t)]
+                + [(x, 2, i) for i, x in enumerate(t) if i % 10 == 0]
+            )
             for x, which, i in sorted(order):
                 if which == 0:
                     w.add_command(x, command[k, :, i])
@@ -332,7 +429,8 @@ def _record(where: Path, d: rigs.Drawn, command: np.ndarray, run: dict, rng, qua
 
 
 def once(job: tuple[dict, int, int, Path]) -> dict:
-    """{name, digest, settings}: the case as it was made before, or made now. job: entry of the plan, number, seed, folder."""
+    """{name, digest, settings}: the case as it was made before, or made now. job: entry of the plan, number, seed,
+    folder."""
     entry, number, seed, root = job
     stub = root / "made" / f"{number}.json"
     if not stub.is_file():

@@ -15,15 +15,25 @@ from benchmarks.concealed.baselines import LABELS
 from benchmarks.concealed.score import wilson
 
 AIMS = {  # line: (to publish, aim), from the project's judging table
-    "right effect first, easy": ("85 %", "95 %"), "right effect first, medium": ("70 %", "88 %"), "right effect first, hard": ("45 %", "65 %"),
-    "right joint (F1), rigs of several": ("0.85", "0.95"), "regime: overlap >= 0.5, where named right": ("70 %", "85 %"), "several effects at once (F1)": ("0.60", "0.80"),
-    "parameter error, median": ("15 %", "8 %"), "90 % interval covers the truth": ("", "85-95 %"), "held-out error removed, mean": ("0.70", "0.90"),
-    "false alarm, nothing missing": ("8 %", "3 %"), "outside the catalogue: not claimed": ("60 %", "80 %"), "confident and wrong, all cases": ("10 %", "3 %"),
+    "right effect first, easy": ("85 %", "95 %"), "right effect first, medium": ("70 %", "88 %"),
+    "right effect first, hard": ("45 %", "65 %"),
+    "right joint (F1), rigs of several": ("0.85", "0.95"),
+    "regime: overlap >= 0.5, where named right": ("70 %", "85 %"), "several effects at once (F1)": ("0.60", "0.80"),
+    "parameter error, median": ("15 %", "8 %"), "90 % interval covers the truth": ("", "85-95 %"),
+    "held-out error removed, mean": ("0.70", "0.90"),
+    "false alarm, nothing missing": ("8 %", "3 %"), "outside the catalogue: not claimed": ("60 %", "80 %"),
+    "confident and wrong, all cases": ("10 %", "3 %"),
 }  # fmt: skip
 PLAIN = ("(F1)", "mean", "error removed")
 SIZES = (1.0, 1.25, 1.6, 2.2, 3.5, 6.0, 1e3)  # x the floor: edges of the bins of the effect's error
 SURE = (0.0, 0.4, 0.65, 0.8, 0.95, 1.0)  # edges of the bins of confidence
-COLOURS = {"right alone": "#2f855a", "right in a set": "#9ae6b4", "nothing claimed": "#cbd5e0", "another, unsure": "#f6ad55", "another, confident": "#c53030"}
+COLOURS = {
+    "right alone": "#2f855a",
+    "right in a set": "#9ae6b4",
+    "nothing claimed": "#cbd5e0",
+    "another, unsure": "#f6ad55",
+    "another, confident": "#c53030",
+}
 
 
 def value(line: str, x: float) -> str:
@@ -37,7 +47,10 @@ def tables(data: dict) -> str:
     for line, v in data["lines"].items():
         least, aim = AIMS.get(line, ("", ""))
         name = line.strip() if not line.startswith("  ") else "&nbsp;&nbsp;" + line.strip()
-        out.append(f"| {name} | {value(line, v['value'])} | {value(line, v['low'])} to {value(line, v['high'])} | {v['n']} | {least} | {aim} |")
+        out.append(
+            f"| {name} | {value(line, v['value'])} | {value(line, v['low'])} to {value(line, v['high'])} |"
+            f" {v['n']} | {least} | {aim} |"
+        )
     out += ["", "| hidden | easy | medium | hard | when not named, taken for |", "|---|---|---|---|---|"]
     for effect, row in effects(data["results"]).items():
         cells = []
@@ -51,10 +64,18 @@ def tables(data: dict) -> str:
         wrong = ", ".join(f"{k} {n}" for k, n in sorted(taken.items(), key=lambda x: -x[1]))
         out.append(f"| {effect} | " + " | ".join(cells) + f" | {wrong or '-'} |")
     if data.get("baselines"):
-        out += ["", "| | held-out error over the floor, median | 95 % interval | cases | time, median | error of the hidden number, median |", "|---|---|---|---|---|---|"]
+        out += [
+            "",
+            "| | held-out error over the floor, median | 95 % interval | cases | time, median | error of the"
+            " hidden number, median |",
+            "|---|---|---|---|---|---|",
+        ]
         for k, v in data["baselines"]["lines"].items():
             number = f"{100 * v['parameter']:.0f} % of {v['parameters']}" if "parameter" in v else "-"
-            out.append(f"| {LABELS[k]} | {v['value']:.2f} | {v['low']:.2f} to {v['high']:.2f} | {v['n']} | {v['seconds']:.0f} s | {number} |")
+            out.append(
+                f"| {LABELS[k]} | {v['value']:.2f} | {v['low']:.2f} to {v['high']:.2f} | {v['n']} |"
+                f" {v['seconds']:.0f} s | {number} |"
+            )
     return "\n".join(out) + "\n"
 
 
@@ -116,9 +137,11 @@ def by_size(results: list[dict]) -> list[tuple[float, float, int, int, int]]:
 
 
 def by_confidence(results: list[dict]) -> list[tuple[float, float, int, int]]:
-    """(from, to, names, of them hidden there) of every single name that was said of physics, sets left out; names are right where the
-    effect is hidden, on any joint."""
-    pairs = [(s[2], s[0] in {h[0] for h in r["hidden"]}) for r in results if r["decoy"] not in ("bad_channel", "confounded", "wrong_mass")
+    """(from, to, names, of them hidden there) of every single name that was said of physics, sets left out; names are
+    right where the effect is hidden, on any joint."""
+    pairs = [(s[2], s[0] in {h[0] for h in r["hidden"]}) for r in results if r["decoy"] not in ("bad_channel",
+                                                                                                "confounded",
+                                                                                                "wrong_mass")
              for s in r["said"] if s[0] != "bad_channel" and len(s[3]) < 2]  # fmt: skip
     out = []
     for a, b in zip(SURE, SURE[1:], strict=False):
@@ -137,12 +160,27 @@ def limits(data: dict, path: Path) -> None:
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
     rows = [r for r in by_size(data["results"]) if r[2]]
     x = range(len(rows))
-    for values, colour, label in (([r[3] for r in rows], "#2f855a", "first name right"), ([r[4] for r in rows], "#718096", "nothing said")):
+    for values, colour, label in (
+        ([r[3] for r in rows], "#2f855a", "first name right"),
+        ([r[4] for r in rows], "#718096", "nothing said"),
+    ):
         rate = [v / r[2] for v, r in zip(values, rows, strict=True)]
         spread = [wilson(v, r[2]) for v, r in zip(values, rows, strict=True)]
-        left.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
-                      fmt="o-", color=colour, label=label, capsize=3)
-    left.set_xticks(list(x), [(f"{a:g}-{b:g}" if b < SIZES[-1] else f"over {a:g}") + f"\n({n})" for a, b, n, *_ in rows], fontsize=8)
+        left.errorbar(
+            x,
+            rate,
+            [
+                [max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)],
+                [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)],
+            ],
+            fmt="o-",
+            color=colour,
+            label=label,
+            capsize=3,
+        )
+    left.set_xticks(
+        list(x), [(f"{a:g}-{b:g}" if b < SIZES[-1] else f"over {a:g}") + f"\n({n})" for a, b, n, *_ in rows], fontsize=8
+    )
     left.set_xlabel("error that the effect makes, in floors (cases)")
     left.set_ylim(-0.02, 1.04)
     left.legend(frameon=False, fontsize=9)
@@ -151,8 +189,18 @@ def limits(data: dict, path: Path) -> None:
     rate = [k / n for *_, n, k in bins]
     spread = [wilson(k, n) for *_, n, k in bins]
     right.plot([0, 1], [0, 1], color="#cbd5e0", label="as sure as right")
-    right.errorbar(x, rate, [[max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)], [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)]],
-                   fmt="o-", color="#2b6cb0", label="names that are true (count)", capsize=3)
+    right.errorbar(
+        x,
+        rate,
+        [
+            [max(v - s[0], 0) for v, s in zip(rate, spread, strict=True)],
+            [max(s[1] - v, 0) for v, s in zip(rate, spread, strict=True)],
+        ],
+        fmt="o-",
+        color="#2b6cb0",
+        label="names that are true (count)",
+        capsize=3,
+    )
     for at, v, (*_, n, _) in zip(x, rate, bins, strict=True):
         right.annotate(str(n), (at, v), textcoords="offset points", xytext=(6, -10), fontsize=8)
     right.set_xlabel("confidence of a name")

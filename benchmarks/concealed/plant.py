@@ -1,10 +1,10 @@
 """The concealed rigs' physics: written apart from the simulator they test, sharing no code with it, and not MuJoCo.
 
-A rig is a set of chains of hinges. Every joint has two inertias, the motor's and the link's, joined by a stiff damped spring with
-optional play; the links' coupled dynamics come from Jacobians (mass matrix, gravity and Coriolis terms, refreshed every
-millisecond and extrapolated between). Friction is the LuGre bristle model (Canudas de Wit et al. 1995) on the motor side; the
-firmware runs its own loop at 1 kHz on its own encoder; all is integrated at 10 kHz, semi-implicit Euler.
-All rows of a batch run at once: parameters are [B, J]. SI units: rad, rad/s, N.m, s, kg, degC.
+A rig is a set of chains of hinges. Every joint has two inertias, the motor's and the link's, joined by a stiff damped
+spring with optional play; the links' coupled dynamics come from Jacobians (mass matrix, gravity and Coriolis terms,
+refreshed every millisecond and extrapolated between). Friction is the LuGre bristle model (Canudas de Wit et al. 1995)
+on the motor side; the firmware runs its own loop at 1 kHz on its own encoder; all is integrated at 10 kHz,
+semi-implicit Euler. All rows of a batch run at once: parameters are [B, J]. SI units: rad, rad/s, N.m, s, kg, degC.
 """
 
 from __future__ import annotations
@@ -21,9 +21,12 @@ REST = 0.02  # rad/s: slower than this a joint dwells
 
 # Every parameter of a joint and its value where the effect is absent.
 DEFAULTS: dict[str, float] = {
-    "mass": 0.15, "extra": 0.0, "com": 1.0,  # of its link [kg], added at its centre [kg], distance of the centre over nominal
-    "rotor": 4e-4, "spring": 600.0, "play": 0.0,  # reflected rotor inertia [kg.m2], N.m/rad (no stiffer than the step allows), rad
-    "voltage": 0.0, "kp": 2.0, "kd": 0.04, "torque_limit": 1.0, "no_load_speed": 15.0,  # 1: the loop gives a duty, 0: a torque
+    # of its link [kg], added at its centre [kg], distance of the centre over nominal
+    "mass": 0.15, "extra": 0.0, "com": 1.0,
+    # reflected rotor inertia [kg.m2], N.m/rad (no stiffer than the step allows), rad
+    "rotor": 4e-4, "spring": 600.0, "play": 0.0,
+    # 1: the loop gives a duty, 0: a torque
+    "voltage": 0.0, "kp": 2.0, "kd": 0.04, "torque_limit": 1.0, "no_load_speed": 15.0,
     "delay": 0.0, "lag": 0.0, "speed_lag": 0.0, "deadband": 0.0,  # s, s, s (of the loop's speed), rad (half width)
     "offset": 0.0, "scale": 1.0, "eccentric": 0.0, "eccentric_at": 0.0,  # of both encoders
     "motor_side": 0.0,  # 1: the loop reads the motor, 0: the link
@@ -44,9 +47,9 @@ DEFAULTS: dict[str, float] = {
 
 @dataclass(frozen=True)
 class Rig:
-    """Chains of links. names [J]; place [J, 2]: chain and depth of each joint. By chain C and depth D, in the parent link's frame:
-    frame [C, D, 3, 3] rotation at angle 0, offset [C, D, 3] m, axis [C, D, 3] (in the link's own); com [C, D, 3] m,
-    spread [C, D, 3, 3] inertia about the centre over mass [m2]. gravity [3] m/s2."""
+    """Chains of links. names [J]; place [J, 2]: chain and depth of each joint. By chain C and depth D, in the parent
+    link's frame: frame [C, D, 3, 3] rotation at angle 0, offset [C, D, 3] m, axis [C, D, 3] (in the link's own); com
+    [C, D, 3] m, spread [C, D, 3, 3] inertia about the centre over mass [m2]. gravity [3] m/s2."""
 
     names: tuple[str, ...]
     place: np.ndarray
@@ -63,7 +66,9 @@ class Rig:
         return self.place[:, 0] * self.com.shape[1] + self.place[:, 1]
 
 
-def pendulum(length: float = 0.1, radius: float = 0.0, names: tuple[str, ...] = ("joint",), lengths: tuple[float, ...] = ()) -> Rig:
+def pendulum(
+    length: float = 0.1, radius: float = 0.0, names: tuple[str, ...] = ("joint",), lengths: tuple[float, ...] = ()
+) -> Rig:
     """A bench of single pendulums about y that hang along -z: bobs of a radius [m] at their lengths [m]."""
     lengths = lengths or (length,) * len(names)
     n = len(names)
@@ -72,7 +77,16 @@ def pendulum(length: float = 0.1, radius: float = 0.0, names: tuple[str, ...] = 
     com[:, 0, 2] = -np.array(lengths)
     spread = np.tile(0.4 * radius**2 * np.eye(3), (n, 1, 1, 1))
     place = np.stack([np.arange(n), np.zeros(n, int)], 1)
-    return Rig(names, place, np.tile(np.eye(3), (n, 1, 1, 1)), one([0, 0, 0]), one([0, 1, 0]), com, spread, np.array([0, 0, -9.81]))
+    return Rig(
+        names,
+        place,
+        np.tile(np.eye(3), (n, 1, 1, 1)),
+        one([0, 0, 0]),
+        one([0, 1, 0]),
+        com,
+        spread,
+        np.array([0, 0, -9.81]),
+    )
 
 
 def rows(count: int, joints: int = 1, **values) -> dict[str, np.ndarray]:
@@ -108,8 +122,9 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def dynamics(rig: Rig, mass: np.ndarray, extra: np.ndarray, reach: np.ndarray, q: np.ndarray, v: np.ndarray,
-             gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def dynamics(
+    rig: Rig, mass: np.ndarray, extra: np.ndarray, reach: np.ndarray, q: np.ndarray, v: np.ndarray, gravity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Mass matrix [B, C, D, D] and the torque [B, C, D] that gravity and the motion itself ask of each hinge.
 
     mass, extra, reach, q, v: [B, C, D]; gravity [B, 3].
@@ -150,13 +165,21 @@ def dynamics(rig: Rig, mass: np.ndarray, extra: np.ndarray, reach: np.ndarray, q
     return M, h
 
 
-def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.ndarray | float = 0.0, driven: bool = True,
-             gravity: np.ndarray | None = None, external: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def simulate(
+    rig: Rig,
+    p: dict[str, np.ndarray],
+    command: np.ndarray,
+    q0: np.ndarray | float = 0.0,
+    driven: bool = True,
+    gravity: np.ndarray | None = None,
+    external: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
     """Runs all rows. command [B, J, M]: the target in every millisecond; q0: first angles, broadcast to [B, J] rad;
     gravity [B, 3]: None for the rig's; external [B, J, M]: torque on the links from outside.
 
-    Returns, each [B, J, M] at the start of every millisecond: position (link), torque (motor), speed (motor), load (through the
-    transmission), slip (friction over its level), asked (before any limit), free (1 where the teeth do not touch), temperature.
+    Returns, each [B, J, M] at the start of every millisecond: position (link), torque (motor), speed (motor), load
+    (through the transmission), slip (friction over its level), asked (before any limit), free (1 where the teeth do not
+    touch), temperature.
     """
     B, J, steps = command.shape
     C, D = rig.com.shape[:2]
@@ -239,7 +262,8 @@ def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.nda
             use = np.abs(tau)
             supply = np.maximum(1 - P["sag"] * (use.sum(1, keepdims=True) - use), 0.05)
         room = np.maximum(supply - np.abs(filtered) / P["no_load_speed"], 0.0)
-        asked = np.where(P["voltage"] > 0.5, P["torque_limit"] * (np.clip(raw, -1, 1) * supply - vm / P["no_load_speed"]),
+        asked = np.where(P["voltage"] > 0.5,
+                         P["torque_limit"] * (np.clip(raw, -1, 1) * supply - vm / P["no_load_speed"]),
                          np.clip(raw, -P["torque_limit"] * room, P["torque_limit"] * room))  # fmt: skip
         tau = tau + rate * (asked - tau) if driven else np.zeros((B, S))
         drive = tau
@@ -248,7 +272,8 @@ def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.nda
             drive = tau * np.maximum(1 + P["thermal_torque"] * (warm - AMBIENT), 0.05)
         if has["thermal_friction"]:
             rub = np.maximum(1 + P["thermal_friction"] * (warm - AMBIENT), 0.05)
-        for name, value in (("position", q), ("torque", tau), ("speed", vm), ("load", push), ("slip", friction / level), ("asked", raw), ("free", free),
+        for name, value in (("position", q), ("torque", tau), ("speed", vm), ("load", push),
+                            ("slip", friction / level), ("asked", raw), ("free", free),
                             ("temperature", warm)):  # fmt: skip
             out[name][:, :, k] = value[:, slots]
         warm = warm + TICK * (P["heat"] * tau * tau - (warm - AMBIENT)) / P["cooling"]
@@ -306,7 +331,11 @@ def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.nda
                 acc = (inverse @ pull.reshape(B, C, D, 1)).reshape(B, S)
             if has["mount"]:
                 soft = np.maximum(P["mount"], 1e-9)
-                base_acc = np.where(P["mount"] > 0, (-push - base / soft - 0.2 * np.sqrt(P["mount_inertia"] / soft) * base_v) / P["mount_inertia"], 0.0)
+                base_acc = np.where(
+                    P["mount"] > 0,
+                    (-push - base / soft - 0.2 * np.sqrt(P["mount_inertia"] / soft) * base_v) / P["mount_inertia"],
+                    0.0,
+                )
                 base_v = base_v + DT * base_acc
                 base = base + DT * base_v
                 acc = acc - base_acc
@@ -317,8 +346,11 @@ def simulate(rig: Rig, p: dict[str, np.ndarray], command: np.ndarray, q0: np.nda
     return out
 
 
-def log(signals: list[np.ndarray], rng: np.random.Generator, rate: float, jitter: float, loss: float = 0.01) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Times [S] s and values [J, S] of millisecond-sampled signals [J, M] as a host reads them: jittered, some samples lost."""
+def log(
+    signals: list[np.ndarray], rng: np.random.Generator, rate: float, jitter: float, loss: float = 0.01
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Times [S] s and values [J, S] of millisecond-sampled signals [J, M] as a host reads them: jittered, some samples
+    lost."""
     period = 1.0 / rate
     n = int(signals[0].shape[-1] * TICK / period) - 2
     t = (np.arange(n) + 0.5) * period + np.clip(rng.normal(0, jitter, n), -0.4 * period, 0.4 * period)

@@ -16,13 +16,15 @@ from benchmarks.concealed.plant import Rig, dynamics, pendulum
 OFF = 0.03  # how far off each nominal quantity may be
 SHAPES = ("one", "bench2", "bench4", "arm2", "arm3", "finger", "hand")
 RADIUS = 0.012  # m, of the bobs
-COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_speed": "no_load_speed", "coulomb": "coulomb_friction", "viscous": "viscous_friction"}
+COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_speed": "no_load_speed",
+           "coulomb": "coulomb_friction", "viscous": "viscous_friction"}
 
 
 @dataclass
 class Drawn:
-    """A rig as it is and as it is believed to be. true, believed: parameters [J]; unit [J]: a typical torque, N.m; low, high
-    [J]: where its joints may be sent, rad; voltage: whether the loop gives a duty; motor_side: whether it reads the motor."""
+    """A rig as it is and as it is believed to be. true, believed: parameters [J]; unit [J]: a typical torque, N.m; low,
+    high [J]: where its joints may be sent, rad; voltage: whether the loop gives a duty; motor_side: whether it reads
+    the motor."""
 
     rig: Rig
     shape: str
@@ -51,7 +53,8 @@ def _chain(rng: np.random.Generator, axes: list[str], start: float) -> Rig:
     com = np.zeros((1, n, 3))
     com[0, :, 2] = -lengths * rng.uniform(0.5, 0.9, n)
     place = np.stack([np.zeros(n, int), np.arange(n)], 1)
-    return Rig(tuple(f"joint{i}" for i in range(n)), place, np.tile(np.eye(3), (1, n, 1, 1)), offset, np.array([[vectors[a] for a in axes]]), com,
+    return Rig(tuple(f"joint{i}" for i in range(n)), place, np.tile(np.eye(3), (1, n, 1, 1)), offset,
+               np.array([[vectors[a] for a in axes]]), com,
                np.tile(0.4 * RADIUS**2 * np.eye(3), (1, n, 1, 1)), np.array([0, 0, -9.81]))  # fmt: skip
 
 
@@ -61,10 +64,12 @@ def draw(rng: np.random.Generator, shape: str) -> Drawn:
         return _hand(rng)
     if shape in ("one", "bench2", "bench4"):
         n = {"one": 1, "bench2": 2, "bench4": 4}[shape]
-        rig = pendulum(radius=RADIUS, names=tuple(f"joint{i}" for i in range(n)), lengths=tuple(float("%.4g" % rng.uniform(0.07, 0.14)) for _ in range(n)))
+        rig = pendulum(radius=RADIUS, names=tuple(f"joint{i}" for i in range(n)),
+                       lengths=tuple(float("%.4g" % rng.uniform(0.07, 0.14)) for _ in range(n)))
         mass = rng.uniform(0.08, 0.3, n)
     elif shape in ("arm2", "arm3", "finger"):
-        rig = _chain(rng, {"arm2": ["y", "y"], "arm3": ["y", "y", "y"], "finger": ["x", "y", "y"]}[shape], rng.uniform(0.07, 0.12))
+        rig = _chain(rng, {"arm2": ["y", "y"], "arm3": ["y", "y", "y"], "finger": ["x", "y", "y"]}[shape],
+                     rng.uniform(0.07, 0.12))
         n = len(rig.names)
         mass = rng.uniform(0.1, 0.2) * np.cumprod(np.r_[1.0, rng.uniform(0.6, 0.9, n - 1)])
     else:
@@ -73,7 +78,8 @@ def draw(rng: np.random.Generator, shape: str) -> Drawn:
     weight, link = _scales(rig, mass)
     inertia = link + b["rotor"]
     kp = weight * rng.uniform(6, 14, n)
-    b |= {"torque_limit": weight * rng.uniform(5, 9, n), "no_load_speed": rng.uniform(9, 18, n), "coulomb": weight * rng.uniform(0.04, 0.1, n),
+    b |= {"torque_limit": weight * rng.uniform(5, 9, n), "no_load_speed": rng.uniform(9, 18, n),
+          "coulomb": weight * rng.uniform(0.04, 0.1, n),
           "viscous": weight * rng.uniform(0.005, 0.02, n)}  # fmt: skip
     kd = 2 * rng.uniform(0.3, 0.6, n) * np.sqrt(kp * inertia)
     if rig.com.shape[1] > 1:  # links shake one another
@@ -84,7 +90,8 @@ def draw(rng: np.random.Generator, shape: str) -> Drawn:
         b["kp"], b["kd"] = kp / b["torque_limit"], 0.2 * kd / b["torque_limit"]
     else:
         b["kp"], b["kd"] = kp, kd
-    return _finish(rng, rig, shape, b, 0.1 * kp, inertia, np.full(n, -0.8), np.full(n, 0.8), voltage, bool(rng.uniform() < 0.3))
+    return _finish(rng, rig, shape, b, 0.1 * kp, inertia, np.full(n, -0.8), np.full(n, 0.8), voltage,
+                   bool(rng.uniform() < 0.3))
 
 
 def _scales(rig: Rig, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,14 +115,18 @@ def _finish(rng, rig, shape, b, unit, inertia, low, high, voltage, motor_side) -
     true["com"] = 1 + rng.uniform(-OFF / 3, OFF / 3, n)
     true["voltage"], true["motor_side"] = np.full(n, float(voltage)), np.full(n, float(motor_side))
     # drawn for every rig, used where an effect asks for them
-    true |= {"peak_speed": rng.uniform(0.05, 0.4, n), "per_turn": rng.integers(6, 40, n).astype(float), "phase": rng.uniform(-3, 3, n),
-             "eccentric_at": rng.uniform(-3, 3, n), "dwell_time": np.full(n, 1.5), "cable_rest": low + 0.5 * (high - low), "tooth_at": low + rng.uniform(0.3, 0.7, n) * (high - low),
-             "tooth_width": 0.05 * (high - low), "mount_inertia": 0.5 * inertia, "heat": 15.0 / np.maximum(unit, 1e-3) ** 2}  # fmt: skip
+    true |= {"peak_speed": rng.uniform(0.05, 0.4, n), "per_turn": rng.integers(6, 40, n).astype(float),
+             "phase": rng.uniform(-3, 3, n),
+             "eccentric_at": rng.uniform(-3, 3, n), "dwell_time": np.full(n, 1.5),
+             "cable_rest": low + 0.5 * (high - low), "tooth_at": low + rng.uniform(0.3, 0.7, n) * (high - low),
+             "tooth_width": 0.05 * (high - low), "mount_inertia": 0.5 * inertia,
+             "heat": 15.0 / np.maximum(unit, 1e-3) ** 2}  # fmt: skip
     return Drawn(rig, shape, true, b, unit, inertia, low, high, voltage, motor_side)
 
 
 def _hand(rng: np.random.Generator) -> Drawn:
-    """The right xHand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the palm."""
+    """The right xHand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the
+    palm."""
     import mujoco
 
     from dexsim.recording.mechanism import mechanism
@@ -160,11 +171,14 @@ def _hand(rng: np.random.Generator) -> Drawn:
 
     column = lambda key: (table[:, INDEX[key]] if table is not None else m.column(key)).astype(float)  # noqa: E731
     dof = model.jnt_dofadr
-    b = {"mass": mass, "rotor": model.dof_armature[dof].copy(), "kp": column("kp"), "kd": column("kd"), "torque_limit": column("torque_limit"),
-         "no_load_speed": column("no_load_speed"), "coulomb": column("coulomb_friction"), "viscous": column("viscous_friction") + model.dof_damping[dof]}  # fmt: skip
+    b = {"mass": mass, "rotor": model.dof_armature[dof].copy(), "kp": column("kp"), "kd": column("kd"),
+         "torque_limit": column("torque_limit"),
+         "no_load_speed": column("no_load_speed"), "coulomb": column("coulomb_friction"),
+         "viscous": column("viscous_friction") + model.dof_damping[dof]}  # fmt: skip
     link = _scales(rig, mass)[1]
     span = model.jnt_range[:, 1] - model.jnt_range[:, 0]
-    out = _finish(rng, rig, "hand", b, 0.1 * b["kp"], link + b["rotor"], model.jnt_range[:, 0] + 0.1 * span, model.jnt_range[:, 1] - 0.15 * span, False, False)
+    out = _finish(rng, rig, "hand", b, 0.1 * b["kp"], link + b["rotor"], model.jnt_range[:, 0] + 0.1 * span,
+                  model.jnt_range[:, 1] - 0.15 * span, False, False)
     out.true["delay"] = column("delay")
     out.believed["delay"] = column("delay")
     return out
@@ -182,13 +196,16 @@ def files(where: Path, d: Drawn) -> list[str]:
         for k in range(D):
             j = next(i for i, at in enumerate(rig.place) if tuple(at) == (c, k))
             lines += [f'<body name="link{j}" pos="{pos(rig.offset[c, k])}">',
-                      f'<joint name="{rig.names[j]}" type="hinge" axis="{pos(rig.axis[c, k])}" armature="{g(b["rotor"][j])}" range="-3 3"/>',
-                      f'<geom name="bob{j}" type="sphere" size="{RADIUS}" pos="{pos(rig.com[c, k])}" mass="{g(b["mass"][j])}" contype="0" conaffinity="0"/>']  # fmt: skip
+                      f'<joint name="{rig.names[j]}" type="hinge" axis="{pos(rig.axis[c, k])}"'
+                      f' armature="{g(b["rotor"][j])}" range="-3 3"/>',
+                      f'<geom name="bob{j}" type="sphere" size="{RADIUS}" pos="{pos(rig.com[c, k])}"'
+                      f' mass="{g(b["mass"][j])}" contype="0" conaffinity="0"/>']  # fmt: skip
         lines += ["</body>"] * D
     lines += ["  </worldbody>", "</mujoco>", ""]
     (where / "rig.xml").write_text("\n".join(lines), encoding="utf-8")
     servo = {"drive": "voltage" if d.voltage else "torque",
-             "joints": {name: {ours: float(g(b[k][j])) for k, ours in COLUMNS.items()} for j, name in enumerate(rig.names)}, "loop_rate": 1000,
+             "joints": {name: {ours: float(g(b[k][j])) for k, ours in COLUMNS.items()} for j,
+                        name in enumerate(rig.names)}, "loop_rate": 1000,
              "loop_encoder": "motor" if d.motor_side else "joint", "position_encoder": "joint"}  # fmt: skip
     (where / "servo.yaml").write_text(yaml.safe_dump(servo, sort_keys=False), encoding="utf-8")
     return [f"model={where / 'rig.xml'}", f"servo={where / 'servo.yaml'}"]

@@ -12,8 +12,10 @@ SURE = 0.8  # a name is confident from here, when it stands alone
 CLASSES = tuple(
     frozenset(c.split())
     for c in (
-        "backlash stribeck_friction coulomb_friction", "command_delay lag", "viscous_friction torque_speed_limit gain_mismatch",
-        "current_sensor payload gain_mismatch", "coulomb_friction load_friction", "supply_sag torque_speed_limit thermal",
+        "backlash stribeck_friction coulomb_friction", "command_delay lag",
+        "viscous_friction torque_speed_limit gain_mismatch",
+        "current_sensor payload gain_mismatch", "coulomb_friction load_friction",
+        "supply_sag torque_speed_limit thermal",
         "position_offset payload", "tactile_gain contact_stiffness", "tactile_hysteresis thermal",
     )
 )  # fmt: skip
@@ -50,7 +52,9 @@ def named_right(finding: dict | None, effect: str) -> bool:
 
 def sure(diagnosis: dict) -> list[dict]:
     """Findings that name one effect with confidence."""
-    return [f for f in diagnosis["findings"] if f["confidence"] >= SURE and len(set(f.get("indistinguishable") or [])) < 2]
+    return [
+        f for f in diagnosis["findings"] if f["confidence"] >= SURE and len(set(f.get("indistinguishable") or [])) < 2
+    ]
 
 
 TRAIN = ("a", "b", "c")
@@ -109,10 +113,18 @@ def _removed(d: dict, effects: list[dict], joints: int) -> float | None:
     h = d.get("held_out") or {}
     if joints > 1:  # the joint's own, as its findings have it
         mine = [f["held_out"] for f in d["findings"] if e["joint"] in f["where"]["joints"] and f.get("held_out")]
-        h = {"before": max(x["before"] for x in mine), "after": min(x["after"] for x in mine)} if mine else {"before": known, "after": known}
+        h = (
+            {"before": max(x["before"] for x in mine), "after": min(x["after"] for x in mine)}
+            if mine
+            else {"before": known, "after": known}
+        )
     if h.get("before") is None or h.get("after") is None:
         return 0.0
-    return float(np.clip((h["before"] - h["after"]) / (h["before"] - floor), -1.0, 1.0)) if h["before"] > 1.3 * floor else None
+    return (
+        float(np.clip((h["before"] - h["after"]) / (h["before"] - floor), -1.0, 1.0))
+        if h["before"] > 1.3 * floor
+        else None
+    )
 
 
 def one(truth: dict, d: dict) -> dict:
@@ -121,14 +133,18 @@ def one(truth: dict, d: dict) -> dict:
     physics = [f for f in findings if f["effect"] != "bad_channel"]
     effects = truth["effects"]
     first = physics[0] if physics else (findings[0] if findings else None)
-    out = {"name": truth["name"], "group": truth["group"], "decoy": truth["decoy"], "shape": truth["shape"], "tier": truth["tier"],
-           "hidden": [(e["effect"] or e["kind"], e["joint"]) for e in effects], "kinds": [e["kind"] for e in effects], "verdict": d["verdict"],
-           "said": [(f["effect"], (f["where"]["joints"] or f["where"]["topics"] or ["-"])[0], round(f["confidence"], 2), sorted(set(f.get("indistinguishable") or [])))
+    out = {"name": truth["name"], "group": truth["group"], "decoy": truth["decoy"], "shape": truth["shape"],
+           "tier": truth["tier"],
+           "hidden": [(e["effect"] or e["kind"], e["joint"]) for e in effects], "kinds": [e["kind"] for e in effects],
+           "verdict": d["verdict"],
+           "said": [(f["effect"], (f["where"]["joints"] or f["where"]["topics"] or ["-"])[0],
+                     round(f["confidence"], 2), sorted(set(f.get("indistinguishable") or [])))
                     for f in findings], "ratio": effects[0]["facts"].get("ratio") if effects else None}  # fmt: skip
     confident = sure({"findings": physics})
     true_ids = {e["effect"] for e in effects if e["effect"]}
 
-    def ends(e: dict) -> list[str]:  # a linkage acts on both of the joints that it connects, a mass on all that carry it
+    # a linkage acts on both of the joints that it connects, a mass on all that carry it
+    def ends(e: dict) -> list[str]:
         return [e["joint"], *e["also"]]
 
     def right_here(f: dict, e: dict) -> bool:
@@ -136,14 +152,24 @@ def one(truth: dict, d: dict) -> dict:
 
     group = truth["group"]
     inside = group in ("effect", "pair") or (group in ("hand", "touch") and effects)
-    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
+    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f,
+                                                                                                             e) for e in effects)
                             for f in confident)  # fmt: skip
     if inside:
         if len(effects) == 1:
             e = effects[0]
             out["right"] = named_right(first, e["effect"])
-            out["alone"] = bool(first and first["effect"] == e["effect"] and len(set(first.get("indistinguishable") or [])) < 2)
-            mine = next((f for f in physics if f["effect"] == e["effect"] and e["joint"] in (f["where"]["joints"] or [e["joint"]])), None)
+            out["alone"] = bool(
+                first and first["effect"] == e["effect"] and len(set(first.get("indistinguishable") or [])) < 2
+            )
+            mine = next(
+                (
+                    f
+                    for f in physics
+                    if f["effect"] == e["effect"] and e["joint"] in (f["where"]["joints"] or [e["joint"]])
+                ),
+                None,
+            )
             out["parameter_errors"], out["covered"] = _parameters(mine, e)
             if mine is not None and e["when"]:
                 out["overlap"] = overlap(mine, e["when"])
@@ -204,14 +230,20 @@ def table(results: list[dict]) -> dict[str, dict]:
     for tier in ("easy", "medium", "hard"):
         rate(f"  of them named alone, {tier}", [r["alone"] for r in hidden if r["tier"] == tier])
     f1("right joint (F1), rigs of several", [r["joint_f1"] for r in hidden if r.get("joint_f1")])
-    rate("regime: overlap >= 0.5, where named right", [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None and r["alone"]])
+    rate(
+        "regime: overlap >= 0.5, where named right",
+        [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None and r["alone"]],
+    )
     rate("regime: overlap >= 0.5, all", [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None])
     f1("several effects at once (F1)", [r["f1"] for r in results if r["group"] == "pair"])
     middle("parameter error, median", [e for r in hidden for e in r["parameter_errors"]], np.median)
     rate("90 % interval covers the truth", [c for r in hidden for c in r["covered"]])
     middle("held-out error removed, mean", [r["removed"] for r in hidden if r.get("removed") is not None], np.mean)
     middle("held-out error removed, median", [r["removed"] for r in hidden if r.get("removed") is not None], np.median)
-    rate("false alarm, nothing missing", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] in ("none", "noise")])
+    rate(
+        "false alarm, nothing missing",
+        [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] in ("none", "noise")],
+    )
     rate("  with doubled noise", [r["false_alarm"] for r in results if r["group"] == "noise"])
     rate("false alarm, xHand", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "hand"])
     rate("touch and contact: right effect first", [r["right"] for r in hidden if r["group"] == "touch"])
@@ -238,7 +270,13 @@ def by_effect(results: list[dict]) -> list[tuple[str, str]]:
             if not r["right"]:
                 name = r["said"][0][0] if r["said"] else "nothing"
                 taken[name] = taken.get(name, 0) + 1
-        out.append((effect, f"{parts[0]:>6}{parts[1]:>8}{parts[2]:>7}   " + ", ".join(f"{k} {v}" for k, v in sorted(taken.items(), key=lambda x: -x[1]))))
+        out.append(
+            (
+                effect,
+                f"{parts[0]:>6}{parts[1]:>8}{parts[2]:>7}"
+                "   " + ", ".join(f"{k} {v}" for k, v in sorted(taken.items(), key=lambda x: -x[1])),
+            )
+        )
     return out
 
 
@@ -248,9 +286,16 @@ def show(lines: dict[str, dict], results: list[dict], cases: bool = True) -> str
     if cases:
         out.append(f"{'case':<10}{'group':<9}{'rig':<8}{'tier':<8}{'hidden':<44}{'verdict':<18}said")
         for r in results:
-            hidden = " + ".join(f"{k}@{j}" for k, (_, j) in zip(r["kinds"], r["hidden"], strict=True)) or r["decoy"] or "-"
-            said = "; ".join(f"{e}@{j} {c:.2f}" + (f" {{{' '.join(g)}}}" if g else "") for e, j, c, g in r["said"][:3]) or "-"
-            out.append(f"{r['name']:<10}{r['group']:<9}{r['shape']:<8}{r['tier']:<8}{hidden:<44}{r['verdict']:<18}{said}")
+            hidden = (
+                " + ".join(f"{k}@{j}" for k, (_, j) in zip(r["kinds"], r["hidden"], strict=True)) or r["decoy"] or "-"
+            )
+            said = (
+                "; ".join(f"{e}@{j} {c:.2f}" + (f" {{{' '.join(g)}}}" if g else "") for e, j, c, g in r["said"][:3])
+                or "-"
+            )
+            out.append(
+                f"{r['name']:<10}{r['group']:<9}{r['shape']:<8}{r['tier']:<8}{hidden:<44}{r['verdict']:<18}{said}"
+            )
     out += ["", f"{'effect hidden':<22}{'easy':>6}{'medium':>8}{'hard':>7}   taken for"]
     out += [f"{e:<22}{text}" for e, text in by_effect(results)]
     out += ["", f"{'figure':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}"]

@@ -1,7 +1,9 @@
-"""A fingertip pressed by a ball, written apart from the simulator: contact, spread over the taxels, rubber, neighbours, readings.
+"""A fingertip pressed by a ball, written apart from the simulator: contact, spread over the taxels, rubber, neighbours,
+readings.
 
-The ball moves on two slides (one against the pad, one along it), each a mass on a PD drive, integrated at 10 kHz. The tip is a convex
-hull with a rounded edge, given as vertices; the taxels are given as points, normals, areas. Only NumPy. SI units.
+The ball moves on two slides (one against the pad, one along it), each a mass on a PD drive, integrated at 10 kHz. The
+tip is a convex hull with a rounded edge, given as vertices; the taxels are given as points, normals, areas. Only NumPy.
+SI units.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import numpy as np
 
 # What is true of a pad and of its drives, and the values where effects are absent.
 DEFAULTS: dict[str, float] = {
-    "stiffness": 7000.0, "power": 1.9, "reach": 1.0e-3,  # N/m of the contact; how pressure falls off around it (own law), m
+    # N/m of the contact; how pressure falls off around it (own law), m
+    "stiffness": 7000.0, "power": 1.9, "reach": 1.0e-3,
     "zero": 0.0, "along": 0.0, "across": 0.0,  # m: the pad is not quite where it is believed
     "gain": 1.0, "fraction": 0.0, "time_constant": 0.3, "crosstalk": 0.0, "delay": 0.0,
     "kp": 4000.0, "kd": 40.0, "mass_press": 0.1, "mass_slide": 0.2,
@@ -45,8 +48,9 @@ def triangle_distance(p: np.ndarray, tri: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 class Pad:
-    """triangles [m, 3, 3] m of the tip's hull, margin m by which it is rounded, points, normals [K, 3], areas [K] of the taxels; start
-    [3]: the ball's centre at joints 0; press, slide [3]: unit directions of the joints; radius m of the ball; gravity [3]. One frame."""
+    """triangles [m, 3, 3] m of the tip's hull, margin m by which it is rounded, points, normals [K, 3], areas [K] of
+    the taxels; start [3]: the ball's centre at joints 0; press, slide [3]: unit directions of the joints; radius m of
+    the ball; gravity [3]. One frame."""
 
     def __init__(self, triangles, margin, points, normals, areas, start, press, slide, radius, gravity):
         self.triangles, self.margin, self.points, self.normals, self.areas = triangles, margin, points, normals, areas
@@ -62,8 +66,12 @@ class Pad:
 
     def depth(self, press: np.ndarray, slide: np.ndarray) -> np.ndarray:
         """Depth m of the ball in the tip (negative: apart), bilinear on the grid."""
-        x = np.clip((press - self.grid_press[0]) / (self.grid_press[1] - self.grid_press[0]), 0, len(self.grid_press) - 1.001)
-        y = np.clip((slide - self.grid_slide[0]) / (self.grid_slide[1] - self.grid_slide[0]), 0, len(self.grid_slide) - 1.001)
+        x = np.clip(
+            (press - self.grid_press[0]) / (self.grid_press[1] - self.grid_press[0]), 0, len(self.grid_press) - 1.001
+        )
+        y = np.clip(
+            (slide - self.grid_slide[0]) / (self.grid_slide[1] - self.grid_slide[0]), 0, len(self.grid_slide) - 1.001
+        )
         i, j = np.floor(x).astype(int), np.floor(y).astype(int)
         u, v = x - i, y - j
         g = self.gap
@@ -92,7 +100,13 @@ def move(pad: Pad, p: dict[str, float], command: np.ndarray) -> tuple[np.ndarray
 def readings(pad: Pad, p: dict[str, float], q: np.ndarray, force: np.ndarray) -> np.ndarray:
     """[M, K] N that the taxels read every millisecond, before noise and counts."""
     across = np.cross(pad.press, pad.slide)
-    centre = pad.start + q[1][:, None] * pad.press + q[0][:, None] * pad.slide + p["along"] * pad.slide + p["across"] * across
+    centre = (
+        pad.start
+        + q[1][:, None] * pad.press
+        + q[0][:, None] * pad.slide
+        + p["along"] * pad.slide
+        + p["across"] * across
+    )
     d = np.linalg.norm(pad.points[None] - centre[:, None], axis=-1) - pad.radius - p["zero"]
     level = np.maximum(d.min(1) + p["reach"], 0.0)
     w = pad.areas * np.maximum(level[:, None] - d, 0.0) ** p["power"]

@@ -1,4 +1,5 @@
-"""Draws touch cases: one xHand fingertip pressed by a ball, with a load cell, an effect of touch or contact of a chosen size or none."""
+"""Draws touch cases: one xHand fingertip pressed by a ball, with a load cell, an effect of touch or contact of a chosen
+size or none."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ def _relaxed(f: np.ndarray, time_constant: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TouchKind:
-    """effect: id of the catalogue; span: sizes; apply(p, s): parameters that change; report(new): {key: value}; own(f, n):
-    [M] strength from force f [M] N and parameters n."""
+    """effect: id of the catalogue; span: sizes; apply(p, s): parameters that change; report(new): {key: value}; own(f,
+    n): [M] strength from force f [M] N and parameters n."""
 
     effect: str
     span: tuple[float, float]
@@ -40,13 +41,17 @@ class TouchKind:
 
 
 KINDS: dict[str, TouchKind] = {
-    "pad_gain": TouchKind("tactile_gain", (0.06, 0.8), lambda p, s: {"gain": p["gain"] * (1 - s)}, lambda n: {"gain": n["gain"]}, lambda f, n: f),
-    "hysteresis": TouchKind("tactile_hysteresis", (0.02, 1.5), lambda p, s: {"fraction": s}, lambda n: {"fraction": n["fraction"], "time_constant": n["time_constant"]},
+    "pad_gain": TouchKind("tactile_gain", (0.06, 0.8), lambda p, s: {"gain": p["gain"] * (1 - s)},
+                          lambda n: {"gain": n["gain"]}, lambda f, n: f),
+    "hysteresis": TouchKind("tactile_hysteresis", (0.02, 1.5), lambda p, s: {"fraction": s},
+                            lambda n: {"fraction": n["fraction"], "time_constant": n["time_constant"]},
                             lambda f, n: np.abs(f - _relaxed(f, n["time_constant"]))),
-    "crosstalk": TouchKind("tactile_crosstalk", (0.02, 0.6), lambda p, s: {"crosstalk": s}, lambda n: {"fraction": n["crosstalk"]}, lambda f, n: f),
+    "crosstalk": TouchKind("tactile_crosstalk", (0.02, 0.6), lambda p, s: {"crosstalk": s},
+                           lambda n: {"fraction": n["crosstalk"]}, lambda f, n: f),
     "touch_delay": TouchKind("tactile_delay", (0.003, 0.2), lambda p, s: {"delay": s}, lambda n: {"delay": n["delay"]},
                              lambda f, n: np.abs(f - np.r_[np.zeros(int(n["delay"] * 1000)), f][: len(f)])),
-    "soft_contact": TouchKind("contact_stiffness", (0.06, 0.85), lambda p, s: {"stiffness": p["stiffness"] * (1 - s)}, lambda n: {"stiffness": n["stiffness"]}, lambda f, n: f),
+    "soft_contact": TouchKind("contact_stiffness", (0.06, 0.85), lambda p, s: {"stiffness": p["stiffness"] * (1 - s)},
+                              lambda n: {"stiffness": n["stiffness"]}, lambda f, n: f),
 }  # fmt: skip
 REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across": 6e-4}
 
@@ -74,7 +79,8 @@ def bench(finger: str, where: Path):
     table = xhand.taxel_table(finger)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    return touch.Pad(vertices[hull.simplices], float(model.geom("tip").margin[0]), table["position"] + body.pos, table["normal"], table["area"],
+    return touch.Pad(vertices[hull.simplices], float(model.geom("tip").margin[0]), table["position"] + body.pos,
+                     table["normal"], table["area"],
                      data.geom("ball").xpos.copy(), press, slide, RADIUS, np.array([0, 0, -9.81]))  # fmt: skip
 
 
@@ -85,7 +91,9 @@ def motion(rng: np.random.Generator) -> np.ndarray:
     q[1] = 0.5e-3
     while at < SECONDS - 0.9:
         deep, ramp, hold = 2e-3 + rng.uniform(0.4e-3, 1.2e-3), rng.choice([0.07, 0.2, 0.6]), rng.choice([0.1, 0.6, 2.2])
-        q[1] = np.maximum(q[1], np.interp(t, [at, at + ramp, at + ramp + hold, at + 2 * ramp + hold], [0, 1, 1, 0]) * deep)
+        q[1] = np.maximum(
+            q[1], np.interp(t, [at, at + ramp, at + ramp + hold, at + 2 * ramp + hold], [0, 1, 1, 0]) * deep
+        )
         q[0] += np.interp(t, [at - 0.15, at], [0, 1]) * rng.uniform(-2e-3, 2e-3) * (t < at + 2 * ramp + hold + 0.05)
         at += 2 * ramp + hold + rng.uniform(0.25, 0.6)
     return np.repeat(q, 10, 1)
@@ -103,8 +111,10 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     pad = bench(finger, where)
     commands = [motion(rng) for _ in RECORDINGS]
     off = lambda: 1 + rng.uniform(-0.03, 0.03)  # noqa: E731
-    true = touch.DEFAULTS | {"stiffness": 7000.0 * off(), "gain": off(), "reach": 1e-3 * off(), "kp": 4000.0 * off(), "kd": 40.0 * off(), "mass_press": 0.1 * off(),
-                             "mass_slide": 0.2 * off(), "zero": rng.uniform(-5e-5, 5e-5), "along": rng.uniform(-2e-4, 2e-4), "across": rng.uniform(-2e-4, 2e-4),
+    true = touch.DEFAULTS | {"stiffness": 7000.0 * off(), "gain": off(), "reach": 1e-3 * off(), "kp": 4000.0 * off(),
+                             "kd": 40.0 * off(), "mass_press": 0.1 * off(),
+                             "mass_slide": 0.2 * off(), "zero": rng.uniform(-5e-5, 5e-5),
+                             "along": rng.uniform(-2e-4, 2e-4), "across": rng.uniform(-2e-4, 2e-4),
                              "time_constant": rng.uniform(0.1, 1.5)}  # fmt: skip
     own_gain = 1 + rng.uniform(-0.02, 0.02, len(pad.areas))
     cache: dict[float, list] = {}
@@ -122,7 +132,15 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     slopes, widths = [], []
     for k, width in REFIT.items():
         step = 0.3 * width * (true[k] if k in ("stiffness", "gain") else 1.0)
-        changed = [(q, f, touch.readings(pad, true | {k: true[k] + step}, q, f * (1 + 0.3 * width) if k == "stiffness" else f) * own_gain) for q, f, _ in nominal]
+        changed = [
+            (
+                q,
+                f,
+                touch.readings(pad, true | {k: true[k] + step}, q, f * (1 + 0.3 * width) if k == "stiffness" else f)
+                * own_gain,
+            )
+            for q, f, _ in nominal
+        ]
         slopes.append((stack(changed) - base).reshape(-1) / 0.3)
         widths.append(1.0)
     Q, R = np.linalg.qr(np.stack(slopes, 1))
@@ -141,16 +159,29 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
         reached = np.hypot(change, floor) / floor
         pick = int(np.nanargmin(np.abs(np.log(reached / TIERS[entry["tier"]]))))
         p = true | kind.apply(true, sizes[pick])
-        facts |= {"ratio": float(reached[pick]), "size": float(sizes[pick]), "before": float(np.hypot(change[pick], floor))}
+        facts |= {
+            "ratio": float(reached[pick]),
+            "size": float(sizes[pick]),
+            "before": float(np.hypot(change[pick], floor)),
+        }
     done = run(p)
-    meta = {"source": "real", "robot": "press_rig", "gravity": "0 0 -9.81", "effort_is": "none", "tactile_unit": "count", "tactile_lsb": f"{LSB:g}"}
+    meta = {
+        "source": "real",
+        "robot": "press_rig",
+        "gravity": "0 0 -9.81",
+        "effort_is": "none",
+        "tactile_unit": "count",
+        "tactile_lsb": f"{LSB:g}",
+    }
     from dexsim.assets import xhand
 
     pad_number = xhand.FINGERS.index(finger)
     when = []
     for k, letter in enumerate(RECORDINGS):
         q, f, z = done[k]
-        t = np.arange(0.005, SECONDS - 0.03, 1 / 90) + np.clip(rng.normal(0, 3e-4, len(np.arange(0.005, SECONDS - 0.03, 1 / 90))), -1e-3, 1e-3)
+        t = np.arange(0.005, SECONDS - 0.03, 1 / 90) + np.clip(
+            rng.normal(0, 3e-4, len(np.arange(0.005, SECONDS - 0.03, 1 / 90))), -1e-3, 1e-3
+        )
         t = t[rng.uniform(size=len(t)) > 0.01]
         grid = np.arange(q.shape[1]) * 1e-3
         with Writer(where / f"{letter}.mcap", ("slide", "press"), meta, START_NS) as w:
@@ -170,10 +201,17 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
                 w.add_external_force(x, np.r_[np.interp(x, grid, f) + 0.02 * rng.normal(), np.zeros(5)], "indenter")
         if kind and k < len(RECORDINGS) - HELD:
             strength = kind.own(f, p)
-            edge = np.flatnonzero(np.diff(np.r_[0, (strength > 0.25 * max(np.percentile(strength, 99.9), 1e-12)).astype(int), 0]))
-            when += [[letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)] for a, b in zip(edge[::2], edge[1::2], strict=True)]
-    effects = [] if not kind else [{"effect": kind.effect, "kind": entry["kinds"][0], "joint": "pad", "parameters": {k: float(v) for k, v in kind.report(p).items()},
+            edge = np.flatnonzero(
+                np.diff(np.r_[0, (strength > 0.25 * max(np.percentile(strength, 99.9), 1e-12)).astype(int), 0])
+            )
+            when += [
+                [letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)]
+                for a, b in zip(edge[::2], edge[1::2], strict=True)
+            ]
+    effects = [] if not kind else [{"effect": kind.effect, "kind": entry["kinds"][0], "joint": "pad",
+                                    "parameters": {k: float(v) for k, v in kind.report(p).items()},
                                     "facts": facts, "also": [], "when": when}]  # fmt: skip
-    answer = {"name": name, "group": "touch", "decoy": "", "bad": "", "asked_tier": entry["tier"], "tier": tier_of(facts["ratio"]) if kind else "none", "shape": "touch",
+    answer = {"name": name, "group": "touch", "decoy": "", "bad": "", "asked_tier": entry["tier"],
+              "tier": tier_of(facts["ratio"]) if kind else "none", "shape": "touch",
               "joints": 1, "voltage": False, "effort": False, "floor": floor, "effects": effects}  # fmt: skip
     return {"name": name, "digest": commit(answer, truth), "settings": []}

@@ -1,21 +1,25 @@
-"""The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run again.
+"""The loop closed, as one command: train naive, lose in a concealed reality, record there, diagnose, fine-tune, run
+again.
 
-    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... | gpus=none]
-                              [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0] [kill_s=0] [report=false]
-                              [train_cores=1] [judge_cores=2] [diagnose_cores=8] [variants=wide,fitted,truth]
-                              [diagnose_gpus=2,3 diagnose_slots=3] [train="worlds=64 ..."]
+    python -m benchmarks.loop [tasks=grasp,rotate] [worlds=late,stiff] [seeds=3] [naive=60] [tune=150] [gpus=0,1,... |
+    gpus=none]
+                              [cpus=N] [episodes=grasp:256,rotate:64] [diagnose_s=600] [out=out/loop] [stop_s=0]
+                              [kill_s=0] [report=false] [train_cores=1] [judge_cores=2] [diagnose_cores=8]
+                              [variants=wide,fitted,truth] [diagnose_gpus=2,3 diagnose_slots=3] [train="worlds=64 ..."]
 
-For each task and seed the included policy goes on for `naive` iterations in the believed simulator without randomization of the
-drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand under safe excitation that is as fast as
-they were, then presses on its five fingertips; all that is diagnosed once. Then three fine-tunes of each naive checkpoint of `tune`
-iterations: with the servo table and the touch that `diagnose` fitted (the intervals are the randomization), with wide randomization of the
-believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in the reality on the same episodes. All steps are
-commands of the product. One GPU a training, as many at a time as `gpus` lists (0,0: two share one); judging, recording and diagnosing use
-the CPUs meanwhile. gpus=none (the default): trainings run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU,
-fine-tuning a policy that has converged changes next to nothing, so that is for trying the command. diagnose_gpus: GPUs beside those of
-gpus= on which the diagnoses are computed too (a reality each), and then so many trainings at a time. Resumable: a step that is done is not
-repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still runs is ended. Writes
-loop.json, table.md, loop.png.
+For each task and seed the included policy goes on for `naive` iterations in the believed simulator without
+randomization of the drives. A reality is one hand: the naive policies' own runs in it are recorded, then the empty hand
+under safe excitation that is as fast as they were, then presses on its five fingertips; all that is diagnosed once.
+Then three fine-tunes of each naive checkpoint of `tune`
+iterations: with the servo table and the touch that `diagnose` fitted (the intervals are the randomization), with wide
+randomization of the believed drives alone, and with the true drives and touch (the ceiling). Every policy is judged in
+the reality on the same episodes. All steps are commands of the product. One GPU a training, as many at a time as `gpus`
+lists (0,0: two share one); judging, recording and diagnosing use the CPUs meanwhile. gpus=none (the default): trainings
+run on the CPU too, as many as cpus= cores allow; with the 128 worlds of a CPU, fine-tuning a policy that has converged
+changes next to nothing, so that is for trying the command. diagnose_gpus: GPUs beside those of gpus= on which the
+diagnoses are computed too (a reality each), and then so many trainings at a time. Resumable: a step that is done is not
+repeated. stop_s: seconds after which no training is begun, and little later no judging; kill_s: after which what still
+runs is ended. Writes loop.json, table.md, loop.png.
 """
 
 from __future__ import annotations
@@ -42,16 +46,22 @@ from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "", "cpus": str(os.cpu_count() or 1),
-            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "", "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
-            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth", "diagnose_gpus": "",
+SETTINGS = {"tasks": "grasp,rotate", "worlds": "late,stiff", "seeds": "3", "naive": "60", "tune": "150", "gpus": "",
+            "cpus": str(os.cpu_count() or 1),
+            "episodes": "grasp:256,rotate:64", "out": "out/loop", "stop_s": "0", "report": "false", "train": "",
+            "cap_s": "60", "diagnose_s": "600", "kill_s": "0",
+            "train_cores": "1", "judge_cores": "2", "diagnose_cores": "8", "variants": "wide,fitted,truth",
+            "diagnose_gpus": "",
             "diagnose_slots": "3"}  # fmt: skip
-# what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand beside it
+# what is judged: file key, larger is better. The share that counts is that of a task's first measure; the others stand
+# beside it
 METRICS = {"grasp": [("hold_rate_all", True, "held %", 100.0), ("force_error_N", False, "force error N", 1.0)],
            "rotate": [("consecutive_successes.average", True, "successes in a row", 1.0)]}  # fmt: skip
-FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "efficiency": 1.0, "deadband": 0.0, "delay": 0.0, "coulomb_friction": 1.0,
+FIXED = {"kp": 1.0, "kd": 1.0, "torque_limit": 1.0, "no_load_speed": 1.0, "efficiency": 1.0, "deadband": 0.0,
+         "delay": 0.0, "coulomb_friction": 1.0,
          "torque_ripple": 0.0}  # fmt: skip
-WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]", "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
+WIDE = {"kp": "[0.4,1.25]", "kd": "[0.4,1.6]", "torque_limit": "[0.6,1.05]", "no_load_speed": "[0.4,1.1]",
+        "efficiency": "[0.7,1.0]", "deadband": "[0.0,0.015]",
         "delay": "[0.0,0.04]", "coulomb_friction": "[0.5,4.0]", "torque_ripple": "[0.0,0.02]"}  # fmt: skip
 OWN_S = 20  # s of a rotation policy's own run that are recorded
 DRAWN = 0.25  # share of what was found by which training draws about it, at most
@@ -62,8 +72,8 @@ VARIANTS = ("naive", "wide", "fitted", "truth")
 
 @dataclass
 class Job:
-    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or "cpu". gpu: takes a GPU where
-    there are any; cores: that it takes otherwise."""
+    """A step: done when its mark is there. run(slot) returns whether it worked; slot: the GPU's name, or "cpu". gpu:
+    takes a GPU where there are any; cores: that it takes otherwise."""
 
     name: str
     mark: Path
@@ -77,7 +87,8 @@ class Job:
 
 
 class Queue:
-    """Runs jobs on GPUs and CPU cores as their predecessors finish, the lowest rank first: none of a higher one overtakes it."""
+    """Runs jobs on GPUs and CPU cores as their predecessors finish, the lowest rank first: none of a higher one
+    overtakes it."""
 
     def __init__(self, jobs: list[Job], gpus: list[str], cores: int, stop_s: float, kill_s: float, kill):
         self.jobs = {j.name: j for j in jobs}
@@ -140,7 +151,11 @@ class Queue:
             self.free += self._takes(job)
             done = sum(s in ("done", "failed") for s in self.state.values())
             spent = time.perf_counter() - self.begun
-            print(f"  {done}/{len(self.state)} {job.name} {'done' if good else 'FAILED'} {time.perf_counter() - start:.0f} s; {spent:.0f} s spent", flush=True)
+            print(
+                f"  {done}/{len(self.state)} {job.name} {'done' if good else 'FAILED'}"
+                f" {time.perf_counter() - start:.0f} s; {spent:.0f} s spent",
+                flush=True,
+            )
             self.lock.notify_all()
 
 
@@ -164,14 +179,20 @@ class Loop:
         return 0 if self.first([(argv, log, gpu, threads)], limit) == 0 else 1
 
     def first(self, commands: list[tuple[list[str], Path, str, int]], limit: float) -> int | None:
-        """Runs commands (argv, log, gpu, threads) side by side until one has ended well, and ends the others: its number, or None."""
+        """Runs commands (argv, log, gpu, threads) side by side until one has ended well, and ends the others: its
+        number, or None."""
         processes = []
         for argv, log, gpu, threads in commands:
             log.parent.mkdir(parents=True, exist_ok=True)
-            env = os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+            env = os.environ | {
+                "OMP_NUM_THREADS": str(threads),
+                "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+            }
             env["CUDA_VISIBLE_DEVICES"] = "" if gpu in ("", "cpu") else gpu
             with open(log, "w", encoding="utf-8") as file:
-                processes.append(subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT))
+                processes.append(
+                    subprocess.Popen([sys.executable, *argv], cwd=ROOT, env=env, stdout=file, stderr=subprocess.STDOUT)
+                )
             if len(commands) > 1 and not gpu:  # what has a GPU beside it leaves that one its cores
                 os.setpriority(os.PRIO_PROCESS, processes[-1].pid, 10)
         self.running |= set(processes)
@@ -210,20 +231,27 @@ class Loop:
             device = self.device(slot)
             if not (where / "start.pt").is_file():
                 fixed = [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, FIXED).items()]
-                status = self.call(["-m", "benchmarks.loop.steps", "start", f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"out={where / 'start.pt'}",
+                status = self.call(["-m", "benchmarks.loop.steps", "start",
+                                    f"checkpoint={ROOT / 'checkpoints' / f'{task}.pt'}", f"out={where / 'start.pt'}",
                                     f"device={device}", f"seed={seed}", *fixed], where / "start.log", slot)  # fmt: skip
                 if status:
                     return False
             worlds = ["worlds=128", f"sim.threads={self.uses['train']}"] if device == "cpu" else ["worlds=8192"]
-            self.call(["train.py", f"resume={where / 'start.pt'}", f"iterations={self.s['naive']}", f"out={where / 'naive'}", f"device={device}",
-                       "final_episodes=0", "save_interval=100000", *worlds, *self.extra], where / "naive.log", slot)  # fmt: skip
+            self.call(["train.py", f"resume={where / 'start.pt'}", f"iterations={self.s['naive']}",
+                       f"out={where / 'naive'}", f"device={device}",
+                       "final_episodes=0", "save_interval=100000", *worlds, *self.extra], where / "naive.log",
+                       slot)  # fmt: skip
             return (where / "naive" / "policy.pt").is_file()
 
         return run
 
     def _ranges(self, task: str, values: dict) -> dict:
         """Those that the task's randomization has."""
-        own = yaml.safe_load((CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(encoding="utf-8"))["servo"]
+        own = yaml.safe_load(
+            (CONFIGS / "randomize" / ("rotate.yaml" if task == "rotate" else "default.yaml")).read_text(
+                encoding="utf-8"
+            )
+        )["servo"]
         return {k: v for k, v in values.items() if k in own}
 
     def tune(self, task: str, seed: int, variant: str, world: str):
@@ -231,33 +259,44 @@ class Loop:
             base = self.folder(task, seed)
             where = base / (f"tune_{variant}" if variant == "wide" else f"{world}/tune_{variant}")
             shutil.rmtree(where, ignore_errors=True)
-            argv = ["train.py", f"resume={base / 'naive' / 'last.pt'}", f"iterations={int(self.s['naive']) + int(self.s['tune'])}", f"out={where}",
+            argv = ["train.py", f"resume={base / 'naive' / 'last.pt'}",
+                    f"iterations={int(self.s['naive']) + int(self.s['tune'])}", f"out={where}",
                     f"device={self.device(slot)}", "final_episodes=0", "save_interval=100000",
                     *([f"sim.threads={self.uses['train']}"] if slot == "cpu" else []), *self.extra]  # fmt: skip
             if variant == "wide":
                 argv += [f"randomize.servo.{k}={v}" for k, v in self._ranges(task, WIDE).items()]
             elif variant == "fitted":
-                argv += [f"servo_file={self.fitted(base, world)}", f"tactile_file={self.out / f'touch_{world}' / 'tactile.yaml'}"]
+                argv += [
+                    f"servo_file={self.fitted(base, world)}",
+                    f"tactile_file={self.out / f'touch_{world}' / 'tactile.yaml'}",
+                ]
                 if presses.feels_others(self.out / f"touch_{world}" / "pinch.mcap"):
                     argv.append("tactile.feel_others=true")
             else:
                 true = yaml.safe_load((CONFIGS / "reality" / f"{world}.yaml").read_text(encoding="utf-8"))
                 (base / world).mkdir(parents=True, exist_ok=True)
-                (base / world / "true.yaml").write_text(yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8")
+                (base / world / "true.yaml").write_text(
+                    yaml.safe_dump(true["servo"], sort_keys=False), encoding="utf-8"
+                )
                 argv.append(f"servo_file={base / world / 'true.yaml'}")
-                argv += [f"tactile.{k}={str(v).lower() if isinstance(v, bool) else v}" for k, v in true["tactile"].items()]
+                argv += [
+                    f"tactile.{k}={str(v).lower() if isinstance(v, bool) else v}" for k, v in true["tactile"].items()
+                ]
             self.call(argv, where.parent / f"{where.name}.log", slot)
             return (where / "policy.pt").is_file()
 
         return run
 
     def fitted(self, base: Path, world: str) -> Path:
-        """The servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is that of one figure with all
-        others free (a longer delay goes with a shorter lag), and drawn at once their corners are drives that no recording allows. A range that
-        `diagnose` let reach the belief, being unsure, is cut like the others."""
+        """The servo.yaml that `diagnose` wrote, its ranges cut to DRAWN of what was found: each interval is that of one
+        figure with all others free (a longer delay goes with a shorter lag), and drawn at once their corners are drives
+        that no recording allows. A range that `diagnose` let reach the belief, being unsure, is cut like the others."""
         from dexsim.actuator.table import ServoTable
 
-        belief, table = ServoTable.load(CONFIGS / "servo" / "xhand.yaml"), ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml")
+        belief, table = (
+            ServoTable.load(CONFIGS / "servo" / "xhand.yaml"),
+            ServoTable.load(self.out / f"diagnosis_{world}" / "servo.yaml"),
+        )
         for joint, columns in table.entries.items():
             for name, v in columns.items():
                 if not v.unknown and v.low < v.high:
@@ -275,29 +314,41 @@ class Loop:
         def run(slot: str) -> bool:
             where = self.folder(task, seed, world) / f"judged_{variant}"
             cap = [f"task.evaluation.cap_s={self.s['cap_s']}"] if task == "rotate" else []
-            status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}", f"episodes={self.episodes[task]}",
-                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap], where / "log.txt", limit=900)  # fmt: skip
+            status = self.call(["play.py", f"checkpoint={self.policy(task, seed, variant, world)}", f"reality={world}",
+                                f"episodes={self.episodes[task]}",
+                                "seed=77", "video=false", f"out={where}", f"sim.threads={self.uses['judge']}", *cap],
+                                where / "log.txt", limit=900)  # fmt: skip
             return status == 0 and (where / "metrics.json").is_file()
 
         return run
 
     def own(self, task: str, world: str):
         """A naive policy's own run in the reality, recorded as its bus reads."""
+
         def run(slot: str) -> bool:
             where = self.out / f"own_{world}"
             cap = [f"task.evaluation.cap_s={OWN_S}"] if task == "rotate" else []
-            argv = ["play.py", f"checkpoint={self.policy(task, self.seeds[0], 'naive', world)}", f"reality={world}", "episodes=4", "seed=101", "video=false",
-                    f"record={where / f'{task}.mcap'}", "record_worlds=1", "realistic=true", f"out={where / task}", "sim.threads=1", *cap]  # fmt: skip
+            argv = ["play.py", f"checkpoint={self.policy(task, self.seeds[0], 'naive', world)}", f"reality={world}",
+                    "episodes=4", "seed=101", "video=false",
+                    f"record={where / f'{task}.mcap'}", "record_worlds=1", "realistic=true", f"out={where / task}",
+                    "sim.threads=1", *cap]  # fmt: skip
             return self.call(argv, where / f"{task}.log", limit=300) == 0 and (where / f"{task}.mcap").is_file()
 
         return run
 
     def excite(self, world: str):
         """As fast as the policies move there."""
+
         def run(slot: str) -> bool:
             where = self.out / f"excited_{world}"
             own = ",".join(str(self.out / f"own_{world}" / f"{task}.mcap") for task in self.tasks)
-            return self.call(["-m", "benchmarks.loop.steps", "record", f"world={world}", f"own={own}", f"out={where}", "seed=1"], where / "log.txt") == 0
+            return (
+                self.call(
+                    ["-m", "benchmarks.loop.steps", "record", f"world={world}", f"own={own}", f"out={where}", "seed=1"],
+                    where / "log.txt",
+                )
+                == 0
+            )
 
         return run
 
@@ -307,18 +358,31 @@ class Loop:
         return gpus[self.worlds.index(world) % len(gpus)] if gpus else ""
 
     def diagnose(self, world: str):
-        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast that has to be, and are
-        not fitted: a joint is judged while nothing is touched, and most of what they touch carries no taxels. What they command, played again
-        on the empty hand, throws the joints against the ends of their motion (docs/results/loop.md)."""
+        """One reality is one hand: it is diagnosed once, from what was excited. The policies' own runs say how fast
+        that has to be, and are not fitted: a joint is judged while nothing is touched, and most of what they touch
+        carries no taxels. What they command, played again on the empty hand, throws the joints against the ends of
+        their motion (docs/results/loop.md)."""
+
         def run(slot: str) -> bool:
             where = self.out / f"diagnosis_{world}"
-            excited, fast = sorted((self.out / f"excited_{world}").glob("excite_*.mcap")), [self.out / f"excited_{world}" / name for name in FAST]
+            excited, fast = (
+                sorted((self.out / f"excited_{world}").glob("excite_*.mcap")),
+                [self.out / f"excited_{world}" / name for name in FAST],
+            )
             fit, held = [*excited[:-KEPT], fast[0]], [*excited[-KEPT:], fast[1]]
-            argv = ["diagnose.py", f"recordings=[{','.join(map(str, fit))}]", f"held_out=[{','.join(map(str, held))}]", "next=false", "replay=none"]
+            argv = [
+                "diagnose.py",
+                f"recordings=[{','.join(map(str, fit))}]",
+                f"held_out=[{','.join(map(str, held))}]",
+                "next=false",
+                "replay=none",
+            ]
             tries = [([*argv, f"out={where}"], self.out / f"diagnosis_{world}.log", "", self.uses["diagnose"])]
             if helper := self.helper(world):  # beside the cores: whichever is done first
                 other = self.out / f"diagnosis_{world}_gpu"
-                tries.append(([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", helper, 2))
+                tries.append(
+                    ([*argv, f"out={other}", "device=cuda"], self.out / f"diagnosis_{world}_gpu.log", helper, 2)
+                )
             won = self.first(tries, float(self.s["diagnose_s"]))
             if won == 1:
                 shutil.rmtree(where, ignore_errors=True)
@@ -329,62 +393,171 @@ class Loop:
 
     def press(self, finger: str, world: str):
         """A fingertip pressed in the reality, and its diagnosis."""
+
         def run(slot: str) -> bool:
             where = self.out / f"touch_{world}" / finger
-            if self.call(["-m", "benchmarks.loop.presses", "record", f"world={world}", f"finger={finger}", f"out={where}"], where / "record.log", limit=300):
+            if self.call(
+                ["-m", "benchmarks.loop.presses", "record", f"world={world}", f"finger={finger}", f"out={where}"],
+                where / "record.log",
+                limit=300,
+            ):
                 return False
-            argv = ["diagnose.py", f"recordings=[{','.join(map(str, sorted(where.glob('press_*.mcap'))))}]", f"model={where / 'rig.xml'}", f"servo={where / 'rig.yaml'}"]
-            return self.call([*argv, "next=false", f"out={where / 'found'}"], where / "found.log", limit=float(self.s["diagnose_s"])) == 0
+            argv = [
+                "diagnose.py",
+                f"recordings=[{','.join(map(str, sorted(where.glob('press_*.mcap'))))}]",
+                f"model={where / 'rig.xml'}",
+                f"servo={where / 'rig.yaml'}",
+            ]
+            return (
+                self.call(
+                    [*argv, "next=false", f"out={where / 'found'}"],
+                    where / "found.log",
+                    limit=float(self.s["diagnose_s"]),
+                )
+                == 0
+            )
 
         return run
 
     def touch(self, world: str):
         """What was found on the five fingertips, as training takes it."""
+
         def run(slot: str) -> bool:
             where = self.out / f"touch_{world}"
-            pinched = self.call(["-m", "benchmarks.loop.presses", "pinch", f"world={world}", f"out={where / 'pinch.mcap'}"], where / "pinch.log", limit=300)
+            pinched = self.call(
+                ["-m", "benchmarks.loop.presses", "pinch", f"world={world}", f"out={where / 'pinch.mcap'}"],
+                where / "pinch.log",
+                limit=300,
+            )
             found = ",".join(str(where / f) for f in FINGERS)
-            return not pinched and self.call(["-m", "benchmarks.loop.presses", "sum", f"found={found}", f"out={where / 'tactile.yaml'}"], where / "sum.log") == 0
+            return (
+                not pinched
+                and self.call(
+                    ["-m", "benchmarks.loop.presses", "sum", f"found={found}", f"out={where / 'tactile.yaml'}"],
+                    where / "sum.log",
+                )
+                == 0
+            )
 
         return run
 
     def jobs(self) -> list[Job]:
-        """All steps; those that others wait for come first, wide randomization last. Nothing is trained or judged that would keep the
-        diagnoses, or what is fitted, waiting for a GPU or for cores."""
+        """All steps; those that others wait for come first, wide randomization last. Nothing is trained or judged that
+        would keep the diagnoses, or what is fitted, waiting for a GPU or for cores."""
         out = []
         for w in self.worlds:
             for task in self.tasks:
-                out.append(Job(f"own {task} {w}", self.out / f"own_{w}" / f"{task}.done", self.own(task, w), False, [f"naive {task} {self.seeds[0]}"], 0))
-            out.append(Job(f"excite {w}", self.out / f"excited_{w}.done", self.excite(w), False, [f"own {task} {w}" for task in self.tasks], 1))
+                out.append(
+                    Job(
+                        f"own {task} {w}",
+                        self.out / f"own_{w}" / f"{task}.done",
+                        self.own(task, w),
+                        False,
+                        [f"naive {task} {self.seeds[0]}"],
+                        0,
+                    )
+                )
+            out.append(
+                Job(
+                    f"excite {w}",
+                    self.out / f"excited_{w}.done",
+                    self.excite(w),
+                    False,
+                    [f"own {task} {w}" for task in self.tasks],
+                    1,
+                )
+            )
             for finger in FINGERS:
-                out.append(Job(f"press {finger} {w}", self.out / f"touch_{w}" / f"{finger}.done", self.press(finger, w), False, [], 1))
-            out.append(Job(f"touch {w}", self.out / f"touch_{w}.done", self.touch(w), False, [f"press {finger} {w}" for finger in FINGERS], 1))
+                out.append(
+                    Job(
+                        f"press {finger} {w}",
+                        self.out / f"touch_{w}" / f"{finger}.done",
+                        self.press(finger, w),
+                        False,
+                        [],
+                        1,
+                    )
+                )
+            out.append(
+                Job(
+                    f"touch {w}",
+                    self.out / f"touch_{w}.done",
+                    self.touch(w),
+                    False,
+                    [f"press {finger} {w}" for finger in FINGERS],
+                    1,
+                )
+            )
             sharing = [x for x in self.worlds if self.helper(x) == self.helper(w)]
             free = ([self.helper(w)] if self.helper(w) else []) * int(self.s["diagnose_slots"])
-            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"], 2, self.uses["diagnose"],
+            out.append(Job(f"diagnose {w}", self.out / f"diagnosed_{w}.done", self.diagnose(w), False, [f"excite {w}"],
+                           2, self.uses["diagnose"],
                            frees=free[sharing.index(w) :: len(sharing)]))  # fmt: skip
         diagnoses = [f"diagnose {w}" for w in self.worlds]
-        tuned = [f"fitted {task} {seed} {w}" for task in self.tasks for seed in self.seeds for w in self.worlds if "fitted" in self.variants]
+        tuned = [
+            f"fitted {task} {seed} {w}"
+            for task in self.tasks
+            for seed in self.seeds
+            for w in self.worlds
+            if "fitted" in self.variants
+        ]
         for task in self.tasks:
             for seed in self.seeds:
                 base, name = self.folder(task, seed), f"{task} {seed}"
-                out.append(Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"]))
-                out.append(Job(f"wide {name}", base / "wide.done", self.tune(task, seed, "wide", ""), True, [f"naive {name}"], 5, self.uses["train"], tuned))
+                out.append(
+                    Job(f"naive {name}", base / "naive.done", self.naive(task, seed), True, [], 1, self.uses["train"])
+                )
+                out.append(
+                    Job(
+                        f"wide {name}",
+                        base / "wide.done",
+                        self.tune(task, seed, "wide", ""),
+                        True,
+                        [f"naive {name}"],
+                        5,
+                        self.uses["train"],
+                        tuned,
+                    )
+                )
                 for w in self.worlds:
                     here = self.folder(task, seed, w)
                     add = lambda what, run, gpu, after, rank, behind=(), here=here, name=name, w=w: out.append(  # noqa: E731
-                        Job(f"{what} {name} {w}", here / f"{what.replace(' ', '_')}.done", run, gpu, after, rank, self.uses["train" if gpu else "judge"], list(behind)))
+                        Job(
+                            f"{what} {name} {w}",
+                            here / f"{what.replace(' ', '_')}.done",
+                            run,
+                            gpu,
+                            after,
+                            rank,
+                            self.uses["train" if gpu else "judge"],
+                            list(behind),
+                        )
+                    )
                     add("judge naive", self.judge(task, seed, "naive", w), False, [f"naive {name}"], 8, diagnoses)
-                    add("fitted", self.tune(task, seed, "fitted", w), True, [f"diagnose {w}", f"touch {w}", f"naive {name}"], 3)
+                    add(
+                        "fitted",
+                        self.tune(task, seed, "fitted", w),
+                        True,
+                        [f"diagnose {w}", f"touch {w}", f"naive {name}"],
+                        3,
+                    )
                     add("truth", self.tune(task, seed, "truth", w), True, [f"naive {name}"], 4)
-                    add("judge wide", self.judge(task, seed, "wide", w), False, [f"wide {name}"], 9, [f"judge {x}" for x in tuned])
+                    add(
+                        "judge wide",
+                        self.judge(task, seed, "wide", w),
+                        False,
+                        [f"wide {name}"],
+                        9,
+                        [f"judge {x}" for x in tuned],
+                    )
                     add("judge fitted", self.judge(task, seed, "fitted", w), False, [f"fitted {name} {w}"], 6)
                     add("judge truth", self.judge(task, seed, "truth", w), False, [f"truth {name} {w}"], 7, diagnoses)
         left_out = {v for v in VARIANTS if v != "naive"} - self.variants
         return [j for j in out if not left_out & set(j.name.split()[:2])]
 
     def report(self) -> dict:
-        """The table: by task, world and measure, the mean of each variant over seeds, and the share of the loss recovered."""
+        """The table: by task, world and measure, the mean of each variant over seeds, and the share of the loss
+        recovered."""
         lines = []
         for task in self.tasks:
             for world in self.worlds:
@@ -395,7 +568,13 @@ class Loop:
                         for v in VARIANTS:
                             values[v].append(math.nan if row[v] is None else row[v] * unit)
                     x = {v: np.array(values[v]) for v in VARIANTS}
-                    line = {"task": task, "world": world, "measure": label, "larger_is_better": larger, "values": values}
+                    line = {
+                        "task": task,
+                        "world": world,
+                        "measure": label,
+                        "larger_is_better": larger,
+                        "values": values,
+                    }
                     both = np.isfinite(x["naive"]) & np.isfinite(x["truth"])
                     line["gap"] = _gap(x["naive"][both], x["truth"][both])
                     for other in ("fitted", "wide"):
@@ -408,8 +587,10 @@ class Loop:
             path = self.out / f"diagnosis_{world}" / "diagnosis.json"
             if path.is_file():
                 d = json.loads(path.read_text(encoding="utf-8"))
-                found[world] = {"verdict": d["verdict"], "before": d["held_out"]["before"], "after": d["held_out"]["after"],
-                                "findings": [[f["effect"], f["where"]["joints"], round(f["confidence"], 2)] for f in d["findings"]]}  # fmt: skip
+                found[world] = {"verdict": d["verdict"], "before": d["held_out"]["before"],
+                                "after": d["held_out"]["after"],
+                                "findings": [[f["effect"], f["where"]["joints"],
+                                              round(f["confidence"], 2)] for f in d["findings"]]}  # fmt: skip
         return {"benchmark": "loop", "settings": self.s, "lines": lines, "diagnoses": found}
 
     def _metric(self, task: str, seed: int, world: str, variant: str, key: str) -> float | None:
@@ -423,8 +604,9 @@ class Loop:
 
 
 def _gap(naive: np.ndarray, truth: np.ndarray) -> dict:
-    """Mean over seeds of truth - naive (a seed's fine-tune begins at its naive policy, and both play the same episodes) with its 95 %
-    interval (Student's t), and whether it is surely not 0: what cannot be told from nothing has no share that could be recovered. One
+    """Mean over seeds of truth - naive (a seed's fine-tune begins at its naive policy, and both play the same episodes)
+    with its 95 % interval (Student's t), and whether it is surely not 0: what cannot be told from nothing has no share
+    that could be recovered. One
     seed: taken as it is."""
     if not len(naive):
         return {"value": None, "low": None, "high": None, "sure": False}
@@ -455,12 +637,19 @@ def _share(r: dict) -> str:
 
 def markdown(data: dict) -> str:
     """The table as Markdown."""
-    text = ["| task, reality | measure | naive | wide | fitted | true physics | recovered by fitted | by wide |", "|---|---|---|---|---|---|---|---|"]
+    text = [
+        "| task, reality | measure | naive | wide | fitted | true physics | recovered by fitted | by wide |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for line in data["lines"]:
         cells = []
         for v in VARIANTS:
             x = np.array([a for a in line["values"][v] if a == a])
-            cells.append("-" if not len(x) else f"{x.mean():.3g}" + (f" ± {x.std(ddof=1) / math.sqrt(len(x)):.2g}" if len(x) > 1 else ""))
+            cells.append(
+                "-"
+                if not len(x)
+                else f"{x.mean():.3g}" + (f" ± {x.std(ddof=1) / math.sqrt(len(x)):.2g}" if len(x) > 1 else "")
+            )
         none = "-" if line["gap"]["sure"] or line["gap"]["value"] is None else "no sure gap"
         shares = [_share(r) if (r := line.get(f"recovered_{o}")) else none for o in ("fitted", "wide")]
         text.append(f"| {line['task']}, {line['world']} | {line['measure']} | " + " | ".join(cells + shares) + " |")
@@ -516,7 +705,11 @@ def main(argv: list[str]) -> int:
     (loop.out / "table.md").write_text(markdown(data), encoding="utf-8")
     figure(data, loop.out / "loop.png")
     print("\n" + markdown(data))
-    print(json.dumps({"benchmark": "loop", "lines": [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]}))
+    print(
+        json.dumps(
+            {"benchmark": "loop", "lines": [{k: v for k, v in x.items() if k != "values"} for x in data["lines"]]}
+        )
+    )
     return 0
 
 

@@ -1,17 +1,19 @@
 """Fingertip presses in a concealed reality, and what their diagnosis says of its touch sensors as training takes it.
 
     python -m benchmarks.loop.presses record world=late finger=index out=DIR      # press_1.mcap ..., rig.xml, rig.yaml
-    python -m benchmarks.loop.presses pinch world=late out=pinch.mcap             # the thumb's tip on the index's, nothing between them
-    python -m benchmarks.loop.presses sum found=DIR,DIR,... out=tactile.yaml      # folders that record made and diagnose.py wrote found/ into
+    python -m benchmarks.loop.presses pinch world=late out=pinch.mcap             # the thumb's tip on the index's,
+    nothing between them python -m benchmarks.loop.presses sum found=DIR,DIR,... out=tactile.yaml      # folders that
+    record made and diagnose.py wrote found/ into
 
-What a user does with a hand that lies on a bench: a ball of known size, on three hand-driven slides that are read, is pressed on
-each fingertip at places all over its pad, fast and slow, some held; a load cell under the ball. What the fingertip answers is the
-reality's touch sensor: the code and the numbers (delay, hysteresis, gains, dead taxels, noise, threshold, counts) with which policies
-are judged there, running faster than it is read. `diagnose.py model=rig.xml servo=rig.yaml` finds it from the recordings alone.
+What a user does with a hand that lies on a bench: a ball of known size, on three hand-driven slides that are read, is
+pressed on each fingertip at places all over its pad, fast and slow, some held; a load cell under the ball. What the
+fingertip answers is the reality's touch sensor: the code and the numbers (delay, hysteresis, gains, dead taxels, noise,
+threshold, counts) with which policies are judged there, running faster than it is read. `diagnose.py model=rig.xml
+servo=rig.yaml` finds it from the recordings alone.
 
-In the judged episodes of a reality, gains and dead taxels are drawn anew each time: another set of fingertips, of one make. So it is
-not the single taxels of the pressed fingertips that training is given, but how far gains scatter and how many are dead. Thresholds and
-noise far under one count cannot be read off counts and are not handed on.
+In the judged episodes of a reality, gains and dead taxels are drawn anew each time: another set of fingertips, of one
+make. So it is not the single taxels of the pressed fingertips that training is given, but how far gains scatter and how
+many are dead. Thresholds and noise far under one count cannot be read off counts and are not handed on.
 """
 
 from __future__ import annotations
@@ -42,15 +44,17 @@ def rig(finger: str):
 
     s, _, direction, along = press_rig.spec(finger)
     side = s.body("slider")
-    side.add_joint(name="across", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.cross(-direction, along).tolist(), range=[-0.025, 0.02])
+    side.add_joint(
+        name="across", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.cross(-direction, along).tolist(), range=[-0.025, 0.02]
+    )
     s.joint("slide").range = [-0.02, 0.02]
     s.joint("press").range = [-0.01, 0.02]
     return s
 
 
 def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Times [T] s and positions [T, 3] m (slide, across, press): a press at each place (along, across), then up and on to the next.
-    onset(along, across): position of `press` at which the ball touches."""
+    """Times [T] s and positions [T, 3] m (slide, across, press): a press at each place (along, across), then up and on
+    to the next. onset(along, across): position of `press` at which the ball touches."""
     knots, at, up = [(0.0, *places[0], onset(*places[0]) - AWAY)], 0.0, None
     for k, (u, v) in enumerate(places):
         touch, deep = onset(u, v), rng.uniform(*DEPTH)
@@ -67,7 +71,8 @@ def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> 
 
 
 def record(given: dict[str, str]) -> None:
-    """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are led by hand)."""
+    """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are
+    led by hand)."""
     from dexsim.gap.touch.press_rig import SERVO
     from dexsim.sim.quiet import quiet_warp
 
@@ -83,14 +88,15 @@ def record(given: dict[str, str]) -> None:
     rng = np.random.default_rng([world["seed"], sensor.pad])
     places = [(u, v) for u in ALONG for v in ACROSS]
     for k in range(SETS):
-        mine = [places[i] for i in rng.permutation(len(places))]  # each time all of them: what is kept out presses no taxel for the first time
+        # each time all of them: what is kept out presses no taxel for the first time
+        mine = [places[i] for i in rng.permutation(len(places))]
         _one(model, sensor, path(mine, lambda u, v: _onset(model, u, v), rng), k, rng, out / f"press_{k + 1}.mcap")
     print(f"{out}: {finger}, {SETS} recordings", flush=True)
 
 
 class Sensor:
-    """The touch sensor of one hand in a reality: the kernels and settings with which policies are judged there. Gains and dead taxels
-    are one draw of them, of the same seed for every finger."""
+    """The touch sensor of one hand in a reality: the kernels and settings with which policies are judged there. Gains
+    and dead taxels are one draw of them, of the same seed for every finger."""
 
     def __init__(self, world: dict, finger: str, pinched: bool = False):
         import torch
@@ -103,15 +109,21 @@ class Sensor:
         from dexsim.tactile.shapes import ShapeSet
         from dexsim.tactile.tactile import Tactile
 
-        self.pad, self.stiffness, self.lsb = xhand.FINGERS.index(finger), world["tasks"]["grasp"]["randomize"]["contact.stiffness"], world["tactile"]["lsb"]
+        self.pad, self.stiffness, self.lsb = (
+            xhand.FINGERS.index(finger),
+            world["tasks"]["grasp"]["randomize"]["contact.stiffness"],
+            world["tactile"]["lsb"],
+        )
         pads = [f"tip_{x}" for x in xhand.FINGERS]
         self.engine = PosedEngine(1, [*xhand.TIP_BODIES, "indenter"], pads)
         settings = yaml.safe_load((CONFIGS / "tactile" / "default.yaml").read_text(encoding="utf-8")) | world["tactile"]
         if not pinched:  # nothing but the ball comes near, and the work is spared
             settings |= {"feel_others": False, "others": False}
         settings |= {"raw": True, "period": 0.5 / (RATE * INNER)}
-        self.touch = Tactile(self.engine, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "indenter", settings, pairs=pads,
-                             tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS], seed=int(world["seed"]))  # fmt: skip
+        self.touch = Tactile(self.engine, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "indenter", settings,
+                             pairs=pads,
+                             tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
+                             seed=int(world["seed"]))  # fmt: skip
         self.touch.shape_id.fill_(0)
         self.touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
         self.engine.t.xpos[0, :5] = 10.0 * torch.arange(1, 6)[:, None]
@@ -128,7 +140,9 @@ class Sensor:
         turn = _onto(thumb["normal"][k], -mine["normal"][k])
         x.xpos[0, self.pad], x.xmat[0, self.pad] = 0.0, torch.eye(3)
         x.xmat[0, 0] = torch.as_tensor(turn, dtype=torch.float32)
-        x.xpos[0, 0] = torch.as_tensor(mine["position"][k] - depth * mine["normal"][k] - turn @ thumb["position"][k], dtype=torch.float32)
+        x.xpos[0, 0] = torch.as_tensor(
+            mine["position"][k] - depth * mine["normal"][k] - turn @ thumb["position"][k], dtype=torch.float32
+        )
         x.xpos[0, 5] = 100.0  # no ball
         x.pair_normal[0] = 0.0
         x.time[0] = t
@@ -188,7 +202,9 @@ def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target
 
     t, q = motion
     reads = np.arange(int((t[-1] - 0.05) * RATE)) / RATE + rng.uniform(0, 1e-3, int((t[-1] - 0.05) * RATE))
-    every = np.concatenate([np.linspace(a, b, INNER, endpoint=False) for a, b in zip(reads[:-1], reads[1:], strict=True)] + [reads[-1:]])
+    every = np.concatenate(
+        [np.linspace(a, b, INNER, endpoint=False) for a, b in zip(reads[:-1], reads[1:], strict=True)] + [reads[-1:]]
+    )
     data, n = mujoco.MjData(model), len(reads)
     felt, force = np.zeros((n, 5, sensor.touch.layout.taxels, 3)), np.zeros(n)
     sensor.forget()
@@ -205,11 +221,16 @@ def _one(model, sensor: Sensor, motion, k: int, rng: np.random.Generator, target
     at = np.stack([np.interp(reads, t, x) for x in q.T], 1)[:, order]
     cell = np.zeros((n, 6))
     cell[:, 0] = force + 0.02 * rng.standard_normal(n)
-    meta = DEFAULTS | {"source": "real", "robot": "press_rig", "joint_names": ",".join(names), "effort_is": "none", "tactile_unit": "count",
-                       "tactile_lsb": f"{sensor.lsb:g}", "notes": "a fingertip pressed by a ball of 12 mm radius, led by hand"}  # fmt: skip
-    recording = Recording(Path("press.mcap"), meta, tuple(names), Series(np.zeros(0), np.zeros((0, len(names))), COMMANDS, np.zeros(0)),
-                          States(Series(reads, np.round(at / 1e-5) * 1e-5, STATES, reads.copy())), tactile=Series(reads, felt, TACTILE),
-                          external_force=Series(reads, cell, EXTERNAL_FORCE, reads.copy(), "indenter"), start_ns=int(1e9 + k * 60e9))  # fmt: skip
+    meta = DEFAULTS | {"source": "real", "robot": "press_rig", "joint_names": ",".join(names), "effort_is": "none",
+                       "tactile_unit": "count",
+                       "tactile_lsb": f"{sensor.lsb:g}",
+                       "notes": "a fingertip pressed by a ball of 12 mm radius, led by hand"}  # fmt: skip
+    recording = Recording(Path("press.mcap"), meta, tuple(names),
+                          Series(np.zeros(0), np.zeros((0, len(names))), COMMANDS, np.zeros(0)),
+                          States(Series(reads, np.round(at / 1e-5) * 1e-5, STATES, reads.copy())),
+                          tactile=Series(reads, felt, TACTILE),
+                          external_force=Series(reads, cell, EXTERNAL_FORCE, reads.copy(), "indenter"),
+                          start_ns=int(1e9 + k * 60e9))  # fmt: skip
     write(target, recording)
 
 
@@ -228,7 +249,8 @@ def pinch(given: dict[str, str]) -> None:
     felt = np.zeros((len(t), 5, xhand.TAXELS_PER_FINGER, 3))
     for i, now in enumerate(t):
         felt[i, ..., 2] = np.round(sensor.feel_thumb(float(now), float(depth[i])) / sensor.lsb)
-    meta = DEFAULTS | {"source": "real", "robot": "xhand_right", "joint_names": "distance", "effort_is": "none", "tactile_unit": "count", "tactile_lsb": f"{sensor.lsb:g}",
+    meta = DEFAULTS | {"source": "real", "robot": "xhand_right", "joint_names": "distance", "effort_is": "none",
+                       "tactile_unit": "count", "tactile_lsb": f"{sensor.lsb:g}",
                        "notes": "the thumb's tip pressed on the index's by hand"}  # fmt: skip
     out = Path(given["out"])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -238,19 +260,23 @@ def pinch(given: dict[str, str]) -> None:
 
 
 def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
-    """What training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip; felt: taxels of each that
-    felt anything; lsb N a count.
+    """What training is given of all fingertips: (tactile settings). folders: diagnose.py's, one a fingertip; felt:
+    taxels of each that felt anything; lsb N a count.
 
-    delay, hysteresis: the median of what was found, from the lowest to the highest, where most fingertips show it; where fewer do, from
-    nothing to the highest. Gains: the normal spread that makes those listed, and that the others are
-    within LISTED, most likely (1 + spread * normal, as the sensor has it); dead: their share, with a Jeffreys prior.
+    delay, hysteresis: the median of what was found, from the lowest to the highest, where most fingertips show it;
+    where fewer do, from nothing to the highest. Gains: the normal spread that makes those listed, and that the others
+    are within LISTED, most likely (1 + spread * normal, as the sensor has it); dead: their share, with a Jeffreys
+    prior.
     """
     from scipy.stats import beta
 
     values: dict[str, list[float]] = {"delay": [], "hysteresis": [], "hysteresis_time": []}
     listed, dead, total = [], 0, 0
     for folder, n in zip(folders, felt, strict=True):
-        effects = {f["effect"]: f["parameters"] for f in json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))["findings"]}
+        effects = {
+            f["effect"]: f["parameters"]
+            for f in json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))["findings"]
+        }
         values["delay"].append(effects["tactile_delay"]["delay"]["value"] if "tactile_delay" in effects else 0.0)
         if "tactile_hysteresis" in effects:
             values["hysteresis"].append(effects["tactile_hysteresis"]["fraction"]["value"])
@@ -258,8 +284,12 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
         else:
             values["hysteresis"].append(0.0)
         gains = []
-        if "tactile_gain" in effects and ":" in str(effects["tactile_gain"]["taxels"]["value"]):  # not one gain for all of the pad
-            gains = np.broadcast_to(effects["tactile_gain"]["gain"]["value"], (len(str(effects["tactile_gain"]["taxels"]["value"]).split(",")),)).tolist()
+        # not one gain for all of the pad
+        if "tactile_gain" in effects and ":" in str(effects["tactile_gain"]["taxels"]["value"]):
+            gains = np.broadcast_to(
+                effects["tactile_gain"]["gain"]["value"],
+                (len(str(effects["tactile_gain"]["taxels"]["value"]).split(",")),),
+            ).tolist()
         dead += sum(g == 0.0 for g in gains)
         listed += [g for g in gains if g > 0.0]
         total += n
@@ -278,12 +308,14 @@ def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
 
 
 def spread(listed: np.ndarray, others: int) -> tuple[float, float, float]:
-    """Standard deviation (value, low, high: 90 % by the likelihood ratio) of gains about 1: `listed` ones as they are, `others` known to
-    be within LISTED only."""
+    """Standard deviation (value, low, high: 90 % by the likelihood ratio) of gains about 1: `listed` ones as they are,
+    `others` known to be within LISTED only."""
     from scipy.stats import norm
 
     s = np.geomspace(1e-3, 1.0, 600)
-    like = norm.logpdf(listed[:, None] - 1.0, scale=s).sum(0) + others * np.log(np.maximum(norm.cdf(LISTED / s) - norm.cdf(-LISTED / s), 1e-300))
+    like = norm.logpdf(listed[:, None] - 1.0, scale=s).sum(0) + others * np.log(
+        np.maximum(norm.cdf(LISTED / s) - norm.cdf(-LISTED / s), 1e-300)
+    )
     inside = s[like > like.max() - 0.5 * 2.706]
     return float(s[np.argmax(like)]), float(inside.min()), float(inside.max())
 
@@ -307,7 +339,9 @@ def summed(given: dict[str, str]) -> None:
         lsb = counts[0].tactile_lsb
     content = make([r / "found" for r in roots], felt, lsb)
     head = f"# From presses on {len(roots)} fingertips ({sum(felt)} taxels felt them), diagnosed one by one: python -m benchmarks.loop.presses sum\n"
-    Path(given["out"]).write_text(head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130), encoding="utf-8")
+    Path(given["out"]).write_text(
+        head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130), encoding="utf-8"
+    )
     print(Path(given["out"]).read_text(encoding="utf-8"), flush=True)
 
 

@@ -1,11 +1,12 @@
-"""The concealed realities of the loop: other contacts, solver, timing and touch, and drives with effects that the belief lacks.
+"""The concealed realities of the loop: other contacts, solver, timing and touch, and drives with effects that the
+belief lacks.
 
     python -m benchmarks.loop.worlds        # writes dexsim/configs/reality/late.yaml and stiff.yaml, drawn once
 
-Built as `dexsim.tasks.reality` builds its own, but the drives are the believed ones, each quantity off by up to 3 %, with
-two or three effects of the catalogue in every joint. late: a delay, a lag, a lower no-load speed. stiff: twice the gain, less than half
-the damping. What they hide was chosen by what the naive policy loses by it and by what can be won back, since nothing of it takes away
-what the drives are able to do (docs/results/loop.md); the numbers are drawn.
+Built as `dexsim.tasks.reality` builds its own, but the drives are the believed ones, each quantity off by up to 3 %,
+with two or three effects of the catalogue in every joint. late: a delay, a lag, a lower no-load speed. stiff: twice the
+gain, less than half the damping. What they hide was chosen by what the naive policy loses by it and by what can be won
+back, since nothing of it takes away what the drives are able to do (docs/results/loop.md); the numbers are drawn.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def draw(name: str) -> dict:
     joints = {}
     for joint in xhand.JOINTS:
         b = nominal["joints"]["*"] | nominal["joints"].get(joint, {})
-        p = {k: b[k] * rng.uniform(0.97, 1.03) for k in ("kp", "kd", "torque_limit", "no_load_speed", "coulomb_friction")}
+        p = {k: b[k] * rng.uniform(0.97, 1.03) for k in ("kp", "kd", "torque_limit", "no_load_speed",
+                                                         "coulomb_friction")}
         p["delay"] = b["delay"]
         if name == "stiff":
             p["kp"] *= rng.uniform(1.7, 2.2)
@@ -53,14 +55,17 @@ def main(argv: list[str]) -> int:
     from dexsim.tasks.reality import text
 
     if argv:
-        raise UserError(f"'{argv[0]}': there are no settings; the numbers are drawn from SEEDS in benchmarks/loop/worlds.py")
+        raise UserError(f"'{argv[0]}': there are no settings; the numbers are drawn from SEEDS in"
+                        " benchmarks/loop/worlds.py")
 
     for name in SEEDS:
         path = CONFIGS / "reality" / f"{name}.yaml"
         body = text(draw(name)).split("\n")
         kept = [line for line in body if not line.startswith("#")]
-        head = ["# A concealed reality of the closed loop (`python -m benchmarks.loop`), standing in for hardware: never trained in.",
-                "# Numbers drawn once: python -m benchmarks.loop.worlds. What it hides (in its servo) was chosen by what it costs a naive policy."]
+        head = ["# A concealed reality of the closed loop (`python -m benchmarks.loop`), standing in for hardware:"
+                " never trained in.",
+                "# Numbers drawn once: python -m benchmarks.loop.worlds. What it hides (in its servo) was chosen by"
+                " what it costs a naive policy."]
         path.write_text("\n".join(head + kept), encoding="utf-8")
         print(path)
     return 0

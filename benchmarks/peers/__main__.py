@@ -4,11 +4,12 @@
     python -m benchmarks.peers cpu shadow=PYTHON [seconds=20]
     python -m benchmarks.peers sysid [cases=8]
 
-gpu: the same hand and box, the same targets: dexsim's full environment step (servo, 600 taxels, rewards, resets) beside bare
-MuJoCo-Warp of the same version and, with `mjlab=` an interpreter that has mjlab 1.6 (pip install mjlab==1.6.0 in a virtual environment
-of its own), beside mjlab's environment loop and its older bare MuJoCo-Warp. `mjlab=` may also be a folder to put before sys.path of this
-interpreter. cpu: one world and one thread beside Gymnasium-Robotics' Shadow hand with its touch sensors, in an interpreter that has
-gymnasium-robotics. sysid: `mujoco.sysid` beside `diagnose` on one joint.
+gpu: the same hand and box, the same targets: dexsim's full environment step (servo, 600 taxels, rewards, resets) beside
+bare MuJoCo-Warp of the same version and, with `mjlab=` an interpreter that has mjlab 1.6 (pip install mjlab==1.6.0 in a
+virtual environment of its own), beside mjlab's environment loop and its older bare MuJoCo-Warp. `mjlab=` may also be a
+folder to put before sys.path of this interpreter. cpu: one world and one thread beside Gymnasium-Robotics' Shadow hand
+with its touch sensors, in an interpreter that has gymnasium-robotics. sysid: `mujoco.sysid` beside `diagnose` on one
+joint.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ def interpreter(given: str) -> tuple[list[str], dict[str, str]]:
     """Command and environment of a peer's Python: an interpreter, or a folder for the front of sys.path."""
     path = Path(given).expanduser()
     if path.is_dir():
-        return [sys.executable], {"PYTHONPATH": f"{path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "off"}
+        return [sys.executable], {"PYTHONPATH": f"{path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+                                  "MUJOCO_GL": "off"}
     if not path.exists():
         raise UserError(f"{given}: neither an interpreter nor a folder of packages")
     return [str(path)], {"PYTHONPATH": "", "MUJOCO_GL": "off"}
@@ -68,12 +70,15 @@ def gpu(own: dict[str, str], out: Path) -> list[dict]:
         for name, command, environment in plan:
             row = {"name": name, "turn": turn} | child(command, environment)
             rows.append(row)
-            print("  " + "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
-            (out / "peers_gpu.json").write_text(json.dumps({"benchmark": "peers gpu", "worlds": int(worlds), "device": device, "rows": rows,
+            print("  " + "  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()),
+                  flush=True)
+            (out / "peers_gpu.json").write_text(json.dumps({"benchmark": "peers gpu", "worlds": int(worlds),
+                                                            "device": device, "rows": rows,
                                                             "ratios": ratios(rows)}, indent=1))
     for name, ratio in ratios(rows).items():
         print(f"  {name:10s} {ratio:.3f} of dexsim's time for a control step")
-    print(json.dumps({"benchmark": "peers gpu", "worlds": int(worlds), "device": device, "ratios": ratios(rows), "rows": rows}), flush=True)
+    print(json.dumps({"benchmark": "peers gpu", "worlds": int(worlds), "device": device, "ratios": ratios(rows),
+                      "rows": rows}), flush=True)
     return rows
 
 

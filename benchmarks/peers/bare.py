@@ -57,8 +57,10 @@ def main(folder: str, worlds: int, device: str) -> dict:
         wp.synchronize_device(device)
         seconds = (time.perf_counter() - start) / about["timed"]
         qpos, contacts = d.qpos.numpy(), int(d.nacon.numpy()[0])
-    return {"peer": f"mujoco-warp {mjw.__version__ if hasattr(mjw, '__version__') else mujoco.__version__}", "worlds": worlds, "ms": 1e3 * seconds,
-            "height": float(np.median(qpos[:, 14])), "in_hand": float((qpos[:, 14] > 0.03).mean()), "contacts": contacts / worlds}
+    return {"peer": f"mujoco-warp {mjw.__version__ if hasattr(mjw, '__version__') else mujoco.__version__}",
+            "worlds": worlds, "ms": 1e3 * seconds,
+            "height": float(np.median(qpos[:, 14])), "in_hand": float((qpos[:, 14] > 0.03).mean()),
+            "contacts": contacts / worlds}
 
 
 if __name__ == "__main__":

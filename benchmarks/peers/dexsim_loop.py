@@ -1,4 +1,5 @@
-"""dexsim's full environment step on the hand and box: python -m benchmarks.peers.dexsim_loop SCENE_FOLDER WORLDS DEVICE."""
+"""dexsim's full environment step on the hand and box: python -m benchmarks.peers.dexsim_loop SCENE_FOLDER WORLDS
+DEVICE."""
 
 from __future__ import annotations
 

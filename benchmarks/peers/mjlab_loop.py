@@ -2,7 +2,8 @@
 
     python mjlab_loop.py SCENE_FOLDER WORLDS DEVICE
 
-A small environment as its manipulation tasks are made: joint position action, joint and box observations, three rewards, two terminations.
+A small environment as its manipulation tasks are made: joint position action, joint and box observations, three
+rewards, two terminations.
 """
 
 from __future__ import annotations
@@ -48,14 +49,17 @@ def config(folder: Path, about: dict, worlds: int) -> ManagerBasedRlEnvCfg:
     for k, name in enumerate(about["joints"]):
         key = (servo["kp"][k], servo["kd"][k], servo["torque_limit"][k])
         groups.setdefault(key, []).append(name)
-    actuators = tuple(BuiltinPositionActuatorCfg(target_names_expr=tuple(names), stiffness=kp, damping=kd, effort_limit=limit)
+    actuators = tuple(BuiltinPositionActuatorCfg(target_names_expr=tuple(names), stiffness=kp, damping=kd,
+                                                 effort_limit=limit)
                       for (kp, kd, limit), names in groups.items())
-    hand = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(folder / "hand.xml")), init_state=EntityCfg.InitialStateCfg(joint_pos=start),
+    hand = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(folder / "hand.xml")),
+                     init_state=EntityCfg.InitialStateCfg(joint_pos=start),
                      articulation=EntityArticulationInfoCfg(actuators=actuators), sort_actuators=True)
     pose = about["object_pose"]
     box = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(folder / "box.xml")),
                     init_state=EntityCfg.InitialStateCfg(pos=tuple(pose[:3]), rot=tuple(pose[3:7])))
-    terms = {"joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel), "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel),
+    terms = {"joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
+             "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel),
              "box": ObservationTermCfg(func=box_pose), "actions": ObservationTermCfg(func=mdp.last_action)}
     joints = SceneEntityCfg("hand", joint_names=(".*",))
     for name in ("joint_pos", "joint_vel"):
@@ -65,18 +69,24 @@ def config(folder: Path, about: dict, worlds: int) -> ManagerBasedRlEnvCfg:
         decimation=about["decimation"], episode_length_s=8.0, seed=1,
         scene=SceneCfg(num_envs=worlds, env_spacing=0.0, entities={"hand": hand, "box": box}),
         observations={"actor": ObservationGroupCfg(dict(terms)), "critic": ObservationGroupCfg(dict(terms))},
-        actions={"joint_pos": JointPositionActionCfg(entity_name="hand", actuator_names=(".*",), scale=1.0, use_default_offset=False)},
+        actions={"joint_pos": JointPositionActionCfg(entity_name="hand", actuator_names=(".*",), scale=1.0,
+                                                     use_default_offset=False)},
         events={"reset": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset"),
                 "joints": EventTermCfg(func=mdp.reset_joints_by_offset, mode="reset", params={
-                    "position_range": (-spread["joint"], spread["joint"]), "velocity_range": (0.0, 0.0), "asset_cfg": joints}),
+                    "position_range": (-spread["joint"], spread["joint"]), "velocity_range": (0.0, 0.0),
+                    "asset_cfg": joints}),
                 "place": EventTermCfg(func=mdp.reset_root_state_uniform, mode="reset", params={
-                    "pose_range": {"x": (-spread["xy"], spread["xy"]), "y": (-spread["xy"], spread["xy"]), "z": (-spread["z"], spread["z"])},
+                    "pose_range": {"x": (-spread["xy"], spread["xy"]), "y": (-spread["xy"], spread["xy"]),
+                                   "z": (-spread["z"], spread["z"])},
                     "velocity_range": {}, "asset_cfg": SceneEntityCfg("box")})},
-        rewards={"height": RewardTermCfg(func=box_height, weight=1.0), "action_rate": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
+        rewards={"height": RewardTermCfg(func=box_height, weight=1.0),
+                 "action_rate": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
                  "lost": RewardTermCfg(func=mdp.is_terminated, weight=-1.0)},
-        terminations={"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True), "lost": TerminationTermCfg(func=box_lost)},
+        terminations={"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+                      "lost": TerminationTermCfg(func=box_lost)},
         sim=SimulationCfg(nconmax=sim["nconmax"], njmax=sim["njmax"], mujoco=MujocoCfg(
-            timestep=sim["timestep"], impratio=sim["impratio"], cone="elliptic", integrator="implicitfast", iterations=sim["iterations"],
+            timestep=sim["timestep"], impratio=sim["impratio"], cone="elliptic", integrator="implicitfast",
+            iterations=sim["iterations"],
             ls_iterations=sim["ls_iterations"], disableflags=("multiccd",))))
 
 
@@ -104,7 +114,8 @@ def main(folder: str, worlds: int, device: str) -> dict:
     sync()
     seconds = (time.perf_counter() - start) / about["timed"]
     height = box_height(env)
-    return {"peer": f"mjlab {importlib.metadata.version('mjlab')}", "worlds": worlds, "ms": 1e3 * seconds, "height": float(height.median()),
+    return {"peer": f"mjlab {importlib.metadata.version('mjlab')}", "worlds": worlds, "ms": 1e3 * seconds,
+            "height": float(height.median()),
             "in_hand": float((height > 0.03).float().mean())}
 
 

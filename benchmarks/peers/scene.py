@@ -1,7 +1,8 @@
-"""The hand and a box as plain MJCF, for simulators that do not know dexsim: written from world 0 of a dexsim environment.
+"""The hand and a box as plain MJCF, for simulators that do not know dexsim: written from world 0 of a dexsim
+environment.
 
-The same bodies, collision shapes, contact parameters, joint friction, armature, solver and time step; in place of dexsim's servo stand MuJoCo's
-own position actuators with its nominal gains and torque limits.
+The same bodies, collision shapes, contact parameters, joint friction, armature, solver and time step; in place of
+dexsim's servo stand MuJoCo's own position actuators with its nominal gains and torque limits.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ from dexsim.assets import xhand
 from dexsim.paths import CONFIGS
 from dexsim.tasks.env import OBJECT, HandEnv, _solver_options
 
-# One box, dropped with a spread of places and joint angles that all simulators get: worlds that are all alike would all need the
-# same few solver iterations, which no training has. The servo is also randomized by world in dexsim; the others have none.
+# One box, dropped with a spread of places and joint angles that all simulators get: worlds that are all alike would all
+# need the same few solver iterations, which no training has. The servo is also randomized by world in dexsim; the
+# others have none.
 SPREAD = {"joint": 0.1, "xy": 0.012, "z": 0.02}  # half widths: rad, m, m
 SETTINGS = ("task=grasp", "task.objects.train=[box]", "task.objects.held_out=[tetra]", "task.action.mode=absolute",
-            "randomize.object.scale=1.38", "randomize.object.aspect=1.0", "randomize.object.mass=0.1", "randomize.object.com=0.0",
-            "randomize.object.friction=0.8", "randomize.initial.joint=[-0.1,0.1]", "randomize.initial.object_xy=[-0.012,0.012]",
+            "randomize.object.scale=1.38", "randomize.object.aspect=1.0", "randomize.object.mass=0.1",
+            "randomize.object.com=0.0",
+            "randomize.object.friction=0.8", "randomize.initial.joint=[-0.1,0.1]",
+            "randomize.initial.object_xy=[-0.012,0.012]",
             "randomize.initial.drop=[0.03,0.07]",
             "randomize.initial.velocity_xy=0.0", "randomize.initial.velocity_z=0.0", "randomize.initial.spin=0.0",
             "randomize.initial.tilt=0.0", "randomize.push.weights=0.0")
@@ -76,15 +80,18 @@ def write(env: HandEnv, folder: Path) -> Path:
     for spec in (box, both):
         body = spec.worldbody.add_body(name=OBJECT, pos=pose[:3], quat=pose[3:7])
         body.add_freejoint(name="object_free")
-        body.add_geom(name="box", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, mass=0.1, condim=4, contype=1, conaffinity=2, friction=friction[g],
+        body.add_geom(name="box", type=mujoco.mjtGeom.mjGEOM_BOX, size=size, mass=0.1, condim=4, contype=1,
+                      conaffinity=2, friction=friction[g],
                       solref=solref[g])
     folder.mkdir(parents=True, exist_ok=True)
     for name, spec in (("hand", hand), ("box", box), ("scene", both)):
         spec.compile()
         (folder / f"{name}.xml").write_text(_plain(spec, nominal if name == "scene" else None))
     start, closed = targets()
-    about = {"joints": list(xhand.JOINTS), "start": start.tolist(), "closed": closed.tolist(), "object_pose": pose.tolist(), "decimation": env.decimation,
-             "closing": CLOSING, "timed": TIMED, "spread": SPREAD, "sim": {k: sim[k] for k in ("timestep", "impratio", "iterations", "ls_iterations", "nconmax", "njmax")},
+    about = {"joints": list(xhand.JOINTS), "start": start.tolist(), "closed": closed.tolist(),
+             "object_pose": pose.tolist(), "decimation": env.decimation,
+             "closing": CLOSING, "timed": TIMED, "spread": SPREAD,
+             "sim": {k: sim[k] for k in ("timestep", "impratio", "iterations", "ls_iterations", "nconmax", "njmax")},
              "servo": {k: v.tolist() for k, v in nominal.items()}}
     (folder / "scene.json").write_text(json.dumps(about, indent=1))
     return folder
@@ -101,7 +108,8 @@ def _plain(spec: mujoco.MjSpec, servo: dict[str, np.ndarray] | None) -> str:
         group = ElementTree.SubElement(root, "actuator")
         for k, name in enumerate(xhand.JOINTS):
             limit = float(servo["torque_limit"][k])
-            ElementTree.SubElement(group, "position", name=name, joint=name, kp=f"{servo['kp'][k]:g}", kv=f"{servo['kd'][k]:g}",
+            ElementTree.SubElement(group, "position", name=name, joint=name, kp=f"{servo['kp'][k]:g}",
+                                   kv=f"{servo['kd'][k]:g}",
                                    forcerange=f"{-limit} {limit}")
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -1,7 +1,9 @@
-"""dexsim on one CPU thread beside Gymnasium-Robotics' Shadow hand: environment steps and simulated seconds per CPU second.
+"""dexsim on one CPU thread beside Gymnasium-Robotics' Shadow hand: environment steps and simulated seconds per CPU
+second.
 
-Two hands, two tasks: Shadow (30 degrees of freedom with the block, 92 touch sites, a scalar each) turns a block, dexsim's xHand (18, 600
-taxels) catches one. So only the order of the ratio means something. CPU time, because the machine may do other work.
+Two hands, two tasks: Shadow (30 degrees of freedom with the block, 92 touch sites, a scalar each) turns a block,
+dexsim's xHand (18, 600 taxels) catches one. So only the order of the ratio means something. CPU time, because the
+machine may do other work.
 """
 
 from __future__ import annotations
@@ -39,18 +41,28 @@ print(json.dumps({"peer": f"dexsim, {worlds} worlds", "steps_per_cpu_s": steps /
 def main(own: dict[str, str], out: Path) -> int:
     """Both, in turns, twice; the better turn counts."""
     if "shadow" not in own:
-        raise UserError("shadow=: an interpreter that has gymnasium-robotics (pip install gymnasium-robotics in a virtual environment of its own)")
+        raise UserError(
+            "shadow=: an interpreter that has gymnasium-robotics (pip install gymnasium-robotics in a"
+            " virtual environment of its own)"
+        )
     python, environment = interpreter(own["shadow"])
     seconds, best = own.get("seconds", "20"), {}
     one = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    plan = [("shadow", [*python, str(HERE / "shadow_loop.py"), seconds], environment | {"OMP_NUM_THREADS": "1"}),
-            ("dexsim_1", [sys.executable, "-c", CODE, "1", seconds], one), ("dexsim_64", [sys.executable, "-c", CODE, "64", seconds], one)]
+    plan = [
+        ("shadow", [*python, str(HERE / "shadow_loop.py"), seconds], environment | {"OMP_NUM_THREADS": "1"}),
+        ("dexsim_1", [sys.executable, "-c", CODE, "1", seconds], one),
+        ("dexsim_64", [sys.executable, "-c", CODE, "64", seconds], one),
+    ]
     for _ in range(2):
         for name, command, env in plan:
             row = child(command, env)
             if "error" in row:
                 raise UserError(f"{name}: {row['error']}")
-            print(f"  {name:10s} {row['steps_per_cpu_s']:8.0f} steps, {row['steps_per_cpu_s'] * row['control_s']:6.1f} simulated s, per CPU second", flush=True)
+            print(
+                f"  {name:10s} {row['steps_per_cpu_s']:8.0f} steps, {row['steps_per_cpu_s'] * row['control_s']:6.1f}"
+                " simulated s, per CPU second",
+                flush=True,
+            )
             if row["steps_per_cpu_s"] > best.get(name, {"steps_per_cpu_s": 0.0})["steps_per_cpu_s"]:
                 best[name] = row
     base = best["shadow"]
@@ -58,8 +70,11 @@ def main(own: dict[str, str], out: Path) -> int:
         row["steps_over_shadow"] = row["steps_per_cpu_s"] / base["steps_per_cpu_s"]
         row["physics_steps_over_shadow"] = row["steps_over_shadow"] * row["physics_per_step"] / base["physics_per_step"]
         row["simulated_time_over_shadow"] = row["steps_over_shadow"] * row["control_s"] / base["control_s"]
-        print(f"  {name:10s} environment steps {row['steps_over_shadow']:.2f}, physics steps {row['physics_steps_over_shadow']:.2f},"
-              f" simulated time {row['simulated_time_over_shadow']:.2f} of Shadow's")
+        print(
+            f"  {name:10s} environment steps {row['steps_over_shadow']:.2f}, physics steps"
+            f" {row['physics_steps_over_shadow']:.2f},"
+            f" simulated time {row['simulated_time_over_shadow']:.2f} of Shadow's"
+        )
     (out / "peers_cpu.json").write_text(json.dumps({"benchmark": "peers cpu", "rows": best}, indent=1))
     print(json.dumps({"benchmark": "peers cpu", "rows": best}), flush=True)
     return 0

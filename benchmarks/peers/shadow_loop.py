@@ -34,9 +34,12 @@ def main(seconds: float) -> dict:
             env.reset()
     spent = time.process_time() - start
     touch = raw.model.nsensor
-    return {"peer": f"{NAME}, gymnasium-robotics {importlib.metadata.version('gymnasium-robotics')}, mujoco {importlib.metadata.version('mujoco')}",
-            "steps_per_cpu_s": steps / spent, "physics_per_step": int(raw.n_substeps), "timestep": float(raw.model.opt.timestep),
-            "control_s": float(raw.n_substeps * raw.model.opt.timestep), "dofs": int(raw.model.nv), "sensors": int(touch),
+    return {"peer": f"{NAME}, gymnasium-robotics {importlib.metadata.version('gymnasium-robotics')}, mujoco"
+                    f" {importlib.metadata.version('mujoco')}",
+            "steps_per_cpu_s": steps / spent, "physics_per_step": int(raw.n_substeps),
+            "timestep": float(raw.model.opt.timestep),
+            "control_s": float(raw.n_substeps * raw.model.opt.timestep), "dofs": int(raw.model.nv),
+            "sensors": int(touch),
             "observation": int(np.asarray(obs["observation"]).size)}
 
 

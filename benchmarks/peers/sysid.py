@@ -1,9 +1,9 @@
 """`mujoco.sysid` beside `diagnose` on one joint: time, and error of the hidden parameter.
 
-Concealed cases (an independent plant, see `benchmarks/concealed`) of one joint whose hidden effect is a parameter that both know. Both get
-the same recordings and the same believed model. `diagnose` has to find which effect it is among its whole catalogue; `mujoco.sysid`
-has no such step: once all nine of its parameters are free and the one that is meant is read off, once it is told which one to fit
-and believes the rest, which but for the law of friction is right here.
+Concealed cases (an independent plant, see `benchmarks/concealed`) of one joint whose hidden effect is a parameter that
+both know. Both get the same recordings and the same believed model. `diagnose` has to find which effect it is among its
+whole catalogue; `mujoco.sysid` has no such step: once all nine of its parameters are free and the one that is meant is
+read off, once it is told which one to fit and believes the rest, which but for the law of friction is right here.
 """
 
 from __future__ import annotations
@@ -40,8 +40,14 @@ def ours(name: str, truth: dict, root: Path, limit: float) -> dict:
     found = json.loads((out / "diagnosis.json").read_text())
     meant = truth["effects"][0]
     finding = next((f for f in found.get("findings", []) if score.named_right(f, meant["effect"])), None)
-    errors, _ = score._parameters(finding, {"parameters": {KINDS[meant["kind"]][0]: meant["parameters"][KINDS[meant["kind"]][0]]}})
-    return {"seconds": float((out / "seconds").read_text()), "error": errors[0] if errors else None, "named": finding is not None}
+    errors, _ = score._parameters(
+        finding, {"parameters": {KINDS[meant["kind"]][0]: meant["parameters"][KINDS[meant["kind"]][0]]}}
+    )
+    return {
+        "seconds": float((out / "seconds").read_text()),
+        "error": errors[0] if errors else None,
+        "named": finding is not None,
+    }
 
 
 def theirs(name: str, truth: dict, root: Path, told: bool) -> dict:
@@ -70,13 +76,22 @@ def main(own: dict[str, str], out: Path) -> int:
     for k in range(count):
         kind = names[k % len(names)]
         name, truth = make(k, kind, root)
-        row = {"case": name, "kind": kind, "tier": truth["tier"], "diagnose": ours(name, truth, root, 600.0), "sysid": theirs(name, truth, root, False),
-               "sysid_told": theirs(name, truth, root, True)}
+        row = {
+            "case": name,
+            "kind": kind,
+            "tier": truth["tier"],
+            "diagnose": ours(name, truth, root, 600.0),
+            "sysid": theirs(name, truth, root, False),
+            "sysid_told": theirs(name, truth, root, True),
+        }
         rows.append(row)
-        text = [f"{who} {r['seconds']:.0f} s, error {_percent(r['error'])}" for who, r in
-                ((who, row[who]) for who in WHO)]
+        text = [
+            f"{who} {r['seconds']:.0f} s, error {_percent(r['error'])}" for who, r in ((who, row[who]) for who in WHO)
+        ]
         print(f"  {k + 1}/{count} {kind:8s} ({truth['tier']})  " + "   ".join(text), flush=True)
-        (out / "sysid.json").write_text(json.dumps({"benchmark": "peers sysid", "rows": rows, "summary": summary(rows)}, indent=1))
+        (out / "sysid.json").write_text(
+            json.dumps({"benchmark": "peers sysid", "rows": rows, "summary": summary(rows)}, indent=1)
+        )
     for who, s in summary(rows).items():
         print(f"  {who:10s} median error {100 * s['error']:.0f} % of {s['n']}, median time {s['seconds']:.0f} s")
     print(json.dumps({"benchmark": "peers sysid", "summary": summary(rows), "rows": rows}), flush=True)
@@ -88,7 +103,11 @@ def summary(rows: list[dict]) -> dict[str, dict]:
     found = {}
     for who in WHO:
         errors = [1.0 if r[who]["error"] is None else min(r[who]["error"], 10.0) for r in rows]
-        found[who] = {"error": float(np.median(errors)), "seconds": float(np.median([r[who]["seconds"] for r in rows])), "n": len(rows)}
+        found[who] = {
+            "error": float(np.median(errors)),
+            "seconds": float(np.median([r[who]["seconds"] for r in rows])),
+            "n": len(rows),
+        }
     return found
 
 

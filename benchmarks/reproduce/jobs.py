@@ -1,8 +1,9 @@
 """Training and judging the rows: one training a GPU at a time, judging on the CPU beside it, all as plain subprocesses.
 
-Whatever is there already is not done again: the same command goes on where it was interrupted, and a larger budget goes on from
-what a smaller one reached; a policy that has learned more since, or is to be judged otherwise, is judged again. Where the budget
-has stages, every row reaches one before any goes on (`benchmarks.reproduce.schedule`), and is judged there.
+Whatever is there already is not done again: the same command goes on where it was interrupted, and a larger budget goes
+on from what a smaller one reached; a policy that has learned more since, or is to be judged otherwise, is judged again.
+Where the budget has stages, every row reaches one before any goes on (`benchmarks.reproduce.schedule`), and is judged
+there.
 """
 
 from __future__ import annotations
@@ -40,12 +41,16 @@ NICE = ("nice", "-n", "5") if shutil.which("nice") else ()
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked. out: folder; task: rotate or grasp; steps: environment steps of each training; per: steps an iteration;
-    minutes: limit of each training (it is then saved and judged as it is), None for none; episodes by world; cap: seconds of a
-    trial, rotation; threads of a judging; extra: further settings of train.py; judge: device of the judging in simulation;
-    sitting: minutes after which nothing more is trained (what runs is saved for the next sitting), None for no end; stages: steps
-    at which all wait for one another and are judged, before `steps`; fit: lower `steps` to what all can reach in the sitting;
-    overlap: the next training starts while the last one on its GPU ends; level: which stage's judging is meant, None for the last."""
+    """What is asked. out: folder; task: rotate or grasp; steps: environment steps of each training; per: steps an
+    iteration;
+    minutes: limit of each training (it is then saved and judged as it is), None for none; episodes by world; cap:
+    seconds of a trial, rotation; threads of a judging; extra: further settings of train.py; judge: device of the
+    judging in simulation;
+    sitting: minutes after which nothing more is trained (what runs is saved for the next sitting), None for no end;
+    stages: steps at which all wait for one another and are judged, before `steps`; fit: lower `steps` to what all can
+    reach in the sitting;
+    overlap: the next training starts while the last one on its GPU ends; level: which stage's judging is meant, None
+    for the last."""
 
     out: Path
     task: str
@@ -116,26 +121,46 @@ def _ended_by_limit(folder: Path, plan: Plan) -> bool:
 
 
 def progress(folder: Path) -> tuple[int, float, float] | None:
-    """(iteration, steps, seconds an iteration lately) at the end of a running training's progress.csv; None before there is one."""
+    """(iteration, steps, seconds an iteration lately) at the end of a running training's progress.csv; None before
+    there is one."""
     try:
         with open(folder / "progress.csv", "rb") as file:
             names = file.readline().decode().strip().split(",")
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 8192, 0))
-            lines = file.read().decode(errors="ignore").split("\n")[1:-1]  # whole lines: what is being written has no end yet
-        rows = [dict(zip(names, line.split(","), strict=True)) for line in lines if line.count(",") == len(names) - 1 and line[:1].isdigit()]
-        each = statistics.mean(float(r["collect_s"]) + float(r["learn_s"]) for r in rows[-5:]) if "learn_s" in names else math.nan
+            # whole lines: what is being written has no end yet
+            lines = file.read().decode(errors="ignore").split("\n")[1:-1]
+        rows = [
+            dict(zip(names, line.split(","), strict=True))
+            for line in lines
+            if line.count(",") == len(names) - 1 and line[:1].isdigit()
+        ]
+        each = (
+            statistics.mean(float(r["collect_s"]) + float(r["learn_s"]) for r in rows[-5:])
+            if "learn_s" in names
+            else math.nan
+        )
         return int(rows[-1]["iteration"]), float(rows[-1]["steps"]), each
     except (OSError, ValueError, IndexError, KeyError, statistics.StatisticsError):
         return None
 
 
-def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], until: float = math.inf, to: float | None = None,
-          nearly: Callable[[], None] = lambda: None, lead: list[float] | None = None) -> Path | None:
-    """Train, or go on training, until `to` (the plan's steps) or the plan's minutes are over, or time.monotonic() reaches `until`.
+def train(
+    job: Job,
+    plan: Plan,
+    gpu: str | None,
+    say: Callable[[str], None],
+    until: float = math.inf,
+    to: float | None = None,
+    nearly: Callable[[], None] = lambda: None,
+    lead: list[float] | None = None,
+) -> Path | None:
+    """Train, or go on training, until `to` (the plan's steps) or the plan's minutes are over, or time.monotonic()
+    reaches `until`.
 
-    Calls `nearly` as many seconds before the end as a training takes to start (`lead[0]`, which it measures; `lead[1]` becomes
-    the time of the first iteration of all). Returns the checkpoint to judge; None if there is none, or less was learned than asked.
+    Calls `nearly` as many seconds before the end as a training takes to start (`lead[0]`, which it measures; `lead[1]`
+    becomes the time of the first iteration of all). Returns the checkpoint to judge; None if there is none, or less was
+    learned than asked.
     """
     folder = job.folder(plan)
     folder.mkdir(parents=True, exist_ok=True)
@@ -144,7 +169,11 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
         return so_far.last
     numbers = [int(n) for p in folder.glob("train_*") if (n := p.name.removeprefix("train_")).isdigit()]
     out = folder / f"train_{max(numbers, default=-1) + 1}"
-    start = [f"task={plan.task}", f"seed={job.seed}", *job.row.settings, *plan.extra] if so_far.last is None else [f"resume={so_far.last}", *plan.extra]
+    start = (
+        [f"task={plan.task}", f"seed={job.seed}", *job.row.settings, *plan.extra]
+        if so_far.last is None
+        else [f"resume={so_far.last}", *plan.extra]
+    )
     iterations = so_far.iteration + math.ceil((to - so_far.steps) / plan.per)
     command = [sys.executable, "train.py", *start, f"iterations={iterations}", "final_episodes=0", f"out={out}"]
     env = os.environ | {"OMP_NUM_THREADS": "1"} | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
@@ -181,8 +210,17 @@ def train(job: Job, plan: Plan, gpu: str | None, say: Callable[[str], None], unt
     if ended and by_limit and now.last is not None:
         (folder / "stopped_by_limit.json").write_text(json.dumps({"steps": plan.steps, "minutes": plan.minutes}))
     enough = now.last is not None and (now.steps >= to or ended and by_limit)
-    why = "" if enough else "; the next sitting goes on" if ended and now.last is not None else f"; FAILED, see {folder / 'train.log'}"
-    say(f"{job.name}: trained {now.steps / 1e6:.3g} of {to / 1e6:.3g} M steps, {duration(time.monotonic() - began)} now{why}")
+    why = (
+        ""
+        if enough
+        else "; the next sitting goes on"
+        if ended and now.last is not None
+        else f"; FAILED, see {folder / 'train.log'}"
+    )
+    say(
+        f"{job.name}: trained {now.steps / 1e6:.3g} of {to / 1e6:.3g} M steps, {duration(time.monotonic() - began)}"
+        f" now{why}"
+    )
     return now.last if enough else None
 
 
@@ -191,28 +229,52 @@ def judge(job: Job, plan: Plan, policy: Path, world: str, gpu: str | None, say: 
     target = job.metrics(plan, world)
     data = checkpoint.load(policy)
     cap, reality = _judging(plan, world)
-    wanted = {"iteration": int(data["iteration"]), "steps": int(data["steps"]), "episodes": plan.episodes[world],
-              "cap_s": cap, "reality": reality}
+    wanted = {
+        "iteration": int(data["iteration"]),
+        "steps": int(data["steps"]),
+        "episodes": plan.episodes[world],
+        "cap_s": cap,
+        "reality": reality,
+    }
     mark = target.parent / "judged.json"
     if target.exists() and mark.exists() and json.loads(mark.read_text()) == wanted:
         return
     mark.unlink(missing_ok=True)
     target.parent.mkdir(parents=True, exist_ok=True)
-    command = [*NICE, sys.executable, "play.py", f"checkpoint={policy}", f"episodes={plan.episodes[world]}", "video=false", "seed=1000",
-               f"out={target.parent}"]
+    command = [
+        *NICE,
+        sys.executable,
+        "play.py",
+        f"checkpoint={policy}",
+        f"episodes={plan.episodes[world]}",
+        "video=false",
+        "seed=1000",
+        f"out={target.parent}",
+    ]
     if plan.task == "rotate":
         command.append(f"task.evaluation.cap_s={plan.cap}")
     if world == "reality":
         command.append(f"reality={plan.reality}")
     cpu = world == "reality" or plan.judge == "cpu"
-    command += ["device=cpu", f"worlds={plan.episodes[world]}", "sim.engine=mujoco", f"sim.threads={plan.threads}"] if cpu else []
-    env = os.environ | {"OMP_NUM_THREADS": "1"} | ({"CUDA_VISIBLE_DEVICES": ""} if cpu else {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
+    command += (
+        ["device=cpu", f"worlds={plan.episodes[world]}", "sim.engine=mujoco", f"sim.threads={plan.threads}"]
+        if cpu
+        else []
+    )
+    env = (
+        os.environ
+        | {"OMP_NUM_THREADS": "1"}
+        | ({"CUDA_VISIBLE_DEVICES": ""} if cpu else {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
+    )
     began = time.monotonic()
     with open(target.parent / "play.log", "w") as log:
         status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=env, cwd=tools.ROOT).returncode
     if status == 0:
         mark.write_text(json.dumps(wanted))
-    say(f"{job.name}: judged in {world} in {duration(time.monotonic() - began)}" + (f"; FAILED, see {target.parent / 'play.log'}" if status else ""))
+    say(
+        f"{job.name}: judged in {world} in"
+        f" {duration(time.monotonic() - began)}" + (f"; FAILED, see {target.parent / 'play.log'}" if status else "")
+    )
 
 
 class Judges:
@@ -287,24 +349,39 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
     pool = Judges(judges, lambda job, p, policy, world: judge(job, p, policy, world, None, say))
 
     def steps_now(k: int) -> float:
-        return max([float(schedule.steps[k]), *(p[1] for f in jobs[k].folder(plan).glob("train_*") if (p := progress(f)) is not None)])
+        return max(
+            [
+                float(schedule.steps[k]),
+                *(p[1] for f in jobs[k].folder(plan).glob("train_*") if (p := progress(f)) is not None),
+            ]
+        )
 
     def settle() -> None:
         """Before the first piece of the last stage: how far all can come in what is left of the sitting."""
         now = [steps_now(k) for k in range(len(jobs))]
         spent, gained = time.monotonic() - (lead[1] if len(lead) > 1 else math.inf), sum(now) - sum(first)
         if gained <= 0 or spent <= 0:  # nothing learned in this sitting yet: as fast as in the one before
-            each = [plan.per / p[2] for job in jobs for f in job.folder(plan).glob("train_*") if (p := progress(f)) is not None and p[2] > 0]
+            each = [
+                plan.per / p[2]
+                for job in jobs
+                for f in job.folder(plan).glob("train_*")
+                if (p := progress(f)) is not None and p[2] > 0
+            ]
             if not each:
                 return
             gained, spent = statistics.median(each) * len(gpus), 1.0
         rate = gained / spent
         left = 0.97 * (until - time.monotonic())
         ahead = (sum(now) + rate * left) / len(jobs) - (plan.stages[-1] if plan.stages else 0.0)
-        left -= min(0.1 * left, 0.5 * max(ahead, 0.0) / PIECES * len(gpus) / rate)  # GPUs end apart by a part of a piece
+        # GPUs end apart by a part of a piece
+        left -= min(0.1 * left, 0.5 * max(ahead, 0.0) / PIECES * len(gpus) / rate)
         plans[-1] = replace(plan, steps=schedule.settle(now, rate, left, plan.per))
         settled[0] = True
-        say(f"{rate / 1e3:.0f}k steps/s, {duration(left)} left for training: every row to {plans[-1].steps / 1e6:.4g} M steps", counts=False)
+        say(
+            f"{rate / 1e3:.0f}k steps/s, {duration(left)} left for training: every row to {plans[-1].steps / 1e6:.4g} M"
+            " steps",
+            counts=False,
+        )
 
     def passed(k: int, gpu: str | None) -> None:
         """Judge what job k has become at each stage that it has passed, unless it was."""
@@ -330,9 +407,19 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
         try:
             if time.monotonic() < until or reached >= to:
                 counts = to in [p.steps for p in plans]
-                policy = train(job, plans[-1], gpu, lambda text: say(text, counts), until, to, free.set if plan.overlap else lambda: None, lead)
+                policy = train(
+                    job,
+                    plans[-1],
+                    gpu,
+                    lambda text: say(text, counts),
+                    until,
+                    to,
+                    free.set if plan.overlap else lambda: None,
+                    lead,
+                )
                 reached = done(job.folder(plan)).steps
-                failed = policy is None or reached < to  # by the sitting's end, by `minutes`, or in truth: that once more
+                # by the sitting's end, by `minutes`, or in truth: that once more
+                failed = policy is None or reached < to
                 if failed and policy is None and time.monotonic() < until:
                     tries[k] = tries.get(k, 0) + 1
                     failed = tries[k] > 1
@@ -383,17 +470,22 @@ def run(jobs: list[Job], plan: Plan, gpus: list[str | None], judges: int) -> Pla
 
 
 def read(job: Job, plan: Plan, world: str) -> dict | None:
-    """The metrics of a judged policy, with the iterations and steps it was trained for; None where it was not judged."""
+    """The metrics of a judged policy, with the iterations and steps it was trained for; None where it was not
+    judged."""
     return _judged(job.metrics(plan, world))
 
 
 def read_at(job: Job, plan: Plan, world: str, steps: float) -> dict | None:
-    """As `read`, of the judging after `steps` environment steps (within an iteration), whichever stage or end of an earlier run it
-    was, in trials of the plan's cap and other world; None where there is none."""
+    """As `read`, of the judging after `steps` environment steps (within an iteration), whichever stage or end of an
+    earlier run it was, in trials of the plan's cap and other world; None where there is none."""
     folder = job.folder(plan)
     for path in (folder / world / "metrics.json", *sorted(folder.glob(f"at_*/{world}/metrics.json"))):
         found = _judged(path)
-        if found is not None and abs(found["trained_steps"] - steps) < plan.per and found["judged_as"] == _judging(plan, world):
+        if (
+            found is not None
+            and abs(found["trained_steps"] - steps) < plan.per
+            and found["judged_as"] == _judging(plan, world)
+        ):
             return found
     return None
 
@@ -408,5 +500,8 @@ def _judged(path: Path) -> dict | None:
     if not path.exists() or not mark.exists():
         return None
     judged = json.loads(mark.read_text())
-    return json.loads(path.read_text()) | {"trained_steps": judged["steps"], "trained_iterations": judged["iteration"],
-                                           "judged_as": (judged["cap_s"], judged["reality"])}
+    return json.loads(path.read_text()) | {
+        "trained_steps": judged["steps"],
+        "trained_iterations": judged["iteration"],
+        "judged_as": (judged["cap_s"], judged["reality"]),
+    }

@@ -1,10 +1,12 @@
-"""What a table's rows need to be continued elsewhere, small enough to take along: between sittings on machines that keep nothing.
+"""What a table's rows need to be continued elsewhere, small enough to take along: between sittings on machines that
+keep nothing.
 
-    python -m benchmarks.reproduce.pack out=out/reproduce_rotation into=out/state [part_mb=15]    # writes state_0.tgz, state_1.tgz, ..
-    python -m benchmarks.reproduce.pack unpack=out/state out=out/reproduce_rotation
+    python -m benchmarks.reproduce.pack out=out/reproduce_rotation into=out/state [part_mb=15]    # writes state_0.tgz,
+    state_1.tgz, .. python -m benchmarks.reproduce.pack unpack=out/state out=out/reproduce_rotation
 
-Of each training the furthest last.pt, without the optimizer's moments (two thirds of it; the learning rate stays, the moments
-build up again within some updates), its progress.csv and config.yaml, and what the judging wrote, without pictures.
+Of each training the furthest last.pt, without the optimizer's moments (two thirds of it; the learning rate stays, the
+moments build up again within some updates), its progress.csv and config.yaml, and what the judging wrote, without
+pictures.
 """
 
 from __future__ import annotations
@@ -79,7 +81,8 @@ def _archives(jobs: list[Path], out: Path, into: Path, part: float) -> list[Path
 
 
 def unpack(prefix: Path, out: Path) -> int:
-    """Put the files of PREFIX_<k>.tgz into `out`, none over one that is there; returns how many. Raises UserError where there are none."""
+    """Put the files of PREFIX_<k>.tgz into `out`, none over one that is there; returns how many. Raises UserError where
+    there are none."""
     parts = sorted(prefix.parent.glob(f"{prefix.name}_*.tgz"))
     if not parts:
         raise UserError(f"unpack={prefix}: no file {prefix.name}_0.tgz")
@@ -87,7 +90,8 @@ def unpack(prefix: Path, out: Path) -> int:
     try:
         return sum(_unpacked(part, out) for part in parts)
     except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
-        raise UserError(f"unpack={prefix}: an archive is cut off or damaged ({error}); what was whole is in {out}") from None
+        raise UserError(f"unpack={prefix}: an archive is cut off or damaged ({error}); what was whole is in"
+                        f" {out}") from None
 
 
 def _unpacked(part: Path, out: Path) -> int:
@@ -97,7 +101,8 @@ def _unpacked(part: Path, out: Path) -> int:
         for entry in archive:
             if not entry.isfile() or (out / entry.name).exists():
                 continue
-            with tempfile.TemporaryDirectory(prefix=".unpack-", dir=out) as beside:  # a cut archive leaves no half of a file
+            # a cut archive leaves no half of a file
+            with tempfile.TemporaryDirectory(prefix=".unpack-", dir=out) as beside:
                 archive.extract(entry, beside, filter="data")
                 (out / entry.name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(Path(beside) / entry.name, out / entry.name)

@@ -18,7 +18,8 @@ from benchmarks.reproduce.rows import Row
 
 RESAMPLES = 4000
 SMOOTH = 15
-"""Iterations of the learning curves' running median: after a resume all worlds begin their episodes at once, and dip together."""
+"""Iterations of the learning curves' running median: after a resume all worlds begin their episodes at once, and dip
+together."""
 COLUMNS = "row | average (95 %) | by seed | median | s a success (seeds) | s to fall (seeds) | to the cap"
 WORLD_NAMES = {"simulation": "simulation", "reality": "other world"}
 
@@ -31,8 +32,11 @@ def trials(found: list[dict]) -> tuple[list[np.ndarray], float, float]:
     return successes, fall, capped
 
 
-def resampled(successes: list[np.ndarray], rng: np.random.Generator, picks: list[np.ndarray] | None = None) -> np.ndarray:
-    """[RESAMPLES] averages: seeds drawn anew with replacement (or as in `picks`, [RESAMPLES] for each seed), then trials within each."""
+def resampled(
+    successes: list[np.ndarray], rng: np.random.Generator, picks: list[np.ndarray] | None = None
+) -> np.ndarray:
+    """[RESAMPLES] averages: seeds drawn anew with replacement (or as in `picks`, [RESAMPLES] for each seed), then
+    trials within each."""
     out = np.zeros(RESAMPLES)
     for pick in picks or [rng.integers(len(successes), size=RESAMPLES) for _ in successes]:
         for k, own in enumerate(successes):
@@ -48,12 +52,17 @@ def rotation_row(row: Row, found: list[dict], rng: np.random.Generator) -> dict[
     draws = resampled(successes, rng)
     average = float(np.mean([s.mean() for s in successes]))
     return {
-        "average": average, "interval": [float(x) for x in np.percentile(draws, [2.5, 97.5])], "median": float(np.median(everything)),
-        "by_seed": [float(s.mean()) for s in successes], "seconds_per_success": fall / average if average else None, "seconds_to_fall": fall,
-        "seconds_by_seed": [m["seconds_to_fall"] / s.mean() if s.any() else None for m, s in zip(found, successes, strict=True)],
+        "average": average, "interval": [float(x) for x in np.percentile(draws, [2.5, 97.5])],
+        "median": float(np.median(everything)),
+        "by_seed": [float(s.mean()) for s in successes], "seconds_per_success": fall / average if average else None,
+        "seconds_to_fall": fall,
+        "seconds_by_seed": [m["seconds_to_fall"] / s.mean() if s.any() else None for m,
+                            s in zip(found, successes, strict=True)],
         "fall_by_seed": [m["seconds_to_fall"] for m in found],
-        "capped": capped, "trials": len(everything), "cap_s": found[0]["cap_s"], "steps": [m["trained_steps"] for m in found],
-        "spread": [int(x) for x in np.percentile(everything, np.linspace(5, 95, 10), method="nearest")], "_draws": draws,
+        "capped": capped, "trials": len(everything), "cap_s": found[0]["cap_s"],
+        "steps": [m["trained_steps"] for m in found],
+        "spread": [int(x) for x in np.percentile(everything, np.linspace(5, 95, 10), method="nearest")],
+        "_draws": draws,
     }  # fmt: skip
 
 
@@ -69,34 +78,62 @@ def rotation(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
                 table.setdefault(row.key, {})[world] = rotation_row(row, found, rng)
     lines = []
     for world in jobs.WORLDS:
-        lines += ["", f"**Judged in {WORLD_NAMES[world]}**", "", f"| {COLUMNS} | paper: average, median, s, s to fall |", "|---" * 8 + "|"]
+        lines += [
+            "",
+            f"**Judged in {WORLD_NAMES[world]}**",
+            "",
+            f"| {COLUMNS} | paper: average, median, s, s to fall |",
+            "|---" * 8 + "|",
+        ]
         for row in order:
             paper = ", ".join(f"{v:g}" for v in row.paper.values())
             lines.append(f"| {row.label} | {_cells(table.get(row.key, {}).get(world))} | {paper} |")
     claims = {world: orderings(table, world) for world in jobs.WORLDS}
-    lines += ["", "**The paper's orderings** (difference with its 95 % interval: bootstrap over seeds and trials, and at least what seeds do to an average, pooled over the rows; undecided: it holds 0)", "",
-              "| the paper says | simulation | other world |", "|---|---|---|"]
-    lines += [f"| {a['says']} | {a['here']} | {b['here']} |" for a, b in zip(claims["simulation"], claims["reality"], strict=True)]
-    return "\n".join(lines) + "\n", {"rows": _plain(table), "orderings": claims}, lambda axes: _rotation_figure(axes, order, table)
+    lines += [
+        "",
+        "**The paper's orderings** (difference with its 95 % interval: bootstrap over seeds and trials, and"
+        " at least what seeds do to an average, pooled over the rows; undecided: it holds 0)",
+        "",
+        "| the paper says | simulation | other world |",
+        "|---|---|---|",
+    ]
+    lines += [
+        f"| {a['says']} | {a['here']} | {b['here']} |"
+        for a, b in zip(claims["simulation"], claims["reality"], strict=True)
+    ]
+    return (
+        "\n".join(lines) + "\n",
+        {"rows": _plain(table), "orderings": claims},
+        lambda axes: _rotation_figure(axes, order, table),
+    )
 
 
 def _cells(r: dict[str, Any] | None) -> str:
     """What stands under COLUMNS, but for the row's name."""
     if r is None:
         return "not judged | | | | | "
-    seconds = "-" if r["seconds_per_success"] is None else f"{r['seconds_per_success']:.2f} ({_each(r['seconds_by_seed'], 2)})"
-    return (f"{r['average']:.1f} ({r['interval'][0]:.1f}-{r['interval'][1]:.1f}) | {_each(r['by_seed'], 1)} | {r['median']:.1f} | {seconds} | "
-            f"{r['seconds_to_fall']:.1f} ({_each(r['fall_by_seed'], 1)}) | {100 * r['capped']:.0f} %")
+    seconds = (
+        "-"
+        if r["seconds_per_success"] is None
+        else f"{r['seconds_per_success']:.2f} ({_each(r['seconds_by_seed'], 2)})"
+    )
+    return (
+        f"{r['average']:.1f} ({r['interval'][0]:.1f}-{r['interval'][1]:.1f}) | {_each(r['by_seed'], 1)} |"
+        f" {r['median']:.1f} | {seconds} | "
+        f"{r['seconds_to_fall']:.1f} ({_each(r['fall_by_seed'], 1)}) | {100 * r['capped']:.0f} %"
+    )
 
 
 def _plain(table: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
     """As it can be written."""
-    return {k: {w: {n: v for n, v in r.items() if not n.startswith("_")} for w, r in by.items()} for k, by in table.items()}
+    return {
+        k: {w: {n: v for n, v in r.items() if not n.startswith("_")} for w, r in by.items()} for k, by in table.items()
+    }
 
 
 def _between_seeds(by_seed: list[list[float]]) -> float:
-    """Half the 95 % interval of one training's average about its row's: pooled over the rows, since a bootstrap of two seeds sees
-    only these two. 0 where no row has two seeds."""
+    """Half the 95 % interval of one training's average about its row's: pooled over the rows, since a bootstrap of two
+    seeds sees only these two. 0 where no row has two seeds."""
     free = sum(len(s) - 1 for s in by_seed)
     if free == 0:
         return 0.0
@@ -105,8 +142,8 @@ def _between_seeds(by_seed: list[list[float]]) -> float:
 
 
 def _difference(a: dict, b: dict, spread: float) -> tuple[float, float, float]:
-    """(a's average less b's, and the ends of its 95 % interval): the wider one of the bootstrap's and of what seeds do to an average
-    (`spread`, of `_between_seeds`)."""
+    """(a's average less b's, and the ends of its 95 % interval): the wider one of the bootstrap's and of what seeds do
+    to an average (`spread`, of `_between_seeds`)."""
     difference, between = a["average"] - b["average"], spread * math.sqrt(1 / len(a["by_seed"]) + 1 / len(b["by_seed"]))
     low, high = np.percentile(a["_draws"] - b["_draws"], [2.5, 97.5])
     return difference, min(float(low), difference - between), max(float(high), difference + between)
@@ -117,8 +154,8 @@ def _each(values: list[float | None], digits: int) -> str:
 
 
 def orderings(table: dict, world: str) -> list[dict[str, str]]:
-    """Each claim of the paper and whether it holds: averages by the interval of their difference (`_difference`); times by every pair
-    of seeds."""
+    """Each claim of the paper and whether it holds: averages by the interval of their difference (`_difference`); times
+    by every pair of seeds."""
     spread = _between_seeds([by[world]["by_seed"] for by in table.values() if world in by])
     labels = {r.key: r.label for r in rows.ROTATION}
     out = []
@@ -134,7 +171,13 @@ def orderings(table: dict, world: str) -> list[dict[str, str]]:
             here += f" ({difference:+.1f}, {low:+.1f} to {high:+.1f})"
         else:
             mine, theirs = ([math.inf if v is None else v for v in r["seconds_by_seed"]] for r in (a, b))
-            here = "holds" if max(mine) < min(theirs) else "reversed" if min(mine) > max(theirs) else "undecided, the seeds overlap"
+            here = (
+                "holds"
+                if max(mine) < min(theirs)
+                else "reversed"
+                if min(mine) > max(theirs)
+                else "undecided, the seeds overlap"
+            )
             here = "undecided, one seed" if min(len(mine), len(theirs)) == 1 else here
             here += f" ({a[quantity]:.2f} and {b[quantity]:.2f} s)"
         out.append({"says": says, "here": here, "first": first, "second": second, "quantity": quantity, "word": word})
@@ -143,8 +186,10 @@ def orderings(table: dict, world: str) -> list[dict[str, str]]:
 
 def _rotation_figure(axes, order: list[Row], table: dict) -> None:
     x = np.arange(len(order))
-    for quantity, seeds, ax, unit in (("average", "by_seed", axes[0], "consecutive successes; dots: each seed"),
-                                      ("seconds_per_success", "seconds_by_seed", axes[1], "s a success; dots: each seed")):
+    for quantity, seeds, ax, unit in (
+        ("average", "by_seed", axes[0], "consecutive successes; dots: each seed"),
+        ("seconds_per_success", "seconds_by_seed", axes[1], "s a success; dots: each seed"),
+    ):
         dots: list[tuple[int, int, float]] = []
         series = [("paper, real hand", [r.paper.get(quantity, np.nan) for r in order], None)]
         for world in jobs.WORLDS:
@@ -152,7 +197,14 @@ def _rotation_figure(axes, order: list[Row], table: dict) -> None:
             value = [np.nan if f is None or f[quantity] is None else f[quantity] for f in found]
             error = None
             if quantity == "average":
-                error = np.array([[np.nan, np.nan] if f is None else [f["average"] - f["interval"][0], f["interval"][1] - f["average"]] for f in found]).T
+                error = np.array(
+                    [
+                        [np.nan, np.nan]
+                        if f is None
+                        else [f["average"] - f["interval"][0], f["interval"][1] - f["average"]]
+                        for f in found
+                    ]
+                ).T
             series.append((WORLD_NAMES[world], value, error))
             for i, f in enumerate(found):
                 here = [(i, len(series) - 2, v) for v in (f or {}).get(seeds, ()) if v is not None]
@@ -165,7 +217,14 @@ def _rotation_figure(axes, order: list[Row], table: dict) -> None:
             ax.set_ylim(0, top)
             for i, k, v in dots:
                 if v > top:
-                    ax.annotate(f"{v:.0f} s", (i + 0.27 * k, top), xytext=(i + 0.27 * k, 0.86 * top), ha="center", fontsize=7, arrowprops={"arrowstyle": "->"})
+                    ax.annotate(
+                        f"{v:.0f} s",
+                        (i + 0.27 * k, top),
+                        xytext=(i + 0.27 * k, 0.86 * top),
+                        ha="center",
+                        fontsize=7,
+                        arrowprops={"arrowstyle": "->"},
+                    )
         ax.set_ylabel(unit)
         ax.set_xticks(x, [r.key.replace("_", "\n") for r in order], fontsize=7)
     axes[0].legend(fontsize=7)
@@ -186,21 +245,35 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
     table: dict[str, dict[str, dict]] = {}
     lines = []
     for world in jobs.WORLDS:
-        lines += ["", f"**Judged in {WORLD_NAMES[world]}** (5 to 95 % of held episodes; correlations over held episodes; in brackets each seed)", "",
-                  "| row | " + " | ".join(q[1] for q in quantities) + " | paper: force, torque (no units) |", "|---" * (len(quantities) + 2) + "|"]
+        lines += [
+            "",
+            f"**Judged in {WORLD_NAMES[world]}** (5 to 95 % of held episodes; correlations over held"
+            " episodes; in brackets each seed)",
+            "",
+            "| row | " + " | ".join(q[1] for q in quantities) + " | paper: force, torque (no units) |",
+            "|---" * (len(quantities) + 2) + "|",
+        ]
         for row in order:
             found = [m for j in all_jobs if j.row == row and (m := jobs.read(j, plan, world)) is not None]
             p = row.paper
             paper = f"{p['force_low']:g}-{p['force_high']:g}, {p['torque_low']:g}-{p['torque_high']:g}"
-            cells, entry = [], {"by_command": [m.get("by_command") for m in found], "steps": [m["trained_steps"] for m in found]}
+            cells, entry = (
+                [],
+                {"by_command": [m.get("by_command") for m in found], "steps": [m["trained_steps"] for m in found]},
+            )
             for name, _, get in quantities:
                 values = [v for m in found if (v := get(m)) is not None]
                 entry[name] = values
                 cells.append("-" if not values else f"{np.mean(values):.2f} ({', '.join(f'{v:.2f}' for v in values)})")
             table.setdefault(row.key, {})[world] = entry
             lines.append(f"| {row.label} | " + " | ".join(cells) + f" | {paper} |")
-    lines += ["", "**Strength of the correlation of force and command** (the paper: both > force only > torque only; differences with the 95 % interval of what"
-              " seeds do to a correlation, pooled over the rows)", ""]
+    lines += [
+        "",
+        "**Strength of the correlation of force and command** (the paper: both > force only > torque only;"
+        " differences with the 95 % interval of what"
+        " seeds do to a correlation, pooled over the rows)",
+        "",
+    ]
     said: dict[str, list] = {}
     for world in jobs.WORLDS:
         said[world] = []
@@ -214,17 +287,30 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
 
 
 def _stronger(a: list[float], b: list[float], spread: float) -> dict[str, Any]:
-    """Whether the correlations `a`, one of each seed, are above `b`: by the interval of their difference and by every pair of seeds.
+    """Whether the correlations `a`, one of each seed, are above `b`: by the interval of their difference and by every
+    pair of seeds.
     spread: `_between_seeds` of all rows."""
     if not a or not b:
         return {"here": "not judged"}
     difference, between = float(np.mean(a) - np.mean(b)), spread * math.sqrt(1 / len(a) + 1 / len(b))
     if not spread:
-        return {"here": f"{'so' if difference > 0 else 'not so'} for one seed each ({a[0]:.3f}, {b[0]:.3f})", "difference": difference}
+        return {
+            "here": f"{'so' if difference > 0 else 'not so'} for one seed each ({a[0]:.3f}, {b[0]:.3f})",
+            "difference": difference,
+        }
     here = "holds" if difference > between else "reversed" if difference < -between else "undecided"
-    pairs = "above in every pair of seeds" if min(a) > max(b) else "below in every pair of seeds" if max(a) < min(b) else "the seeds overlap"
-    return {"here": f"{here} ({difference:+.3f}, {difference - between:+.3f} to {difference + between:+.3f}; {pairs})", "difference": difference,
-            "interval": [difference - between, difference + between]}
+    pairs = (
+        "above in every pair of seeds"
+        if min(a) > max(b)
+        else "below in every pair of seeds"
+        if max(a) < min(b)
+        else "the seeds overlap"
+    )
+    return {
+        "here": f"{here} ({difference:+.3f}, {difference - between:+.3f} to {difference + between:+.3f}; {pairs})",
+        "difference": difference,
+        "interval": [difference - between, difference + between],
+    }
 
 
 def _grasp_figure(axes, order: list[Row], table: dict) -> None:
@@ -243,7 +329,8 @@ def _grasp_figure(axes, order: list[Row], table: dict) -> None:
 
 
 def learning(plan: Plan, all_jobs: list[Job]) -> dict[Row, list[tuple[np.ndarray, np.ndarray]]]:
-    """(millions of steps, successes a minute while training) of each training of each row, as far as there are any: rotation."""
+    """(millions of steps, successes a minute while training) of each training of each row, as far as there are any:
+    rotation."""
     out: dict[Row, list[tuple[np.ndarray, np.ndarray]]] = {}
     for job in all_jobs:
         files = list(job.folder(plan).glob("train_*/progress.csv"))
@@ -253,16 +340,26 @@ def learning(plan: Plan, all_jobs: list[Job]) -> dict[Row, list[tuple[np.ndarray
         with open(longest, newline="") as file:
             rows_ = [r for r in csv.DictReader(file) if r.get("task/successes_per_minute")]
         if rows_:
-            out.setdefault(job.row, []).append((np.array([float(r["steps"]) / 1e6 for r in rows_]),
-                                                np.array([float(r["task/successes_per_minute"]) for r in rows_])))
+            out.setdefault(job.row, []).append(
+                (
+                    np.array([float(r["steps"]) / 1e6 for r in rows_]),
+                    np.array([float(r["task/successes_per_minute"]) for r in rows_]),
+                )
+            )
     return out
 
 
 def _learning_figure(ax, curves: dict[Row, list[tuple[np.ndarray, np.ndarray]]]) -> None:
     for k, (row, seeds) in enumerate(curves.items()):
         for i, (steps, successes) in enumerate(seeds):
-            ax.plot(steps, median_filter(successes, SMOOTH, mode="nearest"), "-" if i % 2 == 0 else "--", color=f"C{k}", linewidth=1.1,
-                    label=row.label if i == 0 else None)
+            ax.plot(
+                steps,
+                median_filter(successes, SMOOTH, mode="nearest"),
+                "-" if i % 2 == 0 else "--",
+                color=f"C{k}",
+                linewidth=1.1,
+                label=row.label if i == 0 else None,
+            )
     ax.set_xlabel("environment steps [million]; dashed: the second seed")
     ax.set_ylabel(f"successes a minute, while training\n(running median of {SMOOTH} iterations)")
     ax.legend(fontsize=7)
@@ -271,25 +368,39 @@ def _learning_figure(ax, curves: dict[Row, list[tuple[np.ndarray, np.ndarray]]])
 
 def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) -> list[Path]:
     """<table>.md, .json and .png in the plan's folder (<table>_at_<steps>M of a stage), the same of rows of our own
-    (<table>_own..., `benchmarks.reproduce.own`), and the learning curves of the rotation, rotation_learning.png; returns the
-    Markdowns' paths."""
+    (<table>_own..., `benchmarks.reproduce.own`), and the learning curves of the rotation, rotation_learning.png;
+    returns the Markdowns' paths."""
     from matplotlib.figure import Figure
 
     from benchmarks.reproduce import own
 
     stage = "" if plan.level is None else f"_at_{plan.level / 1e6:.4g}M"
     written = []
-    for name, make, chosen in ((table, {"rotation": rotation, "grasp": grasp}[table], [j for j in all_jobs if j.row.paper]),
-                               (f"{table}_own", own.table, [j for j in all_jobs if not j.row.paper])):
+    for name, make, chosen in (
+        (table, {"rotation": rotation, "grasp": grasp}[table], [j for j in all_jobs if j.row.paper]),
+        (f"{table}_own", own.table, [j for j in all_jobs if not j.row.paper]),
+    ):
         if not chosen:
             continue
         text, data, draw = make(plan, chosen)
-        steps = sorted({s for j in chosen for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])})
-        trained = "nothing trained yet" if not steps else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
-        title = f"The paper's {table} table" if chosen[0].row.paper else f"Rows of our own beside the paper's {table} table"
-        head = (f"# {title}\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training, {len({j.seed for j in chosen})} seed(s) a row; "
-                 + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
-                 + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "") + ".\n")
+        steps = sorted(
+            {s for j in chosen for w in jobs.WORLDS if (m := jobs.read(j, plan, w)) and (s := m["trained_steps"])}
+        )
+        trained = (
+            "nothing trained yet"
+            if not steps
+            else f"{steps[0] / 1e6:.1f} M" + (f" to {steps[-1] / 1e6:.1f} M" if steps[-1] > steps[0] else "")
+        )
+        title = (
+            f"The paper's {table} table" if chosen[0].row.paper else f"Rows of our own beside the paper's {table} table"
+        )
+        head = (
+            f"# {title}\n\n`{about['command']}`\n\n{about['device']}; {trained} environment steps a training,"
+            f" {len({j.seed for j in chosen})} seed(s) a row; "
+            + ", ".join(f"{n} trials a seed in {WORLD_NAMES[w]}" for w, n in plan.episodes.items())
+            + (f", ended after {plan.cap:g} s at the latest" if plan.task == "rotate" else "")
+            + ".\n"
+        )
         path = plan.out / f"{name}{stage}.md"
         path.write_text(head + text)
         path.with_suffix(".json").write_text(json.dumps({"about": about, **data}, indent=1) + "\n")

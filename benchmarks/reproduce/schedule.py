@@ -1,5 +1,5 @@
-"""Which training goes on next, and how far: every row to one level before any goes on to the next, so that an early end leaves a
-table whose rows compare; and a last level that a sitting's time allows."""
+"""Which training goes on next, and how far: every row to one level before any goes on to the next, so that an early end
+leaves a table whose rows compare; and a last level that a sitting's time allows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class Schedule:
         steps: environment steps that each training has learned already.
         levels: steps at which they wait for one another, ascending; the last is where they end.
         lanes: trainings at a time.
-        cut: train some in pieces in the last stage, so that all lanes end it together where their number does not go into that of
+        cut: train some in pieces in the last stage, so that all lanes end it together where their number does not go
+        into that of
             the trainings. These come first: what ends last is then no more than one training a lane.
 
     ``steps``, ``levels`` and ``busy`` (trainings that run) may be read; ``settle`` lowers the last level.
@@ -62,15 +63,20 @@ class Schedule:
         return self.stage(k) == len(self.levels) - 1
 
     def settle(self, reached: Sequence[float], rate: float, seconds: float, per: int) -> float:
-        """Lower the last level to what all can reach in `seconds` at `rate` steps a second of all lanes together, in whole
-        iterations of `per` steps, not below the level before; `reached` is where the trainings are now. Returns it."""
+        """Lower the last level to what all can reach in `seconds` at `rate` steps a second of all lanes together, in
+        whole iterations of `per` steps, not below the level before; `reached` is where the trainings are now. Returns
+        it."""
         fair = (sum(reached) + rate * max(seconds, 0.0)) / len(reached)
         before = self.levels[-2] if len(self.levels) > 1 else 0.0
         self.levels[-1] = min(self.levels[-1], max(before, per * math.floor(fair / per)))
         return self.levels[-1]
 
     def _next(self) -> int | None:
-        waiting = [k for k in range(len(self.steps)) if k not in self.busy | self._given_up and self.stage(k) < len(self.levels)]
+        waiting = [
+            k
+            for k in range(len(self.steps))
+            if k not in self.busy | self._given_up and self.stage(k) < len(self.levels)
+        ]
         return min(waiting, key=self._order) if waiting else None
 
     def _piece(self) -> float:

@@ -14,8 +14,9 @@ from dexsim.errors import UserError
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
 
-Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C, SIGTERM and SIGHUP relax at once. Stand clear of a real hand,
-and try driver=sim first. On a machine that does other work too, run it with real-time priority (chrt -r 10 python -m ...).
+Run a policy bundle in real time: home slowly, run the policy, relax. Ctrl-C, SIGTERM and SIGHUP relax at once. Stand
+clear of a real hand, and try driver=sim first. On a machine that does other work too, run it with real-time priority
+(chrt -r 10 dexsim deploy ...).
 
 settings (key=default):
   bundle=             folder of dexsim export
@@ -27,7 +28,8 @@ settings (key=default):
   record=             FILE.mcap of everything seen and sent (default: out/deploy_<date>.mcap; record=none: nothing)
   vision=truth        driver=sim: truth, or camera (a rendered depth image and mask); driver=xhand: place="x y z" [m]
   place=              the object's place in the palm frame where nothing sees it, e.g. place="0.055 0 0.04"
-  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours sends lines "w x y z";
+  imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours
+                      sends lines "w x y z";
                       udp:PORT:FROM takes them from that port alone (default: from whoever sends the first good one)
   shape=              driver=sim, grasp: the object's shape
   seed=0              driver=sim
@@ -47,7 +49,8 @@ OWN = ("bundle", "driver", "port", "calibration", "record", "vision", "place", "
 
 
 def main(argv: Sequence[str]) -> int:
-    """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP. Raises UserError."""
+    """Returns the exit status: 0 done, 1 relaxed by a watchdog, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP. Raises
+    UserError."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if argv else 2
@@ -69,14 +72,16 @@ def main(argv: Sequence[str]) -> int:
     settings.check()
     if "command" in changes and b.manifest["task"] != "grasp":
         raise UserError(
-            f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no commanded force"
+            f"command={changes['command']:g}: the policy in {b.path} is of task={b.manifest['task']}, which takes no"
+            " commanded force"
         )
     driver, eye = _hand(given, b, calibration)
     for text in calibration.assumed:
         print(f"note     {text}")
     recorder = _recorder(given, b, settings, calibration)
     print(
-        f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g} Hz"
+        f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g}"
+        " Hz"
     )
     print(f"driver   {driver.name}; starting ...", flush=True)
     loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
@@ -163,7 +168,8 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
         shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
         if given.get("shape", shapes[0]) not in shapes:
             raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
-        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera", shape=given.get("shape"),
+        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera",
+                                shape=given.get("shape"),
                                 grip=b.manifest.get("grip"))  # fmt: skip
         return driver, place or driver
     if kind == "xhand":
@@ -175,7 +181,8 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
             return VendorXHand(given["port"]), _imu(given, b)
         if place is None:
             raise UserError(
-                'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your own'
+                'driver=xhand: nothing sees the object; state place="x y z" [m, palm frame], or run the Loop with your'
+                " own"
                 " HeightSource (dexsim.deploy.vision)"
             )
         return VendorXHand(given["port"]), place
@@ -192,7 +199,8 @@ def _imu(given: dict[str, str], b: Any) -> Any:
     port, colon, sender = ports.partition(":")
     if how != "udp" or not port.isdigit() or (colon and not sender.isdigit()):
         raise UserError(
-            f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y z" there, or run'
+            f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y'
+            ' z" there, or run'
             " the Loop with your own OrientationSource (dexsim.deploy.imu)"
         )
     imu = UdpImu(int(port), sender_port=int(sender) if colon else None)
@@ -218,9 +226,12 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     folders.make(path.parent, "record=")
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
     meta = {
-        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": "xhand_right", "effort_is": "current_A", "effort_sign": sign,
-        "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}", "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),
-        "tactile_layout": "xhand_right", "gravity": "0 0 -9.81", "notes": f"deployed policy {b.manifest['policy']['sha256'][:12]}",
+        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": "xhand_right",
+        "effort_is": "current_A", "effort_sign": sign,
+        "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}",
+        "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),
+        "tactile_layout": "xhand_right", "gravity": "0 0 -9.81",
+        "notes": f"deployed policy {b.manifest['policy']['sha256'][:12]}",
     }  # fmt: skip
     config = yaml.safe_dump({"deploy": dataclasses.asdict(settings), "bundle": b.manifest["versions"]}, sort_keys=False)
     return Recorder(path, b.manifest["joints"], meta, config, time.monotonic())
