@@ -15,8 +15,8 @@ SAME_SIGNAL_S = 5.0  # torchrun passes on a Ctrl-C that the terminal has sent to
 
 
 class Stop:
-    """At once by default; while ``gently`` is set, the first signal only asks the work to end. A SIGHUP that was ignored
-    before (nohup) still is. ``status``: the exit status then, 128 + the signal's number.
+    """At once by default; while ``gently`` is set, the first signal only asks the work to end. A SIGHUP that was
+    ignored before (nohup) still is. ``status``: the exit status then, 128 + the signal's number.
 
     together: one of several processes: signals within SAME_SIGNAL_S count as one.
     """
