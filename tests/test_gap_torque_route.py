@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from dexsim.actuator.columns import INDEX
+from dexsim.actuator.table import ServoTable
 from dexsim.gap.search import torque_told
 from dexsim.gap.search.body_torque import body, motion
 
@@ -102,3 +104,23 @@ def test_readings_too_slow_or_in_no_unit_of_torque_say_nothing():
     amperes.torque_unit = "A"
     assert torque_told.found(cases(), [slow], [0], [], model=model) == []
     assert torque_told.found(cases(), [amperes], [0], [], model=model) == []
+
+
+def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_one():
+    model = arm()
+    given = torque_told.found(cases(), [run(model, 0)], [0], [], model=model)
+    case, x, _ = given[0]
+    case.unknown, case.ranges, case.factors, case.told = ("coulomb_friction", "viscous_friction"), {}, {}, False
+    case.scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=x.value["inertia"])
+    case.plant = SimpleNamespace(nominal=np.zeros((1, len(INDEX))))
+    torque_told.believe(given[:1])
+    servo = ServoTable.from_dict({"drive": "torque", "joints": {"*": {"kp": 80.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}}})
+    d = SimpleNamespace(servo=servo, notes=[], data={"findings": [], "nuisance": {"coulomb_friction@shoulder": 9.0}})
+    trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
+    outcomes = [(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
+    torque_told.hand_on(given[:1], d, outcomes, [], None, [SimpleNamespace(joint="shoulder", sound=False)])
+    told = servo.value("shoulder", "coulomb_friction")
+    assert told.value == pytest.approx(COULOMB[0], rel=0.05) and told.low < told.value < told.high
+    assert d.data["nuisance"]["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
+    assert servo.value("shoulder", "viscous_friction").value == pytest.approx(VISCOUS[0], rel=0.1)
+    assert servo.value("elbow", "coulomb_friction").unknown

@@ -221,7 +221,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes, plains)
     result.stages = [x.text for x in stages] + behind
     add_behind(result, torque_told.findings(by_torque, nothing_believed, runs, train), by_torque)
-    torque_told.hand_on(by_torque, result, outcomes, test, span_test)
+    torque_told.hand_on(by_torque, result, outcomes, test, span_test, stages)
     external_force.claim(result, pushes)
     result.data["unexplained"]["not_considered"] = left_out
     add_touch(result, felt)

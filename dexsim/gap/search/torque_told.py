@@ -101,13 +101,15 @@ def believe(given: Sequence[tuple]) -> list[str]:
     return said
 
 
-def hand_on(given: Sequence[tuple], d, outcomes: Sequence[tuple], test: Sequence[int], span_test: dict | None) -> None:
+def hand_on(given: Sequence[tuple], d, outcomes: Sequence[tuple], test: Sequence[int], span_test: dict | None, stages: Sequence = ()) -> None:
     """Writes the torque's figures into the servo table that is handed on, and the nuisances, where a joint's closed loop does not say
     otherwise: what it was refitted to then is the fit's own wandering.
 
     d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run over what was kept out
-    is followed better than to `ALIKE` with its own figures, or where a finding of at least a half is about them.
+    is followed better than to `ALIKE` with its own figures, or where a finding of at least a half is about them; not where `stages` say that
+    the drive itself is not as believed, since what its loop does then speaks of the drive.
     """
+    strange = {x.joint for x in stages if not x.sound}
     by = {case.joint: (search, outcome) for case, search, outcome in outcomes}
     for case, x, _ in given:
         if not case.told or case.joint not in by:
@@ -120,7 +122,7 @@ def hand_on(given: Sequence[tuple], d, outcomes: Sequence[tuple], test: Sequence
         ours = {n: case.scales.nominal[n] for n in told}
         if "inertia" in case.factors and "inertia_scale" not in claimed:
             ours["inertia"] = x.value["inertia"] / case.scales.inertia
-        if not told or not _alike(case, search, trial, ours, test, span_test):
+        if not told or not (case.joint in strange or _alike(case, search, trial, ours, test, span_test)):
             continue
         for name in told:
             d.servo.set(case.joint, name, round(case.scales.nominal[name], 9), *(round(v, 9) for v in case.ranges[name]))
