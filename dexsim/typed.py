@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from dexsim.errors import UserError
 
@@ -26,7 +27,9 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
         out = msgspec.convert(data, kind, dec_hook=_instance)
     except msgspec.ValidationError as error:
         what, _, at = str(error).partition(" - at `$")
-        place = at.removesuffix("`").lstrip(".").replace("[...]", ".*")
+        place = _named(data, kind, str(error), at.removesuffix("`").lstrip(".").replace("[...]", ".*").lstrip("."))
+        if what.startswith("Invalid enum value") and (allowed := _allowed(inspect.type_info(kind), place)):
+            what = f"must be one of {', '.join(map(str, allowed))}"
         shown = f" ({_shown(data, place)})" if place else ""
         fix = f"; {fix}" if fix else ""
         raise UserError(f"{source}: {place or 'its contents'}{shown}: {what[0].lower()}{what[1:]}{fix}") from None
@@ -34,6 +37,58 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
         raise UserError(f"{source}: nested too deeply{f'; {fix}' if fix else ''}") from None
     _finite(data, source, fix)
     return out
+
+
+def _named(data: Any, kind: Any, message: str, place: str) -> str:
+    """The place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
+    while any(part.startswith("*") for part in place.split(".")):
+        parts = place.split(".")
+        k = next(i for i, part in enumerate(parts) if part.startswith("*"))
+        node = _at(data, parts[:k])
+        for key in list(node) if isinstance(node, dict) else ():
+            alone = _with(data, parts[:k], {key: node[key]})
+            try:
+                msgspec.convert(alone, kind, dec_hook=_instance)
+            except msgspec.ValidationError as error:
+                if str(error) == message:
+                    data, parts[k] = alone, str(key) + parts[k][1:]
+                    break
+        else:
+            return place
+        place = ".".join(parts)
+    return place
+
+
+def _at(node: Any, parts: list[str]) -> Any:
+    for part in ".".join(parts).replace("[", ".[").split("."):
+        if part:
+            node = node[int(part[1:-1])] if part.startswith("[") else next(v for k, v in node.items() if str(k) == part)
+    return node
+
+
+def _with(node: Any, parts: list[str], value: Any) -> Any:
+    """A copy of the data with `value` at a place of dicts."""
+    if not parts or not isinstance(node, dict):
+        return value if not parts else node
+    return {k: _with(v, parts[1:], value) if str(k) == parts[0] else v for k, v in node.items()}
+
+
+def _allowed(kind: Any, place: str) -> list[Any]:
+    """What a value may be there, where only some words or numbers are."""
+    if isinstance(kind, inspect.UnionType):
+        return [x for t in kind.types for x in _allowed(t, place)]
+    if isinstance(kind, inspect.Metadata):
+        return _allowed(kind.type, place)
+    part, _, rest = place.replace("[", ".[").lstrip(".").partition(".")
+    if not part:
+        return list(kind.values) if isinstance(kind, inspect.LiteralType) else []
+    if isinstance(kind, inspect.StructType):
+        return next((_allowed(f.type, rest) for f in kind.fields if f.encode_name == part), [])
+    if isinstance(kind, inspect.DictType):
+        return _allowed(kind.value_type, rest)
+    if isinstance(kind, inspect.TupleType):
+        return _allowed(kind.item_types[int(part[1:-1])], rest)
+    return _allowed(kind.item_type, rest) if hasattr(kind, "item_type") else []
 
 
 def _instance(kind: type, value: Any) -> Any:

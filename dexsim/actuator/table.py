@@ -20,12 +20,13 @@ import copy
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Iterable, Sequence
+from typing import Annotated, Any, Iterable, Literal, Sequence
 
+import msgspec
 import numpy as np
 import yaml
 
-from dexsim import yaml_text
+from dexsim import typed, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES, Column, did_you_mean
 from dexsim.errors import UserError
 
@@ -42,6 +43,23 @@ KEYS = (
     "supply_voltage",
 )
 ALL = "*"
+
+
+Number = typed.Positive | Annotated[str, msgspec.Meta(pattern=r"^(\+?\d+(\.\d*)?[eE][+-]?\d{1,2})$")] | None
+Side = Literal[SIDES]
+
+
+class Content(msgspec.Struct):
+    """`servo.yaml` around its columns, whose values `parse_value` reads. A per N.m, Hz, V."""
+
+    drive: Literal[DRIVES] = "torque"
+    joints: dict[str, dict[str, Any] | None] | None = None
+    current_per_torque: typed.Positive | Annotated[str, msgspec.Meta(pattern=r"^(unknown|\+?\d+(\.\d*)?[eE][+-]?\d{1,2})$")] | dict[str, typed.Positive | Literal["unknown"] | None] | None = None
+    control_rate: Number = None
+    loop_rate: Number = None
+    loop_encoder: Side | dict[str, Side] | None = None
+    position_encoder: Side | dict[str, Side] | None = None
+    supply_voltage: Number = None
 
 
 @dataclass(frozen=True)
@@ -140,19 +158,12 @@ class ServoTable:
             if key not in KEYS:
                 hint = did_you_mean(key, KEYS)
                 raise UserError(f"{source}: key '{key}' does not exist.{hint} Valid keys: {', '.join(KEYS)}")
-        drive = raw.get("drive", "torque")
-        if drive not in DRIVES:
-            hint = did_you_mean(drive, DRIVES)
-            raise UserError(f"{source}: drive '{drive}' does not exist.{hint} Valid: {', '.join(DRIVES)}")
-        joints = raw.get("joints") or {}
-        if not isinstance(joints, dict):
-            raise UserError(f'{source}: joints must map joint names (or "*") to columns; got {type(joints).__name__}.')
+        top = typed.convert(raw, Content, source)
+        joints = top.joints or {}
         entries: dict[str, dict[str, Value]] = {}
         for joint, columns in joints.items():
             if columns is None:
                 columns = {}
-            if not isinstance(columns, dict):
-                raise UserError(f"{source}: joints.{joint} must be like {{kp: 1.5}}; got {columns!r}.")
             entries[str(joint)] = {}
             for name, value in columns.items():
                 where = f"{source}: joints.{joint}.{name}"
@@ -160,18 +171,8 @@ class ServoTable:
                     hint = did_you_mean(name, NAMES)
                     raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
                 entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
-        table = cls(
-            drive=drive,
-            entries=entries,
-            current_per_torque=_scalar_or_map(raw, "current_per_torque", source, unknown=True),
-            control_rate=_positive(raw, "control_rate", "Hz", source),
-            loop_rate=_positive(raw, "loop_rate", "Hz", source),
-            loop_encoder=_side(raw, "loop_encoder", source),
-            position_encoder=_side(raw, "position_encoder", source),
-            supply_voltage=_positive(raw, "supply_voltage", "V", source),
-            source=source,
-        )
-        return table
+        return cls(top.drive, entries, _numbers(top.current_per_torque), _numbers(top.control_rate), _numbers(top.loop_rate), top.loop_encoder or "joint",
+                   top.position_encoder or "joint", _numbers(top.supply_voltage), source)  # fmt: skip
 
     def to_dict(self) -> dict:
         """The file's content again: `from_dict(table.to_dict())` is the same table."""
@@ -291,30 +292,8 @@ def _plain(value: Value) -> Any:
     return {"value": value.value, "low": value.low, "high": value.high}
 
 
-def _positive(raw: dict, key: str, unit: str, source: str) -> float | None:
-    if raw.get(key) is None:
-        return None
-    number = _number(raw[key])
-    if number is None or not 0.0 < number < math.inf:
-        raise UserError(f"{source}: {key} is {raw[key]!r}; it must be a number > 0 [{unit}].")
-    return number
-
-
-def _scalar_or_map(raw: dict, key: str, source: str, unknown: bool) -> float | str | dict | None:
-    value = raw.get(key)
+def _numbers(value: Any) -> Any:
+    """Numbers as float, by joint where it is a mapping; YAML reads 1e-3 as text."""
     if isinstance(value, dict):
-        return {str(joint): _scalar_or_map({key: v}, key, f"{source}: {joint}", unknown) for joint, v in value.items()}
-    if value == "unknown" and unknown:
-        return "unknown"
-    return _positive(raw, key, "A per N.m", source)
-
-
-def _side(raw: dict, key: str, source: str) -> str | dict:
-    value = raw.get(key)
-    if value is None:
-        return "joint"
-    if isinstance(value, dict):
-        return {str(joint): _side({key: v}, key, f"{source}: {joint}") for joint, v in value.items()}
-    if value not in SIDES:
-        raise UserError(f"{source}: {key} is {value!r};{did_you_mean(value, SIDES)} valid: {', '.join(SIDES)}.")
-    return value
+        return {joint: _numbers(v) for joint, v in value.items()}
+    return value if value in (None, "unknown") else float(value)

@@ -13,15 +13,15 @@ Other keys (intervals, R2, reasons) are for people and are kept.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import yaml
 
-from dexsim import yaml_text
+from dexsim import typed, yaml_text
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 
@@ -32,6 +32,56 @@ ASSUMED_CURRENT_PER_TORQUE = 2.7
 """A per N.m until measured; see `dexsim.recording.realistic.CURRENT_PER_TORQUE`, where the figure is explained."""
 ASSUMED_LSB = 0.1
 """N a count: what users of the hand assume; the vendor publishes no unit."""
+
+
+T = xhand.TAXELS_PER_FINGER
+Sign = Literal[-1, 1]
+Finger = Literal[xhand.FINGERS]
+Taxel = Annotated[int, msgspec.Meta(ge=0, lt=T)]
+Taxels = Annotated[list[typed.Real], msgspec.Meta(min_length=T, max_length=T)]
+Newtons = Annotated[float, msgspec.Meta(ge=0, le=100)]
+
+
+class Fitted(msgspec.Struct):
+    """A fitted figure; what stands beside `value` (interval, R2) is for people."""
+
+    value: typed.Positive | Literal["unknown"] | None
+
+
+class Force(msgspec.Struct):
+    """N, as `Fitted`."""
+
+    value: Newtons
+
+
+class Joint(msgspec.Struct):
+    """A per N.m, A, N.m."""
+
+    current_per_torque: Fitted | typed.Positive | Literal["unknown"] | None = None
+    current_max: Fitted | typed.Positive | Literal["unknown"] | None = None
+    torque_max: Fitted | typed.Positive | Literal["unknown"] | None = None
+
+
+class Touch(msgspec.Struct):
+    """N a count, signs, N; by finger: gains [120], counts [120], taxels, pairs of taxels."""
+
+    lsb: typed.Positive | Literal["unknown"] | None = None
+    axis_sign: tuple[Sign, Sign, Sign] = (-1, -1, 1)
+    threshold: Force | Newtons = 0.0
+    gain: dict[Finger, Taxels] | None = None
+    bias: dict[Finger, Taxels] | None = None
+    dead: dict[Finger, list[Taxel]] | None = None
+    swapped: dict[Finger, list[tuple[Taxel, Taxel]]] | None = None
+
+
+class Content(msgspec.Struct):
+    """`calibration.yaml` as far as it is read."""
+
+    schema: Literal[1] = 1
+    normalization: Literal[NORMALIZATIONS] = "matched"
+    current_sign: Sign | dict[Literal[xhand.JOINTS], Sign] = -1
+    joints: dict[Literal[xhand.JOINTS], Joint | None] | None = None
+    touch: Touch | None = None
 
 
 @dataclass
@@ -96,25 +146,16 @@ class Calibration:
     @classmethod
     def from_dict(cls, raw: Any, where: str = "calibration", torque_max: np.ndarray | None = None) -> Calibration:
         """torque_max [12] N.m: what training normalised by; the file may state its own."""
-        if not isinstance(raw, dict):
-            raise UserError(f"{where}: must map keys to values; keys: {', '.join(KEYS)}")
-        _known(raw, KEYS, where)
-        if raw.get("schema", 1) != 1:
-            raise UserError(f"{where}: schema={raw['schema']}: this dexsim reads 1")
-        how = raw.get("normalization", "matched")
-        if how not in NORMALIZATIONS:
-            raise UserError(f"{where}: normalization={how}: must be one of {', '.join(NORMALIZATIONS)}")
+        content = _content(raw, where)
+        how = content.normalization
         base = xhand.efforts() if torque_max is None else np.asarray(torque_max, float)
         out = {"current_per_torque": np.full(12, np.nan), "current_max": np.full(12, np.nan), "torque_max": base.copy()}
-        joints = raw.get("joints") or {}
-        for joint, entry in joints.items():
-            if joint not in xhand.JOINTS:
-                raise UserError(f"{where}: joints.{joint}: no such joint; joints: {', '.join(xhand.JOINTS)}")
+        for joint, entry in (content.joints or {}).items():
             for key, column in out.items():
-                value = (entry or {}).get(key)
-                value = value.get("value") if isinstance(value, dict) else value
+                value = getattr(entry, key) if entry is not None else None
+                value = value.value if isinstance(value, Fitted) else value
                 if value not in (None, "unknown"):
-                    column[xhand.JOINTS.index(joint)] = _positive(value, f"{where}: joints.{joint}.{key}")
+                    column[xhand.JOINTS.index(joint)] = value
         assumed = []
         unknown = [j for j, v in zip(xhand.JOINTS, out["current_per_torque"], strict=True) if not np.isfinite(v)]
         if unknown and how == "matched":
@@ -126,11 +167,9 @@ class Calibration:
         if unmeasured.any() and how == "paper":
             assumed.append("current_max of some joints is not measured: current_per_torque times torque_max taken")
         out["current_max"] = np.where(unmeasured, out["current_per_torque"] * out["torque_max"], out["current_max"])
-        sign = raw.get("current_sign", -1)
+        sign = content.current_sign
         sign = [sign.get(j, -1) for j in xhand.JOINTS] if isinstance(sign, dict) else [sign] * 12
-        if not all(s in (-1, 1) for s in sign):
-            raise UserError(f"{where}: current_sign={raw['current_sign']}: must be -1 or 1, or map joints to these")
-        return cls(**out, current_sign=np.array(sign, float), normalization=how, **_touch(raw.get("touch") or {}, where, assumed),
+        return cls(**out, current_sign=np.array(sign, float), normalization=how, **_touch(content.touch or Touch(), assumed),
                    assumed=assumed, raw=raw)  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
@@ -163,59 +202,36 @@ def save(path: str | Path, content: dict[str, Any]) -> None:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _touch(raw: Any, where: str, assumed: list[str]) -> dict[str, Any]:
-    if not isinstance(raw, dict):
-        raise UserError(f"{where}: touch must map keys to values; keys: {', '.join(TOUCH_KEYS)}")
-    _known(raw, TOUCH_KEYS, f"{where}: touch")
+def _content(raw: Any, where: str) -> Content:
+    """What the deployed policy reads of the file, checked; notes for people are not. Raises UserError."""
+    if isinstance(raw, dict):
+        keys = {"": (raw, KEYS), "touch": (raw.get("touch"), TOUCH_KEYS), "joints": (raw.get("joints"), xhand.JOINTS)}
+        for part, (there, known) in keys.items():
+            for key in there if isinstance(there, dict) else ():
+                if key not in known:
+                    raise UserError(f"{where}: {part}{'.' if part else ''}{key}: no such {'joint' if part == 'joints' else 'key'};"
+                                    f" there are: {', '.join(known)}")  # fmt: skip
+        raw = {k: raw[k] for k in Content.__struct_fields__ if k in raw}
+        if isinstance(raw.get("joints"), dict):
+            raw["joints"] = {j: {k: e[k] for k in Joint.__struct_fields__ if k in e} if isinstance(e, dict) else e for j, e in raw["joints"].items()}
+        if isinstance(raw.get("touch"), dict):
+            raw["touch"] = {k: raw["touch"][k] for k in Touch.__struct_fields__ if k in raw["touch"]}
+    return typed.convert(raw, Content, where, "correct the file, or fit it anew with dexsim calibrate")
+
+
+def _touch(touch: Touch, assumed: list[str]) -> dict[str, Any]:
     out: dict[str, Any] = {}
-    if raw.get("lsb") in (None, "unknown"):
+    if touch.lsb in (None, "unknown"):
         assumed.append(f"touch.lsb is not measured: {ASSUMED_LSB} N a count assumed")
     else:
-        out["lsb"] = _positive(raw["lsb"], f"{where}: touch.lsb")
-    sign = raw.get("axis_sign", [-1, -1, 1])
-    if not (isinstance(sign, (list, tuple)) and len(sign) == 3 and all(s in (-1, 1) for s in sign)):
-        raise UserError(f"{where}: touch.axis_sign={sign}: must be three of -1 and 1")
-    out["axis_sign"] = np.array(sign, float)
-    threshold = raw.get("threshold", 0.0)
-    threshold = threshold.get("value") if isinstance(threshold, dict) else threshold
-    if not isinstance(threshold, (int, float)) or not 0 <= threshold <= 100:
-        raise UserError(f"{where}: touch.threshold={threshold}: must be a number from 0 to 100 N")
-    out["threshold"] = float(threshold)
-    T = xhand.TAXELS_PER_FINGER
+        out["lsb"] = float(touch.lsb)
+    out["axis_sign"] = np.array(touch.axis_sign, float)
+    out["threshold"] = float(touch.threshold.value if isinstance(touch.threshold, Force) else touch.threshold)
     for key, neutral in (("gain", 1.0), ("bias", 0.0)):
-        table = np.full((5, T), neutral)
-        for finger, values in (raw.get(key) or {}).items():
-            values = np.asarray(values, float)
-            if values.shape != (T,) or not np.isfinite(values).all():
-                raise UserError(f"{where}: touch.{key}.{_finger(finger, where)}: must be {T} finite numbers")
-            table[xhand.FINGERS.index(_finger(finger, where))] = values
-        out[key] = table
-    for finger, taxels in (raw.get("dead") or {}).items():
-        out["gain"][xhand.FINGERS.index(_finger(finger, where)), [_taxel(k, where) for k in taxels]] = 0.0
-    out["swapped"] = {_finger(f, where): [[_taxel(a, where), _taxel(b, where)] for a, b in pairs]
-                      for f, pairs in (raw.get("swapped") or {}).items()}  # fmt: skip
+        out[key] = np.full((5, xhand.TAXELS_PER_FINGER), neutral)
+        for finger, values in (getattr(touch, key) or {}).items():
+            out[key][xhand.FINGERS.index(finger)] = values
+    for finger, taxels in (touch.dead or {}).items():
+        out["gain"][xhand.FINGERS.index(finger), list(taxels)] = 0.0
+    out["swapped"] = {finger: [list(pair) for pair in pairs] for finger, pairs in (touch.swapped or {}).items()}
     return out
-
-
-def _known(raw: dict, keys: tuple[str, ...], where: str) -> None:
-    for key in raw:
-        if key not in keys:
-            raise UserError(f"{where}: key '{key}' does not exist; keys: {', '.join(keys)}")
-
-
-def _positive(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise UserError(f"{where}={value!r}: must be a number > 0")
-    return float(value)
-
-
-def _finger(name: Any, where: str) -> str:
-    if name not in xhand.FINGERS:
-        raise UserError(f"{where}: touch: no finger '{name}'; fingers: {', '.join(xhand.FINGERS)}")
-    return name
-
-
-def _taxel(k: Any, where: str) -> int:
-    if isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < xhand.TAXELS_PER_FINGER:
-        raise UserError(f"{where}: touch: taxel {k!r} must be a whole number from 0 to {xhand.TAXELS_PER_FINGER - 1}")
-    return k

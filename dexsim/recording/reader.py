@@ -13,11 +13,12 @@ from mcap.records import Schema as McapSchema
 
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.recording import columns, decode, metadata, names, schema, timeline
+from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
 from dexsim.recording.container import Container, open_container
 from dexsim.recording.schema import Finding, Recording, Series, States
 
 NAN = float("nan")
+MAX_JOINTS = 1000
 _VECTORS = {schema.EXTERNAL_FORCE: ("wrench", 6), schema.OBJECT_POSE: ("pose", 7), schema.IMU: ("imu", 10)}
 
 
@@ -280,6 +281,8 @@ class _Reading:
         t_command, commands = self._decode(schema.COMMANDS, decode.joint_reader)
         t_state, states = self._decode(schema.STATES, decode.joint_reader)
         theirs = self._their_joints(stated, commands, states, joints)
+        if len(theirs) > MAX_JOINTS:
+            raise UserError(f"recording {self.path}: names {len(theirs)} joints; at most {MAX_JOINTS} are read")
         mapping = self._match(theirs, joints)
         ours = tuple(dict.fromkeys(mapping[n] for n in theirs if n in mapping))
         order = joints if joints is not None else xhand.JOINTS if set(ours) <= set(xhand.JOINTS) else ours
@@ -334,6 +337,9 @@ class _Reading:
             (schema.IMU, "imu"),
         ):
             setattr(out, name, self._vectors(topic))
+        if reason := attached.fault(self.config, f"the attached {schema.ATTACHMENT}"):
+            out.config = None
+            self.findings.append(Finding("damage", "", NAN, 1, f"{reason}; it is not used", "error"))
         out.findings = self.findings
         out.breaks = sorted(self.breaks)
         return out

@@ -153,7 +153,8 @@ def _pauses(run: Run) -> list[tuple[float, float]]:
     long = np.flatnonzero(step > max(BLIND, 8 * float(np.median(step))))
     out = [(float(run.t[k]), float(run.t[k + 1])) for k in long]
     # the first sample after a break is of the other time already
-    return sorted({*out, *((a, b) for a, b in run.breaks if run.t[0] <= a and b <= run.t[-1])})
+    first, last = float(run.t[0]), float(run.t[-1])
+    return sorted({*out, *((max(a, first), min(b, last)) for a, b in run.breaks if a < last and b > first)})
 
 
 def _assume(run: Run, j: int, follows: bool, model: mujoco.MjModel) -> None:
