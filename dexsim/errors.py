@@ -8,3 +8,7 @@ class UserError(ValueError):
 
     Entry points print it as one line and exit with status 2; it never comes with a traceback.
     """
+
+    def __init__(self, message: object = "") -> None:
+        """message: kept to one line, whatever line breaks a value in it has."""
+        super().__init__(" ".join(str(message).split()))

@@ -41,9 +41,10 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
 
 def _named(data: Any, kind: Any, message: str, place: str) -> str:
     """The place with the keys in it that msgspec leaves out (*): those without which it would not fail so."""
-    while any(part.startswith("*") for part in place.split(".")):
-        parts = place.split(".")
-        k = next(i for i, part in enumerate(parts) if part.startswith("*"))
+    parts = place.split(".")
+    for k, part in enumerate(parts):
+        if not part.startswith("*"):
+            continue
         node = _at(data, parts[:k])
         for key in list(node) if isinstance(node, dict) else ():
             alone = _with(data, parts[:k], {key: node[key]})
@@ -51,18 +52,17 @@ def _named(data: Any, kind: Any, message: str, place: str) -> str:
                 msgspec.convert(alone, kind, dec_hook=_instance)
             except msgspec.ValidationError as error:
                 if str(error) == message:
-                    data, parts[k] = alone, str(key) + parts[k][1:]
+                    data, parts[k] = alone, str(key) + part[1:]
                     break
         else:
             return place
-        place = ".".join(parts)
-    return place
+    return ".".join(parts)
 
 
 def _at(node: Any, parts: list[str]) -> Any:
     for part in ".".join(parts).replace("[", ".[").split("."):
         if part:
-            node = node[int(part[1:-1])] if part.startswith("[") else next(v for k, v in node.items() if str(k) == part)
+            node = node[int(part[1:-1])] if part.startswith("[") else next((v for k, v in node.items() if str(k) == part), None) if isinstance(node, dict) else None
     return node
 
 

@@ -20,7 +20,7 @@ import copy
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Iterable, Literal, Sequence
+from typing import Any, Iterable, Literal, Sequence
 
 import msgspec
 import numpy as np
@@ -45,7 +45,6 @@ KEYS = (
 ALL = "*"
 
 
-Number = typed.Positive | Annotated[str, msgspec.Meta(pattern=r"^(\+?\d+(\.\d*)?[eE][+-]?\d{1,2})$")] | None
 Side = Literal[SIDES]
 
 
@@ -54,12 +53,12 @@ class Content(msgspec.Struct):
 
     drive: Literal[DRIVES] = "torque"
     joints: dict[str, dict[str, Any] | None] | None = None
-    current_per_torque: typed.Positive | Annotated[str, msgspec.Meta(pattern=r"^(unknown|\+?\d+(\.\d*)?[eE][+-]?\d{1,2})$")] | dict[str, typed.Positive | Literal["unknown"] | None] | None = None
-    control_rate: Number = None
-    loop_rate: Number = None
+    current_per_torque: typed.Positive | Literal["unknown"] | dict[str, typed.Positive | Literal["unknown"] | None] | None = None
+    control_rate: typed.Positive | None = None
+    loop_rate: typed.Positive | None = None
     loop_encoder: Side | dict[str, Side] | None = None
     position_encoder: Side | dict[str, Side] | None = None
-    supply_voltage: Number = None
+    supply_voltage: typed.Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class ServoTable:
             if key not in KEYS:
                 hint = did_you_mean(key, KEYS)
                 raise UserError(f"{source}: key '{key}' does not exist.{hint} Valid keys: {', '.join(KEYS)}")
-        top = typed.convert(raw, Content, source)
+        top = typed.convert({k: v if k in ("drive", "joints") else _numbers(v) for k, v in raw.items()}, Content, source)
         joints = top.joints or {}
         entries: dict[str, dict[str, Value]] = {}
         for joint, columns in joints.items():
@@ -171,8 +170,8 @@ class ServoTable:
                     hint = did_you_mean(name, NAMES)
                     raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
                 entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
-        return cls(top.drive, entries, _numbers(top.current_per_torque), _numbers(top.control_rate), _numbers(top.loop_rate), top.loop_encoder or "joint",
-                   top.position_encoder or "joint", _numbers(top.supply_voltage), source)  # fmt: skip
+        return cls(top.drive, entries, top.current_per_torque, top.control_rate, top.loop_rate, top.loop_encoder or "joint",
+                   top.position_encoder or "joint", top.supply_voltage, source)  # fmt: skip
 
     def to_dict(self) -> dict:
         """The file's content again: `from_dict(table.to_dict())` is the same table."""
@@ -293,7 +292,8 @@ def _plain(value: Value) -> Any:
 
 
 def _numbers(value: Any) -> Any:
-    """Numbers as float, by joint where it is a mapping; YAML reads 1e-3 as text."""
+    """Numbers that YAML reads as text (1e-3) as such, by joint where it is a mapping; whatever else there is as it is."""
     if isinstance(value, dict):
         return {joint: _numbers(v) for joint, v in value.items()}
-    return value if value in (None, "unknown") else float(value)
+    number = _number(value)
+    return value if number is None else number

@@ -36,6 +36,7 @@ _BROKEN = (
     McapError,
     CRCValidationError,
     ValueError,
+    OverflowError,
     struct.error,
     EOFError,
     zstandard.ZstdError,

@@ -11,7 +11,7 @@ import yaml
 from dexsim import files, yaml_text
 from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
-from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers
+from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers, shown
 
 VALID = (*KEYS, *UNIT_KEYS)
 NAN = float("nan")
@@ -45,7 +45,7 @@ def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tup
                         "",
                         NAN,
                         1,
-                        f"{key}: '{stated[key]}' as recorded, '{text}' by {source}; the latter is used",
+                        f"{key}: '{shown(stated[key])}' as recorded, '{shown(text)}' by {source}; the latter is used",
                         "info",
                     )
                 )
@@ -113,7 +113,7 @@ def _check(path: Path, stated: Mapping[str, str]) -> None:
     for key, valid in choices.items():
         if key in stated and stated[key] not in valid:
             raise UserError(
-                f"{path}: metadata {key}='{stated[key]}' must be one of {', '.join(valid)};"
+                f"{path}: metadata {key}='{shown(stated[key])}' must be one of {', '.join(valid)};"
                 f" correct it with meta.{key}=..."
             )
     for key, count in (("gravity", 3), ("tactile_axis_sign", 3), ("tactile_lsb", 1)):

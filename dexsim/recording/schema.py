@@ -278,6 +278,12 @@ class Recording:
         return replace(self.tactile, value=self.tactile.value * (self.tactile_lsb * self.tactile_axis_sign))
 
 
+def shown(text: str) -> str:
+    """A value as a message names it: one line, not long."""
+    text = " ".join(text.split())
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
 def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
     """`count` numbers separated by commas or spaces. Raises UserError naming file and key."""
     try:
@@ -286,12 +292,12 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
         raise UserError(
-            f"{where}: metadata {key}='{text[:80]}' must be {count} finite number{'s' * (count > 1)};"
+            f"{where}: metadata {key}='{shown(text)}' must be {count} finite number{'s' * (count > 1)};"
             f" correct it with meta.{key}=..."
         )
     low, high = ALLOWED.get(key, (-np.inf, np.inf))
     if ((values < low) | (values > high)).any():
-        raise UserError(f"{where}: metadata {key}='{text[:80]}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=...")
+        raise UserError(f"{where}: metadata {key}='{shown(text)}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=...")
     return values
 
 
@@ -301,7 +307,7 @@ def per_joint_sign(text: str, joints: tuple[str, ...], where: str) -> np.ndarray
     values = numbers(text, 1 if count == 1 else len(joints), "effort_sign", where)
     if not np.isin(values, (-1, 0, 1)).all():
         raise UserError(
-            f"{where}: metadata effort_sign='{text}' must hold +1, -1 or 0; correct it with meta.effort_sign=..."
+            f"{where}: metadata effort_sign='{shown(text)}' must hold +1, -1 or 0; correct it with meta.effort_sign=..."
         )
     return np.broadcast_to(values, len(joints)).copy()
 

@@ -1,0 +1,100 @@
+"""Sound files of each kind, from which damaged ones are made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import yaml
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+
+from dexsim.recording import Recording, Series, States, schema, write
+
+JOINTS = ("a", "b")
+SERVO = {
+    "drive": "torque", "control_rate": 100, "loop_encoder": {"a": "motor"}, "current_per_torque": {"a": 0.9, "b": "unknown"}, "supply_voltage": 24.0,
+    "joints": {"*": {"kp": 1.5, "kd": [0.01, 0.03], "torque_limit": 2.0}, "a": {"kp": {"value": 1.0, "low": 0.9, "high": 1.1}, "delay": "unknown"}},
+}  # fmt: skip
+CALIBRATION = {
+    "schema": 1, "normalization": "matched", "current_sign": {"index_joint1": 1, "mid_joint1": -1},
+    "joints": {"index_joint1": {"current_per_torque": {"value": 2.7, "low": 2.5, "high": 2.9, "r2": 0.99}, "current_max": 1.2, "torque_max": 1.1}},
+    "touch": {"lsb": 0.1, "axis_sign": [-1, -1, 1], "threshold": {"value": 0.1}, "gain": {"thumb": [1.0] * 120}, "bias": {"mid": [0.0] * 120},
+              "dead": {"thumb": [3, 4]}, "swapped": {"mid": [[1, 2], [5, 6]]}},
+}  # fmt: skip
+TACTILE = {
+    "tactile": {"friction": [0.35, 0.45], "pads": {"index": {"gain": {"value": 0.6, "low": 0.57, "high": 0.63}, "taxels": {17: [0.4, 0.5]}, "dead": [3],
+                "stuck": {33: 0.4}, "swapped": [[14, 15]], "crosstalk": [0.2, 0.3], "delay": [0.018, 0.022], "rubber": {"c10": [9e4, 1.1e5], "c01": 2e4}}}},
+    "randomize": {"object.friction": [0.35, 0.45], "contact.stiffness": {"value": 4500, "low": 4300, "high": 4700}},
+}  # fmt: skip
+METADATA = {"gravity": "0 0 -9.81", "effort_is": "torque_Nm", "effort_sign": "+1,-1", "robot": "rig", "position_unit": "rad", "tactile_lsb": "0.1",
+            "servo": SERVO, "joint_names": ["a", "b"], "tactile_axis_sign": "1 1 1"}  # fmt: skip
+CONFIG = {
+    "sim": {"timestep": 0.002, "iterations": 10}, "task": {"contact": {"impedance": 0.9}},
+    "recorded_world": {"index": 0, "object": {"kind": "box", "shape": "cube", "size": [0.02, 0.02, 0.02], "mass": 0.1, "friction": 0.5, "stiffness": 4000.0,
+                                              "damping_ratio": 0.3}},
+}  # fmt: skip
+TREES = {"servo": SERVO, "calibration": CALIBRATION, "tactile": TACTILE, "metadata": METADATA, "config": CONFIG}
+
+
+def recording(seconds: float = 1.5, tactile: bool = True, config: str | None = None) -> Recording:
+    """Two joints at 100 Hz, touch and an object now and then."""
+    t = np.arange(0, seconds, 0.01)
+    q = np.stack([0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t)], 1)
+    meta = schema.DEFAULTS | {"effort_is": "torque_Nm", "joint_names": "a,b", "tactile_lsb": "0.1", "servo": yaml.safe_dump(SERVO)}
+    out = Recording(Path("made"), meta, JOINTS, Series(t, q, schema.COMMANDS), States(*(Series(t, x, schema.STATES) for x in (np.roll(q, 3, 0), q, q))),
+                    start_ns=1_700_000_000_000_000_000, config=config)  # fmt: skip
+    out.temperature = Series(t[::10], np.full((len(t[::10]), 2), 30.0), schema.TEMPERATURES)
+    out.enabled = Series(t[::50], np.ones((len(t[::50]), 2)), schema.ENABLED)
+    out.supply_voltage = Series(t[::10], np.full(len(t[::10]), 24.0), schema.SUPPLY)
+    if tactile:
+        out.tactile = Series(t[::30], np.ones((len(t[::30]), 5, 120, 3)), schema.TACTILE)
+        out.object_pose = Series(t[::10], np.tile([0, 0, 0.1, 1.0, 0, 0, 0], (len(t[::10]), 1)), schema.OBJECT_POSE)
+        out.external_force = Series(t[::10], np.ones((len(t[::10]), 6)), schema.EXTERNAL_FORCE)
+        out.imu = Series(t[::10], np.ones((len(t[::10]), 10)), schema.IMU)
+    return out
+
+
+def build(folder: Path) -> dict[str, list[Path]]:
+    """Sound files by kind, written into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write(folder / "full.mcap", recording(config=yaml.safe_dump(CONFIG)))
+    write(folder / "small.mcap", recording(0.5, tactile=False))
+    foreign(folder / "lz4.mcap", CompressionType.LZ4, "cdr")
+    foreign(folder / "json.mcap", CompressionType.NONE, "json")
+    r = recording(0.5, tactile=False)
+    t, q = r.commands.t, r.commands.value
+    rows = "".join(f"{x:.3f},{a:.6f},{b:.6f},{c:.6f},{d:.6f}\n" for x, (a, b), (c, d) in zip(t, q, r.states.position.value, strict=True))
+    (folder / "plain.csv").write_text("time,command.a,command.b,position.a,position.b\n" + rows)
+    np.savez(folder / "plain.npz", time=t, command=q, position=r.states.position.value, joint_names=list(JOINTS))
+    np.savez_compressed(folder / "packed.npz", **{"time_ms": 1e3 * t, "position.a": q[:, 0], "command.a [deg]": q[:, 1]})
+    for kind, tree in TREES.items():
+        (folder / f"{kind}.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+    files = sorted(folder.iterdir())
+    out = {"recording": [p for p in files if p.suffix in (".mcap", ".csv", ".npz")]}
+    return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
+
+
+def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
+    """A bag as others write it: other topics, no metadata."""
+    from dexsim.recording import cdr
+
+    with open(path, "wb") as file:
+        w = McapWriter(file, compression=compression, chunk_size=4096)
+        w.start("ros2" if encoding == "cdr" else "", "other")
+        if encoding == "cdr":
+            kind = w.register_schema(schema.JOINT_STATE, "ros2msg", schema.DEFINITIONS[schema.JOINT_STATE].encode())
+        else:
+            kind = w.register_schema("JointState", "jsonschema", b"{}")
+        channels = [w.register_channel(topic, encoding, kind) for topic in ("/arm/joint_states", "/arm/joint_commands")]
+        for i in range(40):
+            ns = 1_700_000_000_000_000_000 + i * 10_000_000
+            x = np.array([0.01 * i, -0.01 * i])
+            for channel in channels:
+                if encoding == "cdr":
+                    data = cdr.joint_state(ns, JOINTS, x, None, x)
+                else:
+                    data = json.dumps({"name": JOINTS, "position": x.tolist(), "effort": x.tolist(), "header": {"stamp": {"sec": 1, "nanosec": i}}}).encode()
+                w.add_message(channel, log_time=ns, data=data, publish_time=ns)
+        w.finish()

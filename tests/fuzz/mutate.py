@@ -1,0 +1,141 @@
+"""Damage to files: bytes, texts, trees, and recordings that are sound as files but hold what no machine sends. A seed makes a case."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from dexsim.recording import write
+
+from . import corpus
+
+ODD: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1, 2**31, 2**63, -(2**63), 1e-300, 1e300, float("nan"), float("inf"), float("-inf"), "", " ", "x", "unknown", "1e3", "*", "nan",
+    "0 0 -9.81", "a" * 5000, "\u0000", "é\u202e", [], {}, [[]], [1], [1, 2], [2, 1], [1, 2, 3], [None], ["x"], {"value": 1}, {"value": None}, {"low": 1},
+    {"value": float("nan"), "low": 0, "high": 1}, {"x": {"y": {"z": 1}}}, {1: 2}, {None: None}, {True: 1}, "2020-01-01", "!!binary x", [0] * 200, "\n", "a: b",
+)  # fmt: skip
+WORDS = (b"\x00" * 8, b"\xff" * 8, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x01" + b"\x00" * 7, b"\x00\x00\x00\x00\x00\x00\xf0\x7f", b"\x00\x00\x00\x00\x00\x00\xf8\x7f")
+
+
+def bytes_(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
+    """A few edits of a file's bytes."""
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 8))):
+        n = len(out)
+        if not n:
+            break
+        at, size = int(rng.integers(0, n)), int(min(rng.integers(1, 64) ** 2, n))
+        how = rng.integers(0, 9)
+        if how == 0:
+            out[at] ^= 1 << int(rng.integers(0, 8))
+        elif how == 1:
+            out[at] = int(rng.integers(0, 256))
+        elif how == 2:
+            del out[at : at + size]
+        elif how == 3:
+            out[at:at] = out[at : at + size]
+        elif how == 4:
+            del out[at:]
+        elif how == 5:
+            word = WORDS[int(rng.integers(0, len(WORDS)))]
+            out[at : at + len(word)] = word
+        elif how == 6:
+            out[at:at] = rng.integers(0, 256, size % 40, dtype=np.uint8).tobytes()
+        elif how == 7:
+            other = others[int(rng.integers(0, len(others)))]
+            begin = int(rng.integers(0, max(len(other), 1)))
+            out[at : at + size] = other[begin : begin + size]
+        else:
+            out[at : at + size] = bytes(size)
+    return bytes(out)
+
+
+def tree(value: Any, rng: np.random.Generator) -> Any:
+    """One to three changes of plain data: values replaced, keys lost, renamed, exchanged."""
+    root = [copy.deepcopy(value)]
+    for _ in range(int(rng.integers(1, 4))):
+        node, key = root, 0
+        for _ in range(int(rng.integers(0, 7))):
+            inner = node[key]
+            keys = list(inner) if isinstance(inner, dict) else list(range(len(inner))) if isinstance(inner, list) else []
+            if not keys:
+                break
+            node, key = inner, keys[int(rng.integers(0, len(keys)))]
+        odd = copy.deepcopy(ODD[int(rng.integers(0, len(ODD)))])
+        how = rng.integers(0, 6)
+        if how == 0 and node is not root:
+            del node[key]
+        elif how == 1 and isinstance(node, dict):
+            name = ODD[int(rng.integers(0, len(ODD)))]
+            node[name if isinstance(name, (str, int, float, bool, type(None))) else str(name)] = node.pop(key)
+        elif how == 2:
+            node[key] = [node[key]]
+        elif how == 3:
+            node[key] = {"value": node[key]}
+        else:
+            node[key] = odd
+    return root[0]
+
+
+def text_of(kind: str, rng: np.random.Generator) -> bytes:
+    """A damaged YAML file of a kind."""
+    text = yaml.dump(tree(corpus.TREES[kind], rng), Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+    return bytes_(text, rng, [text, b"{[&a*a!!python/name:os.system <<: ]}" * 20]) if rng.random() < 0.4 else text
+
+
+def values(path: Path, rng: np.random.Generator) -> None:
+    """Writes a sound file whose values, times or metadata are none that a machine sends."""
+    r = corpus.recording(float(rng.choice([0.02, 0.3, 1.2])), bool(rng.random() < 0.2))
+    series = [s for s in (r.commands, r.states.position, r.states.velocity, r.states.effort, r.temperature, r.enabled, r.supply_voltage, r.tactile,
+                          r.object_pose, r.external_force, r.imu) if s is not None]  # fmt: skip
+    for _ in range(int(rng.integers(1, 5))):
+        s = series[int(rng.integers(0, len(series)))]
+        n = len(s.t)
+        at = rng.random(n) < rng.choice([0.02, 0.3, 1.0])
+        how = rng.integers(0, 8)
+        odd = float(rng.choice([np.nan, np.inf, -np.inf, 0.0, 1e300, -1e300, 1e-300, 1e9, 65536.0, -1.0]))
+        if how <= 1:
+            s.value = s.value.copy()
+            s.value[at] = odd
+        elif how == 2:
+            s.t = s.t + np.where(at, rng.choice([-3.0, 3.0, 1e-9, 600.0, 1e8]), 0.0)
+        elif how == 3:
+            s.t = np.where(at, s.t[0], s.t)
+        elif how == 4:
+            s.t = s.t * float(rng.choice([0.0, 1e-6, 1e3, 1e6]))
+        elif how == 5:
+            s.t, s.value = s.t[: n // 30], s.value[: n // 30]
+        elif how == 6:
+            s.value = s.value * float(rng.choice([0.0, 1e6, -1.0, 57.3, 4096.0]))
+        else:
+            s.stamp = np.where(at, float(rng.choice([np.nan, 0.0, 1e8, -5.0])), s.t)
+    if rng.random() < 0.4:
+        meta = {k: v for k, v in tree({k: str(v) for k, v in r.meta.items()}, rng).items()} if rng.random() < 0.9 else {}
+        r.meta = {str(k): str(v) for k, v in meta.items() if str(k) in corpus.schema.KEYS}
+    if rng.random() < 0.2:
+        r.config = text_of("config", rng).decode("utf-8", "replace")
+    write(path, r)
+
+
+def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Path:
+    """Writes the damaged file of a seed; returns where."""
+    rng = np.random.default_rng([seed, sum(map(ord, kind))])
+    if kind != "recording":
+        path = folder / "case.yaml"
+        path.write_bytes(text_of(kind, rng))
+        return path
+    source = files[kind][int(rng.integers(0, len(files[kind])))]
+    if rng.random() < 0.5:
+        path = folder / "case.mcap"
+        try:
+            values(path, rng)
+            return path
+        except Exception:  # what the writer does not take: the bytes of another are damaged instead
+            pass
+    path = folder / f"case{source.suffix}"
+    path.write_bytes(bytes_(source.read_bytes(), rng, [p.read_bytes() for p in files[kind]]))
+    return path

@@ -1,0 +1,81 @@
+"""The short run: damaged files of each kind end in an answer or in one line that names the file."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from . import corpus, mutate, strategies, targets
+
+SHORT = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
+WELL = ("fine", "refused")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return corpus.build(tmp_path_factory.mktemp("corpus"))
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def clean(folder):
+    for old in folder.iterdir():
+        old.unlink()
+
+
+def test_the_corpus_itself_is_sound(files, tmp_path):
+    for kind, paths in files.items():
+        for path in paths:
+            copy = tmp_path / f"case{path.suffix}"
+            copy.write_bytes(path.read_bytes())
+            assert targets.verdict(kind, copy) == "fine", path
+
+
+@pytest.mark.parametrize("kind", sorted(corpus.TREES))
+def test_damaged_trees(kind, tmp_path):
+    @SHORT
+    @given(strategies.trees(kind))
+    def run(tree):
+        clean(tmp_path)
+        path = tmp_path / "case.yaml"
+        path.write_text(yaml.dump(tree, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), allow_unicode=True), encoding="utf-8", errors="surrogatepass")
+        assert targets.verdict(kind, path) in WELL
+
+    run()
+
+
+@pytest.mark.parametrize("kind", sorted(targets.TARGETS))
+def test_damaged_files(kind, files, tmp_path):
+    @settings(SHORT, max_examples=30)
+    @given(strategies.seeds)
+    def run(seed):
+        clean(tmp_path)
+        assert targets.verdict(kind, mutate.case(kind, seed, files, tmp_path)) in WELL
+
+    run()
+
+
+FOUND = [("servo", 307), ("metadata", 58), ("metadata", 274), ("recording", 324), ("recording", 1416), ("calibration", 1898), ("tactile", 3033)]
+"""Cases of long runs that once broke something."""
+
+
+@pytest.mark.parametrize(("kind", "seed"), FOUND)
+def test_what_once_broke(kind, seed, files, tmp_path):
+    assert targets.verdict(kind, mutate.case(kind, seed, files, tmp_path)) in WELL
+
+
+@given(st.text(max_size=80))
+@SHORT
+def test_any_name_of_a_column(text):
+    from dexsim.recording.columns import _role
+
+    assert _role(text) is None or len(_role(text)) == 4
