@@ -114,7 +114,7 @@ def test_shipped_servos(name):
         ("joints: [1]", ["joints ([1])", "expected `object"]),
         ("drive: volt", ["drive ('volt')", "torque, voltage"]),
         ("joint: {}", ["'joint'", "Did you mean 'joints'"]),
-        ("control_rate: 0", ["control_rate (0)", "> 0"]),
+        ("control_rate: 0", ["control_rate (0.0)", "> 0"]),
         ("supply_voltage: high", ["supply_voltage ('high')"]),
         ("loop_encoder: rotor", ["loop_encoder ('rotor')", "joint, motor"]),
         ("loop_encoder: {j: moto}", ["loop_encoder.j ('moto')", "joint, motor"]),
