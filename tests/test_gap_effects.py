@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +120,89 @@ def test_an_interval_holds_the_size_by_another_law():
     low, high = search.widen(best, intervals(best.fit, search.blocks, knee=search.r.knee))[0]
     assert low < 0.06 < high < 0.1
     assert best.members[0].variant.label == "exponential in speed"
+
+
+CABLE = '''"""A cable that pulls the joint home, the harder the farther it turned."""
+
+import numpy as np
+
+from dexsim.gap.effects.effect import Effect, Variant, param
+
+
+class Cable(Effect):
+    """A cable that pulls the joint home: -k q^3."""
+
+    id = "cable_pull"
+    words = "is pulled home by a cable"
+    shows = "far from its middle"
+    experiment = "static poses over the whole range"
+    demo = {"cable": 0.08}
+
+    def variants(self, s):
+        return [Variant((param("stiffness", "cable", "set", 0.0, 2.0, 0.0, "N.m/rad3"),), ((0.02,), (0.1,), (0.4,)))]
+
+    def signal(self, case, values, note):
+        return np.abs(case.regimes["position"]) ** 3
+
+    def parameters(self, fit):
+        return {"stiffness": fit.entry("stiffness", "N.m/rad3")}
+'''
+LAW = '''
+
+@wp.func
+def cable_pull(stiffness: Any, q: Any):
+    """Torque [N.m] of a cable [N.m/rad3] at position q [rad]: -stiffness q^3."""
+    return -stiffness * q * q * q
+'''
+ADDED = (  # file, the line before which (none: at its end), what is added: a column, its law in training and search, its reference, an entry
+    ("actuator/columns.py", "    # Torque of nothing that is known", '    Column("cable", "N.m/rad3", 0.0, 0.0, 1e3, "a cable that pulls home"),\n'),
+    ("actuator/laws.py", "", LAW),
+    ("actuator/kernel.py", "KP, KD = INDEX", 'from dexsim.actuator.laws import cable_pull\n\nCABLE = INDEX["cable"]\n'),
+    ("actuator/kernel.py", "        # The stand-in for what is not known", "        t.end += cable_pull(d.params[w, j, CABLE], q)\n"),
+    ("actuator/reference.py", "    of_motor, slope_motor, drawn", '    applied = applied - p["cable"] * q**3\n'),
+    ("gap/plant/kernel.py", "f64 = wp.float64", 'from dexsim.actuator.laws import cable_pull\n\nP_CABLE = INDEX["cable"]\n'),
+    ("gap/plant/kernel.py", "                applied += params[h, P_BIAS]", "                applied += cable_pull(params[h, P_CABLE], q)\n"),
+    ("gap/effects/cable.py", "", CABLE),
+    ("gap/effects/catalogue.py", "CATALOGUE: tuple[Effect, ...] = (", "from dexsim.gap.effects.cable import Cable\n\n"),
+    ("gap/effects/catalogue.py", "    CoulombFriction(),", "    Cable(),\n"),
+)  # fmt: skip
+TRIED = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from dexsim.actuator import reference
+from dexsim.actuator.table import ServoTable
+from dexsim.gap import demo
+from dexsim.gap.diagnosis import Settings, diagnose, save
+
+out = Path(sys.argv[1])
+paths, model, servo, hidden = demo.make(out, "cable_pull", seconds=5.0)
+d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={"cable_pull", "payload"}), say=lambda _: None)
+save(d, out)
+row = ServoTable.from_dict(demo.BELIEVED).nominal(["joint"])[0]
+plain, pulled = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9)["qfrc_applied"] for r in (row, np.where(np.arange(len(row)) == reference.INDEX["cable"], 0.08, row)))
+print(json.dumps({"hidden": hidden, "torque": float(pulled - plain), "row": ServoTable.load(out / "servo.yaml").value("joint", "cable").value}))
+"""
+
+
+@pytest.mark.slow
+def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
+    """A copy of the package with one effect more, added in the places that CONTRIBUTING names and nowhere else: it is planted by the
+    engine that trains, found, sized, written to servo.yaml and shown on the page."""
+    package = tmp_path / "dexsim"
+    shutil.copytree(Path(dexsim.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, before, text in ADDED:
+        path = package / name
+        old = path.read_text(encoding="utf-8") if path.is_file() else ""
+        assert old.count(before) == 1 or not before, f"{name}: {before}"
+        path.write_text(old.replace(before, text + before) if before else old + text, encoding="utf-8")
+    script, out = tmp_path / "tried.py", tmp_path / "out"
+    script.write_text(TRIED, encoding="utf-8")
+    done = subprocess.run([sys.executable, str(script), str(out)], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    said = json.loads(done.stdout.splitlines()[-1])
+    first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]
+    assert said["hidden"] == {"cable": 0.08} and said["torque"] == pytest.approx(-0.08, rel=1e-3)
+    assert first["effect"] == "cable_pull" and first["parameters"]["stiffness"]["value"] == pytest.approx(0.08, rel=0.1)
+    assert said["row"] == pytest.approx(first["parameters"]["stiffness"]["value"], rel=1e-3)
+    assert "is pulled home by a cable" in (out / "report.html").read_text(encoding="utf-8")
