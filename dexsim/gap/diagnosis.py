@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.errors import UserError
-from dexsim.gap.effects.catalogue import EFFECTS, entry
+from dexsim.gap.effects.catalogue import EFFECTS, modelled
 from dexsim.gap.judge import confidence, errors, full_model, not_considered, residual_fit
 from dexsim.gap.judge.conclude import add_behind, assemble
 from dexsim.gap.judge.joint import Kept
@@ -244,7 +244,7 @@ def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, 
     for case, search, outcome in outcomes:
         if d.joints[case.joint]["after"] < 1.5 * floor:
             continue
-        claimed = any(case.joint in f["where"]["joints"] and entry(f) is not None for f in d.data["findings"])
+        claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
         trial = search.polish(outcome.best if claimed else outcome.none)
         found = residual_fit.fit(case, runs, trial, train, test, span_train, span_test, seed)
         if found is not None:
@@ -256,7 +256,7 @@ def _confirm(d: Diagnosis, s: Settings, m: Mechanism, runs, outcomes, test, span
     """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the sentence says so."""
     if s.replay == "none":
         return
-    named = [f for f in d.data["findings"] if f["where"]["joints"] and f["effect"] in EFFECTS]
+    named = [f for f in d.data["findings"] if f["where"]["joints"] and modelled(f)]
     claimed = {j for f in named for j in f["where"]["joints"]}
     searches = {case.joint: (search, outcome) for case, search, outcome in outcomes}
     none = {case.joint: search.polish(outcome.none) for case, search, outcome in outcomes}

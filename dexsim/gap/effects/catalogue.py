@@ -124,6 +124,12 @@ def model_columns() -> frozenset[str]:
     return frozenset(c for e in CATALOGUE for c in e.model_columns)
 
 
+def modelled(finding: dict) -> bool:
+    """Whether a finding is of an effect that the plant has a law of: not a bad channel, nor a push from outside."""
+    e = entry(finding)
+    return e is not None and e.simulated
+
+
 def entry(finding: dict):
     """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
     if finding["where"]["joints"]:

@@ -114,6 +114,7 @@ class Effect:
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
     slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
+    simulated: ClassVar[bool] = True  # the plant has a law of it
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
     jitters: ClassVar[bool] = False  # its size may vary from command to command

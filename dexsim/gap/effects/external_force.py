@@ -21,6 +21,7 @@ class ExternalForce(Effect):
     experiment = "the same commands again with nothing in reach and no cable pulled"
     classes = ("weight or push",)
     motions = ("holds",)
+    simulated = False
 
     def variants(self, s: Scales) -> list[Variant]:
         return []

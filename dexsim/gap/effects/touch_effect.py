@@ -31,6 +31,7 @@ class TouchEffect:
     stage: ClassVar[str] = "taxels"
     report: ClassVar[tuple[tuple[str, str], ...]] = ()
     classes: ClassVar[tuple[str, ...]] = ()
+    simulated: ClassVar[bool] = True  # the plant has a law of it
     by_taxel: ClassVar[bool] = False  # may be another on each taxel
     widens: ClassVar[bool] = False  # with a wider contact beside it one such follows much of the other: all are tried
     replaces: ClassVar[frozenset[str]] = frozenset()  # refitted figures that it takes the place of

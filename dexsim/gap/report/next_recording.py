@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dexsim.errors import UserError
-from dexsim.gap.effects.catalogue import EFFECTS, entry, separating
+from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
 from dexsim.gap.effects.effect import Effect
 from dexsim.gap.plant.case import Case
 from dexsim.gap.report import next_experiment
@@ -19,7 +19,7 @@ from dexsim.recording.mechanism import Mechanism
 def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (), recordings: Sequence[Any] = ()) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
-    named = [f for f in data["findings"] if entry(f) is not None]
+    named = [f for f in data["findings"] if modelled(f)]
     unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < 0.8]
     kinds, joints, why = None, None, ""
     if unsure and not unsure[0]["where"]["joints"]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import entry
-from dexsim.gap.effects.external_force import ExternalForce
+from dexsim.gap.effects.catalogue import entry, modelled
 from dexsim.gap.report.charts import number
 from dexsim.gap.result import Diagnosis
 from dexsim.recording.mechanism import Mechanism
@@ -23,8 +22,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
-    pushed = [f for f in data["findings"] if f["effect"] == ExternalForce.id]
-    named = [f for f in data["findings"] if entry(f) is not None and f not in pushed]
+    named = [f for f in data["findings"] if modelled(f)]
+    pushed = [f for f in data["findings"] if entry(f) is not None and not modelled(f)]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
     prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
     prefix += "".join(f"{spoken(f)[:1].upper() + spoken(f)[1:]} {words_of(f, d.mechanism)}{_size(f)}. " for f in pushed)
