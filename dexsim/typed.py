@@ -62,7 +62,9 @@ def _named(data: Any, kind: Any, message: str, place: str) -> str:
 def _at(node: Any, parts: list[str]) -> Any:
     for part in ".".join(parts).replace("[", ".[").split("."):
         if part:
-            node = node[int(part[1:-1])] if part.startswith("[") else next((v for k, v in node.items() if str(k) == part), None) if isinstance(node, dict) else None
+            node = node[int(part[1:-1])] if part.startswith("[") else next((v for k,
+                                                                            v in node.items() if str(k) == part),
+                                                                            None) if isinstance(node, dict) else None
     return node
 
 

@@ -11,7 +11,17 @@ import yaml
 from dexsim import files, yaml_text
 from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
-from dexsim.recording.schema import DEFAULTS, EFFORT_IS, KEYS, METADATA, TACTILE_UNIT, UNIT_KEYS, Finding, numbers, shown
+from dexsim.recording.schema import (
+    DEFAULTS,
+    EFFORT_IS,
+    KEYS,
+    METADATA,
+    TACTILE_UNIT,
+    UNIT_KEYS,
+    Finding,
+    numbers,
+    shown,
+)
 
 VALID = (*KEYS, *UNIT_KEYS)
 NAN = float("nan")

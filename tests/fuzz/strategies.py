@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+
 from hypothesis import strategies as st
 
 from . import corpus, mutate, targets
