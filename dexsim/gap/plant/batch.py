@@ -254,7 +254,7 @@ class JointPlant:
                 keep, count, rest = self._inputs(windows, tuple(group), "cpu")
                 oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
                 out = [wp.array(x, dtype=wp.float64, device="cpu", copy=False) for x in (oq, ot)]
-                self._split(H, count, [_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out])
+                self._split(H, count, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out))
                 q[:, keep], torque[:, keep] = oq, ot
             return q, torque
         with _GPU:
@@ -267,7 +267,8 @@ class JointPlant:
                     keep, count, rest = self._inputs(windows, tuple(group), self.device)
                     size = H * len(keep)
                     oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
-                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, guess, moves, constants, *rest, oq, ot], device=self.device, block_dim=BLOCK)
+                    given = recorded(guess, moves, constants, *rest, oq, ot)
+                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, given], device=self.device, block_dim=BLOCK)
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
@@ -301,12 +302,12 @@ class JointPlant:
         keep, count, arrays = windows.device[key]
         return keep, count, [*self._d[device], *arrays]
 
-    def _split(self, H: int, count: int, args: list[wp.array]) -> None:
+    def _split(self, H: int, count: int, given: pk.Recorded) -> None:
         """H guesses on the CPU, in two halves side by side."""
         kernel = pk.plant_kernel()
 
         def launch(first: int, number: int) -> None:
-            wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, *args], device="cpu")
+            wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, given], device="cpu")
 
         if H > 1 and THREADS > 1:
             half = (H + 1) // 2
@@ -324,6 +325,14 @@ class JointPlant:
 
 def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:
     return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device, copy=copy or device != "cpu")
+
+
+def recorded(*arrays: wp.array) -> pk.Recorded:
+    """The kernel's struct of its arrays, in the order of `kernel.FIELDS`."""
+    out = pk.Recorded()
+    for name, x in zip(pk.FIELDS, arrays, strict=True):
+        setattr(out, name, x)
+    return out
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:

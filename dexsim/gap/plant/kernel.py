@@ -4,8 +4,8 @@ In free air each joint is its own small system once the other joints' measured m
 
     I(t) dv/dt = eta * motor - gravity(q, t) - rest(t) - friction(v) - viscous v
 
-with I, gravity and rest taken from the MuJoCo model along the measured motion (`mechanics.py`); the motor's law is that
-of `dexsim.actuator.kernel`, line for line, so a fitted column means the same there. With play or elasticity, rotor
+with I, gravity and rest taken from the MuJoCo model along the measured motion (`mechanics.py`); the drive's laws are
+those of `dexsim.actuator.laws`, which the training's kernel calls too, so a fitted column means the same there. With play or elasticity, rotor
 and link are two inertias joined by a spring with a gap, integrated implicitly (no stiffness limit on the step). Dry
 friction is solved exactly in each step (a joint sticks when the level can hold it), not approximated by a smooth law.
 """
@@ -16,11 +16,31 @@ from functools import lru_cache
 
 import warp as wp
 
-from dexsim.actuator.laws import difference, hold, preslide, preslide_speed, ripple_wave, stribeck_power, torque_limit, wind
+from dexsim.actuator.laws import (
+    arrived,
+    difference,
+    eccentricity,
+    eccentricity_slope,
+    hold,
+    lag_share,
+    load_share,
+    other_terms,
+    pd,
+    preslide,
+    preslide_speed,
+    ripple_wave,
+    sagging,
+    stribeck_power,
+    torque_limits,
+    transmission,
+    transmission_damping,
+    voltage_torque,
+    warmed,
+    wind,
+)
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
-vec5 = wp.types.vector(length=5, dtype=f64)
 ONE_BODY_STEPS = 1
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
@@ -74,545 +94,667 @@ P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
 
+@wp.struct
+class Recorded:
+    """What the kernel takes: G grid points, W windows, H guesses, n samples. Units as in `columns.py`."""
+
+    params: wp.array2d(dtype=f64)  # [H, C]
+    inits: wp.array2d(dtype=f64)  # [H, 2] added to the initial position and velocity
+    consts: wp.array(dtype=f64)
+    series: wp.array2d(dtype=f64)  # [G, E]
+    cmd_t: wp.array(dtype=f64)
+    cmd: wp.array(dtype=f64)
+    window: wp.array2d(dtype=int)  # [W, 8] grid start, steps, warm steps, first sample, samples, cmd range, first cmd
+    window_t: wp.array(dtype=f64)  # [W] time at the grid start
+    sample_step: wp.array(dtype=int)  # [n] step of the window in which the sample falls
+    sample_part: wp.array(dtype=f64)  # [n] where in it, 0..1
+    out_q: wp.array2d(dtype=f64)  # [H, n]
+    out_torque: wp.array2d(dtype=f64)  # [H, n]
+
+
+FIELDS = ("params", "inits", "consts", "series", "cmd_t", "cmd", "window", "window_t", "sample_step", "sample_part", "out_q", "out_torque")
+
+
+@wp.struct
+class Guess:  # the columns of one guess that every step asks for
+    kp: f64
+    kd: f64
+    scale: f64
+    offset: f64
+    esin: f64
+    ecos: f64
+    round_: bool  # an eccentric encoder
+    delay: f64
+    speed_lag: f64
+    age: f64
+    deadband: f64
+    deadband_kind: f64
+    ki: f64
+    steep: f64  # braking_slope
+    limit_speed: f64
+    lag: f64
+    gap2: f64
+    soft: f64
+    two: bool  # rotor and link are two bodies
+    give: f64  # presliding
+    viscous: f64
+    ripple: f64
+    peak: f64
+    late: f64
+    late_at: int
+    late_group: int
+
+
+@wp.struct
+class State:  # of the joint
+    q: f64
+    v: f64
+    qm: f64  # of the rotor, the joint's where they are one
+    vm: f64
+    last: f64  # motor torque
+    v_f: f64  # the speed after kd's filter
+    taken: f64  # share of the dry friction that is taken up
+    integral: f64  # the controller's integral term
+    since: f64  # s, since it was taken
+    fresh: bool
+    older: f64  # what the age of its position makes of the torque that the loop asks for
+
+
+@wp.struct
+class Now:  # what holds in one step of the grid
+    target: f64
+    feed: f64  # torque of the feed-forward
+    carried: f64  # speed at which a linkage turns the motor, the joint at rest
+    load: f64  # torque of what is neither gravity nor the joint's own
+    tau0: f64
+    no_load: f64
+    supply: f64
+    efficiency: f64
+    friction: f64  # factor
+    inertia: f64
+    gravity_cos: f64
+    gravity_sin: f64
+    q: f64  # measured
+    drive: f64  # recorded input of the stage after the drive
+    enabled: bool
+    held: bool  # the recorded motion is held on the joint
+
+
+@wp.struct
+class Torque:  # of the motor, as a line in the speeds at the end of the step
+    now: f64
+    end: f64  # at unchanged speed
+    on_loop: f64  # less per speed of the loop's encoder
+    on_drive: f64  # less per speed of the motor's own
+
+
+@wp.func
+def guess(c: Recorded, h: int):
+    p = Guess()
+    p.kp = c.params[h, P_KP]
+    p.kd = c.params[h, P_KD]
+    p.scale = c.params[h, P_SCALE]
+    p.offset = c.params[h, P_OFFSET]
+    p.esin = c.params[h, P_ESIN]
+    p.ecos = c.params[h, P_ECOS]
+    p.round_ = p.esin != f64(0.0) or p.ecos != f64(0.0)
+    p.delay = c.params[h, P_DELAY]
+    p.speed_lag = c.params[h, P_SPEEDLAG]
+    p.age = c.params[h, P_AGE]
+    p.deadband = c.params[h, P_DEADBAND]
+    p.deadband_kind = c.params[h, P_DEADKIND]
+    p.ki = c.params[h, P_KI]
+    p.steep = c.params[h, P_BRAKING]
+    p.limit_speed = c.params[h, P_LIMITSPEED]
+    p.lag = c.params[h, P_LAG]
+    p.gap2 = f64(0.5) * c.params[h, P_GAP]
+    p.soft = c.params[h, P_SOFT]
+    p.two = p.gap2 > f64(0.0) or p.soft > f64(0.0)
+    p.give = c.params[h, P_PRESLIDE]
+    p.viscous = c.params[h, P_VISC]
+    p.ripple = c.params[h, P_RIPPLE]
+    p.peak = c.params[h, P_PEAK]
+    p.late = c.params[h, P_LATE]
+    p.late_at = int(c.params[h, P_LATEAT])
+    p.late_group = int(c.params[h, P_LATEGROUP])
+    return p
+
+
+# -- encoder and commands ------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def shown(q: f64, p: Guess):
+    """What the encoder shows at position q."""
+    m = p.scale * q + p.offset
+    if p.round_:
+        m += eccentricity(q, p.esin, p.ecos)
+    return m
+
+
+@wp.func
+def shown_rate(q: f64, p: Guess):
+    """What the encoder shows of a speed at position q, over that speed."""
+    k = p.scale
+    if p.round_:
+        k += eccentricity_slope(q, p.esin, p.ecos)
+    return k
+
+
+@wp.func
+def position(m: f64, p: Guess):
+    """Where the encoder shows m: its inverse, by two fixed-point steps."""
+    q = (m - p.offset) / p.scale
+    q = (m - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
+    q = (m - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
+    return q
+
+
+@wp.func
+def acts_at(c: Recorded, i: int, p: Guess):
+    """When command i acts, but for the delay: its time, later where it is one of those that are."""
+    t = c.cmd_t[i]
+    if p.late != f64(0.0) and (i // p.late_group) % LATE_GROUPS == p.late_at:
+        t = t + p.late
+    return t
+
+
+@wp.func
+def command(c: Recorded, h: int, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
+    """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken off; command k of
+    the run's first .. last - 1 is in force at its begin."""
+    target = c.cmd[k]
+    kk = int(k)
+    while kk + 1 < last and acts_at(c, kk + 1, p) < end:
+        target += arrived(end, acts_at(c, kk + 1, p), dt) * (c.cmd[kk + 1] - c.cmd[kk])
+        kk += 1
+    feed_v = c.params[h, P_FEEDV]
+    feed_a = c.params[h, P_FEEDA]
+    if feed_v == f64(0.0) and feed_a == f64(0.0):
+        return wp.vec2d(target, f64(0.0))
+    speed = f64(0.0)
+    acceleration = f64(0.0)
+    for m in range(wp.max(k, first + 1), kk + 1):
+        stamp = acts_at(c, m, p)
+        span = stamp - acts_at(c, m - 1, p)
+        rate = difference(c.cmd[m], c.cmd[m - 1], span, dt)
+        earlier = f64(0.0)
+        if m > first + 1:
+            earlier = difference(c.cmd[m - 1], c.cmd[m - 2], acts_at(c, m - 1, p) - acts_at(c, m - 2, p), dt)
+        until = end
+        if m < kk:
+            until = wp.min(until, acts_at(c, m + 1, p))
+        share = hold(stamp, span, until, end - dt, dt)
+        speed += share * rate
+        acceleration += share * difference(rate, earlier, span, dt)
+    return wp.vec2d(target, feed_v * speed + feed_a * acceleration)
+
+
+# -- what holds in a step ------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def drive_now(c: Recorded, h: int, g: int, n: Now):
+    """`n` with what the supply, the temperature and the other joints make of the drive at grid point g."""
+    dragger = int(c.params[h, P_FROM])
+    n.target += c.params[h, P_COUPLING] * c.series[g, XDRAG + dragger]
+    n.carried = c.params[h, P_LINKAGE] * c.series[g, XDV + dragger]
+    if c.consts[C_LOOP_MOTOR] > f64(0.0):
+        n.target += c.params[h, P_LINKAGE] * c.series[g, XDRAG + dragger]
+    n.load = c.params[h, P_REACTION] * c.series[g, XPULL + dragger]
+    n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * (c.params[h, P_ROTOR] + c.params[h, P_ARM])
+    n.load = c.series[g, XR] + n.load
+
+    warmth = c.series[g, XWARM]
+    constant = warmed(c.params[h, P_TTORQUE], warmth)
+    n.friction = wp.max(warmed(c.params[h, P_TFRICTION], warmth), f64(0.0))
+    n.tau0 = c.params[h, P_LIMIT] * constant
+    n.no_load = c.params[h, P_NLS]
+    n.efficiency = c.params[h, P_EFF]
+    if c.consts[C_VOLTAGE] > f64(0.0):
+        n.tau0 = n.tau0 / wp.max(warmed(c.params[h, P_TRES], warmth), f64(0.1))
+        n.no_load = n.no_load / constant
+    else:
+        n.efficiency = n.efficiency * constant
+    n.supply = sagging(c.params[h, P_SUPPLY] * c.series[g, XSUP], c.params[h, P_SAG], c.series[g, XOTH])
+    n.drive = c.series[g, XDRIVE]
+    n.enabled = c.series[g, XON] >= f64(0.5)
+    return n
+
+
+@wp.func
+def body_now(c: Recorded, h: int, g: int, n: Now):
+    """`n` with the inertia about the joint and the gravity on it at grid point g."""
+    zero = f64(0.0)
+    mass = c.params[h, P_PAYLOAD]
+    out = c.params[h, P_COUT]
+    across = c.params[h, P_CACROSS]
+    inertia = c.params[h, P_ISCALE] * c.series[g, XI] + c.params[h, P_ARM] + mass * c.series[g, XLI]
+    gc = c.params[h, P_GSCALE] * c.series[g, XGC] + mass * c.series[g, XLC]
+    gs = c.params[h, P_GSCALE] * c.series[g, XGS] + mass * c.series[g, XLS]
+    own = c.params[h, P_OWN]
+    if own != zero:
+        inertia += own * c.series[g, XOWI]
+        gc += own * c.series[g, XOWC]
+        gs += own * c.series[g, XOWS]
+    if mass != zero and (out != zero or across != zero):
+        inertia += mass * (out * c.series[g, XOI] + across * c.series[g, XAI] + out * out + across * across)
+        gc += mass * (out * c.series[g, XOC] + across * c.series[g, XAC])
+        gs += mass * (out * c.series[g, XOS] + across * c.series[g, XAS])
+    tx = c.params[h, P_TX]
+    ty = c.params[h, P_TY]
+    tz = c.params[h, P_TZ]
+    if tx != zero or ty != zero or tz != zero:
+        gc += tx * c.series[g, XTXC] + ty * c.series[g, XTYC] + tz * c.series[g, XTZC]
+        gs += tx * c.series[g, XTXS] + ty * c.series[g, XTYS] + tz * c.series[g, XTZS]
+    n.inertia = wp.max(inertia, f64(1.0e-9))
+    n.gravity_cos = gc
+    n.gravity_sin = gs
+    n.q = c.series[g, XQ]
+    return n
+
+
+# -- the drive -----------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep: f64, gain: f64, drift: f64, n: Now):
+    """What a torque drive gives of u = (now, end, slope). At its limit the torque keeps to the limit for the whole step, unless the
+    step's end is within the limits; gain, drift: the change of speed in this step is gain * torque + drift."""
+    t = Torque()
+    t.now = wp.clamp(u[0], -lower, upper)
+    t.end = wp.clamp(u[1], -lower, upper)
+    t.on_loop = u[2]
+    limit = upper
+    if u[1] < f64(0.0):
+        limit = lower
+    if wp.abs(u[1]) > limit:
+        end = u[1] - u[2] * (gain * t.end + drift)
+        if end * wp.sign(u[1]) >= limit:
+            t.on_loop = f64(0.0)
+            if u[1] * v_lim > f64(0.0) and limit > f64(0.0):
+                t.on_drive = n.tau0 / (n.no_load * n.supply)
+            elif u[1] * v_lim < f64(0.0) and limit > f64(0.0):
+                # it grows as the speed falls, exponentially: taken at the step's start it would come late
+                t.on_drive = -wp.min(steep * n.tau0 / (n.no_load * n.supply), f64(0.5) / wp.max(gain, f64(1.0e-12)))
+        else:
+            t.on_loop = u[2] * limit / wp.abs(u[1])
+    return t
+
+
+@wp.func
+def drive_voltage(u: wp.vec3d, v: f64, gain: f64, drift: f64, n: Now):
+    """What a voltage drive gives of a duty u = (now, end, slope); gain, drift as for `drive_torque`."""
+    t = Torque()
+    t.on_drive = n.tau0 / n.no_load
+    t.now = voltage_torque(u[0], n.tau0, n.supply, t.on_drive, v)
+    t.end = voltage_torque(u[1], n.tau0, n.supply, t.on_drive, v)
+    slope = u[2]
+    if wp.abs(u[1]) > f64(1.0):
+        end = u[1] - u[2] * (gain * t.end + drift)
+        if end * wp.sign(u[1]) >= f64(1.0):
+            slope = f64(0.0)
+        else:
+            slope = slope / wp.abs(u[1])
+    t.on_loop = n.tau0 * n.supply * slope
+    return t
+
+
+@wp.func
+def opened(c: Recorded, t: Torque, v: f64, p: Guess, n: Now):
+    """The torque where a stage is tested with its recorded input, or the drive is off; a light rotor's slope is bounded."""
+    if p.two:  # its steps are short, and a light rotor's would not stand it
+        t.on_drive = wp.max(t.on_drive, f64(0.0))
+    if c.consts[C_OPEN] > f64(0.0):  # the stage after the drive, with its recorded input
+        t.now = n.drive
+        t.end = t.now
+        t.on_loop = f64(0.0)
+        t.on_drive = f64(0.0)
+        if c.consts[C_OPEN] > f64(1.5):  # that input is the duty
+            line = n.tau0 / n.no_load
+            t.now = n.tau0 * n.supply * n.drive - line * v
+            t.end = t.now
+            t.on_drive = line
+    if not n.enabled:
+        t.now = f64(0.0)
+        t.end = f64(0.0)
+        t.on_loop = f64(0.0)
+        t.on_drive = f64(0.0)
+    return t
+
+
+@wp.func
+def dry_friction(c: Recorded, h: int, torque: f64, v: f64, p: Guess, n: Now):
+    """Level [N.m] at the motor's speed; torque: the motor's of the step before."""
+    level = c.params[h, P_COULOMB]
+    if p.peak > f64(0.0):
+        power = stribeck_power(v / c.params[h, P_VS], c.params[h, P_EXPONENT])
+        if power < f64(25.0):
+            level += p.peak * wp.exp(-power)
+    share = load_share(torque, v, c.params[h, P_LOAD], c.params[h, P_BACK])
+    return (level + share * wp.abs(torque)) * n.friction
+
+
+# -- the bodies ----------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def one_body(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, theta: f64, dt: f64,
+             p: Guess, n: Now):  # fmt: skip
+    """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]."""
+    begun = x.v
+    damping = n.efficiency * t.on_loop + n.efficiency * t.on_drive
+    level += c.consts[C_FRICTION]
+    a = n.inertia / (theta * dt) + damping + visc + stop_d
+    free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + p.viscous * n.friction * n.carried) / a
+    free -= n.carried  # dry friction acts where the motor turns
+    if n.held:
+        if p.give > f64(0.0):
+            x.taken = preslide(x.taken, (x.v - n.carried) * dt / p.give)
+    else:
+        went = n.carried  # speed in the middle of the step, or at its end
+        if p.give > f64(0.0):
+            free = preslide_speed(free, a, level, x.taken, p.give / dt)
+            went = free + n.carried
+            x.taken = preslide(x.taken, free * dt / p.give)
+            x.q += dt * (free + n.carried)
+            x.v = x.v + (free + n.carried - x.v) / theta
+            if (x.v - n.carried) * free < f64(0.0):
+                x.v = n.carried
+        elif wp.abs(free) * a <= level:
+            x.q += dt * n.carried
+            x.v = n.carried
+        else:
+            free -= wp.sign(free) * level / a
+            went = free + n.carried
+            x.q += dt * went
+            ahead = x.v + (free + n.carried - x.v) / theta
+            if (ahead - n.carried) * free < f64(0.0):  # friction stops the joint within the step
+                ahead = n.carried
+            x.v = ahead
+        x.last = t.end - (t.on_loop + t.on_drive) * (went - begun)  # what it gave: the lag goes on from there
+    x.qm = x.q
+    x.vm = x.v
+    return x
+
+
+@wp.func
+def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, rotor: f64, dt: f64,
+               p: Guess, n: Now):  # fmt: skip
+    """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits the step."""
+    zero = f64(0.0)
+    begun = x.v
+    begun_m = x.vm
+    link = n.inertia - rotor
+    stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
+    hardening = c.params[h, P_HARD]
+    if p.soft <= zero:
+        stiff = c.consts[C_STIFF]
+        hardening = zero
+    damp = transmission_damping(c.params[h, P_REBOUND], stiff, rotor, link, n.inertia)
+    twist = x.qm + dt * x.vm - x.q - dt * x.v
+    kh = zero  # slope of the spring at this stretch
+    pull = zero
+    if wp.abs(twist) >= p.gap2:
+        spring = transmission(x.qm - x.q - wp.sign(twist) * p.gap2, stiff, hardening)
+        kh = spring[1] * dt + damp
+        pull = spring[0]
+    d_l = n.efficiency * t.on_loop
+    d_m = n.efficiency * t.on_drive
+    if c.consts[C_LOOP_MOTOR] >= f64(0.5):
+        d_m = d_l + d_m
+        d_l = zero
+    # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
+    a11 = rotor / dt + p.viscous * n.friction + kh + d_m
+    a12 = -kh + d_l
+    a21 = -kh
+    a22 = link / dt + c.consts[C_DAMPING] + kh + stop_d
+    b1 = rotor / dt * x.vm + applied + d_m * x.vm + d_l * x.v - pull
+    b2 = link / dt * x.v - load + pull
+    if n.held:  # link held
+        a21 = zero
+        a22 = f64(1.0)
+        b2 = x.v
+    det = a11 * a22 - a12 * a21
+    x1 = (b1 * a22 - a12 * b2) / det
+    x2 = zero
+    gain = a22 / det
+    if p.give > zero:
+        x1 = preslide_speed(x1, f64(1.0) / gain, level, x.taken, p.give / dt)
+        x.taken = preslide(x.taken, x1 * dt / p.give)
+        x2 = (b2 - a21 * x1) / a22
+    elif wp.abs(x1) <= gain * level:
+        x1 = zero
+        x2 = b2 / a22
+    else:
+        x1 -= wp.sign(x1) * gain * level
+        x2 = (b2 - a21 * x1) / a22
+    base_friction = c.consts[C_FRICTION]
+    if base_friction > zero and not n.held:
+        still = base_friction / a22
+        if wp.abs(x2) <= still:
+            x2 = zero
+        else:
+            x2 -= wp.sign(x2) * still
+    x.vm = x1
+    x.qm += dt * x.vm
+    if n.held:  # a held link must not let the rotor run past the play
+        wound = wp.abs(x.last) / stiff * f64(2.0)
+        x.qm = wp.clamp(x.qm, x.q - p.gap2 - wound, x.q + p.gap2 + wound)
+    else:
+        x.v = x2
+        x.q += dt * x.v
+        turned = x.v - begun
+        if c.consts[C_LOOP_MOTOR] > f64(0.5):
+            turned = x.vm - begun_m
+        x.last = t.end - t.on_loop * turned - t.on_drive * (x.vm - begun_m)
+    return x
+
+
+@wp.func
+def substep(c: Recorded, h: int, x: State, visc: f64, dt: f64, p: Guess, n: Now):
+    """The joint after a step of dt [s]."""
+    zero = f64(0.0)
+    half = f64(0.5)
+    voltage = c.consts[C_VOLTAGE] > zero
+    loop_motor = c.consts[C_LOOP_MOTOR] > zero
+
+    # what the loop sees
+    q_l = x.q
+    v_l = x.v
+    v_drive = x.vm
+    if p.two:
+        if loop_motor:
+            q_l = x.qm
+            v_l = x.vm
+    else:
+        v_drive = x.v - n.carried
+        if loop_motor:
+            v_l = v_drive
+    shows = shown_rate(q_l, p)
+    if x.fresh or p.speed_lag <= zero:
+        x.v_f = v_l
+    else:
+        x.v_f += lag_share(p.speed_lag, dt) * (v_l - x.v_f)
+    e = n.target - shown(q_l, p) + p.age * shows * v_l  # a sampled loop acts on where the joint was
+    rate = shows * x.v_f
+
+    load = n.gravity_cos
+    if c.consts[C_SLIDE] < half:
+        dq = x.q - n.q  # the model was evaluated at the measured pose
+        load = n.gravity_cos * wp.cos(dq) + n.gravity_sin * wp.sin(dq)
+    load += n.load
+
+    # theta-method: the middle of the step where it is smooth, its end where it is stiff
+    theta = f64(1.0)
+    rotor = wp.clamp(c.params[h, P_ROTOR] + c.params[h, P_ARM], f64(0.03) * n.inertia, f64(0.97) * n.inertia)
+    body = n.inertia
+    if p.two:
+        if wp.abs(x.qm - x.q) < p.gap2:
+            body = rotor
+    else:
+        stiffness = n.efficiency * (p.kd + p.kp * dt)
+        if voltage:
+            stiffness = n.efficiency * n.tau0 * (n.supply * (p.kd + p.kp * dt) + f64(1.0) / n.no_load)
+        theta = wp.clamp(half + half * ((stiffness + visc) * dt / n.inertia - f64(0.6)), half, f64(1.0))
+    step = theta * dt
+
+    # what the loop asks for, and what the motor gives of it
+    if x.fresh and p.ki != zero:  # a drive that has been on before: its integral holds the load
+        x.integral = load / wp.max(n.efficiency, f64(0.01))
+        if voltage:
+            x.integral = x.integral / (n.tau0 * n.supply)
+    u = pd(e, rate, rate, rate, shows, p.kp, p.kd, p.deadband, p.deadband_kind, step, p.age, f64(1.0))
+    v_lim = v_drive + p.limit_speed * (rate - v_drive)
+    speed = zero  # over the no-load speed
+    limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
+    if not voltage:
+        speed = wp.abs(v_lim) / (n.no_load * n.supply)
+        limits = torque_limits(n.tau0, speed, v_lim, p.steep)
+    x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
+    x.since = dt
+    asked = other_terms(u, n.feed, x.integral, p.ki, rate, shows, step)
+    gain = n.efficiency * step / body
+    drift = -load * step / body
+    t = Torque()
+    if voltage:
+        t = drive_voltage(asked, v_drive, gain, drift, n)
+    else:
+        t = drive_torque(asked, v_lim, speed, limits[0], limits[1], p.steep, gain, drift, n)
+    x.older = zero
+    if t.on_loop != zero:
+        x.older = p.kp * p.age * shows * v_l
+        if voltage:
+            x.older = n.tau0 * n.supply * x.older
+    t = opened(c, t, v_drive, p, n)
+    if not n.enabled:
+        x.integral = zero
+    if x.fresh:
+        x.last = t.now
+        x.fresh = False
+    share = lag_share(p.lag, dt)
+    before = x.last
+    x.last = before + share * (t.now - before)
+    t.end = before + share * (t.end - before)
+    t.on_loop = share * t.on_loop
+    t.on_drive = share * t.on_drive
+
+    # what acts on the bodies
+    applied = n.efficiency * t.end
+    if p.ripple != zero:
+        wave = ripple_wave(c.params[h, P_TURN] * x.q + c.params[h, P_PHASE], c.params[h, P_SHAPE])
+        applied += p.ripple * wave[0]
+    applied += c.params[h, P_BIAS]
+    level = dry_friction(c, h, before, v_drive, p, n)
+    applied -= half * c.params[h, P_ASYM] * level
+    stop_d = zero
+    if x.q < c.consts[C_LOW]:
+        load -= c.consts[C_STIFF] * (c.consts[C_LOW] - x.q - dt * x.v)
+        stop_d = c.consts[C_STIFF] * f64(0.02)
+    if x.q > c.consts[C_HIGH]:
+        load += c.consts[C_STIFF] * (x.q + dt * x.v - c.consts[C_HIGH])
+        stop_d = c.consts[C_STIFF] * f64(0.02)
+    if p.two:
+        x = two_bodies(c, h, x, t, applied, load, level, stop_d, rotor, dt, p, n)
+    else:
+        x = one_body(c, x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
+    return x
+
+
+@wp.func
+def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
+    """The joint at the begin of a window: where it was measured."""
+    x = State()
+    x.q = position(c.series[g, XQ], p)
+    x.v = c.series[g, XV] / shown_rate(x.q, p)
+    if warm == 0:
+        x.q += c.inits[h, 0]
+        x.v += c.inits[h, 1]
+    x.qm = x.q
+    x.vm = x.v
+    x.v_f = x.v
+    x.fresh = True
+    return x
+
+
+@wp.func
+def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
+    """The joint on its recorded motion, while the drive's own state settles; last: it is let go now."""
+    m = c.series[g, XQ]
+    if p.round_:
+        m = m - p.esin * wp.sin(x.q) - p.ecos * (wp.cos(x.q) - f64(1.0))
+    x.q = (m - p.offset) / p.scale
+    x.v = c.series[g, XV] / shown_rate(x.q, p)
+    if last:
+        x.q += c.inits[h, 0]
+        x.v += c.inits[h, 1]
+    if not p.two:
+        x.qm = x.q
+        x.vm = x.v
+    return x
+
+
 @lru_cache(maxsize=None)
 def plant_kernel():
-    """The kernel; inputs documented at its launch in `plant.py`."""
-
-    @wp.func
-    def law(
-        e: f64, v_m: f64, v: f64, kp: f64, kd: f64, scale: f64, deadband: f64, tau0: f64, nls: f64, supply: f64,
-        dt: f64, voltage: f64, gain: f64, drift: f64, steep: f64, kind: f64, age: f64, v_lim: f64,
-        feed: f64, ki: f64, since: f64, wound: f64,
-    ):  # fmt: skip
-        """(motor torque now, at the end of the step at unchanged speed, its slope in the loop's speed, its slope in the
-        motor's speed, the integral term). gain, drift: the change of speed in this step is gain * torque + drift. feed: torque of
-        the feed-forward; ki: integral_gain; wound: the integral term, `since` s before.
-
-        At its limit the torque keeps to the limit for the whole step, unless the step's end is within the limits."""
-        zero = f64(0.0)
-        one = f64(1.0)
-        half = f64(0.5)
-        now = kp * e - kd * v_m
-        pd = now - kp * dt * v_m
-        slope = scale * (kp * (dt - age) + kd)
-        if kind > f64(1.5):  # a dead zone: the error counts from its edge on
-            cut = kp * wp.clamp(e, -deadband, deadband)
-            now -= cut
-            pd -= cut
-        dead = wp.abs(e) < deadband
-        if dead:
-            if kind < half:  # no torque at all
-                now = zero
-                pd = zero
-                slope = zero
-            else:  # the error is taken for zero, the speed still counts
-                now = -kd * v_m
-                pd = now
-                slope = scale * kd
-        upper = one  # limits of the duty, or of the torque
-        lower = one
-        x = zero
-        if voltage <= zero:
-            x = wp.abs(v_lim) / (nls * supply)
-            upper = torque_limit(tau0, x, one)
-            lower = upper
-            if v_lim > zero:
-                lower = torque_limit(tau0, x, steep)
-            elif v_lim < zero:
-                upper = torque_limit(tau0, x, steep)
-        kept = wound
-        if not dead or kind > half:
-            if not dead:
-                e_i = e
-                if kind > f64(1.5):
-                    e_i = e - wp.clamp(e, -deadband, deadband)
-                kept = wind(wound, since * ki * e_i, now + feed + wound, lower, upper)
-                pd += ki * dt * (e_i - dt * v_m)
-                slope += scale * ki * dt * dt
-            now += feed + kept
-            pd += feed + kept
-        motor_now = zero
-        motor = zero
-        line = zero
-        if voltage > zero:
-            line = tau0 / nls
-            motor_now = tau0 * supply * wp.clamp(now, -one, one) - line * v
-            motor = tau0 * supply * wp.clamp(pd, -one, one) - line * v
-            if wp.abs(pd) > one:
-                end = pd - slope * (gain * motor + drift)
-                if end * wp.sign(pd) >= one:
-                    slope = zero
-                else:
-                    slope = slope / wp.abs(pd)
-            slope = tau0 * supply * slope
-        else:
-            motor_now = wp.clamp(now, -lower, upper)
-            motor = wp.clamp(pd, -lower, upper)
-            limit = upper
-            if pd < zero:
-                limit = lower
-            if wp.abs(pd) > limit:
-                end = pd - slope * (gain * motor + drift)
-                if end * wp.sign(pd) >= limit:
-                    slope = zero
-                    if pd * v_lim > zero and limit > zero:
-                        line = tau0 / (nls * supply)
-                    elif pd * v_lim < zero and limit > zero:
-                        # it grows as the speed falls, exponentially: taken at the step's start it would come late
-                        line = -wp.min(steep * tau0 / (nls * supply), half / wp.max(gain, f64(1.0e-12)))
-                else:
-                    slope = slope * limit / wp.abs(pd)
-        return vec5(motor_now, motor, slope, line, kept)
-
-    @wp.func
-    def measured(q: f64, scale: f64, offset: f64, esin: f64, ecos: f64, round_: bool):
-        """What the encoder shows at position q."""
-        m = scale * q + offset
-        if round_:
-            m += esin * wp.sin(q) + ecos * (wp.cos(q) - f64(1.0))
-        return m
-
-    @wp.func
-    def rate_of(q: f64, scale: f64, esin: f64, ecos: f64, round_: bool):
-        """What the encoder shows of a speed at position q, over that speed."""
-        k = scale
-        if round_:
-            k += esin * wp.cos(q) - ecos * wp.sin(q)
-        return k
-
-    @wp.func
-    def acts_at(t: f64, i: int, late: f64, at: int, group: int):
-        """When command i acts, but for the delay: its time t, later where it is one of those that are."""
-        if late != f64(0.0) and (i // group) % LATE_GROUPS == at:
-            return t + late
-        return t
-
-    @wp.func
-    def target_rates(cmd_t: wp.array(dtype=f64), cmd: wp.array(dtype=f64), first: int, k: int, last: int, begin: f64, dt: f64,
-                     late: f64, at: int, group: int):  # fmt: skip
-        """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step (see `actuator.laws.difference`): commands
-        k .. last of the run, which begins with command `first`, are in force in it."""
-        speed = f64(0.0)
-        acceleration = f64(0.0)
-        for m in range(wp.max(k, first + 1), last + 1):
-            stamp = acts_at(cmd_t[m], m, late, at, group)
-            before = acts_at(cmd_t[m - 1], m - 1, late, at, group)
-            rate = difference(cmd[m], cmd[m - 1], stamp - before, dt)
-            earlier = f64(0.0)
-            if m > first + 1:
-                earlier = difference(cmd[m - 1], cmd[m - 2], before - acts_at(cmd_t[m - 2], m - 2, late, at, group), dt)
-            until = begin + dt
-            if m < last:
-                until = wp.min(until, acts_at(cmd_t[m + 1], m + 1, late, at, group))
-            share = hold(stamp, stamp - before, until, begin, dt)
-            speed += share * rate
-            acceleration += share * difference(rate, earlier, stamp - before, dt)
-        return wp.vec2d(speed, acceleration)
+    """The kernel: one thread a guess and window. first: number of the launch's first guess; dt: step of the grid [s]."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plant(
-        first: int,  # first guess of this launch
-        dt: f64,
-        params: wp.array2d(dtype=f64),  # [H, C]
-        inits: wp.array2d(dtype=f64),  # [H, 2] added to the initial position and velocity
-        consts: wp.array(dtype=f64),
-        series: wp.array2d(dtype=f64),  # [G, E]
-        cmd_t: wp.array(dtype=f64),
-        cmd: wp.array(dtype=f64),
-        window: wp.array2d(dtype=int),  # [W, 8] grid start, steps, warm steps, first sample, samples, cmd range, first cmd
-        window_t: wp.array(dtype=f64),  # [W] time at the grid start
-        sample_step: wp.array(dtype=int),  # [n] step of the window in which the sample falls
-        sample_part: wp.array(dtype=f64),  # [n] where in it, 0..1
-        out_q: wp.array2d(dtype=f64),  # [H, n]
-        out_torque: wp.array2d(dtype=f64),  # [H, n]
-    ):
+    def plant(first: int, dt: f64, c: Recorded):
         hh, w = wp.tid()
         h = first + hh
-        zero = f64(0.0)
-        one = f64(1.0)
-        half = f64(0.5)
-        g0 = window[w, 0]
-        steps = window[w, 1]
-        warm = window[w, 2]
-        s = window[w, 3]
-        s_end = s + window[w, 4]
-        c_end = window[w, 6]
-        k = window[w, 7]
-        t = window_t[w]
-
-        kp = params[h, P_KP]
-        kd = params[h, P_KD]
-        scale = params[h, P_SCALE]
-        offset = params[h, P_OFFSET]
-        esin = params[h, P_ESIN]
-        ecos = params[h, P_ECOS]
-        delay = params[h, P_DELAY]
-        gap2 = half * params[h, P_GAP]
-        soft = params[h, P_SOFT]
-        two = gap2 > zero or soft > zero
-        round_ = esin != zero or ecos != zero  # an eccentric encoder
-        turn = params[h, P_TURN]
-        ripple = params[h, P_RIPPLE]
-        peak = params[h, P_PEAK]
-        tilted = params[h, P_TX] != zero or params[h, P_TY] != zero or params[h, P_TZ] != zero
-        speed_lag = params[h, P_SPEEDLAG]
-        load_mass = params[h, P_PAYLOAD]
-        out = params[h, P_COUT]
-        across = params[h, P_CACROSS]
-        off_centre = load_mass != zero and (out != zero or across != zero)
-        hard = params[h, P_HARD]
-        late = params[h, P_LATE]
-        late_at = int(params[h, P_LATEAT])
-        late_group = int(params[h, P_LATEGROUP])
-        voltage = consts[C_VOLTAGE]
-        base_damping = consts[C_DAMPING]
-        base_friction = consts[C_FRICTION]
-        low = consts[C_LOW]
-        high = consts[C_HIGH]
-
-        # measured = scale * q + offset + eccentricity(q): invert once, by two fixed-point steps
-        m0 = series[g0, XQ]
-        q = (m0 - offset) / scale
-        q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
-        q = (m0 - offset - esin * wp.sin(q) - ecos * (wp.cos(q) - one)) / scale
-        v = series[g0, XV] / rate_of(q, scale, esin, ecos, round_)
-        if warm == 0:
-            q += inits[h, 0]
-            v += inits[h, 1]
-        qm = q
-        vm = v
-        last = zero
-        v_f = v
-        fresh = int(1)
-        prev_tau = zero
-        give = params[h, P_PRESLIDE]
-        age = params[h, P_AGE]
-        z = zero  # share of the friction that is taken up
-        feed_v = params[h, P_FEEDV]
-        feed_a = params[h, P_FEEDA]
-        ki = params[h, P_KI]
-        wound = zero  # the controller's integral term
-        since = zero
-
-        for i in range(steps):
+        g0 = c.window[w, 0]
+        warm = c.window[w, 2]
+        s = c.window[w, 3]
+        s_end = s + c.window[w, 4]
+        c_begin = c.window[w, 5]
+        c_end = c.window[w, 6]
+        k = c.window[w, 7]
+        t = c.window_t[w]
+        p = guess(c, h)
+        x = begun(c, h, g0, warm, p)
+        on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
+        for i in range(c.window[w, 1]):
             g = g0 + i
-            # the recorded motion is held on the joint while the drive's own state settles
             if i <= warm and warm > 0:
-                m1 = series[g, XQ]
-                if round_:
-                    m1 = m1 - esin * wp.sin(q) - ecos * (wp.cos(q) - one)
-                q = (m1 - offset) / scale
-                v = series[g, XV] / rate_of(q, scale, esin, ecos, round_)
-                if i == warm:
-                    q += inits[h, 0]
-                    v += inits[h, 1]
-                if not two:
-                    qm = q
-                    vm = v
-            if i == 0 and two:
-                qm = q
-                vm = v
-
-            # target in force at the end of this step, averaged over it
-            end = t + dt - delay
-            while k + 1 < c_end and acts_at(cmd_t[k + 1], k + 1, late, late_at, late_group) <= end - dt:
+                x = held(c, h, g, i == warm, x, p)
+            if i == 0 and p.two:
+                x.qm = x.q
+                x.vm = x.v
+            n = Now()
+            n.held = i < warm
+            end = t + dt - p.delay
+            while k + 1 < c_end and acts_at(c, k + 1, p) <= end - dt:
                 k += 1
-            target = cmd[k]
-            kk = int(k)
-            while kk + 1 < c_end and acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group) < end:
-                part = wp.clamp((end - acts_at(cmd_t[kk + 1], kk + 1, late, late_at, late_group)) / dt, zero, one)
-                target += part * (cmd[kk + 1] - cmd[kk])
-                kk += 1
-            feed = zero
-            if feed_v != zero or feed_a != zero:
-                wish = target_rates(cmd_t, cmd, window[w, 5], k, kk, end - dt, dt, late, late_at, late_group)
-                feed = feed_v * wish[0] + feed_a * wish[1]
-            dragger = int(params[h, P_FROM])
-            target += params[h, P_COUPLING] * series[g, XDRAG + dragger]
-            carried = params[h, P_LINKAGE] * series[g, XDV + dragger]  # speed at which a linkage turns the motor, the joint at rest
-            if consts[C_LOOP_MOTOR] > zero:
-                target += params[h, P_LINKAGE] * series[g, XDRAG + dragger]
-            elsewhere = params[h, P_REACTION] * series[g, XPULL + dragger]
-            elsewhere -= params[h, P_LINKAGE] * series[g, XDA + dragger] * (params[h, P_ROTOR] + params[h, P_ARM])
+            aim = command(c, h, c_begin, k, c_end, end, dt, p)
+            n.target = aim[0]
+            n.feed = aim[1]
+            n = drive_now(c, h, g, n)
+            n = body_now(c, h, g, n)
+            reported = shown(x.q, p)
+            if on_motor:
+                reported = shown(x.qm, p)
 
-            warmth = series[g, XWARM]
-            torque_factor = one + params[h, P_TTORQUE] * warmth
-            friction_factor = wp.max(one + params[h, P_TFRICTION] * warmth, zero)
-            resistance = wp.max(one + params[h, P_TRES] * warmth, f64(0.1))
-            tau0 = params[h, P_LIMIT] * torque_factor
-            nls = params[h, P_NLS]
-            if voltage > zero:
-                tau0 = tau0 / resistance
-                nls = nls / torque_factor
-            supply = params[h, P_SUPPLY] * series[g, XSUP] * wp.max(one - params[h, P_SAG] * series[g, XOTH], f64(0.05))
-            eff = params[h, P_EFF]
-            if voltage <= zero:
-                eff = eff * torque_factor
-
-            inertia = params[h, P_ISCALE] * series[g, XI] + params[h, P_ARM] + load_mass * series[g, XLI]
-            gc = params[h, P_GSCALE] * series[g, XGC] + load_mass * series[g, XLC]
-            gs = params[h, P_GSCALE] * series[g, XGS] + load_mass * series[g, XLS]
-            own = params[h, P_OWN]
-            if own != zero:
-                inertia += own * series[g, XOWI]
-                gc += own * series[g, XOWC]
-                gs += own * series[g, XOWS]
-            if off_centre:
-                inertia += load_mass * (out * series[g, XOI] + across * series[g, XAI] + out * out + across * across)
-                gc += load_mass * (out * series[g, XOC] + across * series[g, XAC])
-                gs += load_mass * (out * series[g, XOS] + across * series[g, XAS])
-            if tilted:
-                gc += params[h, P_TX] * series[g, XTXC] + params[h, P_TY] * series[g, XTYC] + params[h, P_TZ] * series[g, XTZC]
-                gs += params[h, P_TX] * series[g, XTXS] + params[h, P_TY] * series[g, XTYS] + params[h, P_TZ] * series[g, XTZS]
-            inertia = wp.max(inertia, f64(1.0e-9))
-
-            reported = measured(q, scale, offset, esin, ecos, round_)
-            shown = reported
-            if consts[C_POS_MOTOR] > zero:
-                shown = measured(qm, scale, offset, esin, ecos, round_)
-
-            visc = base_damping + params[h, P_VISC] * friction_factor
+            visc = c.consts[C_DAMPING] + p.viscous * n.friction
             n_sub = int(ONE_BODY_STEPS)
-            if two:
+            if p.two:
                 n_sub = TWO_BODY_STEPS
-            dts = dt / f64(n_sub)
-            for sub in range(n_sub):
-                q_l = reported
-                v_l = v
-                if not two and consts[C_LOOP_MOTOR] > zero:
-                    v_l = v - carried
-                if two and consts[C_LOOP_MOTOR] > zero:
-                    q_l = measured(qm, scale, offset, esin, ecos, round_)
-                    v_l = vm
-                elif sub > 0:
-                    q_l = measured(q, scale, offset, esin, ecos, round_)
-                q_e = q
-                if two and consts[C_LOOP_MOTOR] > zero:
-                    q_e = qm
-                shows = rate_of(q_e, scale, esin, ecos, round_)
-                if fresh == 1 or speed_lag <= zero:
-                    v_f = v_l
-                else:
-                    v_f += dts / (speed_lag + dts) * (v_l - v_f)
-                e = target - q_l + age * shows * v_l  # a sampled loop acts on where the joint was
-                v_drive = vm
-                if not two:
-                    v_drive = v - carried
-                # the lag acts on the velocity that kd sees; without it v_f is v_l
-                load = gc
-                if consts[C_SLIDE] < half:
-                    dq = q - series[g, XQ]  # the model was evaluated at the measured pose
-                    load = gc * wp.cos(dq) + gs * wp.sin(dq)
-                load += series[g, XR] + elsewhere
-                # theta-method: the middle of the step where it is smooth, its end where it is stiff
-                theta = one
-                if not two:
-                    stiffness = eff * (kd + kp * dts)
-                    if voltage > zero:
-                        stiffness = eff * tau0 * (supply * (kd + kp * dts) + one / nls)
-                    theta = wp.clamp(half + half * ((stiffness + visc) * dts / inertia - f64(0.6)), half, one)
-                body = inertia
-                if two and wp.abs(qm - q) < gap2:
-                    body = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
-                step = theta * dts
-                if fresh == 1 and ki != zero:  # a drive that has been on before: its integral holds the load
-                    wound = load / wp.max(eff, f64(0.01))
-                    if voltage > zero:
-                        wound = wound / (tau0 * supply)
-                torque = law(
-                    e, shows * v_f, v_drive, kp, kd, shows, params[h, P_DEADBAND], tau0, nls, supply, step, voltage,
-                    eff * step / body, -load * step / body, params[h, P_BRAKING], params[h, P_DEADKIND], age,
-                    v_drive + params[h, P_LIMITSPEED] * (shows * v_f - v_drive), feed, ki, since, wound,
-                )
-                now = torque[0]
-                motor = torque[1]
-                damping = torque[2]
-                wound = torque[4]
-                since = dts
-                older = zero  # what the age of its position makes of the torque that the loop asks for
-                if damping != zero:
-                    older = kp * age * shows * v_l
-                    if voltage > zero:
-                        older = tau0 * supply * older
-                slope_m = torque[3]
-                if two:  # its steps are short, and a light rotor's would not stand it
-                    slope_m = wp.max(slope_m, zero)
-                if consts[C_OPEN] > zero:  # the stage after the drive, with its recorded input
-                    now = series[g, XDRIVE]
-                    motor = now
-                    damping = zero
-                    slope_m = zero
-                    if consts[C_OPEN] > f64(1.5):  # that input is the duty
-                        line = tau0 / nls
-                        now = tau0 * supply * series[g, XDRIVE] - line * v_drive
-                        motor = now
-                        slope_m = line
-                if series[g, XON] < half:
-                    wound = zero
-                    now = zero
-                    motor = zero
-                    damping = zero
-                    slope_m = zero
-                blend = dts / (params[h, P_LAG] + dts)
-                if fresh == 1:
-                    last = now
-                    fresh = 0
-                now = last + blend * (now - last)
-                motor = last + blend * (motor - last)
-                line_l = blend * damping
-                line_m = blend * slope_m
-                damping = eff * line_l
-                slope_m = eff * line_m
-                before = last
-                last = now
-                begun = v
-                begun_m = vm
-                applied = eff * motor
-                if ripple != zero:
-                    wave = ripple_wave(turn * q + params[h, P_PHASE], params[h, P_SHAPE])
-                    applied += ripple * wave[0]
-                applied += params[h, P_BIAS]
+            for _ in range(n_sub):
+                x = substep(c, h, x, visc, dt / f64(n_sub), p, n)
 
-                v_fric = v - carried
-                if two:
-                    v_fric = vm
-                fraction = params[h, P_LOAD]
-                if before * v_fric < zero:
-                    fraction = params[h, P_BACK]
-                level = params[h, P_COULOMB]
-                if peak > zero:
-                    ratio_v = v_fric / params[h, P_VS]
-                    power = stribeck_power(ratio_v, params[h, P_EXPONENT])
-                    if power < f64(25.0):
-                        level += peak * wp.exp(-power)
-                level = (level + fraction * wp.abs(before)) * friction_factor
-                applied -= half * params[h, P_ASYM] * level
-
-                stop_d = zero
-                if q < low:
-                    load -= consts[C_STIFF] * (low - q - dts * v)
-                    stop_d = consts[C_STIFF] * f64(0.02)
-                if q > high:
-                    load += consts[C_STIFF] * (q + dts * v - high)
-                    stop_d = consts[C_STIFF] * f64(0.02)
-
-                if not two:
-                    level += base_friction
-                    damping += slope_m
-                    a = inertia / (theta * dts) + damping + visc + stop_d
-                    free = (inertia / (theta * dts) * v + applied + damping * v - load + params[h, P_VISC] * friction_factor * carried) / a
-                    free -= carried  # dry friction acts where the motor turns
-                    if i < warm:
-                        if give > zero:
-                            z = preslide(z, v_fric * dts / give)
-                    else:
-                        went = carried  # speed in the middle of the step, or at its end
-                        if give > zero:
-                            free = preslide_speed(free, a, level, z, give / dts)
-                            went = free + carried
-                            z = preslide(z, free * dts / give)
-                            q += dts * (free + carried)
-                            v = v + (free + carried - v) / theta
-                            if (v - carried) * free < zero:
-                                v = carried
-                        elif wp.abs(free) * a <= level:
-                            q += dts * carried
-                            v = carried
-                        else:
-                            free -= wp.sign(free) * level / a
-                            went = free + carried
-                            q += dts * went
-                            ahead = v + (free + carried - v) / theta
-                            if (ahead - carried) * free < zero:  # friction stops the joint within the step
-                                ahead = carried
-                            v = ahead
-                        last = motor - (line_l + line_m) * (went - begun)  # what it gave: the lag goes on from there
-                    qm = q
-                    vm = v
-                else:
-                    rotor = wp.clamp(params[h, P_ROTOR] + params[h, P_ARM], f64(0.03) * inertia, f64(0.97) * inertia)
-                    link = inertia - rotor
-                    stiff = one / wp.max(soft, f64(1.0e-9))
-                    if soft <= zero:
-                        stiff = consts[C_STIFF]
-                    damp = f64(2.0) * params[h, P_REBOUND] * wp.sqrt(stiff * rotor * link / inertia)  # how gear teeth rebound, an elasticity rings
-                    twist = qm + dts * vm - q - dts * v
-                    engaged = zero
-                    side = zero
-                    if wp.abs(twist) >= gap2:
-                        engaged = one
-                        side = wp.sign(twist) * gap2
-                    stretch = stiff * (qm - q - side)
-                    harder = one
-                    if soft > zero:
-                        harder = one + hard * stretch * stretch
-                    kh = engaged * ((f64(3.0) * harder - f64(2.0)) * stiff * dts + damp)  # its slope at this stretch
-                    pull = engaged * stretch * harder
-                    d_m = damping + slope_m
-                    d_l = zero
-                    if consts[C_LOOP_MOTOR] < half:
-                        d_m = slope_m
-                        d_l = damping
-                    # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
-                    a11 = rotor / dts + params[h, P_VISC] * friction_factor + kh + d_m
-                    a12 = -kh + d_l
-                    a21 = -kh
-                    a22 = link / dts + base_damping + kh + stop_d
-                    b1 = rotor / dts * vm + applied + d_m * vm + d_l * v - pull
-                    b2 = link / dts * v - load + pull
-                    if i < warm:  # link held
-                        a21 = zero
-                        a22 = one
-                        b2 = v
-                    det = a11 * a22 - a12 * a21
-                    x1 = (b1 * a22 - a12 * b2) / det
-                    gain = a22 / det
-                    if give > zero:
-                        x1 = preslide_speed(x1, one / gain, level, z, give / dts)
-                        z = preslide(z, x1 * dts / give)
-                        x2 = (b2 - a21 * x1) / a22
-                    elif wp.abs(x1) <= gain * level:
-                        x1 = zero
-                        x2 = b2 / a22
-                    else:
-                        x1 -= wp.sign(x1) * gain * level
-                        x2 = (b2 - a21 * x1) / a22
-                    if base_friction > zero and i >= warm:
-                        still = base_friction / a22
-                        if wp.abs(x2) <= still:
-                            x2 = zero
-                        else:
-                            x2 -= wp.sign(x2) * still
-                    vm = x1
-                    qm += dts * vm
-                    if i >= warm:
-                        v = x2
-                        q += dts * v
-                        turned = v - begun
-                        if consts[C_LOOP_MOTOR] > half:
-                            turned = vm - begun_m
-                        last = motor - line_l * turned - line_m * (vm - begun_m)
-                    if i < warm:  # a held link must not let the rotor run past the play
-                        qm = wp.clamp(qm, q - gap2 - wp.abs(last) / stiff * f64(2.0), q + gap2 + wp.abs(last) / stiff * f64(2.0))
-
-            if not (wp.abs(q) < f64(1.0e4)):  # diverged: keep it finite, far off
-                q = f64(1.0e4)
-                v = zero
-                qm = q
-                vm = zero
-            nxt = measured(q, scale, offset, esin, ecos, round_)
-            if consts[C_POS_MOTOR] > zero:
-                nxt = measured(qm, scale, offset, esin, ecos, round_)
-            if i < warm and consts[C_POS_MOTOR] <= zero:
-                nxt = shown
-            if i == 0:
-                prev_tau = last
-            while s < s_end and sample_step[s] == i:
-                p = sample_part[s]
-                out_q[h, s] = shown + p * (nxt - shown)
-                out_torque[h, s] = last - params[h, P_FRESH] * older
+            if not (wp.abs(x.q) < f64(1.0e4)):  # diverged: keep it finite, far off
+                x.q = f64(1.0e4)
+                x.v = f64(0.0)
+                x.qm = x.q
+                x.vm = f64(0.0)
+            after = shown(x.q, p)
+            if on_motor:
+                after = shown(x.qm, p)
+            elif i < warm:
+                after = reported
+            while s < s_end and c.sample_step[s] == i:
+                c.out_q[h, s] = reported + c.sample_part[s] * (after - reported)
+                c.out_torque[h, s] = x.last - c.params[h, P_FRESH] * x.older
                 s += 1
-            prev_tau = last
             t += dt
 
     return plant
