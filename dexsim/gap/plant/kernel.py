@@ -125,24 +125,47 @@ class Guess:  # the columns of one guess that every step asks for
     ecos: f64
     round_: bool  # an eccentric encoder
     delay: f64
+    dt: f64  # of a sub-step
     speed_lag: f64
+    filter: f64  # share of its way that kd's filter goes in a sub-step
     age: f64
     deadband: f64
     deadband_kind: f64
     ki: f64
     steep: f64  # braking_slope
     limit_speed: f64
-    lag: f64
+    lag: f64  # share of its way that the torque goes in a sub-step
     gap2: f64
     soft: f64
     two: bool  # rotor and link are two bodies
     give: f64  # presliding
     viscous: f64
     ripple: f64
+    coulomb: f64
     peak: f64
+    load: f64  # friction's share of the load, driving, and
+    back: f64  # back-driven
+    uneven: f64  # half the friction's asymmetry
+    bias: f64
     late: f64
     late_at: int
     late_group: int
+    feed_v: f64
+    feed_a: f64
+    rotor: f64  # kg.m2, before it is kept within the inertia
+    mass: f64  # payload
+    own_mass: f64
+    off_centre: bool
+    tilted: bool
+    # of the joint's constants
+    voltage: bool
+    loop_motor: bool
+    slide: bool
+    open_: f64
+    base_friction: f64
+    low: f64
+    high: f64
+    stop: f64
 
 
 @wp.struct
@@ -189,7 +212,7 @@ class Torque:  # of the motor, as a line in the speeds at the end of the step
 
 
 @wp.func
-def guess(c: Recorded, h: int):
+def guess(c: Recorded, h: int, dt: f64):
     p = Guess()
     p.kp = c.params[h, P_KP]
     p.kd = c.params[h, P_KD]
@@ -206,17 +229,41 @@ def guess(c: Recorded, h: int):
     p.ki = c.params[h, P_KI]
     p.steep = c.params[h, P_BRAKING]
     p.limit_speed = c.params[h, P_LIMITSPEED]
-    p.lag = c.params[h, P_LAG]
     p.gap2 = f64(0.5) * c.params[h, P_GAP]
     p.soft = c.params[h, P_SOFT]
     p.two = p.gap2 > f64(0.0) or p.soft > f64(0.0)
+    p.dt = dt / f64(ONE_BODY_STEPS)
+    if p.two:
+        p.dt = dt / f64(TWO_BODY_STEPS)
+    p.lag = lag_share(c.params[h, P_LAG], p.dt)
+    p.filter = lag_share(p.speed_lag, p.dt)
     p.give = c.params[h, P_PRESLIDE]
     p.viscous = c.params[h, P_VISC]
     p.ripple = c.params[h, P_RIPPLE]
+    p.coulomb = c.params[h, P_COULOMB]
     p.peak = c.params[h, P_PEAK]
+    p.load = c.params[h, P_LOAD]
+    p.back = c.params[h, P_BACK]
+    p.uneven = f64(0.5) * c.params[h, P_ASYM]
+    p.bias = c.params[h, P_BIAS]
     p.late = c.params[h, P_LATE]
     p.late_at = int(c.params[h, P_LATEAT])
     p.late_group = int(c.params[h, P_LATEGROUP])
+    p.feed_v = c.params[h, P_FEEDV]
+    p.feed_a = c.params[h, P_FEEDA]
+    p.rotor = c.params[h, P_ROTOR] + c.params[h, P_ARM]
+    p.mass = c.params[h, P_PAYLOAD]
+    p.own_mass = c.params[h, P_OWN]
+    p.off_centre = p.mass != f64(0.0) and (c.params[h, P_COUT] != f64(0.0) or c.params[h, P_CACROSS] != f64(0.0))
+    p.tilted = c.params[h, P_TX] != f64(0.0) or c.params[h, P_TY] != f64(0.0) or c.params[h, P_TZ] != f64(0.0)
+    p.voltage = c.consts[C_VOLTAGE] > f64(0.0)
+    p.loop_motor = c.consts[C_LOOP_MOTOR] > f64(0.0)
+    p.slide = c.consts[C_SLIDE] >= f64(0.5)
+    p.open_ = c.consts[C_OPEN]
+    p.base_friction = c.consts[C_FRICTION]
+    p.low = c.consts[C_LOW]
+    p.high = c.consts[C_HIGH]
+    p.stop = c.consts[C_STIFF]
     return p
 
 
@@ -260,7 +307,7 @@ def acts_at(c: Recorded, i: int, p: Guess):
 
 
 @wp.func
-def command(c: Recorded, h: int, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
+def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
     """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken off; command k of
     the run's first .. last - 1 is in force at its begin."""
     target = c.cmd[k]
@@ -268,9 +315,7 @@ def command(c: Recorded, h: int, first: int, k: int, last: int, end: f64, dt: f6
     while kk + 1 < last and acts_at(c, kk + 1, p) < end:
         target += arrived(end, acts_at(c, kk + 1, p), dt) * (c.cmd[kk + 1] - c.cmd[kk])
         kk += 1
-    feed_v = c.params[h, P_FEEDV]
-    feed_a = c.params[h, P_FEEDA]
-    if feed_v == f64(0.0) and feed_a == f64(0.0):
+    if p.feed_v == f64(0.0) and p.feed_a == f64(0.0):
         return wp.vec2d(target, f64(0.0))
     speed = f64(0.0)
     acceleration = f64(0.0)
@@ -287,22 +332,22 @@ def command(c: Recorded, h: int, first: int, k: int, last: int, end: f64, dt: f6
         share = hold(stamp, span, until, end - dt, dt)
         speed += share * rate
         acceleration += share * difference(rate, earlier, span, dt)
-    return wp.vec2d(target, feed_v * speed + feed_a * acceleration)
+    return wp.vec2d(target, p.feed_v * speed + p.feed_a * acceleration)
 
 
 # -- what holds in a step ------------------------------------------------------------------------------------------------------
 
 
 @wp.func
-def drive_now(c: Recorded, h: int, g: int, n: Now):
+def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     """`n` with what the supply, the temperature and the other joints make of the drive at grid point g."""
     dragger = int(c.params[h, P_FROM])
     n.target += c.params[h, P_COUPLING] * c.series[g, XDRAG + dragger]
     n.carried = c.params[h, P_LINKAGE] * c.series[g, XDV + dragger]
-    if c.consts[C_LOOP_MOTOR] > f64(0.0):
+    if p.loop_motor:
         n.target += c.params[h, P_LINKAGE] * c.series[g, XDRAG + dragger]
     n.load = c.params[h, P_REACTION] * c.series[g, XPULL + dragger]
-    n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * (c.params[h, P_ROTOR] + c.params[h, P_ARM])
+    n.load -= c.params[h, P_LINKAGE] * c.series[g, XDA + dragger] * p.rotor
     n.load = c.series[g, XR] + n.load
 
     warmth = c.series[g, XWARM]
@@ -311,7 +356,7 @@ def drive_now(c: Recorded, h: int, g: int, n: Now):
     n.tau0 = c.params[h, P_LIMIT] * constant
     n.no_load = c.params[h, P_NLS]
     n.efficiency = c.params[h, P_EFF]
-    if c.consts[C_VOLTAGE] > f64(0.0):
+    if p.voltage:
         n.tau0 = n.tau0 / wp.max(warmed(c.params[h, P_TRES], warmth), f64(0.1))
         n.no_load = n.no_load / constant
     else:
@@ -323,28 +368,27 @@ def drive_now(c: Recorded, h: int, g: int, n: Now):
 
 
 @wp.func
-def body_now(c: Recorded, h: int, g: int, n: Now):
+def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     """`n` with the inertia about the joint and the gravity on it at grid point g."""
-    zero = f64(0.0)
-    mass = c.params[h, P_PAYLOAD]
-    out = c.params[h, P_COUT]
-    across = c.params[h, P_CACROSS]
+    mass = p.mass
     inertia = c.params[h, P_ISCALE] * c.series[g, XI] + c.params[h, P_ARM] + mass * c.series[g, XLI]
     gc = c.params[h, P_GSCALE] * c.series[g, XGC] + mass * c.series[g, XLC]
     gs = c.params[h, P_GSCALE] * c.series[g, XGS] + mass * c.series[g, XLS]
-    own = c.params[h, P_OWN]
-    if own != zero:
+    own = p.own_mass
+    if own != f64(0.0):
         inertia += own * c.series[g, XOWI]
         gc += own * c.series[g, XOWC]
         gs += own * c.series[g, XOWS]
-    if mass != zero and (out != zero or across != zero):
+    if p.off_centre:
+        out = c.params[h, P_COUT]
+        across = c.params[h, P_CACROSS]
         inertia += mass * (out * c.series[g, XOI] + across * c.series[g, XAI] + out * out + across * across)
         gc += mass * (out * c.series[g, XOC] + across * c.series[g, XAC])
         gs += mass * (out * c.series[g, XOS] + across * c.series[g, XAS])
-    tx = c.params[h, P_TX]
-    ty = c.params[h, P_TY]
-    tz = c.params[h, P_TZ]
-    if tx != zero or ty != zero or tz != zero:
+    if p.tilted:
+        tx = c.params[h, P_TX]
+        ty = c.params[h, P_TY]
+        tz = c.params[h, P_TZ]
         gc += tx * c.series[g, XTXC] + ty * c.series[g, XTYC] + tz * c.series[g, XTZC]
         gs += tx * c.series[g, XTXS] + ty * c.series[g, XTYS] + tz * c.series[g, XTZS]
     n.inertia = wp.max(inertia, f64(1.0e-9))
@@ -401,16 +445,16 @@ def drive_voltage(u: wp.vec3d, v: f64, gain: f64, drift: f64, n: Now):
 
 
 @wp.func
-def opened(c: Recorded, t: Torque, v: f64, p: Guess, n: Now):
+def opened(t: Torque, v: f64, p: Guess, n: Now):
     """The torque where a stage is tested with its recorded input, or the drive is off; a light rotor's slope is bounded."""
     if p.two:  # its steps are short, and a light rotor's would not stand it
         t.on_drive = wp.max(t.on_drive, f64(0.0))
-    if c.consts[C_OPEN] > f64(0.0):  # the stage after the drive, with its recorded input
+    if p.open_ > f64(0.0):  # the stage after the drive, with its recorded input
         t.now = n.drive
         t.end = t.now
         t.on_loop = f64(0.0)
         t.on_drive = f64(0.0)
-        if c.consts[C_OPEN] > f64(1.5):  # that input is the duty
+        if p.open_ > f64(1.5):  # that input is the duty
             line = n.tau0 / n.no_load
             t.now = n.tau0 * n.supply * n.drive - line * v
             t.end = t.now
@@ -426,12 +470,12 @@ def opened(c: Recorded, t: Torque, v: f64, p: Guess, n: Now):
 @wp.func
 def dry_friction(c: Recorded, h: int, torque: f64, v: f64, p: Guess, n: Now):
     """Level [N.m] at the motor's speed; torque: the motor's of the step before."""
-    level = c.params[h, P_COULOMB]
+    level = p.coulomb
     if p.peak > f64(0.0):
         power = stribeck_power(v / c.params[h, P_VS], c.params[h, P_EXPONENT])
         if power < f64(25.0):
             level += p.peak * wp.exp(-power)
-    share = load_share(torque, v, c.params[h, P_LOAD], c.params[h, P_BACK])
+    share = load_share(torque, v, p.load, p.back)
     return (level + share * wp.abs(torque)) * n.friction
 
 
@@ -439,12 +483,12 @@ def dry_friction(c: Recorded, h: int, torque: f64, v: f64, p: Guess, n: Now):
 
 
 @wp.func
-def one_body(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, theta: f64, dt: f64,
+def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, visc: f64, theta: f64, dt: f64,
              p: Guess, n: Now):  # fmt: skip
     """The step of a joint whose motor is fixed to it; applied, load: torques with and against it [N.m]."""
     begun = x.v
     damping = n.efficiency * t.on_loop + n.efficiency * t.on_drive
-    level += c.consts[C_FRICTION]
+    level += p.base_friction
     a = n.inertia / (theta * dt) + damping + visc + stop_d
     free = (n.inertia / (theta * dt) * x.v + applied + damping * x.v - load + p.viscous * n.friction * n.carried) / a
     free -= n.carried  # dry friction acts where the motor turns
@@ -489,7 +533,7 @@ def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64
     stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
     hardening = c.params[h, P_HARD]
     if p.soft <= zero:
-        stiff = c.consts[C_STIFF]
+        stiff = p.stop
         hardening = zero
     damp = transmission_damping(c.params[h, P_REBOUND], stiff, rotor, link, n.inertia)
     twist = x.qm + dt * x.vm - x.q - dt * x.v
@@ -501,7 +545,7 @@ def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64
         pull = spring[0]
     d_l = n.efficiency * t.on_loop
     d_m = n.efficiency * t.on_drive
-    if c.consts[C_LOOP_MOTOR] >= f64(0.5):
+    if p.loop_motor:
         d_m = d_l + d_m
         d_l = zero
     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
@@ -529,9 +573,8 @@ def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64
     else:
         x1 -= wp.sign(x1) * gain * level
         x2 = (b2 - a21 * x1) / a22
-    base_friction = c.consts[C_FRICTION]
-    if base_friction > zero and not n.held:
-        still = base_friction / a22
+    if p.base_friction > zero and not n.held:
+        still = p.base_friction / a22
         if wp.abs(x2) <= still:
             x2 = zero
         else:
@@ -545,56 +588,56 @@ def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64
         x.v = x2
         x.q += dt * x.v
         turned = x.v - begun
-        if c.consts[C_LOOP_MOTOR] > f64(0.5):
+        if p.loop_motor:
             turned = x.vm - begun_m
         x.last = t.end - t.on_loop * turned - t.on_drive * (x.vm - begun_m)
     return x
 
 
 @wp.func
-def substep(c: Recorded, h: int, x: State, visc: f64, dt: f64, p: Guess, n: Now):
-    """The joint after a step of dt [s]."""
+def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
+    """The joint after a sub-step. visc: the model's damping and viscous friction [N.m.s/rad]."""
+    dt = p.dt
     zero = f64(0.0)
     half = f64(0.5)
-    voltage = c.consts[C_VOLTAGE] > zero
-    loop_motor = c.consts[C_LOOP_MOTOR] > zero
 
     # what the loop sees
     q_l = x.q
     v_l = x.v
     v_drive = x.vm
     if p.two:
-        if loop_motor:
+        if p.loop_motor:
             q_l = x.qm
             v_l = x.vm
     else:
         v_drive = x.v - n.carried
-        if loop_motor:
+        if p.loop_motor:
             v_l = v_drive
     shows = shown_rate(q_l, p)
     if x.fresh or p.speed_lag <= zero:
         x.v_f = v_l
     else:
-        x.v_f += lag_share(p.speed_lag, dt) * (v_l - x.v_f)
+        x.v_f += p.filter * (v_l - x.v_f)
     e = n.target - shown(q_l, p) + p.age * shows * v_l  # a sampled loop acts on where the joint was
     rate = shows * x.v_f
 
     load = n.gravity_cos
-    if c.consts[C_SLIDE] < half:
+    if not p.slide:
         dq = x.q - n.q  # the model was evaluated at the measured pose
         load = n.gravity_cos * wp.cos(dq) + n.gravity_sin * wp.sin(dq)
     load += n.load
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)
-    rotor = wp.clamp(c.params[h, P_ROTOR] + c.params[h, P_ARM], f64(0.03) * n.inertia, f64(0.97) * n.inertia)
+    rotor = f64(0.0)
     body = n.inertia
     if p.two:
+        rotor = wp.clamp(p.rotor, f64(0.03) * n.inertia, f64(0.97) * n.inertia)
         if wp.abs(x.qm - x.q) < p.gap2:
             body = rotor
     else:
         stiffness = n.efficiency * (p.kd + p.kp * dt)
-        if voltage:
+        if p.voltage:
             stiffness = n.efficiency * n.tau0 * (n.supply * (p.kd + p.kp * dt) + f64(1.0) / n.no_load)
         theta = wp.clamp(half + half * ((stiffness + visc) * dt / n.inertia - f64(0.6)), half, f64(1.0))
     step = theta * dt
@@ -602,13 +645,13 @@ def substep(c: Recorded, h: int, x: State, visc: f64, dt: f64, p: Guess, n: Now)
     # what the loop asks for, and what the motor gives of it
     if x.fresh and p.ki != zero:  # a drive that has been on before: its integral holds the load
         x.integral = load / wp.max(n.efficiency, f64(0.01))
-        if voltage:
+        if p.voltage:
             x.integral = x.integral / (n.tau0 * n.supply)
     u = pd(e, rate, rate, rate, shows, p.kp, p.kd, p.deadband, p.deadband_kind, step, p.age, f64(1.0))
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
     limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
-    if not voltage:
+    if not p.voltage:
         speed = wp.abs(v_lim) / (n.no_load * n.supply)
         limits = torque_limits(n.tau0, speed, v_lim, p.steep)
     x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
@@ -617,47 +660,46 @@ def substep(c: Recorded, h: int, x: State, visc: f64, dt: f64, p: Guess, n: Now)
     gain = n.efficiency * step / body
     drift = -load * step / body
     t = Torque()
-    if voltage:
+    if p.voltage:
         t = drive_voltage(asked, v_drive, gain, drift, n)
     else:
         t = drive_torque(asked, v_lim, speed, limits[0], limits[1], p.steep, gain, drift, n)
     x.older = zero
     if t.on_loop != zero:
         x.older = p.kp * p.age * shows * v_l
-        if voltage:
+        if p.voltage:
             x.older = n.tau0 * n.supply * x.older
-    t = opened(c, t, v_drive, p, n)
+    t = opened(t, v_drive, p, n)
     if not n.enabled:
         x.integral = zero
     if x.fresh:
         x.last = t.now
         x.fresh = False
-    share = lag_share(p.lag, dt)
     before = x.last
-    x.last = before + share * (t.now - before)
-    t.end = before + share * (t.end - before)
-    t.on_loop = share * t.on_loop
-    t.on_drive = share * t.on_drive
+    x.last = before + p.lag * (t.now - before)
+    t.end = before + p.lag * (t.end - before)
+    t.on_loop = p.lag * t.on_loop
+    t.on_drive = p.lag * t.on_drive
 
     # what acts on the bodies
     applied = n.efficiency * t.end
     if p.ripple != zero:
         wave = ripple_wave(c.params[h, P_TURN] * x.q + c.params[h, P_PHASE], c.params[h, P_SHAPE])
         applied += p.ripple * wave[0]
-    applied += c.params[h, P_BIAS]
+    applied += p.bias
     level = dry_friction(c, h, before, v_drive, p, n)
-    applied -= half * c.params[h, P_ASYM] * level
+    applied -= p.uneven * level
     stop_d = zero
-    if x.q < c.consts[C_LOW]:
-        load -= c.consts[C_STIFF] * (c.consts[C_LOW] - x.q - dt * x.v)
-        stop_d = c.consts[C_STIFF] * f64(0.02)
-    if x.q > c.consts[C_HIGH]:
-        load += c.consts[C_STIFF] * (x.q + dt * x.v - c.consts[C_HIGH])
-        stop_d = c.consts[C_STIFF] * f64(0.02)
+    if x.q < p.low:
+        load -= p.stop * (p.low - x.q - dt * x.v)
+        stop_d = p.stop * f64(0.02)
+    if x.q > p.high:
+        load += p.stop * (x.q + dt * x.v - p.high)
+        stop_d = p.stop * f64(0.02)
     if p.two:
         x = two_bodies(c, h, x, t, applied, load, level, stop_d, rotor, dt, p, n)
     else:
-        x = one_body(c, x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
+        x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
     return x
 
 
@@ -710,36 +752,37 @@ def plant_kernel():
         c_end = c.window[w, 6]
         k = c.window[w, 7]
         t = c.window_t[w]
-        p = guess(c, h)
+        p = guess(c, h, dt)
         x = begun(c, h, g0, warm, p)
         on_motor = c.consts[C_POS_MOTOR] > f64(0.0)
+        after = shown(x.q, p)  # at the end of the step
         for i in range(c.window[w, 1]):
             g = g0 + i
             if i <= warm and warm > 0:
                 x = held(c, h, g, i == warm, x, p)
-            if i == 0 and p.two:
-                x.qm = x.q
-                x.vm = x.v
+                if i == 0:
+                    x.qm = x.q
+                    x.vm = x.v
+                after = shown(x.q, p)
+                if on_motor:
+                    after = shown(x.qm, p)
+            reported = after
             n = Now()
             n.held = i < warm
             end = t + dt - p.delay
             while k + 1 < c_end and acts_at(c, k + 1, p) <= end - dt:
                 k += 1
-            aim = command(c, h, c_begin, k, c_end, end, dt, p)
+            aim = command(c, c_begin, k, c_end, end, dt, p)
             n.target = aim[0]
             n.feed = aim[1]
-            n = drive_now(c, h, g, n)
-            n = body_now(c, h, g, n)
-            reported = shown(x.q, p)
-            if on_motor:
-                reported = shown(x.qm, p)
-
+            n = drive_now(c, h, g, p, n)
+            n = body_now(c, h, g, p, n)
             visc = c.consts[C_DAMPING] + p.viscous * n.friction
             n_sub = int(ONE_BODY_STEPS)
             if p.two:
                 n_sub = TWO_BODY_STEPS
             for _ in range(n_sub):
-                x = substep(c, h, x, visc, dt / f64(n_sub), p, n)
+                x = substep(c, h, x, visc, p, n)
 
             if not (wp.abs(x.q) < f64(1.0e4)):  # diverged: keep it finite, far off
                 x.q = f64(1.0e4)
