@@ -193,7 +193,6 @@ class Servo:
 
     def before_each(self) -> None:
         """Launches the servo for one physics step: the engine's `before_each` (capturable; one launch, two where a supply sags)."""
-        w = self._wp
         if "sag" in self.features:
             wp.launch(self._sum, dim=self._shape[0], inputs=[self._shape[1], self._torque, self._given], device=self.engine.device)
         self._launch(self._servo, self.engine.dt, self.queue, self._drives)
