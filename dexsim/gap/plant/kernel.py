@@ -132,6 +132,7 @@ class Guess:  # the columns of one guess that every step asks for
     deadband: f64
     deadband_kind: f64
     ki: f64
+    beyond: bool  # the controller has more terms than the PD
     steep: f64  # braking_slope
     limit_speed: f64
     lag: f64  # share of its way that the torque goes in a sub-step
@@ -143,6 +144,8 @@ class Guess:  # the columns of one guess that every step asks for
     ripple: f64
     coulomb: f64
     peak: f64
+    stribeck_speed: f64
+    exponent: f64
     load: f64  # friction's share of the load, driving, and
     back: f64  # back-driven
     uneven: f64  # half the friction's asymmetry
@@ -242,6 +245,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.ripple = c.params[h, P_RIPPLE]
     p.coulomb = c.params[h, P_COULOMB]
     p.peak = c.params[h, P_PEAK]
+    p.stribeck_speed = c.params[h, P_VS]
+    p.exponent = c.params[h, P_EXPONENT]
     p.load = c.params[h, P_LOAD]
     p.back = c.params[h, P_BACK]
     p.uneven = f64(0.5) * c.params[h, P_ASYM]
@@ -251,6 +256,7 @@ def guess(c: Recorded, h: int, dt: f64):
     p.late_group = int(c.params[h, P_LATEGROUP])
     p.feed_v = c.params[h, P_FEEDV]
     p.feed_a = c.params[h, P_FEEDA]
+    p.beyond = p.ki != f64(0.0) or p.feed_v != f64(0.0) or p.feed_a != f64(0.0)
     p.rotor = c.params[h, P_ROTOR] + c.params[h, P_ARM]
     p.mass = c.params[h, P_PAYLOAD]
     p.own_mass = c.params[h, P_OWN]
@@ -312,16 +318,19 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
     the run's first .. last - 1 is in force at its begin."""
     target = c.cmd[k]
     kk = int(k)
-    while kk + 1 < last and acts_at(c, kk + 1, p) < end:
-        target += arrived(end, acts_at(c, kk + 1, p), dt) * (c.cmd[kk + 1] - c.cmd[kk])
+    while kk + 1 < last:
+        stamp = acts_at(c, kk + 1, p)
+        if stamp >= end:
+            break
+        target += arrived(end, stamp, dt) * (c.cmd[kk + 1] - c.cmd[kk])
         kk += 1
-    if p.feed_v == f64(0.0) and p.feed_a == f64(0.0):
+    if not p.beyond:
         return wp.vec2d(target, f64(0.0))
     speed = f64(0.0)
     acceleration = f64(0.0)
     for m in range(wp.max(k, first + 1), kk + 1):
-        stamp = acts_at(c, m, p)
-        span = stamp - acts_at(c, m - 1, p)
+        since = acts_at(c, m, p)
+        span = since - acts_at(c, m - 1, p)
         rate = difference(c.cmd[m], c.cmd[m - 1], span, dt)
         earlier = f64(0.0)
         if m > first + 1:
@@ -329,7 +338,7 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
         until = end
         if m < kk:
             until = wp.min(until, acts_at(c, m + 1, p))
-        share = hold(stamp, span, until, end - dt, dt)
+        share = hold(since, span, until, end - dt, dt)
         speed += share * rate
         acceleration += share * difference(rate, earlier, span, dt)
     return wp.vec2d(target, p.feed_v * speed + p.feed_a * acceleration)
@@ -362,7 +371,8 @@ def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     else:
         n.efficiency = n.efficiency * constant
     n.supply = sagging(c.params[h, P_SUPPLY] * c.series[g, XSUP], c.params[h, P_SAG], c.series[g, XOTH])
-    n.drive = c.series[g, XDRIVE]
+    if p.open_ > f64(0.0):
+        n.drive = c.series[g, XDRIVE]
     n.enabled = c.series[g, XON] >= f64(0.5)
     return n
 
@@ -468,11 +478,11 @@ def opened(t: Torque, v: f64, p: Guess, n: Now):
 
 
 @wp.func
-def dry_friction(c: Recorded, h: int, torque: f64, v: f64, p: Guess, n: Now):
+def dry_friction(torque: f64, v: f64, p: Guess, n: Now):
     """Level [N.m] at the motor's speed; torque: the motor's of the step before."""
     level = p.coulomb
     if p.peak > f64(0.0):
-        power = stribeck_power(v / c.params[h, P_VS], c.params[h, P_EXPONENT])
+        power = stribeck_power(v / p.stribeck_speed, p.exponent)
         if power < f64(25.0):
             level += p.peak * wp.exp(-power)
     share = load_share(torque, v, p.load, p.back)
@@ -643,10 +653,6 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
-    if x.fresh and p.ki != zero:  # a drive that has been on before: its integral holds the load
-        x.integral = load / wp.max(n.efficiency, f64(0.01))
-        if p.voltage:
-            x.integral = x.integral / (n.tau0 * n.supply)
     u = pd(e, rate, rate, rate, shows, p.kp, p.kd, p.deadband, p.deadband_kind, step, p.age, f64(1.0))
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
@@ -654,9 +660,15 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
     if not p.voltage:
         speed = wp.abs(v_lim) / (n.no_load * n.supply)
         limits = torque_limits(n.tau0, speed, v_lim, p.steep)
-    x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
-    x.since = dt
-    asked = other_terms(u, n.feed, x.integral, p.ki, rate, shows, step)
+    asked = wp.vec3d(u[0], u[1], u[2])
+    if p.beyond:
+        if x.fresh and p.ki != zero:  # a drive that has been on before: its integral holds the load
+            x.integral = load / wp.max(n.efficiency, f64(0.01))
+            if p.voltage:
+                x.integral = x.integral / (n.tau0 * n.supply)
+        x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
+        x.since = dt
+        asked = other_terms(u, n.feed, x.integral, p.ki, rate, shows, step)
     gain = n.efficiency * step / body
     drift = -load * step / body
     t = Torque()
@@ -687,7 +699,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
         wave = ripple_wave(c.params[h, P_TURN] * x.q + c.params[h, P_PHASE], c.params[h, P_SHAPE])
         applied += p.ripple * wave[0]
     applied += p.bias
-    level = dry_friction(c, h, before, v_drive, p, n)
+    level = dry_friction(before, v_drive, p, n)
     applied -= p.uneven * level
     stop_d = zero
     if x.q < p.low:
