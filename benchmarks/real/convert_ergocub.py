@@ -23,6 +23,7 @@ FINGERS = {"middle": ("middle", "middle1", "middle3", "middle4", "middle5", "mid
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
 CLIP = 2.0  # s
 KEPT = 0.25  # of a run's clips
+CLOSES = -1.0  # sign of the duty that turns the joint to larger angles (0 is the open stop)
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
 PER_DUTY = 1e-3 / np.pi  # duty per rad of the loop that stands for none: a finger's whole turn is 0.03 % of the duty
 MODEL = f"""<mujoco model="ergocub_finger">
@@ -73,7 +74,7 @@ def convert(data: Path, out: Path) -> Ergocub:
     made = {}
     for name in names:
         raw = np.load(data / f"{name}.npz")
-        t, set_, read = raw["t"], raw["pwm_set"] / 100.0, raw["pwm_read"] / 100.0
+        t, set_, read = raw["t"], CLOSES * raw["pwm_set"] / 100.0, CLOSES * raw["pwm_read"] / 100.0
         q = np.radians(raw["theta_deg"])
         made[name] = []
         for k, (a, b) in enumerate(_clips(t, set_, q)):

@@ -56,7 +56,7 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
             quantum = float(smallest)
     changes = np.abs(np.diff(x))
     if not quantum and np.mean(changes == 0.0) > REPEATS and (changes > 1e-7).any():  # steps of an encoder that are not all alike
-        quantum = float(np.median(changes[changes > 1e-7]))
+        quantum = float(np.quantile(changes[changes > 1e-7], 0.1))
     if len(x) < 9:
         return max(quantum / np.sqrt(12), 1e-9), quantum
     k = 3
