@@ -51,6 +51,11 @@ def _pyramidal(spec: mujoco.MjSpec) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
+def _newton(iterations: int) -> dict[str, int]:
+    """Newton iterations at most, of either engine."""
+    return {"iterations": iterations, "iterations_mujoco": iterations}
+
+
 def _ccd(**options: float) -> Callable[[mujoco.MjSpec], None]:
     """Options of convex collision: ccd_tolerance [m], ccd_iterations."""
 
@@ -94,15 +99,15 @@ class Setting:
 
 SETTINGS = {
     "chosen": Setting(),
-    "reference 1 ms x 21": Setting({"timestep": 0.001, "iterations": 50, "ls_iterations": 50}),
+    "reference 1 ms x 21": Setting({"timestep": 0.001, "ls_iterations": 50} | _newton(50)),
     "3.5 ms x 6": Setting({"timestep": 0.0035}),
     "5.25 ms x 4": Setting({"timestep": 0.00525}),
     "10.5 ms x 2": Setting({"timestep": 0.0105}),
     "pyramidal": Setting({"njmax": 256}, _pyramidal),
-    "iterations 4": Setting({"iterations": 4}),
-    "iterations 6": Setting({"iterations": 6}),
-    "iterations 12": Setting({"iterations": 12}),
-    "iterations 20": Setting({"iterations": 20}),
+    "iterations 4": Setting(_newton(4)),
+    "iterations 6": Setting(_newton(6)),
+    "iterations 12": Setting(_newton(12)),
+    "iterations 20": Setting(_newton(20)),
     "impratio 1": Setting({"impratio": 1.0}),
     "impratio 3": Setting({"impratio": 3.0}),
     "impratio 10": Setting({"impratio": 10.0}),

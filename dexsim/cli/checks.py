@@ -22,6 +22,8 @@ LIMITS: dict[str, tuple[float, float, bool]] = {
     "final_episodes": (0, 10**7, True),
     "sim.timestep": (1e-5, 0.02, False),
     "sim.control_period": (1e-4, 1.0, False),
+    "sim.iterations": (1, 10**4, True),
+    "sim.iterations_mujoco": (1, 10**4, True),
     "sim.nconmax": (1, 10**6, True),
     "sim.njmax": (1, 10**6, True),
     "agent.num_steps_per_env": (1, 10**5, True),

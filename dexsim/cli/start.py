@@ -156,6 +156,8 @@ def _from_checkpoint(
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
     own = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
     cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
+    if "sim" in cfg:
+        cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)
     OmegaConf.set_struct(cfg, True)
     cfg = _files(settings.choose(cfg, config_dir, request.choices), request)
     return settings.override(cfg, request.values)

@@ -25,6 +25,7 @@ from dexsim.assets.objects import library
 from dexsim.errors import UserError
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
+from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import xhand_layout
 from dexsim.tactile.shapes import ShapeSet
@@ -99,7 +100,7 @@ class HandEnv(VecEnv):
                 # stiffer dry friction than MuJoCo's default, in which a stuck joint creeps; stiffer yet, and Newton
                 # needs many more iterations (measured: 99th percentile 9 at 0.9999, 5 here)
                 joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
-        _solver_options(spec, sim)
+        _solver_options(spec, sim, engine_of(engine, device))
         self.rng = torch.Generator(device=device)
         self.rng.manual_seed(seed)
         self.reality = Reality(cfg["reality"], self.rng) if present(cfg) else None  # another world to be judged in
@@ -570,12 +571,12 @@ def _known_shape(name: str, shapes: dict) -> str:
     return name
 
 
-def _solver_options(spec: mujoco.MjSpec, sim: dict) -> None:
+def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:
     o = spec.option
     o.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     o.impratio = sim["impratio"]
-    o.iterations, o.ls_iterations = sim["iterations"], sim["ls_iterations"]
+    o.iterations, o.ls_iterations = newton_iterations(sim, engine), sim["ls_iterations"]
     o.noslip_iterations = sim["noslip_iterations"]
     # one contact a convex pair, so that a fingertip's stiffness is that of one contact
     o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD

@@ -20,7 +20,7 @@ VERSION = "4.0.0"
 """The MuJoCo-Warp whose stages this replaces and calls; with another one the setting is refused (see `unsupported`)."""
 KINDS = {(GeomType(kind), GeomType.MESH) for kind in (SPHERE, CAPSULE, BOX, HULL)}
 """Types of geom pairs that are ours."""
-_DISTANCE_SENSORS = (mujoco.mjtSensor.mjSENS_GEOMDIST, mujoco.mjtSensor.mjSENS_GEOMNORMAL, mujoco.mjtSensor.mjSENS_GEOMFROMTO)
+_DISTANCE_SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_GEOM{name}")) for name in ("DIST", "NORMAL", "FROMTO")]
 _MOST_CORNERS = 1 << 15  # corners are named by 16 bits
 
 
@@ -32,7 +32,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         return "it makes one contact a pair, and the model asks for several (multiccd)"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         return "it does not let bodies sleep, and the model asks for that"
-    if any(model.sensor_type[k] in _DISTANCE_SENSORS for k in range(model.nsensor)):
+    if np.isin(model.sensor_type, _DISTANCE_SENSORS).any():
         return "it answers no sensor of distances between geoms, and the model has one"
     most = max((len(c) for c in _hulls(model)), default=0)
     if most > _MOST_CORNERS:

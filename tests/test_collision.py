@@ -1,0 +1,190 @@
+"""The narrow phase of hulls: against C MuJoCo on random poses, warm starts, what it refuses, and its place in a physics step."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from worlds import grasp_env
+
+from benchmarks import narrow_phase as bench
+from dexsim.errors import UserError
+from dexsim.sim import make_engine
+from dexsim.sim import warmup
+from dexsim.sim.collision import unsupported
+from dexsim.sim.pendulum import pendulum_spec
+
+POSES = 768
+
+
+@pytest.mark.parametrize("kind", bench.KINDS)
+def test_contacts_of_random_poses_are_those_of_c_mujoco(kind):
+    """Surfaces from 2 mm deep to the margin apart, a tenth with faces parallel: all contacts, none too many, to 1e-7 m."""
+    got = bench.kind_of_pair(kind, POSES, "cpu", POSES, seed=3)["hand"]
+    assert got["contacts"] > POSES / 6 and got["missed"] == got["extra"] == 0
+    assert got["dist_m"]["median"] < 5e-9 and got["dist_m"]["worst"] < 1e-7, got["dist_m"]
+    assert got["normal_rad"]["p99"] < 1e-5, got["normal_rad"]
+    assert got["point_m"]["p99"] < 1e-7 and got["point_m"]["worst"] < 1e-5, got["point_m"]  # worst: a core only 10 um away
+
+
+@pytest.fixture(scope="module", params=["capsule", "box", "hull"])
+def two_poses(request):
+    """Poses, and the same a step later: 1 mm and 0.03 rad further."""
+    model, a, b = bench.scene(request.param)
+    rng = np.random.default_rng(5)
+    before = bench.draw(model, request.param, a, b, POSES, rng)
+    after = before[np.arange(POSES)]
+    after.pos = before.pos + np.stack([np.zeros((POSES, 3)), 1e-3 * rng.normal(size=(POSES, 3))], 1)
+    turn = np.empty((POSES, 9))
+    for i in range(POSES):
+        q = np.r_[1.0, 0.015 * rng.normal(size=3)]
+        mujoco.mju_quat2Mat(turn[i], q / np.linalg.norm(q))
+    after.rot = np.stack([before.rot[:, 0], turn.reshape(-1, 3, 3) @ before.rot[:, 1]], 1)
+    return bench.Worlds(model, POSES, "cpu", "hand"), before, after
+
+
+def test_what_was_nearest_before_does_not_decide_what_is_nearest_now(two_poses):
+    """Begun at the last step's corners, at corners of other worlds' bodies, or at none: the same contacts."""
+    worlds, before, after = two_poses
+    found = {}
+    for start in ("none", "before", "others"):
+        worlds.put(before)
+        worlds.collide()
+        kept = worlds.narrow.simplex.numpy()
+        worlds.put(after)
+        if start != "none":
+            worlds.narrow.simplex.assign(kept if start == "before" else np.roll(kept, 7, axis=0))
+        worlds.collide()
+        found[start] = worlds.found()
+    cold = found["none"]
+    assert np.isfinite(cold[0]).sum() > POSES / 8
+    for start in ("before", "others"):
+        dist, normal, _ = found[start]
+        with np.errstate(invalid="ignore"):
+            error = np.abs(dist - cold[0])
+        edge = np.abs(np.where(np.isfinite(cold[0]), cold[0], dist) - bench.MARGIN) < 1e-7  # a contact or not, by rounding
+        assert ((np.isfinite(dist) == np.isfinite(cold[0])) | edge).all(), start
+        both = np.isfinite(dist) & np.isfinite(cold[0])
+        assert error[both].max() < 1e-7, start
+        assert np.percentile(np.linalg.norm(normal - cold[1], axis=1)[both], 98) < 1e-5, start
+
+
+def test_corners_of_another_mesh_are_forgotten(two_poses):
+    worlds, before, _ = two_poses
+    worlds.put(before)
+    worlds.collide()
+    want = worlds.found()[0]
+    worlds.narrow.simplex.fill_(wp.vec3i(60 | (60 << 16), 61 | (61 << 16), 62 | (62 << 16)))  # no hull of the library has so many
+    worlds.collide()
+    got = worlds.found()[0]
+    near = np.isfinite(want) & np.isfinite(got)
+    assert near.sum() >= np.isfinite(want).sum() - 1 and np.abs(want[near] - got[near]).max() < 1e-7
+
+
+@pytest.fixture(scope="module")
+def grasping():
+    """A closing hand of each setting, the same worlds: (hand, mujoco)."""
+    return tuple(grasp_env("task.objects.baked_scales=[1.25]", f"sim.collision={c}", worlds=9, engine="warp") for c in ("hand", "mujoco"))
+
+
+def test_both_settings_make_the_same_contacts_of_a_hand(grasping):
+    """All that a contact holds: parameters bitwise, places to what MuJoCo-Warp's own search is exact to."""
+    hand, mujoco_warp = grasping
+    assert hand.engine.narrow is not None and mujoco_warp.engine.narrow is None
+    action = torch.zeros(9, hand.num_actions)
+    action[:, 4:], action[:, :3] = 0.5, 0.4
+    for k in range(40):
+        hand.step(action if k > 12 else 0 * action)
+    hand.engine.physics_step()
+    theirs, ours = mujoco_warp.engine, hand.engine
+    for name in ours._fields:
+        theirs.field(name).copy_(ours.field(name))
+    theirs.set_state(torch.ones(9, dtype=torch.bool), ours.t.qpos, ours.t.qvel)
+    ours.physics_step(), theirs.physics_step()
+    tables = []
+    for e in (ours, theirs):
+        n, c = int(e.d.nacon.numpy()[0]), e.d.contact
+        geom, world, pos = c.geom.numpy()[:n], c.worldid.numpy()[:n], c.pos.numpy()[:n]
+        order = np.lexsort((pos[:, 0].round(4), geom[:, 1], geom[:, 0], world))
+        names = ("worldid", "geom", "dim", "includemargin", "friction", "solref", "solreffriction", "solimp", "type", "geomcollisionid", "dist", "pos", "frame")
+        tables.append({f: getattr(c, f).numpy()[:n][order] for f in names})
+    a, b = tables
+    assert len(a["dist"]) == len(b["dist"]) > 30
+    for name in a:
+        limit = {"dist": 1e-5, "pos": 1e-4, "frame": 0.2}.get(name, 0.0)
+        assert np.abs(a[name].astype(float) - b[name]).max() <= limit, name
+    assert np.median(np.abs(a["dist"] - b["dist"])) < 1e-7
+
+
+def test_a_reset_forgets_the_corners_of_its_worlds_only(grasping):
+    hand = grasping[0]
+    simplex = torch.from_numpy(hand.engine.narrow.simplex.numpy()).clone()
+    assert bool((simplex[0] >= 0).any()) and bool((simplex[1] >= 0).any())
+    mask = torch.arange(9) == 1
+    hand.engine.set_state(mask, hand.engine.t.qpos.clone(), hand.engine.t.qvel.clone())
+    after = torch.from_numpy(hand.engine.narrow.simplex.numpy())
+    assert bool((after[1] == -1).all()) and torch.equal(after[0], simplex[0])
+
+
+def test_all_kernels_of_a_step_are_listed_for_compiling_together(grasping):
+    e = grasping[0].engine
+    e._one_step()
+    used = {kernel.module for kernel, _ in _launched(e._one_step)}
+    assert used and used <= {module for module, _ in warmup.listed(e._one_step)}
+    assert warmup.compile_together(e._one_step, "cpu") == 0
+
+
+def _launched(program) -> list:
+    from warp._src import context
+
+    seen, launch = [], context.launch
+
+    def spy(kernel, dim, *args, **kwargs):
+        seen.append((kernel, dim))
+        return launch(kernel, dim, *args, **kwargs)
+
+    kept = wp.launch
+    wp.launch = context.launch = spy
+    try:
+        program()
+    finally:
+        wp.launch, context.launch = kept, launch
+    return [(k, d) for k, d in seen if np.prod(d) and not k.is_generic]
+
+
+# -- what it refuses --------------------------------------------------------------------------------------------------------------
+
+
+def test_settings_that_do_not_exist_or_cannot_be_served():
+    with pytest.raises(UserError, match="sim.collision='both'"):
+        make_engine(pendulum_spec(), 1, "cpu", "mujoco", collision="both")
+    with pytest.raises(UserError, match="one contact a pair"):
+        make_engine(pendulum_spec(), 1, "cpu", "warp", collision="hand")
+    assert make_engine(pendulum_spec(), 1, "cpu", "warp").narrow is None
+
+
+@pytest.mark.parametrize("edit, word", [
+    (lambda s: None, None),
+    (lambda s: s.add_sensor(type=mujoco.mjtSensor.mjSENS_GEOMDIST, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname="a", reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                            refname="b", cutoff=1.0), "sensor"),
+    (lambda s: setattr(s.option, "disableflags", 0), "multiccd"),
+])  # fmt: skip
+def test_what_a_model_asks_for_is_served_or_the_reason_said(edit, word):
+    spec = mujoco.MjSpec()
+    for name in ("a", "b"):
+        spec.worldbody.add_body(name=name, pos=[0.1 * (name == "a"), 0, 0]).add_geom(name=name, size=[0.01, 0, 0])
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    edit(spec)
+    why = unsupported(spec.compile())
+    assert why is None if word is None else word in why
+
+
+def test_another_mujoco_warp_is_not_guessed_at(monkeypatch):
+    import mujoco_warp
+
+    monkeypatch.setattr(mujoco_warp, "__version__", "4.0.1")
+    spec = pendulum_spec()
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    assert "4.0.1 is installed" in unsupported(spec.compile())
