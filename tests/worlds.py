@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import torch
@@ -34,6 +36,19 @@ def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int
     from dexsim.tasks import make_env
 
     return make_env(grasp_cfg(*settings, worlds=worlds), worlds, "cpu", seed, engine)
+
+
+def play_env(checkpoint: str, worlds: int, *settings: str, engine: str = "mujoco"):
+    """(environment, policy) of an included checkpoint, as `python play.py checkpoint=... device=cpu SETTINGS` has them."""
+    from dexsim.cli import start
+    from dexsim.learning.ppo import load_policy
+    from dexsim.paths import CONFIGS
+    from dexsim.tasks import make_env
+
+    path = Path(__file__).parents[1] / "checkpoints" / f"{checkpoint}.pt"
+    begun = start.for_play([f"checkpoint={path}", "device=cpu", f"episodes={worlds}", f"worlds={worlds}", f"sim.engine={engine}", *settings], CONFIGS)
+    env = make_env(begun.cfg, worlds, "cpu", begun.cfg["seed"], engine)
+    return env, load_policy(begun.data, env, str(begun.source), begun.typed)
 
 
 def hand_scene(n: int, shapes=ALL, kind: str = "mujoco", scales=(1.25,), timestep: float = 0.002, edit=None, **kw):
