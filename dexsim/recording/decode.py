@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from dexsim.recording import cdr, idl
+from dexsim.recording import ros2
 from dexsim.recording.schema import DEFINITIONS, JOINT_STATE, MULTI_ARRAY
 
 
@@ -38,23 +38,26 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
     raise Unreadable(f"its messages are encoded as '{encoding}', which is not read; cdr (ROS 2), json and protobuf are")
 
 
-def is_standard(channel: Channel, schema: Schema | None, kind: str) -> bool:
-    """Whether the fast readers of `cdr.py` fit: CDR, and the definition is the standard one."""
+def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
+    """Whether the messages are of the standard definition, whose fields need not be looked for."""
     if channel.message_encoding != "cdr" or schema is None or schema.name != kind:
         return False
-    return schema.encoding != "ros2msg" or _fields(schema.data.decode("utf-8", "replace")) == _fields(DEFINITIONS[kind])
+    lines = lambda text: [" ".join(x.split("#")[0].split()[:2]).replace("/msg/", "/") for x in text.splitlines() if x.split("#")[0].strip("= \t")]  # noqa: E731
+    text = schema.data.decode("utf-8", "replace")
+    return schema.encoding != "ros2msg" or not text.strip() or lines(text) == lines(DEFINITIONS[kind])
 
 
 def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable[[bytes], JointSample]:
     """Reads joint states. part: dotted path of the sub-message that holds them ("" the message itself)."""
-    if not part and is_standard(channel, schema, JOINT_STATE):
-
-        def fast(data: bytes) -> JointSample:
-            stamp, names, *arrays = cdr.read_joint_state(data)
-            return JointSample(names, *arrays, stamp or None)
-
-        return fast
     decode = decoder(channel, schema)
+    if not part and _usual(channel, schema, JOINT_STATE):
+
+        def standard(data: bytes) -> JointSample:
+            m = decode(data)
+            stamp = m.header.stamp
+            return JointSample(m.name, m.position, m.velocity, m.effort, stamp.sec * 1_000_000_000 + stamp.nanosec or None)
+
+        return standard
 
     def read(data: bytes) -> JointSample:
         whole = decode(data)
@@ -89,9 +92,14 @@ def array_reader(
     channel: Channel, schema: Schema | None, part: str
 ) -> Callable[[bytes], tuple[tuple[int, ...], np.ndarray]]:
     """Reads arrays: (dimensions or (), flat values)."""
-    if not part and is_standard(channel, schema, MULTI_ARRAY):
-        return cdr.read_multi_array
     decode = decoder(channel, schema)
+    if not part and _usual(channel, schema, MULTI_ARRAY):
+
+        def standard(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
+            m = decode(data)
+            return tuple([d.size for d in m.layout.dim]), m.data.astype(float)
+
+        return standard
 
     def read(data: bytes) -> tuple[tuple[int, ...], np.ndarray]:
         m = walk(decode(data), part)
@@ -199,34 +207,21 @@ def _number(value: Any) -> float:
     return np.nan if value is None else float(value)
 
 
-def _fields(definition: str) -> list[str]:
-    """The lines of a message definition that matter, defaults and comments left out."""
-    lines = (" ".join(line.split("#")[0].split()[:2]) for line in definition.splitlines())
-    return [line.replace("/msg/", "/") for line in lines if line and not line.startswith("==")]
-
-
 def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
-    from mcap_ros2._dynamic import generate_dynamic
-
     if schema is None:
         raise Unreadable("its message definition is lost")
-    text = schema.data.decode("utf-8", "replace")
-    if schema.encoding == "ros2idl" and text.strip():
-        try:
-            text = idl.to_msg(schema.name, text)
-        except idl.IdlError as error:
-            raise Unreadable(f"the IDL definition of {schema.name} is not read: {error}") from None
-    elif schema.encoding != "ros2msg" or not text.strip():  # none stored: the standard messages are known anyway
-        text = DEFINITIONS.get(schema.name, "")
-        if not text:
-            raise Unreadable(
-                f"its type {schema.name} is described in '{schema.encoding or 'nothing'}', which is not read;"
-                " record it with message definitions (ros2msg or ros2idl)"
-            )
+    text, encoding = schema.data.decode("utf-8", "replace"), schema.encoding
+    if schema.name in DEFINITIONS and (encoding != "ros2msg" or not text.strip()):
+        text, encoding = DEFINITIONS[schema.name], "ros2msg"  # the standard messages are known anyway
+    if encoding not in ("ros2msg", "ros2idl") or not text.strip():
+        raise Unreadable(
+            f"its type {schema.name} is described in '{encoding or 'nothing'}', which is not read;"
+            " record it with message definitions (ros2msg or ros2idl)"
+        )
     try:
-        return generate_dynamic(schema.name, text)[schema.name]
-    except Exception as error:  # the parser raises whatever it likes
-        raise Unreadable(f"the definition of {schema.name} cannot be parsed: {error}") from None
+        return ros2.decoder(schema.name, encoding, text)
+    except ros2.BadDefinition as error:
+        raise Unreadable(f"the {'IDL ' if encoding == 'ros2idl' else ''}definition of {schema.name} is not read: {error}") from None
 
 
 def _protobuf(schema: Schema | None) -> Callable[[bytes], Any]:
