@@ -54,7 +54,7 @@ def write(env: HandEnv, folder: Path) -> Path:
     hand, e = xhand.hand_spec(), env.engine
     sim = env.cfg["sim"]
     hand.option.timestep = sim["timestep"]
-    _solver_options(hand, sim)
+    _solver_options(hand, sim, e.kind)
     d = env.task["contact"]["impedance"]
     for geom in list(hand.geoms):
         if not geom.contype and not geom.conaffinity:
