@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_gap_torque_route import arm, run
+from test_gap_torque_route import ARM, arm, run
 
 from dexsim.gap.search import external_force
 
@@ -56,3 +56,26 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
     assert d.sentence.startswith("Joint elbow is pushed by something outside")
     assert d.data["verdict"] == "explained" and len(d.notes) == 1
+
+
+@pytest.mark.slow
+def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
+    from benchmarks.real.common import dump, save
+    from dexsim.gap.diagnosis import Settings, diagnose
+
+    model, made = arm(), []
+    (tmp_path / "arm.xml").write_text(ARM)
+    believed = {"kp": 80.0, "kd": 3.0, "torque_limit": 40.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}
+    servo = dump(tmp_path / "arm.yaml", {"drive": "torque", "joints": {"*": believed}})
+    for k in range(3):
+        r = run(model, k, pushed=shove if k == 1 else None)
+        cmd = r.q + (r.torque + 3.0 * np.gradient(r.q, r.t, axis=0)) / 80.0
+        made.append(save(tmp_path / f"r{k}.mcap", r.joints, r.t, cmd, r.t, r.q, effort=r.torque, gravity="0 0 -9.81"))
+    asked = Settings(made[:2], tmp_path, made[2:], str(tmp_path / "arm.xml"), str(servo), next_recording=False, replay="none", allowed={"viscous_friction"}, joints={"elbow"})
+    d = diagnose(asked, say=lambda _: None)
+    assert d.sentence.startswith("Joint elbow is pushed by something outside")
+    first = d.data["findings"][0]
+    assert first["effect"] == "external_force" and {w["recording"] for w in first["when"]} == {"r1.mcap"}
+    assert all(f["confidence"] < 0.5 for f in d.data["findings"][1:])
+    assert any("judged by the" in n for n in d.notes)  # without those stretches
+    assert d.servo.value("elbow", "coulomb_friction").value == pytest.approx(0.2, rel=0.05)

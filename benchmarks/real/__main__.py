@@ -169,6 +169,7 @@ def ergocub(data: Path, out: Path, jobs: int) -> dict:
 
 HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
 JOBS = {"bam": bam, "emps": emps, "sage": sage, "panda": panda, "ergocub": ergocub}
+FIGURES = ("bam", "emps", "sage")
 
 
 def figure(result: dict, path: Path) -> None:
@@ -219,6 +220,8 @@ def main(argv: list[str]) -> int:
     if not plain or len(plain) > 2 or plain[0] not in JOBS or set(given) - {"data", "out", "jobs", "figure", "fit"} or not given.get("jobs", "1").isdigit():
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
+    if "figure" in given and plain[0] not in FIGURES:
+        raise UserError(f"figure= is drawn for {', '.join(FIGURES)}, not for {plain[0]}")
     data = folder(plain[0], plain[1] if len(plain) == 2 else given.get("data"))
     if data is None:
         print(json.dumps({"benchmark": plain[0], "skipped": f"../shared/realdata/{FOLDERS[plain[0]]} is absent; data=PATH names the recordings "

@@ -20,8 +20,8 @@ from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.recorded_motion import forbids, room_for_friction
 
-WINDOW, WINDOWS = 2.0, 24  # s of a window, and how many: more would say little more
-GUESSES, BEST = 96, 2  # all over the bounds; of them so many are fitted
+WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
+GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside what is believed
 ITERATIONS = 8
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
