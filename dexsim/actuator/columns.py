@@ -2,8 +2,9 @@
 
 Each column has a neutral value at which its effect is absent: neutral values with kp and kd set are an ideal PD drive.
 Units are those of a hinge; for a slide joint read m, m/s, N, N/m for rad, rad/s, N.m, N.m/rad.
-To add an effect: one `Column` here, its lines in `kernel.py`, the same lines in `reference.py`. Effects that most drives
-do without are compiled in only where they are used (`FEATURES`): the usual servo does not pay for them.
+To add an effect: one `Column` here, its law in `laws.py`, which the training's kernel and the search's plant call, and
+the same law in `reference.py`, written apart. Effects that most drives do without are compiled in only where they are
+used (`FEATURES`): the usual servo does not pay for them.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ COLUMNS: tuple[Column, ...] = (
     # The servo's loop (paper, "Actuator Model Randomization").
     Column("kp", "N.m/rad", 0.0, 0.0, 1e5, "proportional gain; duty per rad when drive is voltage"),
     Column("kd", "N.m.s/rad", 0.0, 0.0, 1e4, "gain on the measured velocity; duty per rad/s when drive is voltage"),
-    Column("speed_feedforward", "N.m.s/rad", 0.0, 0.0, 1e4, "gain on the target's speed, added to the PD; duty per rad/s when drive is voltage"),
-    Column("acceleration_feedforward", "N.m.s2/rad", 0.0, 0.0, 1e4, "gain on the target's acceleration, added to the PD; duty per rad/s2 when drive is voltage"),
-    Column("integral_gain", "N.m/(rad.s)", 0.0, 0.0, 1e6, "gain on the time integral of the position error, which waits at the torque limit; duty per rad.s when drive is voltage"),
+    Column("speed_feedforward", "N.m.s/rad", 0.0, 0.0, 1e4, "added to the PD: gain * r', r' the backward difference of the targets; duty per rad/s when drive is voltage"),
+    Column("acceleration_feedforward", "N.m.s2/rad", 0.0, 0.0, 1e4, "added to the PD: gain * r'', the difference of r'; duty per rad/s2 when drive is voltage"),
+    Column("integral_gain", "N.m/(rad.s)", 0.0, 0.0, 1e6, "added to the PD: gain * integral of the error, which waits at the torque limit; duty per rad.s when drive is voltage"),
     Column("deadband", "rad", 0.0, 0.0, 1.0, "no torque while |target - position| is less (the paper's epsilon)"),
     Column("torque_limit", "N.m", INF, 0.0, INF, "stall torque tau0: the clamp at zero speed"),
     Column("no_load_speed", "rad/s", INF, 1e-3, INF, "speed at which the torque-speed line reaches zero"),
@@ -51,7 +52,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("stribeck_peak", "N.m", 0.0, 0.0, 1e3, "breakaway friction in excess of the sliding level"),
     Column("stribeck_speed", "rad/s", 1.0, 1e-4, 1e3, "speed at which that excess is down to 1/e (if stribeck_peak)"),
     Column("stribeck_exponent", "1", 2.0, 0.2, 6.0, "how it falls with speed: exp(-(|speed| / stribeck_speed)^exponent)"),
-    Column("presliding", "rad", 0.0, 0.0, 1.0, "how far the joint gives way elastically before its dry friction slides (Dahl's law)"),
+    Column("presliding", "rad", 0.0, 0.0, 1.0, "how far the joint gives way elastically before its dry friction slides: friction * z, dz/dq = (1 - z sign(speed)) / presliding"),
     Column("viscous_friction", "N.m.s/rad", 0.0, 0.0, 1e4, "friction proportional to speed"),
     Column("load_friction", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the motor drives the load"),
     Column("load_friction_backdriven", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the load drives it"),

@@ -1,11 +1,12 @@
-"""The servo as Warp kernels: one thread per world and joint. `reference.py` holds the same lines in NumPy.
+"""The servo as Warp kernels: one thread per world and joint. Each law stands in `laws.py`; what
+is here takes them to the end of a step. `reference.py` has both in NumPy.
 
 The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is taken as zero: targets are held):
 
     e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder
-    tau_c  = kp * e - kd * qd_m                                            (+ the controller's other terms, `laws.controller_terms`)
+    tau_c  = kp * e - kd * qd_m                                            (+ `laws.other_terms`: feed-forward, integral)
     tau_b  = 0 if |e| < deadband else tau_c
-    limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b = 1 where motor * qd >= 0, braking_slope where it brakes
+    limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b: 1 driving, braking_slope while it brakes
     motor  = clip(tau_b, -limit, +limit)                                   what the motor's current shows
     joint  = efficiency * lag(motor) + ripple(q) - friction
 
@@ -20,21 +21,24 @@ which implicitfast and discrete integrate implicitly: M (v' - v) = dt (qfrc_appl
   - At the limits the line goes through (v, T = +-limit) and the velocity at which the law itself is zero: the unlimited
     PD's zero or the no-load speed, whichever comes first. Driving along the torque-speed line D is that line's slope; a
     drive at its limit never overshoots in one step, whatever the inertia. While it brakes, the paper's limit grows as
-    the speed falls, exponentially with rate r = braking_slope * efficiency * tau0 / no_load_speed / inertia; a tiny link does so within one
-    step, so T takes the mean over the step, limit * (exp(r dt) - 1) / (r dt), `inertia` being 1 / dof_invweight0.
+    the speed falls, exponentially with rate r = braking_slope * efficiency * tau0 / no_load_speed / inertia; a tiny
+    link does so within one step, so T takes the mean over the step, limit * (exp(r dt) - 1) / (r dt), `inertia` being
+    1 / dof_invweight0.
   All differences from the law are O(dt).
 
-Play and elasticity. The motor turns a rotor of inertia J_r, which leaves the joint's armature; a spring K with a gap joins
-rotor and link. Backward Euler over the step, with the link's velocity v' at its end still open:
-    J_r (w' - w) / dt = motor(w', v') - viscous w' - level sign(w') - tau',   tau' = K (stretch + dt (w' - v')) + C (w' - v').
-Friction and the side of the gap are taken from the step's start with v' = v; what remains is a line w' = A + B v', so that the link
-feels tau' = T - D v'. D dt goes to dof_armature and T - D v to qfrc_applied, so that MuJoCo solves link, contact and spring together (its
-contacts know the inertia, not the damping). The rotor's step is completed with the v' it
-found when the next begins: what the rotor loses the link receives. With K -> inf, D dt -> J_r: the armature again.
+Play and elasticity. The motor turns a rotor of inertia J_r, which leaves the joint's armature; a spring K with a gap
+joins rotor and link. Backward Euler over the step, with the link's velocity v' at its end still open:
+    J_r (w' - w) / dt = motor(w', v') - viscous w' - level sign(w') - tau',
+    tau' = K (stretch + dt (w' - v')) + C (w' - v').
+Friction and the side of the gap are taken from the step's start with v' = v; what remains is a line w' = A + B v', so
+that the link feels tau' = T - D v'. D dt goes to dof_armature and T - D v to qfrc_applied, so that MuJoCo solves link,
+contact and spring together (its contacts know the inertia, not the damping). The rotor's step is completed with the v'
+it found when the next begins: what the rotor loses the link receives. With K -> inf, D dt -> J_r: the armature again.
 Rotors carry the motor's friction and turn the torque-speed line; the model's own friction stays on the link.
-Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking; one that is elastic before it
-slides (`presliding`) is a spring there and goes to qfrc_applied and dof_damping. How hard it sticks is
-the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 does not.
+
+Dry friction goes to dof_frictionloss (as a torque it would chatter), so MuJoCo resolves sticking. How hard it sticks is
+the joint's solimpfriction: the default (0.9) lets a stuck joint creep, 0.999 does not. Friction that is elastic before
+it slides (`presliding`) is a spring there: level * z goes to qfrc_applied, its line in v' to dof_damping.
 """
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
@@ -112,7 +116,8 @@ REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 @lru_cache(maxsize=None)
 def drives(real):
-    """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in `servo.Servo`."""
+    """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in
+    `servo.Servo`."""
 
     @wp.struct
     class Drives:
@@ -162,8 +167,8 @@ def target_in_force(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, en
 
 @wp.func
 def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin: Any, dt: Any):
-    """(speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt] of what is in force
-    (`laws.difference`, `laws.hold`): begin is the step's, less the delay."""
+    """(speed [rad/s], acceleration [rad/s2]) of the target, each the mean over the step [begin, begin + dt] of what is
+    in force (`laws.difference`, `laws.hold`): begin is the step's, less the delay."""
     speed = begin * type(begin)(0.0)
     acceleration = begin * type(begin)(0.0)
     rate = begin * type(begin)(0.0)
@@ -183,11 +188,12 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
 
 @lru_cache(maxsize=None)
 def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
-    """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and `FEATURES`.
+    """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and
+    `FEATURES`.
 
-    Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop asks for;
-    `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two. Each has the law as
-    `laws.py` states it and takes it to the end of the step ("Integration")."""
+    Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
+    asks for; `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two.
+    Each has the law as `laws.py` states it and takes it to the end of the step ("Integration")."""
     play, sag, rare, braking, controller, presliding, shape = (
         name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape")
     )
@@ -235,7 +241,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
 
     @wp.func
     def locate(dt: real, x0: int, fresh: bool, d: Drives, w: int, j: int):
-        """The rotor where the last step's v' has left it; writes its slot and the armature of what stays with the joint."""
+        """The rotor where the last step's v' has left it; writes its slot and the armature of what stays with the
+        joint."""
         r = Rotor()
         r.v = d.qvel[w, d.dof[j]]
         if wp.static(play):
@@ -310,7 +317,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
 
     @wp.func
     def control(dt: real, queue: int, x0: int, s: Sensed, lower: real, upper: real, d: Drives, w: int, j: int):
-        """(now, end, slope) that the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at which its integral waits."""
+        """(now, end, slope) that the loop asks for, torque [N.m] or duty; -lower .. upper: the limits, at which its
+        integral waits."""
         end = d.time[w] - d.params[w, j, DELAY] + dt
         target = target_in_force(d.state, w, j, queue, end, dt)
         kind = real(0.0)
@@ -447,8 +455,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
 
     @wp.func
     def couple(dt: real, t: Torque, f: Friction, r: Rotor, stiffness: real, d: Drives, w: int, j: int):
-        """(torque on the link T, its slope D in the link's speed, A, B): the rotor's step as a line w' = A + B v', "Play and
-        elasticity". stiffness: of the loop [N.m/rad]."""
+        """(torque on the link T, its slope D in the link's speed, A, B): the rotor's step as a line w' = A + B v',
+        "Play and elasticity". stiffness: of the loop [N.m/rad]."""
         q = d.qpos[w, d.dof_q[j]]
         v = d.qvel[w, d.dof[j]]
         gap2 = real(0.5) * d.params[w, j, BACKLASH]
@@ -529,7 +537,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
         t.end -= stiffness * dt * v
         t.slope += stiffness * dt
 
-        # The stand-in for what is not known; what of it brakes, or pulls like a spring, is taken at the end of the step.
+        # The stand-in for what is not known; what of it brakes, or pulls like a spring, is taken at the end of the
+        # step.
         applied = t.end
         damping = t.slope
         pull = d.params[w, j, REST_POSITION]
@@ -557,7 +566,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
                 c = couple(dt, t, f, r, loop, d, w, j)
                 d.state[w, j, x0 + LINE_A] = c[2]
                 d.state[w, j, x0 + LINE_B] = c[3]
-                # D goes to the armature, D (v' - v) = D dt a: contacts are solved with the inertia, which a damping is no part of
+                # D goes to the armature, D (v' - v) = D dt a: contacts are solved with the inertia, which a damping is
+                # no part of
                 d.qfrc_applied[w, i] = applied + damping * v + c[0] - c[1] * v
                 d.dof_armature[w, i] = d.dof_armature[w, i] + c[1] * dt
                 d.dof_damping[w, i] = d.base_damping[w, j] + damping

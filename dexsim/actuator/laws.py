@@ -1,6 +1,6 @@
-"""The physics of a drive, one small Warp function a law, in SI units: what the training's servo (`kernel.py`) and the search's
-plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32 and in float64; `reference.py` has the same laws in
-NumPy, written apart, as their check."""
+"""The physics of a drive, one small Warp function a law, in SI units: what the training's servo (`kernel.py`) and the
+search's plant (`dexsim.gap.plant.kernel`) have in common. Each works in float32 and in float64; `reference.py` has the
+same laws in NumPy, written apart, as their check."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the module.
 
@@ -9,12 +9,13 @@ from typing import Any
 import warp as wp
 
 
-# -- encoder -------------------------------------------------------------------------------------------------------------------
+# -- encoder -----------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def eccentricity(q: Any, sine: Any, cosine: Any):
-    """Error [rad] at position q [rad] of an encoder whose disk is off its axis: sine * sin q + cosine * (cos q - 1), zero at q = 0."""
+    """Error [rad] at position q [rad] of an encoder whose disk is off its axis: sine * sin q + cosine * (cos q - 1),
+    zero at q = 0."""
     return sine * wp.sin(q) + cosine * (wp.cos(q) - type(q)(1.0))
 
 
@@ -24,28 +25,30 @@ def eccentricity_slope(q: Any, sine: Any, cosine: Any):
     return sine * wp.cos(q) - cosine * wp.sin(q)
 
 
-# -- delay and lag -------------------------------------------------------------------------------------------------------------
+# -- delay and lag -----------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def arrived(end: Any, stamp: Any, dt: Any):
-    """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in force: a delay
-    that ends inside a step acts for the rest of it."""
+    """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in
+    force: a delay that ends inside a step acts for the rest of it."""
     return wp.clamp((end - stamp) / dt, type(dt)(0.0), type(dt)(1.0))
 
 
 @wp.func
 def lag_share(time: Any, dt: Any):
-    """Share of the way that a first-order lag, time * y' = u - y, goes from y to u in a step of dt [s]: backward Euler."""
+    """Share of the way that a first-order lag, time * y' = u - y, goes from y to u in a step of dt [s]: backward
+    Euler."""
     return dt / (time + dt)
 
 
-# -- the motor -----------------------------------------------------------------------------------------------------------------
+# -- the motor ---------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def warmed(per_degree: Any, warmth: Any):
-    """Factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree [1/degC] * warmth [degC].
+    """Factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree [1/degC] *
+    warmth [degC].
 
     Copper has +0.0039, the magnets' flux about -0.001 (NdFeB) per degree; grease gets thinner."""
     return type(warmth)(1.0) + per_degree * warmth
@@ -53,24 +56,26 @@ def warmed(per_degree: Any, warmth: Any):
 
 @wp.func
 def sagging(supply: Any, per_torque: Any, others: Any):
-    """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque| [N.m])."""
+    """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque|
+    [N.m])."""
     return supply * wp.max(type(supply)(1.0) - per_torque * others, type(supply)(0.05))
 
 
 @wp.func
 def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
-    """Torque [N.m] of a DC motor at a duty (clipped to -1 .. 1) of its supply: tau0 * supply * duty - line * v, line = stall torque over
-    no-load speed [N.m.s/rad] (R i = u - k v, torque = k i)."""
+    """Torque [N.m] of a DC motor at a duty (clipped to -1 .. 1) of its supply: tau0 * supply * duty - line * v, line =
+    stall torque over no-load speed [N.m.s/rad] (R i = u - k v, torque = k i)."""
     return tau0 * supply * wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)) - line * v
 
 
 @wp.func
 def torque_limit(tau0: Any, x: Any, slope: Any):
-    """Largest torque [N.m] of a motor: tau0 * max(0, 1 - slope * x), x = |speed| / no-load speed at the supply's voltage.
+    """Largest torque [N.m] of a motor: tau0 * max(0, 1 - slope * x), x = |speed| / no-load speed at the supply's
+    voltage.
 
-    tau0: stall torque [N.m]. slope: 1 while the motor drives (the torque-speed line of a DC motor at its full voltage), the
-    column `braking_slope` while it brakes: 1 the driving line mirrored (the paper's limit), 0 a current limit (tau0 at any
-    speed), -1 the driving line gone on beyond zero speed (back-EMF and full voltage add up: a voltage limit).
+    tau0: stall torque [N.m]. slope: 1 while the motor drives (the torque-speed line of a DC motor at its full voltage),
+    the column `braking_slope` while it brakes: 1 the driving line mirrored (the paper's limit), 0 a current limit (tau0
+    at any speed), -1 the driving line gone on beyond zero speed (back-EMF and full voltage add up: a voltage limit).
     """
     limit = type(tau0)(0.0)
     if slope * x < type(x)(1.0):
@@ -80,8 +85,8 @@ def torque_limit(tau0: Any, x: Any, slope: Any):
 
 @wp.func
 def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
-    """(lower, upper) >= 0: the torque lies in -lower .. upper [N.m] at speed v [rad/s], x = |v| / no-load speed; `torque_limit` with
-    slope 1 in the direction of v, with `slope` against it."""
+    """(lower, upper) >= 0: the torque lies in -lower .. upper [N.m] at speed v [rad/s], x = |v| / no-load speed;
+    `torque_limit` with slope 1 in the direction of v, with `slope` against it."""
     upper = torque_limit(tau0, x, type(x)(1.0))
     lower = upper
     if v > type(v)(0.0):
@@ -91,13 +96,14 @@ def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
     return wp.vector(lower, upper)
 
 
-# -- transmission --------------------------------------------------------------------------------------------------------------
+# -- transmission ------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def transmission(turn: Any, stiff: Any, hardening: Any):
-    """(torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening t^2), t = stiff * turn;
-    its stiffness is 1 + 3 hardening t^2 times as large (a cubic hardening spring, as harmonic drives show)."""
+    """(torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening t^2), t =
+    stiff * turn; its stiffness is 1 + 3 hardening t^2 times as large (a cubic hardening spring, as harmonic drives
+    show)."""
     stretch = stiff * turn
     harder = type(turn)(1.0) + hardening * stretch * stretch
     return wp.vector(stretch * harder, (type(turn)(3.0) * harder - type(turn)(2.0)) * stiff)
@@ -110,15 +116,16 @@ def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: 
     return type(stiff)(2.0) * rebound * wp.sqrt(stiff * rotor * link / both)
 
 
-# -- friction ------------------------------------------------------------------------------------------------------------------
+# -- friction ----------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def stribeck_power(ratio: Any, exponent: Any):
-    """p of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed / stribeck_speed.
+    """p of exp(-p), the share of `stribeck_peak` that is left at a speed: |ratio|^exponent, ratio = speed /
+    stribeck_speed.
 
-    2: Gaussian (Armstrong-Helouvry 1994, Tustin's exponential is 1); see B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit,
-    A survey of models ... for the control of machines with friction, Automatica 30 (1994), eq. 5.
+    2: Gaussian (Armstrong-Helouvry 1994, Tustin's exponential is 1); see B. Armstrong-Helouvry, P. Dupont, C. Canudas
+    de Wit, A survey of models ... for the control of machines with friction, Automatica 30 (1994).
     """
     power = ratio * ratio
     if exponent != type(ratio)(2.0):
@@ -128,8 +135,8 @@ def stribeck_power(ratio: Any, exponent: Any):
 
 @wp.func
 def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
-    """Dry friction per motor torque of a gear: `driving` where the motor drives the load (torque and speed agree), `backdriven` where
-    the load drives the motor (they do not). The friction is this share of |torque|."""
+    """Dry friction per motor torque of a gear: `driving` where the motor drives the load (torque and speed agree),
+    `backdriven` where the load drives the motor (they do not). The friction is this share of |torque|."""
     share = driving
     if torque * v < type(v)(0.0):
         share = backdriven
@@ -138,7 +145,8 @@ def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
 
 @wp.func
 def preslide(taken: Any, turned: Any):
-    """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn / presliding.
+    """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn /
+    presliding.
 
     Dahl's law dz/dy = 1 - z sign(y) (P. Dahl, A solid friction model, 1968), taken implicitly over the turn."""
     return (taken + turned) / (type(taken)(1.0) + wp.abs(turned))
@@ -146,7 +154,8 @@ def preslide(taken: Any, turned: Any):
 
 @wp.func
 def preslide_slope(taken: Any, turned: Any):
-    """Slope of `preslide` from no turn to this one, (z' - z) / y >= 0: of a line in the turn that is right at both ends."""
+    """Slope of `preslide` from no turn to this one, (z' - z) / y >= 0: of a line in the turn that is right at both
+    ends."""
     ahead = taken  # what of it lies in the direction of the turn; from rest either way
     if turned < type(turned)(0.0):
         ahead = -taken
@@ -157,10 +166,11 @@ def preslide_slope(taken: Any, turned: Any):
 
 @wp.func
 def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
-    """Speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) + level z' = 0.
+    """Speed v [rad/s] at the end of a step under friction level * z' (`preslide`): the root of a (v - free) + level z'
+    = 0.
 
-    a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction; level [N.m];
-    w = presliding / step: the speed that takes up all of the friction in one step."""
+    a: inertia over the step, and all that is proportional to the speed [N.m.s/rad]; free: the speed without friction;
+    level [N.m]; w = presliding / step: the speed that takes up all of the friction in one step."""
     turn = wp.sign(a * free - level * taken)
     f = turn * free
     y = turn * taken
@@ -174,13 +184,14 @@ def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
     return turn * w * wp.max(u, type(a)(0.0))
 
 
-# -- ripple --------------------------------------------------------------------------------------------------------------------
+# -- ripple ------------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def ripple_wave(angle: Any, shape: Any):
-    """(value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0 sin(angle), 1 a sawtooth
-    that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and jumps up at 0; mixtures between."""
+    """(value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0 sin(angle),
+    1 a sawtooth that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and jumps up at 0;
+    mixtures between."""
     value = wp.sin(angle)
     slope = wp.cos(angle)
     if shape != type(angle)(0.0):
@@ -196,7 +207,7 @@ def ripple_wave(angle: Any, shape: Any):
     return wp.vector(value, slope)
 
 
-# -- the controller ------------------------------------------------------------------------------------------------------------
+# -- the controller ----------------------------------------------------------------------------------------------------
 #
 # tau_c = kp e - kd qd_m + speed_feedforward * r' + acceleration_feedforward * r'' + integral_gain * integral of e dt,
 # e = r - q_m, r the target in force. r' and r'' are taken from the targets as a drive takes them, by `difference`.
@@ -204,22 +215,25 @@ def ripple_wave(angle: Any, shape: Any):
 # A cascade of a proportional position loop and a PI speed loop,
 #     u = K_pp e + F r',    tau_c = K_vp (u - qd) + K_vi * integral of (u - qd) dt,
 # is the same law with
-#     kp = K_vp K_pp + K_vi F,  kd = K_vp,  speed_feedforward = K_vp F,  integral_gain = K_vi K_pp    where F = 1 or K_vi = 0
-# (from rest at e = 0: the integral of r' - qd is e). Without feed-forward (F = 0) its integral holds -K_vi q, a term in q alone:
-# kp = K_vp K_pp + K_vi then acts on -q, and only K_vp K_pp of it on r; that one is not expressed by these columns. A current loop
-# below is the column `lag`. (G. Ellis, Control System Design Guide, 4th ed. 2012, ch. 17.)
+#     kp = K_vp K_pp + K_vi F,  kd = K_vp,  speed_feedforward = K_vp F,  integral_gain = K_vi K_pp
+# where F = 1 or K_vi = 0 (from rest at e = 0: the integral of r' - qd is e). Without feed-forward (F = 0) its integral
+# holds -K_vi q, a term in q alone: kp = K_vp K_pp + K_vi then acts on -q, and only K_vp K_pp of it on r; that one is
+# not expressed by these columns. A current loop below is the column `lag`. (G. Ellis, Control System Design Guide,
+# 4th ed. 2012, chapter 17.)
 
 
 
 @wp.func
 def pd(e: Any, v: Any, v_end: Any, rate: Any, scale: Any, kp: Any, kd: Any, width: Any, kind: Any, dt: Any, age: Any, share: Any):
-    """(now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a step of dt [s] at unchanged
-    speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then [N.m.s/rad].
+    """(now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a step of dt
+    [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then
+    [N.m.s/rad].
 
-    e: error of the measured position [rad]. v, v_end: measured speed that kd acts on, now and then [rad/s]; rate: measured speed
-    of the position; scale: what the encoder shows over what turns; share: of a change of speed, what kd's filter passes in the
-    step; age: of the position [s]. width, kind: the deadband (columns `deadband`, `deadband_kind`): inside it 0 no torque at all,
-    1 the error counts as zero, 2 it counts from the edge on. acts: 0 no torque, 1 all but the error, 2 all."""
+    e: error of the measured position [rad]. v, v_end: measured speed that kd acts on, now and then [rad/s]; rate:
+    measured speed of the position; scale: what the encoder shows over what turns; share: of a change of speed, what
+    kd's filter passes in the step; age: of the position [s]. width, kind: the deadband (columns `deadband`,
+    `deadband_kind`): inside it 0 no torque at all, 1 the error counts as zero, 2 it counts from the edge on. acts: 0 no
+    torque, 1 all but the error, 2 all."""
     now = kp * e - kd * v
     end = kp * e - kd * v_end - kp * dt * rate
     slope = scale * (kp * (dt - age) + share * kd)
@@ -246,8 +260,8 @@ def pd(e: Any, v: Any, v_end: Any, rate: Any, scale: Any, kp: Any, kd: Any, widt
 
 @wp.func
 def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scale: Any, dt: Any):
-    """(now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term [N.m]; the integral goes on
-    over the step: + gain * dt * (e - rate dt), gain = `integral_gain`."""
+    """(now, end, slope) of `pd`'s answer `asked` with the torque of the feed-forward and the integral term [N.m]; the
+    integral goes on over the step: + gain * dt * (e - rate dt), gain = `integral_gain`."""
     now = asked[0]
     end = asked[1]
     slope = asked[2]
@@ -266,7 +280,8 @@ SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this ar
 
 @wp.func
 def difference(new: Any, old: Any, span: Any, dt: Any):
-    """Backward difference (new - old) / span of two targets, or of two of their speeds, span [s] apart; 0 for a jump in no time."""
+    """Backward difference (new - old) / span of two targets, or of two of their speeds, span [s] apart; 0 for a jump in
+    no time."""
     rate = type(new)(0.0)
     if span > type(dt)(SHORTEST) * dt:
         rate = (new - old) / span
@@ -275,17 +290,18 @@ def difference(new: Any, old: Any, span: Any, dt: Any):
 
 @wp.func
 def hold(stamp: Any, span: Any, until: Any, begin: Any, dt: Any):
-    """Share of the step [begin, begin + dt] in which a target's speed is in force: from the target's time `stamp` to `until` (the
-    step's end, or the next target), for at most HOLDS times the interval `span` that it was taken over [s]."""
+    """Share of the step [begin, begin + dt] in which a target's speed is in force: from the target's time `stamp` to
+    `until` (the step's end, or the next target), for at most HOLDS times the interval `span` that it was taken over
+    [s]."""
     end = wp.min(until, stamp + type(span)(HOLDS) * span)
     return wp.max(end - wp.max(stamp, begin), type(dt)(0.0)) / dt
 
 
 @wp.func
 def wind(integral: Any, step: Any, asked: Any, lower: Any, upper: Any):
-    """The integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for, with it, is beyond the
-    limits -lower .. upper and the step would take it further (conditional integration: K. Astrom, T. Hagglund, PID Controllers,
-    2nd ed. 1995, section 3.5)."""
+    """The integral term [N.m] after a step of integral_gain * e * dt: it waits while the torque asked for, with it, is
+    beyond the limits -lower .. upper and the step would take it further (conditional integration: K. Astrom, T.
+    Hagglund, PID Controllers, 2nd ed. 1995, section 3.5)."""
     if (asked > upper and step > type(step)(0.0)) or (asked < -lower and step < type(step)(0.0)):
         return integral
     return integral + step

@@ -25,8 +25,8 @@ def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
 def target_rates(time, stamps, targets, delay, dt) -> tuple[np.ndarray, np.ndarray]:
     """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step: arguments as for `target_in_force`.
 
-    Target k has speed (x_k - x_k-1) / span and acceleration (speed_k - speed_k-1) / span, span = t_k - t_k-1, from t_k to the
-    next target, for at most 2 span.
+    Target k has speed (x_k - x_k-1) / span and acceleration (speed_k - speed_k-1) / span, span = t_k - t_k-1, from t_k
+    to the next target, for at most 2 span.
     """
     begin = np.asarray(time - delay, dtype=float)
     spans = np.diff(stamps, axis=-1)
@@ -72,13 +72,13 @@ def servo(
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
     target [rad]; q [rad], v [rad/s] of the driven joint; q_loop, v_loop of the joint that carries the loop's encoder
-    (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint
-    [kg.m2]; base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
-    far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered, rotor, line_a,
-    line_b, fresh, integral, taken: the state's slots; loop_motor: the loop's encoder is on the rotor; rates: the target's speed and
-    acceleration (`target_rates`).
-    Returns `torque` (motor torque the current shows), `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as
-    `kernel.py` defines them, and the next `filtered`, `rotor`, `line_a`, `line_b`, `integral`, `taken`.
+    (default q, v); last: motor torque of the step before [N.m]; enabled 1 or 0; inertia about the joint [kg.m2];
+    base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
+    far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered,
+    rotor, line_a, line_b, fresh, integral, taken: the state's slots; loop_motor: the loop's encoder is on the rotor;
+    rates: the target's speed and acceleration (`target_rates`). Returns `torque` (motor torque the current shows),
+    `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as `kernel.py` defines them, and the next
+    `filtered`, `rotor`, `line_a`, `line_b`, `integral`, `taken`.
     """
     play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
@@ -240,8 +240,9 @@ def servo(
 
 
 def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:
-    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and armature of what
-    passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop [N.m/rad]."""
+    """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and
+    armature of what passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop
+    [N.m/rad]."""
     on_drive = np.where(on_rotor, slope, on_drive)
     on_loop = np.where(on_rotor, 0.0, slope - on_drive)
     soft, gap2 = p["softness"], 0.5 * p["backlash"]

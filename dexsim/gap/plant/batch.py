@@ -1,4 +1,4 @@
-"""Batched simulation of one joint's recorded windows under many parameter guesses (see `plant_kernel.py`)."""
+"""Batched simulation of one joint's recorded windows under many parameter guesses (see `kernel.py`)."""
 
 from __future__ import annotations
 

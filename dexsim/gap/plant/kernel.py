@@ -3,11 +3,11 @@
 In free air each joint is its own small system once the other joints' measured motion is prescribed:
 
     I(t) dv/dt = eta * motor - gravity(q, t) - rest(t) - friction(v) - viscous v
-
-with I, gravity and rest taken from the MuJoCo model along the measured motion (`mechanics.py`); the drive's laws are
-those of `dexsim.actuator.laws`, which the training's kernel calls too, so a fitted column means the same there. With play or elasticity, rotor
-and link are two inertias joined by a spring with a gap, integrated implicitly (no stiffness limit on the step). Dry
-friction is solved exactly in each step (a joint sticks when the level can hold it), not approximated by a smooth law.
+ with I, gravity and rest taken from the MuJoCo model along the measured motion (`mechanics.py`); the drive's laws are
+those of `dexsim.actuator.laws`, which the training's kernel calls too, so a fitted column means the same there. With
+play or elasticity, rotor and link are two inertias joined by a spring with a gap, integrated implicitly (no stiffness
+limit on the step). Dry friction is solved exactly in each step (a joint sticks when the level can hold it), not
+approximated by a smooth law.
 """
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
@@ -273,7 +273,7 @@ def guess(c: Recorded, h: int, dt: f64):
     return p
 
 
-# -- encoder and commands ------------------------------------------------------------------------------------------------------
+# -- encoder and commands ----------------------------------------------------------------------------------------------
 
 
 @wp.func
@@ -314,8 +314,8 @@ def acts_at(c: Recorded, i: int, p: Guess):
 
 @wp.func
 def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Guess):
-    """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken off; command k of
-    the run's first .. last - 1 is in force at its begin."""
+    """(target [rad], torque of the feed-forward), means over the step of dt [s] that ends at `end`, the delay taken
+    off; command k of the run's first .. last - 1 is in force at its begin."""
     target = c.cmd[k]
     kk = int(k)
     while kk + 1 < last:
@@ -344,7 +344,7 @@ def command(c: Recorded, first: int, k: int, last: int, end: f64, dt: f64, p: Gu
     return wp.vec2d(target, p.feed_v * speed + p.feed_a * acceleration)
 
 
-# -- what holds in a step ------------------------------------------------------------------------------------------------------
+# -- what holds in a step ----------------------------------------------------------------------------------------------
 
 
 @wp.func
@@ -408,13 +408,14 @@ def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     return n
 
 
-# -- the drive -----------------------------------------------------------------------------------------------------------------
+# -- the drive ---------------------------------------------------------------------------------------------------------
 
 
 @wp.func
 def drive_torque(u: wp.vec3d, v_lim: f64, x: f64, lower: f64, upper: f64, steep: f64, gain: f64, drift: f64, n: Now):
-    """What a torque drive gives of u = (now, end, slope). At its limit the torque keeps to the limit for the whole step, unless the
-    step's end is within the limits; gain, drift: the change of speed in this step is gain * torque + drift."""
+    """What a torque drive gives of u = (now, end, slope). At its limit the torque keeps to the limit for the whole
+    step, unless the step's end is within the limits; gain, drift: the change of speed in this step is gain * torque +
+    drift."""
     t = Torque()
     t.now = wp.clamp(u[0], -lower, upper)
     t.end = wp.clamp(u[1], -lower, upper)
@@ -456,7 +457,8 @@ def drive_voltage(u: wp.vec3d, v: f64, gain: f64, drift: f64, n: Now):
 
 @wp.func
 def opened(t: Torque, v: f64, p: Guess, n: Now):
-    """The torque where a stage is tested with its recorded input, or the drive is off; a light rotor's slope is bounded."""
+    """The torque where a stage is tested with its recorded input, or the drive is off; a light rotor's slope is
+    bounded."""
     if p.two:  # its steps are short, and a light rotor's would not stand it
         t.on_drive = wp.max(t.on_drive, f64(0.0))
     if p.open_ > f64(0.0):  # the stage after the drive, with its recorded input
@@ -489,7 +491,7 @@ def dry_friction(torque: f64, v: f64, p: Guess, n: Now):
     return (level + share * wp.abs(torque)) * n.friction
 
 
-# -- the bodies ----------------------------------------------------------------------------------------------------------------
+# -- the bodies --------------------------------------------------------------------------------------------------------
 
 
 @wp.func
@@ -535,7 +537,8 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 @wp.func
 def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, rotor: f64, dt: f64,
                p: Guess, n: Now):  # fmt: skip
-    """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits the step."""
+    """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
+    the step."""
     zero = f64(0.0)
     begun = x.v
     begun_m = x.vm
@@ -750,7 +753,8 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
 
 @lru_cache(maxsize=None)
 def plant_kernel():
-    """The kernel: one thread a guess and window. first: number of the launch's first guess; dt: step of the grid [s]."""
+    """The kernel: one thread a guess and window. first: number of the launch's first guess; dt: step of the grid
+    [s]."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def plant(first: int, dt: f64, c: Recorded):
