@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import sys
@@ -35,16 +36,18 @@ def configs(tmp_path, monkeypatch):
     return shell.configs(tmp_path)
 
 
-@pytest.fixture(scope="module")
-def stand_in(tmp_path_factory):
-    """One for all tests: rsl-rl keeps the module that it imported first."""
-    lib = tmp_path_factory.mktemp("lib")
-    (lib / "wandb.py").write_text(STAND_IN)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(lib)
-        yield
-    for name in ("wandb", "rsl_rl.utils.wandb_log_writer"):
-        sys.modules.pop(name, None)
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """rsl-rl looks for wandb once, when it is imported: what it found then is exchanged too."""
+    import dexsim.learning.ppo  # noqa: F401  imports rsl-rl as dexsim wants it
+
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "wandb.py").write_text(STAND_IN)
+    monkeypatch.syspath_prepend(tmp_path / "lib")
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", importlib.import_module("wandb"))
+    yield
+    sys.modules.pop("wandb", None)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("wandb") is not None, reason="wandb is installed")
