@@ -7,10 +7,10 @@ hull, against hulls of the object library; surfaces from 2 mm deep to 1.5 mm (th
 MuJoCo's `mj_geomDistance` in float64 with a tolerance of 1e-10 m. Printed for each pair of types and both settings:
 percentiles of the error of the distance, of the angle of the normal and of the contact's place, and microseconds a pair
 of the narrow phase alone (of all worlds at once, cold: no pair has been there before).
-
-Normals and places are compared where the reference is well-posed: not where overlapping bodies have two ways out of equal
-length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two roundings; places also only where a corner of one
-body is nearest, since parallel edges and faces have no single nearest point. The number compared is printed.
+ Normals and places are compared where the reference is well-posed: not where overlapping bodies have two ways out of
+equal length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two roundings; places also only where a
+corner of one body is nearest, since parallel edges and faces have no single nearest point. The number compared is
+printed.
 """
 
 from __future__ import annotations
@@ -217,7 +217,8 @@ def compare(model: mujoco.MjModel, poses: Poses, want, got) -> dict[str, np.ndar
     error = np.where(both, got[0] - dist, np.nan)
     angle = np.arctan2(np.linalg.norm(np.cross(normal, got[1]), axis=1), (normal * got[1]).sum(1))
     sound, unique = well_posed(model, poses, want)
-    rival = (dist < 0) & (angle > 1e-3) & (np.abs(confirmed(model, poses, got[1]) - confirmed(model, poses, normal)) < 1e-6)
+    rival = (dist < 0) & (angle > 1e-3) & (np.abs(confirmed(model, poses, got[1]) - confirmed(model, poses,
+                                                                                              normal)) < 1e-6)
     sound &= ~rival  # two ways out, equally long
     return {
         "missed": missed, "extra": extra, "dist": error, "angle": np.where(both & sound, angle, np.nan),

@@ -11,8 +11,7 @@ from worlds import grasp_env
 
 from benchmarks import narrow_phase as bench
 from dexsim.errors import UserError
-from dexsim.sim import make_engine
-from dexsim.sim import warmup
+from dexsim.sim import make_engine, warmup
 from dexsim.sim.collision import unsupported
 from dexsim.sim.pendulum import pendulum_spec
 
