@@ -165,8 +165,36 @@ def test_the_python_api_trains_in_the_folder_that_it_claimed(place, monkeypatch)
     from dexsim.cli import train as training
 
     ran = []
-    monkeypatch.setattr(training, "_run", lambda start, make_env, ranks, stop, where: ran.append(where) or 0)
+    monkeypatch.setattr(training, "_run", lambda start, make_env, ranks, stop, where, open_: ran.append(where) or 0)
     where = dexsim.train(worlds=2, iterations=1, device="cpu", out=place / "mine")
     assert ran == [where] == [place / "mine"]
     with pytest.raises(UserError, match="already holds a run"):
         dexsim.train(worlds=2, iterations=1, device="cpu", out=place / "mine")
+
+
+def test_a_closed_environment_gives_everything_back_at_once():
+    """Without Python's search for circles: the engine is gone, and so are its threads, of each of several."""
+    import gc
+    import weakref
+
+    import torch
+    from worlds import grasp_env
+
+    def threads():
+        return len(os.listdir("/proc/self/task"))
+
+    gc.collect()
+    gc.disable()
+    try:
+        counts = []
+        for _ in range(3):
+            env = grasp_env("sim.threads=2", worlds=2)
+            env.step(torch.zeros(2, 12))
+            held = [weakref.ref(x) for x in (env.engine, env.servo, env.touch, env.objects, env.engine.t.qpos)]
+            env.close()
+            env.close()
+            assert [ref() for ref in held] == [None] * len(held)
+            counts.append(threads())
+        assert counts[0] == counts[1] == counts[2], counts
+    finally:
+        gc.enable()

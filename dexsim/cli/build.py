@@ -43,6 +43,11 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
     return env
 
 
+def close(env: Any) -> None:
+    """Give back an environment's memory and threads, where it can."""
+    getattr(env, "close", lambda: None)()
+
+
 def print_tables(env: Any) -> None:
     """Observation, action, reward, termination and randomization tables."""
     print("\n" + describe_env(env.describe()) + "\n", flush=True)

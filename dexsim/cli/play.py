@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from dexsim.cli import build, folder, machine
@@ -39,7 +40,10 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if play["view"]:
         from dexsim.cli import live
 
-        return live.run(start, env, policy)
+        try:
+            return live.run(start, env, policy)
+        finally:
+            build.close(env)
     print(f"playing {play['episodes']} episodes", flush=True)
     recorder = None
     if play["record"] is not None:
@@ -47,7 +51,8 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
 
         PlayRecorder.place(play["record"])  # a place that cannot be written is answered before the play
         recorder = PlayRecorder(env, play["record_worlds"], cfg)
-    with Stop() as stop:
+    with Stop() as stop, contextlib.ExitStack() as open_:
+        open_.callback(build.close, env)
         try:
             replay(env, policy, out, play["episodes"], play["seed"], play["video"], about)
         except KeyboardInterrupt:

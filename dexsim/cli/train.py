@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shlex
 import time
@@ -42,12 +43,22 @@ def run(start: Start, make_env: build.MakeEnv | None = None, where: Path | None 
     _check_resume(start)
     if start.source and ranks.leader:
         folder.tidy([Path(start.source).expanduser().parent])
-    with ranks.only_leader_prints(), Stop(together=ranks.size > 1) as stop, ranks.joined(start.cfg["device"]):
-        return _run(start, make_env, ranks, stop, where)
+    with (
+        ranks.only_leader_prints(),
+        Stop(together=ranks.size > 1) as stop,
+        contextlib.ExitStack() as open_,
+        ranks.joined(start.cfg["device"]),
+    ):
+        return _run(start, make_env, ranks, stop, where, open_)
 
 
 def _run(
-    start: Start, make_env: build.MakeEnv | None, ranks: Ranks, stop: Stop, where: Path | None = None
+    start: Start,
+    make_env: build.MakeEnv | None,
+    ranks: Ranks,
+    stop: Stop,
+    where: Path | None,
+    open_: contextlib.ExitStack,
 ) -> int:
     cfg = start.cfg
     where = Path(ranks.tell(str(where or folder.for_run(cfg)) if ranks.leader else None))
@@ -57,6 +68,7 @@ def _run(
     facts = {"run": where} if ranks.size == 1 else {"ranks": f"{ranks.size}, {cfg['worlds']} worlds each", "run": where}
     with ranks.one_compiles():
         env = build.build_env(cfg | {"seed": ranks.seed(cfg["seed"])}, make_env, facts)
+    open_.callback(build.close, env)
     env.dump_folder = where if ranks.leader else where / f"rank_{ranks.rank}"  # for worlds that were not finite
     build.print_tables(env)
     stop.asked()  # Ctrl-C while compiling: nothing to save

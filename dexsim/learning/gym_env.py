@@ -75,6 +75,10 @@ class GymVectorEnv(VectorEnv):
             info["_final_obs"] = self._out(done)
         return self._out(obs[self._group]), self._out(reward), self._out(done & ~truncated), self._out(truncated), info
 
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environment, too (called by ``close``)."""
+        getattr(self.env, "close", lambda: None)()
+
     def _others(self, obs: Any) -> dict[str, Any]:
         return {name: self._out(obs[name]) for name in obs.keys() if name != self._group}
 
