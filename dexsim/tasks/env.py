@@ -479,8 +479,11 @@ class HandEnv(VecEnv):
         return model
 
     def close(self) -> None:
-        """Give back memory and threads at once. They refer to each other in circles, so that Python would keep them until
-        it happens to look for such; of 64 worlds that is some 100 MB. Nothing else may be called afterwards, but `close`."""
+        """Give back memory and threads at once; afterwards nothing but `close` may be called.
+
+        They refer to each other in circles, so that Python would keep them until it happens to look for such; of 64
+        worlds that is some 100 MB.
+        """
         for part in ("_recorded", "_nan_dump", "touch", "servo", "objects", "sampler", "engine"):
             held = self.__dict__.pop(part, None)
             if hasattr(held, "__dict__"):
