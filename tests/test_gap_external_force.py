@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from test_gap_torque_route import ARM, arm, run
@@ -38,6 +39,21 @@ def test_pushes_are_told_with_when_and_how_hard():
 def test_nothing_is_told_where_nothing_pushes():
     model = arm()
     assert external_force.find(model, [run(model, 0), run(model, 1, friction=(1.5, 0.6))], [0, 1]) == []
+
+
+def test_what_friction_carries_at_rest_and_noise_are_no_push():
+    model, rng = arm(), np.random.default_rng(3)
+    r = run(model, 0)  # from 12 s on it stands, its motors pulling within their friction
+    start = int(np.argmax(r.t > 12.0))
+    r.q[start:] = r.q[start] + 1e-5 * rng.standard_normal((len(r.t) - start, 2))
+    data = mujoco.MjData(model)
+    data.qpos[:] = r.q[start]
+    mujoco.mj_forward(model, data)
+    r.torque[start:] = data.qfrc_bias + 0.9 * np.array([0.5, 0.2]) * np.sin(2 * np.pi * 0.5 * r.t[start:])[:, None]
+    assert external_force.find(model, [r], [0]) == []
+    loud = run(model, 1)
+    loud.torque += 8.0 * rng.standard_normal(loud.torque.shape)
+    assert external_force.find(model, [loud], [0]) == []
 
 
 def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():

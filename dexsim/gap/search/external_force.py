@@ -24,6 +24,9 @@ QUIET = 0.3  # of the variance of the quiet torque: what the trimmed fit may lea
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
 FAR, LEAST = 5.0, 0.15  # x the quiet residual, and of the torque's rms: a push
 JOIN, LASTS = 0.15, 0.05  # s: gaps that are joined, and the shortest push
+MOVING = 0.1  # of the joint's large speed
+CARRIES = 1.3  # x its dry friction: what a joint at rest may carry
+SLOW = 0.25  # of the residual's variance between half seconds: less is noise
 MOST = 0.6  # of the time: what pushes longer is no stretch
 REST = 0.4  # of the time: what must be left without pushes to judge a joint by it
 SURE, HINT = 0.9, 0.4
@@ -70,41 +73,62 @@ def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed
         for r in use:
             if r not in motions:
                 motions[r] = moved(runs[r], model, cutoff)
-        push = _of_joint(joint, [columns_of([motions[r]], j) for r in use], [r in own for r in use], rng)
+        push = _of_joint([columns_of([motions[r]], j) for r in use], [r in own for r in use], rng)
         if push is not None:
             spans, slide = _spans(push[0], [runs[r] for r in use]), int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+            if push[4] and not spans:
+                continue
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
     return out
 
 
-def _of_joint(joint: str, pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator):
-    """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest fits); None where little is left."""
+def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator):
+    """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest fits); None where little is left.
+
+    Fitted while the joint moves: at rest its dry friction carries any torque up to its level, and only what is beyond that speaks."""
     names = [n for n in pieces[0].names if all(n in p.names for p in pieces)]
     X = [p.X[:, [p.names.index(n) for n in names]] for p in pieces]
-    mine = [k for k, x in enumerate(own) if x and len(pieces[k].u)]
-    if not mine or sum(len(pieces[k].u) for k in mine) < 200:
+    fast = MOVING * float(np.percentile(np.abs(np.concatenate([p.v for p in pieces])), 95))
+    moves = [np.abs(p.v) > fast for p in pieces]
+    mine = [k for k, x in enumerate(own) if x and moves[k].sum() > 20]
+    if not mine or sum(int(moves[k].sum()) for k in mine) < 200:
         return None
-    A, u = np.concatenate([X[k] for k in mine]), np.concatenate([pieces[k].u for k in mine])
-    torque = np.concatenate([pieces[k].torque for k in mine])
-    total = float(np.var(torque))
-    plain = solved(A.T @ A, A.T @ u)
-    left = float(np.var(u - A @ plain)) / max(total, 1e-30)
+    cat = lambda f: np.concatenate([f(k)[moves[k]] for k in mine])  # noqa: E731
+    A, u, torque = cat(lambda k: X[k]), cat(lambda k: pieces[k].u), cat(lambda k: pieces[k].torque)
+    left = float(np.var(u - A @ solved(A.T @ A, A.T @ u))) / max(float(np.var(torque)), 1e-30)
     if left < MUCH:
         return None
     ends = np.cumsum([0, *(pieces[k].blocks.max() + 1 for k in mine)])
-    block = np.concatenate([pieces[k].blocks + e for k, e in zip(mine, ends, strict=False)])
-    x, quiet = _trimmed(A, u, block, int(ends[-1]), rng)
+    _, block = np.unique(cat(lambda k: pieces[k].blocks + ends[mine.index(k)]), return_inverse=True)
+    x, quiet = _trimmed(A, u, block, int(block.max()) + 1, rng)
     on = quiet[block]
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
-    clear = noise**2 < QUIET * float(np.var(torque[on])) and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
+    fits = noise**2 < QUIET * float(np.var(torque[on])) and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
     least = max(FAR * noise, LEAST * float(np.sqrt(np.mean(torque**2))))
-    residual = [p.u - a @ x for p, a in zip(pieces, X, strict=True)]
+    residual = [_beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)]
     pushed = [np.abs(r) > least for r in residual]
     share = float(np.mean(np.concatenate(pushed)))
-    clear = clear and 0 < share < MOST
+    if fits and share == 0 or not fits and not _slow(u - A @ x, block):
+        return None  # nothing stands out, or noise does
     top = max((float(r[np.argmax(np.abs(r))]) for r in residual if len(r)), key=abs)
     times = [np.concatenate([q.motion.t[q.keep] - q.motion.t[0] for q in p.pieces]) for p in pieces]
-    return list(zip(times, pushed, strict=True)), -top, noise, left, clear  # what the motor gives less, something else gives
+    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < MOST  # what the motor gives less, something else gives
+
+
+def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np.ndarray) -> np.ndarray:
+    """[m] torque that the fit misses; at rest only beyond what dry friction may carry either way."""
+    still = A.copy()
+    still[:, coulomb] = 0.0
+    held = u - still @ x
+    free = np.sign(held) * np.maximum(np.abs(held) - CARRIES * max(float(x[coulomb]), 0.0), 0.0)
+    return np.where(moves, u - A @ x, free)
+
+
+def _slow(residual: np.ndarray, block: np.ndarray) -> bool:
+    """Whether residuals are alike over half a second, as forces are and noise is not."""
+    count = np.maximum(np.bincount(block), 1)
+    means = np.bincount(block, residual) / count
+    return float(np.sum(count * means**2)) > SLOW * float(np.sum(residual**2))
 
 
 def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Columns:
