@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.thermal import temperature_follows
-from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge import confidence, verdict
 from dexsim.gap.judge.confidence import DOUBTED, Evidence
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param
@@ -134,7 +134,7 @@ def test_temperature_that_follows_something_else(starts, gains, what):
                                                                   (4.0, 3.0, True, "unknown"), (12.0, 1.1, True, "unknown"), (12.0, 9.0, False, "unknown")])  # fmt: skip
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
-    assert errors.verdict([], 1.0, before, low, before, structured, errors.FAR) == word
+    assert verdict.verdict([], 1.0, before, low, before, structured) == word
 
 
 def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from dexsim.gap.command import Progress
-from dexsim.gap.judge import conclude, errors
+from dexsim.gap.judge import conclude, errors, verdict
 from dexsim.gap.judge.joint import STRETCHED, stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.param import Param
@@ -97,7 +97,7 @@ def test_what_only_the_recording_kept_out_shows_is_said():
 @pytest.mark.parametrize(("confidence", "group", "word"), [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")])
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
     finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
-    assert errors.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
+    assert verdict.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 
 def test_temperature_counts_from_that_of_a_data_sheet():

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +17,7 @@ from dexsim.console import program
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
+    from dexsim.gap.search.time_limit import TimeLimit
     from dexsim.gap.result import Settings
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
@@ -44,6 +49,8 @@ settings (key=default):
   servo=                      servo.yaml believed of its drives; the xHand's by default
   out=out/diagnosis           folder for the results
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
+  joints=                     judge only these joints: [elbow,wrist]; the others' recorded motion is only prescribed
+  limit=                      seconds to take at most: the best answer by then, saying so. Ctrl-C does the same at once
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
   replay=mujoco               engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp, on the device), none
@@ -54,7 +61,7 @@ settings (key=default):
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
   remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state, remap.position.elbow=enc1
 """
-KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "replay", "demo", "columns")
+KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "replay", "demo", "columns", "limit", "joints")
 
 
 def parse(argv: list[str]) -> dict:
@@ -73,7 +80,7 @@ def parse(argv: list[str]) -> dict:
             continue
         if key not in KEYS:
             raise UserError(f"setting '{key}' does not exist.{did_you_mean(key, KEYS)} Valid: {', '.join(KEYS)}, meta.KEY, remap.OURS")
-        if key in ("recordings", "held_out", "effects"):
+        if key in ("recordings", "held_out", "effects", "joints"):
             text = text.strip()
             items = text[1:-1].split(",") if text.startswith("[") and text.endswith("]") else [text]
             out[key] = [i.strip().strip("'\"") for i in items if i.strip()]
@@ -84,6 +91,13 @@ def parse(argv: list[str]) -> dict:
             if not isinstance(value, bool):
                 raise UserError(f"{key}={text}: must be true or false")
             out[key] = value
+        elif key == "limit":
+            try:
+                out[key] = float(text)
+            except ValueError:
+                out[key] = 0.0
+            if not 1.0 <= out[key] < 1e7:
+                raise UserError(f"limit={text}: must be a number of seconds from 1 on")
         elif key == "seed":
             if not text.lstrip("-").isdigit():
                 raise UserError(f"seed={text}: must be a whole number")
@@ -118,6 +132,7 @@ def main(argv: list[str]) -> int:
     from dexsim import outputs
     from dexsim.gap.diagnosis import diagnose, save
     from dexsim.gap.report.files import RESULTS
+    from dexsim.gap.search.time_limit import TimeLimit
 
     start = time.perf_counter()
     device = started(given.get("device", "cpu"))
@@ -136,7 +151,9 @@ def main(argv: list[str]) -> int:
     claim(settings)
     if given.get("demo"):
         outputs.note_paths(out, [out / "recordings"])
-    result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
+    settings.time_limit = TimeLimit(settings.limit)
+    with _interruptible(settings.time_limit):
+        result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())
     written = save(result, out)
     print(verdict(result))
     if demo is not None:
@@ -152,6 +169,25 @@ def claim(s: Settings) -> None:
 
     read = [*s.recordings, *(s.held_out or []), *(Path(p) for p in (s.model, s.servo) if p)]
     outputs.claim(s.out, "out=", RESULTS, read)
+
+
+@contextmanager
+def _interruptible(limit: TimeLimit) -> Iterator[None]:
+    """Ctrl-C ends the search with the best answer so far; a second one ends the program."""
+
+    def ask(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        print("\n  ending with the best answer so far; Ctrl-C again gives up", flush=True)
+        limit.stop()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def settings_of(given: dict, out: Path, device: str) -> Settings:
@@ -174,7 +210,7 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
     return Settings(
         inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
         given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "mujoco"), meta=given["meta"],
-        remap=given["remap"],
+        remap=given["remap"], limit=given.get("limit"), joints=set(given["joints"]) if given.get("joints") else None,
     )  # fmt: skip
 
 

@@ -17,21 +17,22 @@ from dexsim.gap.judge.conclude import add_behind, assemble
 from dexsim.gap.judge.joint import Kept
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.coupled_motion import again, coupled, sharpen
-from dexsim.gap.read import channels, end_stops, inputs, stage_tests
+from dexsim.gap.read import channels, end_stops, inputs, keep_out, stage_tests
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_experiment import rival_of
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Clock, Diagnosis, Settings, empty
 from dexsim.gap.search import baseline, external_force, torque_told
-from dexsim.gap.search.parallel import together
+from dexsim.gap.search.parallel import lanes, together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.search.time_limit import TimeLimit
 from dexsim.gap.touch import handed_on as touch_handed
 from dexsim.gap.touch import touch
 from dexsim.gap.touch.merge import add_touch, touch_alone
 from dexsim.recording.mechanism import Mechanism
 
-KEEP_OUT = 0.25  # of the time of each recording, where there are too few to keep a whole condition out
+OTHERWISE = 0.1  # of what is left of a joint: by as much it must change with what is known of the others to be searched again
 UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
 
 
@@ -41,6 +42,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     from dexsim.recording.mechanism import mechanism
 
     clock = Clock()
+    limit = s.time_limit or TimeLimit(s.limit)
     notes: list[str] = []
     try:
         m = mechanism(s.model, s.servo)
@@ -162,13 +164,17 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     group = conditions(runs)
     drives = [json.dumps(plain(r.servo.to_dict()), sort_keys=True) for r in runs]
     fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
-    train, test, span_train, span_test, how = _split(runs, held, group)
+    parts = keep_out.split(runs, held, group, cases)
+    train, test, span_train, span_test, how = parts.train, parts.test, parts.span_train, parts.span_test, parts.how
     say(f"kept out of the fit: {how}")
     floor, floor_how = errors.floor(runs, cases)
+    floors = errors.floors(runs, cases)[0]
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
     def begun(k: int, tell: Callable[[float], None]) -> JointSearch:
-        return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed, tell=tell)
+        share = min(1.0, lanes(s.device, len(cases)) / max(left[0], 1))
+        return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed, tell=tell,
+                           deadline=limit.share(cases[k].joint, share))
 
     def search_of(k: int, tell: Callable[[float], None]) -> tuple[JointSearch, Outcome | None]:
         search = begun(k, tell)
@@ -176,13 +182,14 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
             return search, None
         found = search.run() if cases[k].moved else search.idle()
         search.settle(found)
+        left[0] -= 1
         return search, found
 
     def start_of(k: int, tell: Callable[[float], None]) -> Trial | None:
         search = begun(k, tell)
         return search.start() if len(search.long.window) else None
 
-    joints = [c.joint for c in cases]
+    joints, left = [c.joint for c in cases], [len(cases)]
     linked = len(cases) > 1 and s.joints is None and coupled(cases)
     if linked:
         first = together(joints, start_of, s.device)
@@ -205,6 +212,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     if linked and len(unsettled) > 1 and all(found is not None for _, found in answers):
         # what was found in one joint moves the others otherwise than was thought
         cases = again(model, runs, cases, [found.best for _, found in answers], s.device, _step(runs))
+        unsettled = [k for k in unsettled if not limit.stopped and _other(begun(k, lambda _: None), answers[k][1])]
+        left[0] = len(unsettled)
         for k, answer in zip(unsettled, together([joints[k] for k in unsettled], lambda i, tell: search_of(unsettled[i], tell), s.device, progress), strict=True):
             answers[k] = answer
     for search, found in answers:
@@ -215,10 +224,16 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
             notes.append(f"{case.joint}: no stretch long enough to simulate")
         else:
             outcomes.append((case, search, found))
+    if limit.cut:
+        why = "it was interrupted" if limit.stopped else f"the limit of {limit.seconds:g} s"
+        notes.insert(0, f"the search of {', '.join(sorted(limit.cut))} ended early ({why}): this is the best answer by then, further effects were not looked for")
     clock.lap("search")
     plains = [b for case, search, _ in outcomes if case.moved and (b := baseline.fit(case, train, test, span_train, span_test, s.seed, search.whole))]
     clock.lap("plain model")
-    result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how), how, channel, notes, plains)
+    result = assemble(s, m, outcomes, Kept(runs, train, test, span_train, span_test), (floor, floor_how, floors), how, channel, notes, plains)
+    result.data["held_out"]["not_judged"] = parts.not_judged
+    if parts.not_judged:
+        notes.append(f"not judged: {', '.join(parts.not_judged)}; what was kept out visits it and no recording that is fitted does")
     result.stages = [x.text for x in stages] + behind
     add_behind(result, torque_told.findings(by_torque, nothing_believed, runs, train), by_torque)
     torque_told.hand_on(by_torque, result, outcomes, test, span_test, stages)
@@ -237,6 +252,16 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         clock.lap("next recording")
     result.shares = clock.shares
     return result
+
+
+def _other(search: JointSearch, found: Outcome) -> bool:
+    """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was thought."""
+    for trial in (found.none, found.best):
+        with search._fix(trial.members):
+            loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
+        if abs(loss - trial.fit.loss) > OTHERWISE * trial.fit.loss:
+            return True
+    return False
 
 
 def _stand_in(d: Diagnosis, outcomes, runs, train, test, span_train, span_test, floor: float, seed: int) -> None:
@@ -287,25 +312,6 @@ def _step(runs: list[Run]) -> float:
     """Integration step [s]: 1 ms, and no coarser than half a sampling period."""
     period = min(float(np.median(np.diff(r.t))) for r in runs)
     return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
-
-
-def _split(runs, held, group):
-    """(training runs, test runs, spans of both, in words)."""
-    if held:
-        train = [i for i in range(len(runs)) if i not in held]
-        return train, held, None, None, "the held_out recordings " + ", ".join(runs[i].name for i in held)
-    groups = sorted(set(group))
-    if len(groups) >= 3:
-        tells = [g for g in groups if not any(runs[i].left_out for i in range(len(runs)) if group[i] == g)] or groups
-        test = [i for i in range(len(runs)) if group[i] == tells[-1]]
-        train = [i for i in range(len(runs)) if i not in test]
-        if sum(runs[i].duration for i in train) > sum(runs[i].duration for i in test):
-            return train, test, None, None, "one condition, " + ", ".join(runs[i].name for i in test)
-    every = list(range(len(runs)))
-    cut = {i: (1 - KEEP_OUT) * runs[i].duration for i in every}
-    return every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every}, (
-        f"the last {100 * KEEP_OUT:.0f} % of each recording's time"
-    )
 
 
 def _limits(model, runs: list[Run]) -> list[str]:

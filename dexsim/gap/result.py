@@ -13,6 +13,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.judge import confidence, full_model, residual_fit
 from dexsim.gap.locate import bins
 from dexsim.gap.search.search import Outcome
+from dexsim.gap.search.time_limit import TimeLimit
 from dexsim.gap.touch.touch import TouchResult
 from dexsim.recording.mechanism import Mechanism
 
@@ -34,6 +35,8 @@ class Settings:
     joints: set[str] | None = None
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
+    limit: float | None = None  # s of wall time for all; the best answer by then
+    time_limit: TimeLimit | None = None  # made from `limit` where it is not given; its `stop()` ends the search with the best so far
     replay: str = "mujoco"  # see `confirm.REPLAY`
 
 

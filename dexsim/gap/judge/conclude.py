@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, entry
-from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
-from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances
+from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
 from dexsim.gap.report.sentence import sentence
@@ -23,18 +23,17 @@ from dexsim.recording.mechanism import Mechanism
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/results/concealed.md)
 NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
 SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
-HINTED = 0.45  # confidence of what a plain model does better without
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 
 
-def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]], kept: Kept, floor: tuple[float, str], how: str,
+def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]], kept: Kept, floor: tuple[float, str, dict[str, float]], how: str,
              channel: list[dict[str, Any]], notes: list[str], plains: Sequence[baseline.Baseline] = ()) -> Diagnosis:
     """The diagnosis of the joints.
 
-    outcomes: what the search answered of each; floor: of the noise [rad or m], and where it comes from; how: what was kept out, in words;
+    outcomes: what the search answered of each; floor: of the noise [rad or m], where it comes from, of each joint; how: what was kept out, in words;
     channel: findings about signals, of all joints; notes: what the page says beside the findings, added to; plains: the plain model of each joint."""
     data = empty("none")
-    data["noise_floor"] = {"position_rad": float(floor[0]), "how": floor[1]}
+    data["noise_floor"] = {"position_rad": float(floor[0]), "how": floor[1], "joints": {k: float(v) for k, v in floor[2].items()}}
     out = Diagnosis(data, "", notes, mechanism=m)
     rng = np.random.default_rng(s.seed)
     answers = [JointAnswer(case, search, outcome, kept) for case, search, outcome in outcomes]
@@ -71,8 +70,11 @@ def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSear
     if worse:
         data["baseline"]["handed_on"] = baseline.hand_on(plains, out.servo, list(worse))
     findings = _linkages(findings, answers)
+    quiet = {a.case.joint for a in answers if rms(a.before) <= verdict.WITHIN * floor[2][a.case.joint]}
+    verdict.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
+    findings.sort(key=lambda f: f.get("hint", False))
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
-    _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed)
+    _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed, len(quiet) == len(answers))
     out.sentence = sentence(data, out, floor[0])
     return out
 
@@ -84,7 +86,7 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
         for e in d.evidence:
             if e.joint == joint and not EFFECTS[e.effect].effort_only:
                 e.reasons.append(reason)
-                e.confidence = min(e.confidence, HINTED)
+                e.confidence = min(e.confidence, verdict.HINTED)
 
 
 def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:
@@ -127,7 +129,7 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
 
 
 def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings: list[dict[str, Any]], refuted: set[str], floor: float, how: str,
-             seed: int) -> None:
+             seed: int, quiet: bool) -> None:
     """Errors over all joints on what was kept out, and the word for it."""
     data, times = d.data, [a.t for a in answers]
     b, bl, bh = errors.rms_interval([a.before for a in answers], times, seed)
@@ -136,7 +138,8 @@ def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings:
     data["held_out"] = {"recordings": [kept.runs[i].name for i in kept.test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
                         "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}  # fmt: skip
     structured = any(x.outcome.none.fit.loss > 1.3**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
-    data["verdict"] = errors.verdict(data["findings"], floor, b, bl, a, structured, errors.FAR)
+    data["verdict"] = verdict.verdict(data["findings"], floor, b, bl, a, structured, quiet)
+    findings = [f for f in findings if f["confidence"] >= verdict.FIRM]
     if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
         squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
@@ -152,7 +155,7 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[
     """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing (a limit, a sag) shows
     there alone, and what is kept out must not be fitted."""
     found = {j for f in findings for j in f["where"]["joints"]}
-    return [j for j, v in joints.items() if j not in found and v["before"] > max(errors.FAR * v["sigma"], ALONE * v["fitted"])]
+    return [j for j, v in joints.items() if j not in found and v["before"] > max(verdict.FAR * v["sigma"], ALONE * v["fitted"])]
 
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
+from dexsim.gap.judge.verdict import HINTED
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 
@@ -41,6 +42,11 @@ class Evidence:
     reasons: list[str] = field(default_factory=list)
     confidence: float = 0.0
     of_pose: bool = False  # whether it is a torque that changes slowly with the pose alone
+
+    def hint(self, reason: str) -> None:
+        """Makes it a hint."""
+        self.reasons.append(reason)
+        self.confidence = min(self.confidence, HINTED)
 
     def plain(self) -> dict:
         """As it is written."""

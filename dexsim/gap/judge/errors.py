@@ -10,33 +10,40 @@ from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.read.runs import Run, same_commands
 
-FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
 FIRST = 0.1  # s tell where and how fast: within
 START_NOISE, START_SPEED = 10.0, 0.2  # x the noise, and of a joint's speed, of what the samples about its first say
-SURE_ENOUGH = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
 
 
 def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
     """(noise floor of the position error, how): from repeats of the same commands, else from split samples, else from
     the encoder's quantum. Root mean square over joints."""
-    sums, count = 0.0, 0
+    each, how = floors(runs, cases)
+    if how == "repeats":
+        return float(np.sqrt(np.mean([each[c.joint] ** 2 for c in cases]))), how
+    split = float(np.sqrt(np.mean([c.sigma**2 for c in cases])))
+    quantum = float(np.sqrt(np.mean([c.quantum**2 for c in cases]))) / np.sqrt(12)
+    return split, "quantum" if split <= 1.02 * quantum else "split"
+
+
+def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
+    """(noise floor of each joint's position error, how): from repeats where there are any, never below the noise of its samples.
+
+    Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can explain."""
+    sums, count = np.zeros(len(runs[0].joints)), 0
     for i, a in enumerate(runs):
         for b in runs[i + 1 :]:
             if a.name == b.name or not same_commands(a, b):  # pieces of one recording are aligned only by where they were cut
                 continue
             t = np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
             # repeats are aligned by their commands, which were sent at the same times from the start
-            for j, joint in enumerate(a.joints):
-                if joint in a.left_out | b.left_out:
-                    continue
+            for j in range(len(a.joints)):
                 d = np.interp(a.t[0] + t, a.t, a.q[:, j]) - np.interp(b.t[0] + t, b.t, b.q[:, j])
-                sums, count = sums + float((d**2).sum()) / 2.0, count + len(t)
-    split = float(np.sqrt(np.mean([c.sigma**2 for c in cases])))
-    quantum = float(np.sqrt(np.mean([c.quantum**2 for c in cases]))) / np.sqrt(12)
-    if count:
-        return max(float(np.sqrt(sums / count)), split), "repeats"
-    return split, "quantum" if split <= 1.02 * quantum else "split"
+                sums[j] += float((d**2).sum()) / 2.0
+            count += len(t)
+    if not count:
+        return {c.joint: c.sigma for c in cases}, "split"
+    return {c.joint: max(float(np.sqrt(sums[c.index] / count)), c.sigma) for c in cases}, "repeats"
 
 
 def free_run(case: Case, params: list[Param], x: np.ndarray, windows: Windows, fixed=(), underway: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -113,19 +120,3 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
     out.sort(key=lambda w: w["start"] - w["end"])
     out = out[:400]
     return sorted(out, key=lambda w: (w["recording"], w["start"]))
-
-
-def verdict(findings: list[dict], floor_: float, before: float, before_low: float, after: float, structured: bool, far: float = np.inf) -> str:
-    """The one word. Where every name is doubtful and none stands for a set, an error that is gone is not yet explained; an error
-    before beyond `far` x the floor is unknown even where it lies in too few moments to be sure of."""
-    named = [f for f in findings if f["held_out"]]
-    if not named:
-        if before <= far * floor_ and (before_low <= 1.3 * floor_ or not structured):
-            return "none"
-        return "unknown"
-    if after <= 1.3 * floor_ and any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named):
-        return "explained"
-    gap = max(before - floor_, 1e-12)
-    if after <= 1.3 * floor_ or (before - after) / gap >= 0.3:
-        return "partly_explained"
-    return "unknown"

@@ -41,7 +41,7 @@ BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for t
 APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
 LITTLE = 0.1  # of the error before: what the engine may leave beside what the plant leaves, added in squares
 MOSTLY = 0.3  # of the error before: what the engine may leave for the answer to hold there in the main
-MOST = 120.0  # s of recordings that are replayed, at most
+MOST = 8.0  # s of what was kept out that is replayed: a step of the engine is a turn of Python
 
 
 @dataclass

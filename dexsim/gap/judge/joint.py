@@ -9,7 +9,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import confusable, separating
 from dexsim.gap.effects.effect import FittedEffect
-from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
@@ -21,6 +21,8 @@ from dexsim.recording.mechanism import Mechanism
 
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 STRETCH, STRETCHED = 0.5, (0.5, 4.0)  # of the intervals: by the square of what is left of what was kept out, over the noise
+PART = 0.2  # of the squared error on what was kept out: what an effect removes at least that is more than a hint
+HARM = 0.05  # of the draws of recordings in which an effect may do more harm than good
 CLEAR = 1.5  # x the noise squared that windows keep after the fit, from which on what it depends on is said
 
 
@@ -96,6 +98,14 @@ class JointAnswer:
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.effect.effort_only
         evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
+        gain = verdict.gain_interval((self.measured - q) ** 2, self.after, self.t)
+        was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if effort_only and self.effort_after is not None else (error_without, rms(self.after))
+        if left**2 > (1 - PART) * was**2:
+            evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * PART:.0f} %")
+        elif not effort_only and gain[0] <= 0:
+            evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
+        if not effort_only and (harmed := self._harmed(trial)):
+            evidence.hint(harmed)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
@@ -114,12 +124,23 @@ class JointAnswer:
             "when": errors.intervals_of(active, case, self.kept.runs, self.kept.train),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
             "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)} if of_effort else
-                        {"before": error_without, "after": rms(self.after)},
+                        {"before": error_without, "after": rms(self.after), "removed_low": round(gain[0], 4), "removed_high": round(gain[1], 4)},
         }  # fmt: skip
         late = jitter.estimate(self.search, best) if mm.effect.jitters and best.fit.loss > jitter.LEFT else None
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
+
+    def _harmed(self, without_it: Trial) -> str:
+        """Why an effect is a hint only: what it gains in some recordings it loses in others, as what differs from run to run does; empty
+        where it helps or does nothing in nearly every draw of the recordings."""
+        lost, mine = (self.search.by_run(t) for t in (without_it, self.best))
+        runs = np.flatnonzero(lost > 0)
+        if len(runs) < 3:
+            return ""
+        pick = np.random.default_rng(0).integers(0, len(runs), (400, len(runs)))
+        gained = (lost - mine)[runs][pick].sum(1)
+        return "it helps in some recordings and harms in others, as what differs from run to run does" if np.mean(gained < 0) > HARM else ""
 
     def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
@@ -140,7 +161,8 @@ class JointAnswer:
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, case.sigma),
             confidence.left_over(after, error_without, case.sigma), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
-        if confidence.holds_nothing(mm.variant.params, spread, case):
+        nothing = confidence.holds_nothing(mm.variant.params, spread, case)
+        if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
         small = "" if effort_only else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
         if small:
@@ -151,6 +173,8 @@ class JointAnswer:
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
         evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, case.sigma)
+        if nothing or small:
+            evidence.confidence = min(evidence.confidence, verdict.HINTED)
         return evidence
 
     def spots(self, rng: np.random.Generator, seed: int) -> tuple[list[bins.Spot], list[str]]:

@@ -10,13 +10,14 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
-from dexsim.actuator.table import ALL
+from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants, along
 from dexsim.gap.plant.scales import Scales
 from dexsim.gap.read.runs import Run
 
+PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
 BELIEF = 0.05  # nominal figures of a real machine are off by as much, and no finding before
@@ -100,7 +101,7 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
         constants = constants or c
         if progress:
             progress(i + 1, len(runs))
-    rows = [run.servo.nominal(joints) for run in runs]
+    rows = [_believed(run, joints) for run in runs]
     torques = []
     for run, row in zip(runs, rows, strict=True):
         cmd = run.command_at(run.t)
@@ -141,6 +142,19 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
         plant.finish()
         cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
     return cases
+
+
+def _believed(run: Run, joints: Sequence[str]) -> np.ndarray:
+    """[J, C] servo columns of a recording, with what is believed of a drive of which nothing is said: that it brakes with its full torque."""
+    rows = run.servo.nominal(joints)
+    for row, joint in zip(rows, joints, strict=True):
+        if not _stated(run.servo, joint, "braking_slope"):
+            row[SERVO_INDEX["braking_slope"]] = PHYSICAL
+    return rows
+
+
+def _stated(table: ServoTable, joint: str, column: str) -> bool:
+    return any(column in table.entries.get(key, {}) for key in (ALL, joint))
 
 
 def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:

@@ -22,7 +22,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
-    named = [f for f in data["findings"] if modelled(f)]
+    named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
     pushed = [f for f in data["findings"] if entry(f) is not None and not modelled(f)]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
     prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""

@@ -145,7 +145,7 @@ class Fitter:
         res, s = self.init_directions(params, x)
         return self.eliminated(res[None], s)[0]
 
-    def shake(self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 32) -> Fitted:
+    def shake(self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20) -> Fitted:
         """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the loss
         rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
         P = len(params)
@@ -171,7 +171,7 @@ class Fitter:
             here = float(score(f.x, f.residual))
             best = int(np.argmin(tried))
             start = trial[best] if tried[best] < here else f.x
-            again = self.fit(params, x0=start, iterations=4, tolerance=5e-3)
+            again = self.fit(params, x0=start, iterations=4, tolerance=5e-3, slopes=slopes_of(f))
             if not float(score(again.x, again.residual)) < here * (1 - 5e-3):
                 break
             f = again
@@ -213,7 +213,7 @@ class Fitter:
             here, best = float(score(f.x, f.residual)), int(np.argmin(tried))
             if not tried[best] < here * (1 - 5e-3):
                 return f
-            f = self.fit(params, x0=guesses[best], iterations=4, tolerance=5e-3)
+            f = self.fit(params, x0=guesses[best], iterations=4, tolerance=5e-3, slopes=slopes_of(f))
         return f
 
     def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
@@ -229,8 +229,13 @@ class Fitter:
         return np.array(out)
 
     def fit(self, params: list[Param], x0: np.ndarray | None = None, iterations: int = 10, tolerance: float = 2e-3,
-            step: float = 0.01) -> Fitted:
-        """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts)."""
+            step: float = 0.01, slopes: dict[str, np.ndarray] | None = None, lazy: bool = False, exact: bool = True) -> Fitted:
+        """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
+
+        slopes: change [m] of the residuals per span of a parameter, by its key, known from a fit nearby on the same windows. lazy: once
+        known, from there or from the first batch, the slopes of beliefs and of these parameters follow the steps by Broyden's rank-one
+        updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only where they lead no further: a third of the simulations.
+        exact: end with slopes that were simulated at the end."""
         low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
         x = np.array([p.start for p in params], float) if x0 is None else np.array(x0, float)
         x = np.clip(x, low, high)
@@ -239,28 +244,23 @@ class Fitter:
         damping = 1e-2
         P = len(params)
         believed, centre = prior_weight(params), np.array([p.start for p in params], float)
-        res = jac = s = None
+        jac, known = self._known(params, slopes)  # known: slopes that were not simulated here
+        follow = (belief | known) if lazy or slopes is not None else np.zeros(P, bool)
+        moved = last = s = None
         fresh = True
         it = 0
-        for it in range(iterations + 1):
+        while True:
             if fresh:
-                # one batch: here, each parameter moved, the initial state moved
                 # small beside the value too: a range may be wide, and many effects are kinked where they begin
                 size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
                 size = np.where(belief, STEP_OF_BELIEF * span, size)
                 delta = np.where(x + size <= high, size, -size)
-                guesses = np.concatenate([x[None], x[None] + np.diag(delta), np.repeat(x[None], 2, 0)])
-                inits = np.zeros((P + 3, 2))
-                inits[P + 1, 0], inits[P + 2, 1] = self.r.sigma_q0, self.r.sigma_v0
-                if not self.eliminate:
-                    guesses, inits = guesses[: P + 1], inits[: P + 1]
-                raw = self.residuals(params, guesses, inits)
-                s = raw[P + 1 :] - raw[0] if self.eliminate else None
-                clean = self.eliminated(raw[: P + 1], s)
-                res = clean[0]
-                jac = (clean[1:] - res).T / (delta / span)  # per span
+                res, columns, s = self._slopes(params, x, delta, np.flatnonzero(~known))
+                if known.any() and moved is not None:
+                    jac = jac + np.outer((res - last) - jac @ moved, moved) / max(float(moved @ moved), 1e-30)
+                jac[:, ~known] = columns / (delta / span)[~known]
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
-            if it == iterations or P == 0:
+            if it >= iterations or P == 0:
                 break
             k = self.r.knee
             weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
@@ -285,10 +285,19 @@ class Fitter:
             trial = np.clip(x + steps * span, low, high)
             tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
             best = int(np.argmin(tried))
+            gain = (loss - float(tried[best])) / max(loss, 1e-30)
+            if known.any() and gain < tolerance:  # by slopes from elsewhere: here they are simulated before this is the end
+                if gain > 0:
+                    x = trial[best]
+                known[:], fresh, moved, damping = False, True, None, 1e-2
+                if not exact:
+                    iterations = min(iterations, it + 2)
+                continue
             if not tried[best] < loss * (1 - 1e-6):
                 if damping <= 1e2:
                     damping *= 1e3
                     fresh = False
+                    it += 1
                     continue
                 # a kinked loss has no slope to follow: try sizes outright
                 trial = np.clip(self.pattern(params, x), low, high)
@@ -296,15 +305,50 @@ class Fitter:
                 best = int(np.argmin(tried))
                 if not tried[best] < loss * (1 - tolerance):
                     break
-                x, damping, fresh = trial[best], 1e-2, True
+                x, damping, fresh, moved = trial[best], 1e-2, True, None
+                it += 1
                 continue
-            gain = (loss - tried[best]) / max(loss, 1e-30)
+            moved, last = (trial[best] - x) / span, res
             x, damping, fresh = trial[best], max(lambdas[best] * 0.3, 1e-6), True
+            it += 1
             if gain < tolerance:
                 # one more Jacobian at the new point, for the intervals
-                iterations = min(iterations, it + 1)
+                iterations = min(iterations, it)
+            known = follow.copy()
+        if exact and known.any():
+            res, jac, s = self._slopes(params, x, delta, np.arange(P))
+            jac = jac / (delta / span)
         return Fitted(list(params), x, res, jac / span if P else np.zeros((len(res), 0)), self.window, float(self.loss(res)),
                       self.window_loss(res), iterations=it)
+
+    def _known(self, params: list[Param], slopes: dict[str, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
+        """(slopes [m, P] per span as far as they are known, which are [P])."""
+        m = len(self.window)
+        jac, known = np.zeros((m, len(params))), np.zeros(len(params), bool)
+        for i, p in enumerate(params):
+            if slopes is not None and p.key in slopes and len(slopes[p.key]) == m:
+                jac[:, i], known[i] = slopes[p.key], True
+        return jac, known
+
+    def _slopes(self, params: list[Param], x: np.ndarray, delta: np.ndarray, which: np.ndarray):
+        """(residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states [2, m]), by one batch of
+        simulations: here, each of them moved, the initial state moved."""
+        k = len(which)
+        guesses = np.repeat(x[None], k + 3, 0)
+        guesses[1 + np.arange(k), which] += delta[which]
+        inits = np.zeros((k + 3, 2))
+        inits[k + 1, 0], inits[k + 2, 1] = self.r.sigma_q0, self.r.sigma_v0
+        if not self.eliminate:
+            guesses, inits = guesses[: k + 1], inits[: k + 1]
+        raw = self.residuals(params, guesses, inits)
+        s = raw[k + 1 :] - raw[0] if self.eliminate else None
+        clean = self.eliminated(raw[: k + 1], s)
+        return clean[0], (clean[1:] - clean[0]).T, s
+
+
+def slopes_of(f: Fitted) -> dict[str, np.ndarray]:
+    """Slopes [m] of a fit's residuals per span of each parameter, by its key, as `Fitter.fit` takes them."""
+    return {p.key: f.jacobian[:, i] * p.span for i, p in enumerate(f.params)}
 
 
 def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, knee: float = 0.0) -> np.ndarray:

@@ -11,36 +11,40 @@ from dexsim.gap.effects.catalogue import CATALOGUE, compatible, confusable
 from dexsim.gap.effects.effect import Effect, Variant
 from dexsim.gap.effects.presliding import give
 from dexsim.gap.plant.batch import JointPlant, Windows
-from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.case import BELIEF, PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.plant.scales import Scales
-from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, disbelief, prior_weight
+from dexsim.gap.search.time_limit import Deadline
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, disbelief, prior_weight, slopes_of
 
 USUAL = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
          "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
          "position_offset", "position_scale", "speed_lag", "backlash", "softness")  # fmt: skip
 WITH_OTHERS = ("torque_ripple", "ripple_per_turn", "ripple_phase", "deadband_kind", "coupling", "coupling_from", "warmth")
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
-LEAST = 0.09  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
+LEAST = 0.12  # an effect must remove this part of the squared error on conditions left out, or it is not claimed
 CHANCE = 0.03  # of the bootstraps in which an effect may be of no use to what was left out
 PRICE = 0.05  # chance that the scan's best effect is there by accident, at most
 BOOTSTRAPS = 300
 DOUBT, OFF = 0.015, 0.025  # relative: what a fitted effect, and a refitted belief, is off by whatever the residuals say
-BUDGET = 100.0  # s of a joint's recordings that the search simulates
+SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate
 BALANCE = 0.03  # of its misfit without any effect: the least a signal counts as noise where motion and effort are fitted
+EXTREMES = ("saturation", "speed", "acceleration", "load", "position error")  # regime variables whose largest values are never thinned out
+RESTLESS = 10.0  # x the noise of a resting torque: what changes from sample to sample counts as noise up to as much
 SECOND = 0.02  # of what earlier effects removed: what a further one must remove
 ENOUGH = 1.08  # x the noise: an error within it needs no effect
 HINT = 0.03  # of the squared error with what the beliefs give for it: an effect that the scan sees to save as much is tried, whatever its price
 ROUGH = 3.0  # x the noise squared: above it every effect that helps is tried, whatever its price
-AGAIN = 3  # hypotheses from which the fit without any effect is begun again before one is claimed
+CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs back home
+AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
 TIE = 0.02  # of the loss: nearer than this the one that lasts better on what was left out is taken without a closer look
 ALIKE = 0.06  # of the loss on what was left out: laws of one effect that come within as much may each be the true one
 CLEAR = 0.11  # of the squared error: what an effect must remove where the error is within the noise without it
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 MOST = 4  # effects on one joint
-FINER = 4  # steps of whole recordings, where an effect was found, in one of the windows'
-MAYBE = {"braking_slope": 1.0, "limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
+FINER = 2  # steps of whole recordings, where an effect was found, in one of the windows'
+MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 PIN = 1e-6  # of room for what is held at a value
 LATE = 0.75  # periods of its loop by which any drive may act on its commands late
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
@@ -108,15 +112,18 @@ class JointSearch:
     """The search on one joint. train: run indices; span: part of each run to use; folds [R]: condition of each run."""
 
     def __init__(self, case: Case, train: list[int], span: dict[int, tuple[float, float]] | None, conditions: list[int],
-                 seed: int = 0, allowed: set[str] | None = None, long: float = LONG, tell: Callable[[float], None] | None = None):
+                 seed: int = 0, allowed: set[str] | None = None, long: float = LONG, tell: Callable[[float], None] | None = None,
+                 deadline: Deadline | None = None):
         self.case, self.train, self.span = case, train, span
         self.rng = np.random.default_rng(seed)
         self.allowed = allowed
+        self.deadline = deadline or Deadline()
         self.tell, self._part = tell or (lambda _: None), 0.0
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
         self.long = plant.windows(long, train, span=span)
-        self.short, self.long = (_thin(w, plant) for w in (self.short, self.long))
+        self.short, self.long = _thin(self.short, case, SCAN_BUDGET), _thin(self.long, case, BUDGET)
+        self.short_slopes: dict[str, np.ndarray] = {}
         sigma = case.sigma
         self.r = Residuals(sigma, case.sigma_torque, sigma_q0=0.7 * sigma, sigma_v0=max(sigma / 0.02, 0.02 * case.scales.speed))
         self.scan_fitter = Fitter(plant, self.short, self.r)
@@ -193,7 +200,7 @@ class JointSearch:
         out.append(Param("presliding", ("presliding",), "set", 0.0, small, 0.1 * small, nuisance=True))
         if not s.voltage and s.nominal["no_load_speed"] < 1e8:
             if "braking_slope" not in taken and "braking_slope" not in c.stated:
-                out.append(Param("braking_slope", ("braking_slope",), "set", -1.0, 1.0, s.nominal["braking_slope"], nuisance=True))
+                out.append(Param("braking_slope", ("braking_slope",), "set", -1.0, 1.0, PHYSICAL, nuisance=True))
             if s.nominal["kd"] > 0:  # a limit of the motor, or of a firmware that goes by its own reading
                 out.append(Param("limit_speed", ("limit_speed",), "set", 0.0, 1.0, 0.5, nuisance=True))
         low, high = c.factors.get("inertia", (1 - BELIEF, 1 + BELIEF))
@@ -225,13 +232,14 @@ class JointSearch:
     def start(self) -> Trial:
         """No effect: the nuisances alone. Those without a trace are left out from here on."""
         params = self.all_nuisances
-        f = self.scan_fitter.fit(params, x0=self._begin(params), iterations=6)
+        f = self.scan_fitter.fit(params, x0=self._begin(params), iterations=6, lazy=True)
         if self.scan_fitter.use_torque:  # neither signal drowns the other: what is missing shows in both
             n = self.scan_fitter.w.n
             parts = [float(np.sqrt(np.mean(x**2))) for x in (f.residual[:n], f.residual[n:][self.scan_fitter.tau_on])]
             self.r.sigma_q *= max(1.0, BALANCE * parts[0])
-            self.r.sigma_torque *= max(1.0, BALANCE * parts[1])
-            f = self.scan_fitter.fit(params, x0=f.x, iterations=4)
+            restless = _restless(f.residual[n:], self.scan_fitter.w.sample_window)
+            self.r.sigma_torque *= max(1.0, BALANCE * parts[1], min(restless, RESTLESS))
+            f = self.scan_fitter.fit(params, x0=f.x, iterations=4, lazy=True)
         if params:
             span = np.array([p.span for p in params])
             trace = np.sqrt((f.jacobian**2).mean(0)) * span
@@ -240,7 +248,7 @@ class JointSearch:
         x = f.x[keep]
         # large residuals are effects still to be named: the knee follows them down
         self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
-        fit = self.fitter.fit(self.nuisances, x0=x, iterations=8)
+        fit = self.fitter.fit(self.nuisances, x0=x, iterations=8, lazy=True)
         return Trial((), self.fitter.homeward(self.nuisances, self._shaken(self.nuisances, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
@@ -248,6 +256,8 @@ class JointSearch:
         x = np.array([p.start for p in params], float)
         for i, p in enumerate(params):
             found = unknown(p.key, self.case.scales) if p.key in self.case.unknown else None
+            if p.key == "braking_slope":  # kinked: the paper's line, full torque and the line that goes on are each tried
+                found = (p, [PHYSICAL, 1.0, -1.0])
             if found is not None and len(found[1]) > 1:
                 tries = np.repeat(x[None], len(found[1]), 0)
                 tries[:, i] = np.clip(found[1], p.low, p.high)
@@ -266,6 +276,7 @@ class JointSearch:
         fitter = self.scan_fitter
         with self._fix(current.members):
             here = fitter.fit(params, x0=current.fit.x, iterations=0)
+            self.short_slopes = slopes_of(here)
             x = current.fit.x
             raw, s = fitter.init_directions(params, x)
             r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
@@ -401,20 +412,22 @@ class JointSearch:
         free = np.array([p.mode == "add" for p in params[:n]], bool)
         x0[:n] = np.where(free, x0[:n], inside[:n])
         with self._fix(members):
-            return members, x0, self.scan_fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2)
+            return members, x0, self.scan_fitter.fit(params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False)
 
     def finish(self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False) -> Trial:
-        """The draft refitted on long windows."""
-        params = short.params
+        """The draft refitted on long windows. quick: fewer steps, and beliefs are not asked back home."""
+        params, slopes = short.params, slopes_of(like.fit) if like is not None else None
         with self._fix(members):
-            a = self.fitter.fit(params, x0=short.x, iterations=4 if quick else 7, tolerance=5e-3)
+            a = self.fitter.fit(params, x0=short.x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
             if like is not None and not quick and a.loss > like.fit.loss:
-                b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3)
+                b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
                 a = b if b.loss < a.loss else a
-            if not quick:
-                a = self._shaken(params, a)
-            a = self.fitter.homeward(params, a)
         return Trial(members, a)
+
+    def thorough(self, trial: Trial) -> Trial:
+        """The trial looked for nearby, and with its beliefs asked back home."""
+        with self._fix(trial.members):
+            return Trial(trial.members, self.fitter.homeward(trial.fit.params, self._shaken(trial.fit.params, trial.fit)))
 
     def fit(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False) -> Trial:
         """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long ones."""
@@ -489,7 +502,9 @@ class JointSearch:
             for number in folds:
                 on = self.fold_of != number
                 fitter = Fitter(self.case.plant, subset(self.long, on), self.r)
-                x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2).x
+                rows = on[self.fitter.window]
+                known = {key: v[rows] for key, v in slopes_of(f).items()}
+                x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
                 r = self.fitter.evaluate(f.params, x)
                 a, k = np.abs(r), self.r.knee
                 a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
@@ -515,7 +530,7 @@ class JointSearch:
         for _ in range(MOST):
             loss = self._left(current).sum() / per
             enough = loss < ENOUGH**2
-            if enough and current.members:
+            if (enough and current.members) or self.deadline.over():
                 break
             scan = self.scan(current)
             self._on(0.06)
@@ -530,6 +545,8 @@ class JointSearch:
                 break
             drafts = []
             for _, p, member, start in listed:
+                if drafts and self.deadline.over():
+                    break
                 if member.id not in pool or price.get(member.id, 1.0) > p:
                     pool[member.id] = (member, start)
                 price[member.id] = p
@@ -540,14 +557,15 @@ class JointSearch:
                 drafts.append(min(tries, key=lambda d: d[2].loss))
                 self._on(0.03)
             drafts.sort(key=lambda d: d[2].loss)
-            good = [d for k, d in enumerate(drafts) if k < 3 or (k < 6 and d[2].loss < 2.0 * drafts[0][2].loss + 0.3)]
+            good = [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
             for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
                 if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
                     pool[member.id], price[member.id] = (member, start), p
-            trials = []
-            for d in good:
-                trial = self.finish(*d, current)
-                trials.append(trial)
+            trials = sorted((self.finish(*d, current) for k, d in enumerate(good) if k == 0 or not self.deadline.over()), key=lambda t: t.fit.loss)
+            least = trials[0].fit.loss
+            # those that may still be the best are looked at closely
+            trials = [self.thorough(t) if not self.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1)) else t for k, t in enumerate(trials)]
+            for trial in trials:
                 self._on(0.06)
                 known = self.fitted.get(frozenset(trial.ids))
                 if known is None or trial.fit.loss < known.fit.loss:
@@ -580,13 +598,14 @@ class JointSearch:
                 break
             if not self._earns(best, current):
                 # a pair may be there where neither of its halves is seen alone
-                best = current if enough else self._pair(current, listed[:4]) or current
+                best = current if enough or self.deadline.over() else self._pair(current, listed[:3]) or current
                 if best is current:
                     break
             current, level = best, trials
-            if len(current.members) > 1:
+            if len(current.members) > 1 and not self.deadline.over():
                 current, level = self._swap(current, pool, level)
-        current = self._lawful(self._refine(self._drop(current)))
+        if not self.deadline.over():
+            current = self._lawful(self._refine(self._drop(current)))
         self._on(0.1)
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):  # one that only seemed worse before it was fitted in full takes the place
@@ -613,7 +632,10 @@ class JointSearch:
             x0 = [own.get(p.key, p.start) if not p.nuisance else a / b if p.mode == "factor" else a - b if p.mode == "add" else a
                   for p, a, b in zip(params, at, believed, strict=True)]  # fmt: skip
             with self._fix(current.members):
-                new = Trial(current.members, self.fitter.homeward(params, self.fitter.fit(params, x0=np.array(x0), iterations=8)))
+                new = Trial(current.members, self.fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit)))
+            if self._here(new) < (1 - 0.5 * TIE) * self._here(best):
+                with self._fix(current.members):
+                    new = Trial(current.members, self.fitter.homeward(params, new.fit))
             if self._here(new) < (1 - 0.5 * TIE) * self._here(best) and not self._shrunk(new):
                 best = new
         return best
@@ -793,6 +815,8 @@ class JointSearch:
         mine = self._left(current)
         sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
         values = np.split(self._values(current), sizes)
+        with self._fix(current.members):
+            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
         for i, member in enumerate(current.members):
             rest = tuple(m for k, m in enumerate(current.members) if k != i)
             kept = [v for k, v in enumerate(values) if k != i]
@@ -804,9 +828,14 @@ class JointSearch:
                 if key == member.id or key in current.ids or any(not _compatible(other, m) for m in rest):
                     continue
                 known = self.fitted.get(frozenset((key, *(m.id for m in rest))))
-                if known is None and len(others) >= 3 and not confusable(key, member.id):
+                if known is None and ((len(others) >= 3 and not confusable(key, member.id)) or self.deadline.over()):
                     continue
-                trial = known or self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                trial = known
+                if trial is None:
+                    draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
+                    if draft[2].loss > 2.5 * short + 0.4:  # one that cannot follow even short stretches is no rival
+                        continue
+                    trial = self.finish(*draft, current, quick=True)
                 self._on(0.05)
                 self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
@@ -847,7 +876,8 @@ class JointSearch:
         """What was found, and nothing, as they are judged: on whole recordings, in shorter steps where an effect was found (where a joint
         sticks, or rattles in a dead zone, a millisecond leaves errors beyond the noise)."""
         if found.best.members:
-            found.best = self._simpler(found.best)
+            if not self.deadline.over():
+                found.best = self._simpler(found.best)
             self.whole = self.case.plant.refined(FINER)
         self._on(0.3)
         self.polish(found.best), self.polish(found.none)  # kept for the judgement
@@ -877,6 +907,8 @@ class JointSearch:
         return self._polished[id(trial)][1]
 
     def _polish(self, trial: Trial) -> Trial:
+        if self.deadline.over():
+            return trial
         plant = self.whole
         whole = plant.windows(None, self.train, span=self.span)
         r = Residuals(self.r.sigma_q, self.r.sigma_torque, knee=max(self.r.knee, 3.0))
@@ -885,7 +917,9 @@ class JointSearch:
         with self._fix(trial.members, plant):
             here = fitter.residuals(params, trial.fit.x[None])[0]
             fitter.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
-            f = fitter.fit(params, x0=trial.fit.x, iterations=5, tolerance=5e-3)
+            # slopes in the windows' own steps serve for shorter ones
+            slopes = slopes_of(Fitter(self.case.plant, self.case.plant.windows(None, self.train, span=self.span), r).fit(params, x0=trial.fit.x, iterations=0))
+            f = fitter.fit(params, x0=trial.fit.x, iterations=3, tolerance=1e-2, slopes=slopes, exact=False)
         if fitter.loss(f.residual[None])[0] < 0.97 * fitter.loss(here[None])[0]:
             with self._fix(trial.members):
                 again = self.fitter.fit(params, x0=f.x, iterations=0)
@@ -902,6 +936,15 @@ class JointSearch:
     def _here(self, trial: Trial) -> float:
         """Mean square where it was fitted, with what the beliefs give for it."""
         return trial.fit.loss + disbelief(trial.fit.params, trial.fit.x) / len(self.blocks)
+
+    def by_run(self, trial: Trial) -> np.ndarray:
+        """[R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
+        with self._fix(trial.members):
+            r = self.fitter.evaluate(trial.fit.params, trial.fit.x)
+        a, k = np.abs(r), self.r.knee
+        a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
+        run, count = self.long.run[self.fitter.window], self.case.plant.runs
+        return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
     def in_windows(self, trial: Trial, runs: list[int], span: dict[int, tuple[float, float]] | None) -> float:
         """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
@@ -986,13 +1029,35 @@ def _legal(g: np.ndarray) -> np.ndarray:
     return g
 
 
-def _thin(w: Windows, plant) -> Windows:
-    """At most BUDGET seconds of windows, evenly over all: more would say little more."""
-    seconds = float(w.window[:, 1].sum()) * plant.dt
-    if seconds <= BUDGET:
+def _restless(r: np.ndarray, window: np.ndarray) -> float:
+    """What of residuals [n] in windows [n] changes from sample to sample, as a standard deviation: by second differences, whose variance
+    is six times that of white noise; the largest, of jumps, are cut. A loop's torque is as restless as the encoder that it reads."""
+    inner = (window[2:] == window[:-2])
+    d = np.abs(r[2:] - 2 * r[1:-1] + r[:-2])[inner]
+    if len(d) < 20:
+        return 0.0
+    return float(np.sqrt(np.mean(np.minimum(d, 4 * np.quantile(d, 0.75)) ** 2) / 6))
+
+
+def _thin(w: Windows, case: Case, budget: float) -> Windows:
+    """At most `budget` seconds of windows: more would say little more. Half of them are those in which a regime variable is most extreme
+    (a limit that is reached in one recording of ten must not be thinned out), the others are spread evenly."""
+    count, seconds = len(w.window), float(w.window[:, 1].sum()) * case.plant.dt
+    if seconds <= budget:
         return w
-    keep = np.zeros(len(w.window), bool)
-    keep[np.unique(np.linspace(0, len(w.window) - 1, max(int(len(w.window) * BUDGET / seconds), 8)).astype(int))] = True
+    most = max(int(count * budget / seconds), 8)
+    size = np.maximum(np.bincount(w.sample_window, minlength=count), 1)
+    chosen: list[int] = []
+    orders = [np.argsort(-np.bincount(w.sample_window, np.abs(case.regimes[name][w.sample_row]), count) / size, kind="stable")
+              for name in EXTREMES if name in case.regimes]  # fmt: skip
+    for k in range(count):
+        for order in orders:
+            if len(chosen) < most // 2 and order[k] not in chosen:
+                chosen.append(int(order[k]))
+    rest = np.setdiff1d(np.arange(count), chosen)
+    keep = np.zeros(count, bool)
+    keep[chosen] = True
+    keep[rest[np.unique(np.linspace(0, len(rest) - 1, most - len(chosen)).astype(int))]] = True
     return subset(w, keep)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexsim.gap.judge import errors
+from dexsim.gap.judge import verdict
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, empty
 from dexsim.gap.touch import touch
@@ -14,8 +14,11 @@ def _touch_verdict(felt: touch.TouchResult) -> str | None:
     """The word for touch alone; None where it was not judged."""
     if felt.before is None:
         return "explained" if felt.findings else None
-    named = [{"held_out": True} for f in felt.findings]
-    word = errors.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    for f in felt.findings:
+        if f["confidence"] < verdict.FIRM:
+            f["hint"] = True
+    named = [{"held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
+    word = verdict.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
     return "partly_explained" if word == "explained" and felt.structured else word
 
 

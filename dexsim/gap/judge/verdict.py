@@ -1,0 +1,64 @@
+"""The one word of a diagnosis, and which names count for it: by the error on what was kept out, never by a name alone.
+
+One place decides: the sentence, the page and `diagnosis.json` all follow what stands in the findings after `settle`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+WITHIN = 1.3  # x the floor: an error within it asks for no effect
+FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
+FIRM = 0.5  # confidence from which on a name counts; below it is a hint
+SURE_ENOUGH = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
+HINTED = 0.45  # what a name keeps at most that the error on what was kept out does not bear out
+REMOVED = 0.3  # of the gap between error and floor: what counts as partly explained
+
+
+def settle(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
+    """Marks the findings of joints that are hints: names below `FIRM`, and those on joints that are followed to their floor without any
+    effect (`quiet`), whose confidence goes below it."""
+    for f in findings:
+        joints = f["where"]["joints"]
+        if joints and set(joints) <= quiet and f["held_out"]:
+            f["confidence"] = min(f["confidence"], HINTED)
+        if f["held_out"] and f["confidence"] < FIRM:
+            f["hint"] = True
+
+
+def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The findings of physics that are more than hints."""
+    return [f for f in findings if f["held_out"] and not f.get("hint")]
+
+
+def verdict(findings: Sequence[dict[str, Any]], floor: float, before: float, before_low: float, after: float, structured: bool,
+            quiet: bool = False) -> str:
+    """The one word. findings: after `settle`; floor, before, after: of the error on what was kept out; before_low: of its 90 % interval;
+    structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its own floor."""
+    named = firm(findings)
+    if not named:
+        if quiet or before <= WITHIN * floor or (before <= FAR * floor and (before_low <= WITHIN * floor or not structured)):
+            return "none"
+        return "unknown"
+    if after <= WITHIN * floor:  # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
+        sure = any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named)
+        return "explained" if sure else "partly_explained"
+    return "partly_explained" if (before - after) / max(before - floor, 1e-12) >= REMOVED else "unknown"
+
+
+def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = 0.5) -> tuple[float, float]:
+    """90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both at times [n] s on what was
+    kept out: a bootstrap over half-second blocks in stretches of two seconds, paired. (0, 0) without samples."""
+    if not len(without):
+        return 0.0, 0.0
+    b = ((times - times.min()) / block).astype(int)
+    _, b = np.unique(b, return_inverse=True)
+    a, c = np.bincount(b, without), np.bincount(b, with_it)
+    n, size = len(a), min(4, len(a))
+    starts = np.random.default_rng(seed).integers(0, n, (400, -(-n // size)))
+    index = ((starts[..., None] + np.arange(size)) % n).reshape(400, -1)
+    share = 1 - c[index].sum(1) / np.maximum(a[index].sum(1), 1e-300)
+    return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))

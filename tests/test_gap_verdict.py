@@ -1,0 +1,86 @@
+"""The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of time."""
+
+import numpy as np
+import pytest
+
+from dexsim.gap.judge import verdict
+from dexsim.gap.read import keep_out
+from dexsim.gap.search.time_limit import TimeLimit
+
+
+def finding(confidence: float, joint: str = "a") -> dict:
+    return {"where": {"joints": [joint]}, "held_out": {"before": 2.0, "after": 1.0}, "confidence": confidence}
+
+
+def test_names_on_joints_that_need_no_effect_are_hints():
+    found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
+    verdict.settle(found, quiet={"a"})
+    assert [f.get("hint", False) for f in found] == [True, False, True]
+    assert found[0]["confidence"] < verdict.FIRM and found[1]["confidence"] == 0.9
+    assert verdict.firm(found) == [found[1]]
+
+
+@pytest.mark.parametrize(("before", "after", "confidence", "word"), [
+    (1.2, 0.9, 0.45, "none"), (1.2, 0.9, 0.9, "explained"), (4.0, 1.1, 0.9, "explained"), (4.0, 1.1, 0.6, "partly_explained"),
+    (4.0, 2.5, 0.9, "partly_explained"), (4.0, 3.5, 0.9, "unknown"), (4.0, 1.0, 0.45, "unknown"),
+])  # fmt: skip
+def test_no_verdict_by_a_whisper(before, after, confidence, word):
+    found = [finding(confidence)]
+    verdict.settle(found, set())
+    assert verdict.verdict(found, 1.0, before, 0.9 * before, after, True) == word
+
+
+def test_the_interval_of_a_gain_holds_it_and_knows_chance():
+    rng = np.random.default_rng(1)
+    t = np.arange(0, 20, 0.01)
+    noise = rng.standard_normal(len(t)) ** 2
+    low, high = verdict.gain_interval(4 * noise, noise, t)
+    assert low == pytest.approx(0.75, abs=1e-9) and high == pytest.approx(0.75, abs=1e-9)
+    low, high = verdict.gain_interval(noise, rng.permutation(noise), t)
+    assert low < 0 < high
+
+
+class Held:
+    """Regimes of runs, as `keep_out` asks a case for them: T s of each at 100 Hz."""
+
+    def __init__(self, saturated: list[tuple[float, float]], T: float = 10.0):
+        n = int(100 * T)
+        self.joint, self.moved = "a", True
+        self.scales = type("S", (), {"peak_speed": 1.0})()
+        slow = 0.1 * np.sin(np.linspace(0, 6, n))
+        on = np.concatenate([(np.arange(n) / 100 >= a) & (np.arange(n) / 100 < b) for a, b in saturated])
+        count = len(saturated) * n
+        self.regimes = {"saturation": 2.0 * on, "_asked": np.ones(count), "_speed": np.tile(slow, len(saturated)), "speed": np.full(count, 1.0),
+                        "load": np.full(count, 1.0), "acceleration": np.full(count, 1.0), "position": np.tile(np.sin(np.linspace(0, 40, n)), len(saturated))}  # fmt: skip
+        self.plant = type("P", (), {"rows": staticmethod(lambda i: slice(i * n, (i + 1) * n))})()
+        self.runs = [type("R", (), {"t": np.arange(n) / 100, "duration": T, "name": f"r{i}"})() for i in range(len(saturated))]
+
+
+def test_what_alone_visits_a_regime_is_not_kept_out_whole():
+    case = Held([(0, 0), (0, 0), (0, 0), (1.0, 9.0)])  # the last, which used to be kept out, is the only one at its limit
+    parts = keep_out.split(case.runs, [], [0, 1, 2, 3], [case])
+    assert parts.test == [2, 3] and parts.train == [0, 1, 3] and not parts.not_judged
+    assert parts.span_train[3][1] == parts.span_test[3][0] == 7.5 and parts.span_test[2][0] == 0.0
+
+
+def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
+    case = Held([(0, 0), (0, 0), (1.0, 9.0)])
+    parts = keep_out.split(case.runs, [2], [0, 1, 2], [case])
+    assert parts.test == [2] and "saturation of a" in parts.not_judged
+    both = Held([(0, 0), (2.0, 4.0), (1.0, 9.0)])
+    assert not keep_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
+
+
+def test_ends_of_all_recordings_where_there_are_few():
+    case = Held([(0, 0), (0, 0)])
+    parts = keep_out.split(case.runs, [], [0, 1], [case])
+    assert parts.train == parts.test == [0, 1] and parts.span_train[0] == (0.0, 7.5)
+
+
+def test_a_limit_ends_searches_and_says_which():
+    limit = TimeLimit(1e6)
+    first, second = limit.share("a", 0.5), limit.share("b", 1.0)
+    assert not first.over() and not limit.cut
+    limit.stop()
+    assert second.over() and limit.cut == {"b"} and limit.left() == 0.0
+    assert TimeLimit(1e-9).share("c", 1.0).over()
