@@ -22,6 +22,7 @@ from dexsim.recording.mechanism import Mechanism
 SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
 STRETCH, STRETCHED = 0.5, (0.5, 4.0)  # of the intervals: by the square of what is left of what was kept out, over the noise
 PART = 0.2  # of the squared error on what was kept out: what an effect removes at least that is more than a hint
+SLACK = 0.05  # of the squared error: what may be lost where an effect does not act, by what was refitted beside it
 HARM = 0.05  # of the draws of recordings in which an effect may do more harm than good
 CLEAR = 1.5  # x the noise squared that windows keep after the fit, from which on what it depends on is said
 
@@ -102,7 +103,7 @@ class JointAnswer:
         was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if effort_only and self.effort_after is not None else (error_without, rms(self.after))
         if left**2 > (1 - PART) * was**2:
             evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * PART:.0f} %")
-        elif not effort_only and gain[0] <= 0:
+        elif not effort_only and gain[0] < -SLACK:
             evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(trial)):
             evidence.hint(harmed)
@@ -139,8 +140,9 @@ class JointAnswer:
         if len(runs) < 3:
             return ""
         pick = np.random.default_rng(0).integers(0, len(runs), (400, len(runs)))
-        gained = (lost - mine)[runs][pick].sum(1)
-        return "it helps in some recordings and harms in others, as what differs from run to run does" if np.mean(gained < 0) > HARM else ""
+        gained, of = (lost - mine)[runs][pick].sum(1), lost[runs][pick].sum(1)
+        harms = float(np.mean(gained < -SLACK * of)) > HARM
+        return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
     def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
@@ -167,6 +169,8 @@ class JointAnswer:
         small = "" if effort_only else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
         if small:
             evidence.reasons.append(small)
+        if mm.id in self.search.unasked:
+            evidence.reasons.append("the search ended before all that it may be confused with was tried in its place")
         stopped = confidence.at_bound(mm.variant.params, raw, case)
         if stopped:
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")

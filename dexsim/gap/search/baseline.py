@@ -14,7 +14,7 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.search.fit import Fitter, Residuals
@@ -144,7 +144,9 @@ def refused(given: Sequence[Baseline], joints: dict[str, dict[str, float]], fits
     for case, trial, squares in fits:
         joint = case.joint
         row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
-        reason = forbids(case, train, float(row[INDEX["coulomb_friction"]]), float(row[INDEX["friction_asymmetry"]]))
+        friction = float(row[INDEX["coulomb_friction"]])
+        more = friction > (1 + BELIEF) * case.scales.nominal["coulomb_friction"] + 1e-12  # than was believed: that is not this answer's
+        reason = forbids(case, train, friction, float(row[INDEX["friction_asymmetry"]])) if more else ""
         plain, after = by.get(joint), joints[joint]["after"]
         if reason:
             out[joint] = reason

@@ -118,6 +118,7 @@ class JointSearch:
         self.rng = np.random.default_rng(seed)
         self.allowed = allowed
         self.deadline = deadline or Deadline()
+        self.unasked: set[str] = set()  # effects whose likenesses the deadline left untried
         self.tell, self._part = tell or (lambda _: None), 0.0
         plant = self.whole = case.plant
         self.short = plant.windows(SHORT, train, span=span)
@@ -828,7 +829,10 @@ class JointSearch:
                 if key == member.id or key in current.ids or any(not _compatible(other, m) for m in rest):
                     continue
                 known = self.fitted.get(frozenset((key, *(m.id for m in rest))))
-                if known is None and ((len(others) >= 3 and not confusable(key, member.id)) or self.deadline.over()):
+                if known is None and len(others) >= 3 and not confusable(key, member.id):
+                    continue
+                if known is None and self.deadline.over():
+                    self.unasked |= {member.id} if confusable(key, member.id) else set()
                     continue
                 trial = known
                 if trial is None:
