@@ -124,3 +124,8 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     assert d.data["nuisance"]["coulomb_friction@shoulder"] == pytest.approx(told.value, abs=1e-5)
     assert servo.value("shoulder", "viscous_friction").value == pytest.approx(VISCOUS[0], rel=0.1)
     assert servo.value("elbow", "coulomb_friction").unknown
+    notes: list[str] = []
+    stages = [SimpleNamespace(joint="shoulder", fit=0.1), SimpleNamespace(joint="elbow", fit=0.1)]  # of the elbow the torque told nothing
+    given[1][0].told = False
+    assert torque_told.mute(given, stages, notes) == {"shoulder"} and "controller is another" in notes[0]
+    assert torque_told.mute(given, [SimpleNamespace(joint="shoulder", fit=0.9)], notes) == set()

@@ -171,6 +171,8 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     floors = errors.floors(runs, cases)[0]
     say(f"noise floor {1e3 * floor:.2f} mrad ({floor_how})")
 
+    mute: set[str] = set()  # joints whose closed loop says nothing of them
+
     def begun(k: int, tell: Callable[[float], None]) -> JointSearch:
         share = min(1.0, lanes(s.device, len(cases)) / max(left[0], 1))
         return JointSearch(cases[k], train, span_train, fold_groups, seed=s.seed + k, allowed=s.allowed, tell=tell,
@@ -180,7 +182,7 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
         search = begun(k, tell)
         if len(search.long.window) == 0:
             return search, None
-        found = search.run() if cases[k].moved else search.idle()
+        found = search.run() if cases[k].moved and cases[k].joint not in mute else search.idle()
         search.settle(found)
         left[0] -= 1
         return search, found
@@ -203,12 +205,13 @@ def diagnose(s: Settings, say: Callable[[str], None] = print, progress: Callable
     behind = torque_told.texts(by_torque)
     nothing_believed = [c.joint for c, _, _ in by_torque if "coulomb_friction" in c.unknown]
     notes += torque_told.believe(by_torque)
+    mute |= torque_told.mute(by_torque, stages, notes)
     for x in behind[:4]:
         say(f"  {x}")
     clock.lap("stage tests")
     outcomes: list[tuple[Case, JointSearch, Outcome]] = []
     answers = together(joints, search_of, s.device, progress)
-    unsettled = [k for k, (_, found) in enumerate(answers) if found is not None and (found.best.members or found.best.fit.loss > UNSETTLED)]
+    unsettled = [k for k, (_, found) in enumerate(answers) if found is not None and joints[k] not in mute and (found.best.members or found.best.fit.loss > UNSETTLED)]
     if linked and len(unsettled) > 1 and all(found is not None for _, found in answers):
         # what was found in one joint moves the others otherwise than was thought
         cases = again(model, runs, cases, [found.best for _, found in answers], s.device, _step(runs))

@@ -15,6 +15,7 @@ from dexsim.gap.search.torque_columns import HEAVY, NAMES, PER_CUTOFF, columns_o
 
 SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
 TRUSTED = 0.6  # of the torque's rms: what may be left for figures to be believed
+FOLLOWS = 0.5  # of the logged torque's variance: what the drive's believed law must give for its closed loop to tell of the joint
 ALIKE = 1.05  # x the error of a free run in closed loop: within it the loop does not tell one from the other
 
 
@@ -131,6 +132,18 @@ def hand_on(given: Sequence[tuple], d, outcomes: Sequence[tuple], test: Sequence
         if "inertia" in ours:
             d.data["nuisance"][f"inertia_factor@{case.joint}"] = round(ours["inertia"], 6)
         d.notes.append(f"{case.joint}: friction is handed on as the recorded torque tells it; its closed loop does not tell it better")
+
+
+def mute(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
+    """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly in part: their closed loop
+    speaks of an unknown controller, and no effect of the joint is looked for in it. Said in `notes`."""
+    told = {case.joint for case, _, _ in given if case.told}
+    out = {x.joint for x in stages if x.joint in told and x.fit < FOLLOWS}
+    for x in stages:
+        if x.joint in out:
+            notes.append(f"{x.joint}: the believed law of its drive gives {100 * max(x.fit, 0.0):.0f} % of the torque that was logged: its controller is another, "
+                         "and only the torque is judged")  # fmt: skip
+    return out
 
 
 def _alike(case, search, trial, ours: dict[str, float], test: Sequence[int], span_test: dict | None) -> bool:
