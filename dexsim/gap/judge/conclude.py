@@ -17,7 +17,8 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings, empty
 from dexsim.gap.search import baseline
-from dexsim.gap.search.search import ENOUGH, JointSearch, Outcome
+from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
 DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/results/concealed.md)
@@ -165,10 +166,10 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
-    if before > ENOUGH**2 and after < (1 - SIDES) * before:
+    if before > SEARCH.enough**2 and after < (1 - SIDES) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
     sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
-    plain = outcome.none.fit.loss > ENOUGH**2 and search.gain(outcome.best, outcome.none) >= SIDES
+    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= SIDES
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
-from dexsim.gap.search.search import unknown
+from dexsim.gap.search.beliefs import unknown
 from dexsim.gap.touch.touch import TouchResult
 
 

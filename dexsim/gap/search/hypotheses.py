@@ -1,0 +1,295 @@
+"""Hypotheses of one joint: its windows, what is refitted with each, and fits of effects together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dexsim.gap.plant.batch import JointPlant, Windows
+from dexsim.gap.plant.case import PHYSICAL, Case
+from dexsim.gap.plant.param import Param
+from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.beliefs import refitted, unknown
+from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
+from dexsim.gap.search.time_limit import Deadline
+from dexsim.gap.search.trial import Fixed, Member, Trial, named
+
+SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
+SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate
+EXTREMES = (
+    "saturation",
+    "speed",
+    "acceleration",
+    "load",
+    "position error",
+)  # regime variables whose largest values are never thinned out
+MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
+
+
+class JointHypotheses:
+    """The recordings of one joint and fits to them. train: run indices; span: part of each run to use; folds [R]:
+    condition of each run."""
+
+    def __init__(
+        self,
+        case: Case,
+        train: list[int],
+        span: dict[int, tuple[float, float]] | None,
+        conditions: list[int],
+        seed: int = 0,
+        allowed: set[str] | None = None,
+        long: float = LONG,
+        tell: Callable[[float], None] | None = None,
+        deadline: Deadline | None = None,
+    ):
+        self.case, self.train, self.span = case, train, span
+        self.rng = np.random.default_rng(seed)
+        self.allowed = allowed
+        self.deadline = deadline or Deadline()
+        self.unasked: set[str] = set()  # effects whose likenesses the deadline left untried
+        self.tell, self._part = tell or (lambda _: None), 0.0
+        plant = self.whole = case.plant
+        self.short = plant.windows(SHORT, train, span=span)
+        self.long = plant.windows(long, train, span=span)
+        self.short, self.long = thin(self.short, case, SCAN_BUDGET), thin(self.long, case, BUDGET)
+        self.short_slopes: dict[str, np.ndarray] = {}
+        sigma = case.sigma
+        self.r = Residuals(
+            sigma, case.sigma_torque, sigma_q0=0.7 * sigma, sigma_v0=max(sigma / 0.02, 0.02 * case.scales.speed)
+        )
+        self.scan_fitter = Fitter(plant, self.short, self.r)
+        self.fitter = Fitter(plant, self.long, self.r)
+        groups = sorted({conditions[r] for r in train})
+        if len(groups) >= 3:
+            self.fold_of = np.array([groups.index(conditions[r]) for r in self.long.run])
+            if len(groups) > 4:
+                self.fold_of %= 4
+            self.fold_by = "conditions"
+        else:
+            count = len(self.long.window)
+            self.fold_of = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
+            self.fold_by = "time"
+        self.blocks = self._blocks(self.fitter, self.long)
+        self.by_law: dict[str, list[Trial]] = {}  # by effect: the hypothesis by every law that the effect may have
+        self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
+        self.all_nuisances = refitted(case)
+        self.nuisances = self.all_nuisances
+        believed = [
+            p
+            for p in self.all_nuisances
+            if p.key not in case.unknown and p.key not in MAYBE and not (p.mode == "factor" and p.span > 0.3)
+        ]
+        self.wide = {c for p in self.all_nuisances if p not in believed for c in p.columns}
+
+    def _on(self, share: float) -> None:
+        """Tells that about this share of the work that was left is done: how many effects there are to look for is not
+        known before."""
+        self._part += (1 - self._part) * share
+        self.tell(self._part)
+
+    def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
+        """Block of each residual [m]: half-second stretches of one window."""
+        t = self.case.plant.t[w.sample_row]
+        start = np.zeros(len(w.window))
+        np.minimum.at(start := np.full(len(w.window), np.inf), w.sample_window, t)
+        b = w.sample_window * 1000 + ((t - start[w.sample_window]) / 0.5).astype(int)
+        _, b = np.unique(b, return_inverse=True)
+        return np.concatenate([b, b]) if fitter.use_torque else b
+
+    def _params(self, members: tuple[Member, ...]) -> list[Param]:
+        """Effects' parameters, then the nuisances that act on no column of theirs."""
+        mine = [p for m in members for p in named(m)]
+        taken = {c for p in mine for c in p.columns}
+        # what left no trace without them may with them: a motor that rattles behind its joint turns faster than the
+        # loop knows
+        others = self.all_nuisances if any(m.effect.parts_motor for m in members) else self.nuisances
+        return mine + [p for p in others if not taken & set(p.columns)]
+
+    def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None):
+        """Constants of the variants, written to the plant's nominal for the time of a fit."""
+        return Fixed(plant or self.case.plant, [f for m in members for f in m.variant.fixed])
+
+    def start(self) -> Trial:
+        """No effect: the nuisances alone. Those without a trace are left out from here on."""
+        params = self.all_nuisances
+        f = self.scan_fitter.fit(params, x0=self._begin(params), iterations=6, lazy=True)
+        if self.scan_fitter.use_torque:  # neither signal drowns the other: what is missing shows in both
+            n = self.scan_fitter.w.n
+            parts = [float(np.sqrt(np.mean(x**2))) for x in (f.residual[:n], f.residual[n:][self.scan_fitter.tau_on])]
+            self.r.sigma_q *= max(1.0, SEARCH.balance * parts[0])
+            restless = restlessness(f.residual[n:], self.scan_fitter.w.sample_window)
+            self.r.sigma_torque *= max(1.0, SEARCH.balance * parts[1], min(restless, SEARCH.restless))
+            f = self.scan_fitter.fit(params, x0=f.x, iterations=4, lazy=True)
+        if params:
+            span = np.array([p.span for p in params])
+            trace = np.sqrt((f.jacobian**2).mean(0)) * span
+            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > 0.02]
+        keep = [i for i, p in enumerate(params) if p in self.nuisances]
+        x = f.x[keep]
+        # large residuals are effects still to be named: the knee follows them down
+        self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
+        fit = self.fitter.fit(self.nuisances, x0=x, iterations=8, lazy=True)
+        return Trial((), self.fitter.homeward(self.nuisances, self._shaken(self.nuisances, fit)))
+
+    def _begin(self, params: list[Param]) -> np.ndarray:
+        """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the
+        next."""
+        x = np.array([p.start for p in params], float)
+        for i, p in enumerate(params):
+            found = unknown(p.key, self.case.scales) if p.key in self.case.unknown else None
+            if (
+                p.key == "braking_slope"
+            ):  # kinked: the paper's line, full torque and the line that goes on are each tried
+                found = (p, [PHYSICAL, 1.0, -1.0])
+            if found is not None and len(found[1]) > 1:
+                tries = np.repeat(x[None], len(found[1]), 0)
+                tries[:, i] = np.clip(found[1], p.low, p.high)
+                s = self.scan_fitter.init_directions(params, x)[1] if self.scan_fitter.eliminate else None
+                x = tries[
+                    int(
+                        np.argmin(
+                            self.scan_fitter.loss(
+                                self.scan_fitter.eliminated(self.scan_fitter.residuals(params, tries), s)
+                            )
+                        )
+                    )
+                ]
+        return x
+
+    def _shaken(self, params: list[Param], fit: Fitted) -> Fitted:
+        """The fit, looked for nearby too, where it does not follow the data yet."""
+        return self.fitter.shake(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
+
+    def _simulate(self, fitter: Fitter, plants: np.ndarray, s) -> np.ndarray:
+        q, tau = self.case.plant.simulate(plants, fitter.w)
+        return fitter.eliminated(fitter.compare(q, tau, plants), s)
+
+    def draft(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None):
+        """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
+        params = self._params(members)
+        x0 = np.array([p.start for p in params], float)
+        if like is not None:
+            known = {p.key: v for p, v in zip(like.fit.params, like.fit.x, strict=True)}
+            x0 = np.array([known.get(p.key, v) for p, v in zip(params, x0, strict=True)])
+        x0[: len(starts)] = starts
+        low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+        n = sum(len(m.variant.params) for m in members)
+        # an optimizer stalls at a bound: start inside it
+        inside = np.clip(x0, low + 0.02 * (high - low), high - 0.02 * (high - low))
+        free = np.array([p.mode == "add" for p in params[:n]], bool)
+        x0[:n] = np.where(free, x0[:n], inside[:n])
+        with self._fix(members):
+            return (
+                members,
+                x0,
+                self.scan_fitter.fit(
+                    params, x0=x0, iterations=5, tolerance=1e-2, slopes=self.short_slopes, exact=False
+                ),
+            )
+
+    def finish(
+        self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
+    ) -> Trial:
+        """The draft refitted on long windows. quick: fewer steps, and beliefs are not asked back home."""
+        params, slopes = short.params, slopes_of(like.fit) if like is not None else None
+        with self._fix(members):
+            a = self.fitter.fit(
+                params, x0=short.x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True
+            )
+            if like is not None and not quick and a.loss > like.fit.loss:
+                b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
+                a = b if b.loss < a.loss else a
+        return Trial(members, a)
+
+    def thorough(self, trial: Trial) -> Trial:
+        """The trial looked for nearby, and with its beliefs asked back home."""
+        with self._fix(trial.members):
+            return Trial(
+                trial.members, self.fitter.homeward(trial.fit.params, self._shaken(trial.fit.params, trial.fit))
+            )
+
+    def fit(
+        self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None, quick: bool = False
+    ) -> Trial:
+        """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long
+        ones."""
+        return self.finish(*self.draft(members, starts, like), like, quick)
+
+    def _values(self, trial: Trial) -> np.ndarray:
+        n = sum(len(m.variant.params) for m in trial.members)
+        return trial.fit.x[:n]
+
+    def _shrunk(self, trial: Trial) -> bool:
+        """Whether an effect was fitted down to the size at which it begins: what it gained is another's."""
+        at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
+        for m in trial.members:
+            first = m.variant.params[0]
+            sizes = [
+                p for p in m.variant.params if p.key.startswith(first.key)
+            ]  # of a friction with load one direction may have none
+            if (
+                first.mode == "set"
+                and first.start == first.low
+                and all(at[f"{m.id}.{p.key}"] <= p.low + 1e-3 * p.span for p in sizes)
+            ):
+                return True
+        return False
+
+    def _here(self, trial: Trial) -> float:
+        """Mean square where it was fitted, with what the beliefs give for it."""
+        return trial.fit.loss + disbelief(trial.fit.params, trial.fit.x) / len(self.blocks)
+
+
+def restlessness(r: np.ndarray, window: np.ndarray) -> float:
+    """What of residuals [n] in windows [n] changes from sample to sample, as a standard deviation: by second
+    differences, whose variance is six times that of white noise; the largest, of jumps, are cut. A loop's torque is as
+    restless as the encoder that it reads."""
+    inner = window[2:] == window[:-2]
+    d = np.abs(r[2:] - 2 * r[1:-1] + r[:-2])[inner]
+    if len(d) < 20:
+        return 0.0
+    return float(np.sqrt(np.mean(np.minimum(d, 4 * np.quantile(d, 0.75)) ** 2) / 6))
+
+
+def thin(w: Windows, case: Case, budget: float) -> Windows:
+    """At most `budget` seconds of windows: more would say little more. Half of them are those in which a regime
+    variable is most extreme (a limit that is reached in one recording of ten must not be thinned out), the others are
+    spread evenly."""
+    count, seconds = len(w.window), float(w.window[:, 1].sum()) * case.plant.dt
+    if seconds <= budget:
+        return w
+    most = max(int(count * budget / seconds), 8)
+    size = np.maximum(np.bincount(w.sample_window, minlength=count), 1)
+    chosen: list[int] = []
+    orders = [np.argsort(-np.bincount(w.sample_window, np.abs(case.regimes[name][w.sample_row]), count) / size, kind="stable")
+              for name in EXTREMES if name in case.regimes]  # fmt: skip
+    for k in range(count):
+        for order in orders:
+            if len(chosen) < most // 2 and order[k] not in chosen:
+                chosen.append(int(order[k]))
+    rest = np.setdiff1d(np.arange(count), chosen)
+    keep = np.zeros(count, bool)
+    keep[chosen] = True
+    keep[rest[np.unique(np.linspace(0, len(rest) - 1, most - len(chosen)).astype(int))]] = True
+    return subset(w, keep)
+
+
+def subset(w: Windows, keep: np.ndarray) -> Windows:
+    """The windows where keep [W] bool holds."""
+    pick = np.flatnonzero(keep)
+    new = np.full(len(w.window), -1)
+    new[pick] = np.arange(len(pick))
+    samples = keep[w.sample_window]
+    window = w.window[pick].copy()
+    if len(pick):
+        window[:, 3] = np.concatenate([[0], np.cumsum(window[:-1, 4])])
+    return Windows(
+        window,
+        w.window_t[pick],
+        w.sample_step[samples],
+        w.sample_part[samples],
+        new[w.sample_window[samples]],
+        w.sample_row[samples],
+        w.run[pick],
+    )
