@@ -202,6 +202,7 @@ def thrown(steps: int, *settings: str) -> set[int]:
     """Worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than 1.5 m/s in one control
     step: gravity adds 0.2 m/s, a firm catch takes 0.6."""
     env, policy = play_env("grasp", 64, *settings)
+    env.reset_all()
     obs, found = env.get_observations(), set()
     with torch.no_grad():
         for _ in range(steps):
