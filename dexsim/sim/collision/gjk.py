@@ -6,7 +6,8 @@ step before is over after one look for a nearer corner, because bodies hardly mo
 follows from that:
 
 - directions are taken from the simplex's edges or face, not from the small difference of two large positions;
-- a search ends when the corner found is no news, or promises less than `GAIN`, or does not bring the bodies nearer.
+- a search ends when the corner found is no news, or promises less than `GAIN`, or does not bring the bodies
+  nearer although it promised hardly more (`DOUBT`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ OVERLAP = wp.constant(1.0e-6)
 """Cores nearer than this [m] count as overlapping: their distance says nothing about depth."""
 GAIN = wp.constant(2.0e-8)
 """A corner that brings two cores nearer by less than this [m] is not worth having; float32 resolves 7e-9 m at 0.1 m."""
+DOUBT = wp.constant(1.0e-6)
+"""A search that gets no nearer, although a corner promises more than this [m], goes on: the bodies may overlap."""
 LOOKS = 24
 """Most looks for a nearer corner. Searches end by themselves; the worst of a million random poses took 17."""
 
@@ -223,7 +226,8 @@ def distance(
         if vv - vw <= GAIN * norm or (vw > 0.0 and vw >= cutoff * norm):
             break
         t = with_corner(s, w, i)
-        if t.inside == 0 and wp.dot(t.v, t.v) >= vv:
+        # no nearer: over, unless the corner had promised much, when it is v that rounding has spoilt
+        if t.inside == 0 and wp.dot(t.v, t.v) >= vv and vv - vw <= DOUBT * norm:
             break
         s = t
         if s.inside != 0:
