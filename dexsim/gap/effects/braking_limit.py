@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 class BrakingLimit(Effect):
     """A torque limit that falls otherwise with speed while the drive brakes than while it drives.
 
-    Where torque and speed differ in sign it is tau0 max(0, 1 - slope |v| / no-load speed). Nameable where the servo's file
-    states a slope; where it states none, nothing is believed of braking and the slope is refitted with every hypothesis.
+    Where torque and speed differ in sign it is tau0 max(0, 1 - slope |v| / no-load speed). Nameable where the servo's
+    file states a slope; where it states none, nothing is believed of braking and the slope is refitted with every
+    hypothesis.
     """
 
     id = "braking_limit"

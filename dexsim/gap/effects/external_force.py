@@ -11,8 +11,8 @@ from dexsim.gap.plant.scales import Scales
 class ExternalForce(Effect):
     """Something outside that pushes: a contact, a person, a cable.
 
-    It is no state of the joint, so no law of the plant has it: it is named where the recorded motor torque does not fit the
-    body at all, in stretches of time.
+    It is no state of the joint, so no law of the plant has it: it is named where the recorded motor torque does not fit
+    the body at all, in stretches of time.
     """
 
     id = "external_force"

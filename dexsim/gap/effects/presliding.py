@@ -23,7 +23,8 @@ def give(s: Scales) -> float:
 class Presliding(Effect):
     """Dry friction that gives way elastically before it slides.
 
-    The share z of the friction that is taken up grows along the way: dz = (1 - z sign(dq)) dq / distance (P. Dahl 1968).
+    The share z of the friction that is taken up grows along the way: dz = (1 - z sign(dq)) dq / distance (P. Dahl
+    1968).
     """
 
     id = "presliding"

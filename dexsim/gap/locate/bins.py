@@ -1,5 +1,5 @@
-"""Where a residual lives: its size in bins of every regime variable, with block-bootstrap intervals and one false-discovery
-control over all bins of all joints."""
+"""Where a residual lives: its size in bins of every regime variable, with block-bootstrap intervals and one
+false-discovery control over all bins of all joints."""
 
 from __future__ import annotations
 
@@ -37,17 +37,34 @@ class Spot:
     def where(self) -> str:
         """The bin in words."""
         if self.regime == "time since reversal":
-            return f"within {1e3 * self.high:.0f} ms after a reversal" if self.low == 0 else f"from {1e3 * self.low:.0f} ms after a reversal on"
+            return (
+                f"within {1e3 * self.high:.0f} ms after a reversal"
+                if self.low == 0
+                else f"from {1e3 * self.low:.0f} ms after a reversal on"
+            )
         if self.regime == "direction":
             return "moving positive" if self.high > 0.5 else "moving negative" if self.low < -0.5 else "at rest"
         if self.regime == "driven against its load":  # the sign of speed times torque
-            return "while the motor drives" if self.high > 1.0 else "while the motor brakes" if self.low < -1.0 else "at rest or without torque"
+            return (
+                "while the motor drives"
+                if self.high > 1.0
+                else "while the motor brakes"
+                if self.low < -1.0
+                else "at rest or without torque"
+            )
         return f"{self.regime} {self.low:.3g} to {self.high:.3g}"
 
 
-def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str, np.ndarray], rng: np.random.Generator,
-          of: str = "position") -> list[Spot]:
-    """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name -> [n]."""
+def spots(
+    joint: str,
+    residual: np.ndarray,
+    block: np.ndarray,
+    regimes: dict[str, np.ndarray],
+    rng: np.random.Generator,
+    of: str = "position",
+) -> list[Spot]:
+    """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name
+    -> [n]."""
     out = []
     _, block = np.unique(block, return_inverse=True)
     count = int(block.max()) + 1
@@ -73,7 +90,10 @@ def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str
             inside = (x >= low) & ((x < high) if high != edges[-1] else (x <= high))
             if not 0.02 < inside.mean() < 0.98:
                 continue
-            s, n = np.bincount(block[inside], square[inside], count), np.bincount(block[inside], minlength=count).astype(float)
+            s, n = (
+                np.bincount(block[inside], square[inside], count),
+                np.bincount(block[inside], minlength=count).astype(float),
+            )
             bs, bn = weight @ s, weight @ n
             ok = (bn > 0) & (all_n > bn)
             if ok.mean() < 0.9:
@@ -84,8 +104,21 @@ def spots(joint: str, residual: np.ndarray, block: np.ndarray, regimes: dict[str
             z = np.log(max(np.sqrt(inner / max(outer, 1e-300)), 1e-9)) / max(log.std(), 1e-6)
             p = 2 * _tail(abs(z))
             top = float(np.max(x)) if not np.isfinite(high) else float(high)
-            out.append(Spot(joint, name, float(low), top, float(np.sqrt(inner / max(outer, 1e-300))), float(np.quantile(ratio, 0.05)),
-                            float(np.quantile(ratio, 0.95)), float(np.sqrt(inner)), float(inside.mean()), p, of=of))
+            out.append(
+                Spot(
+                    joint,
+                    name,
+                    float(low),
+                    top,
+                    float(np.sqrt(inner / max(outer, 1e-300))),
+                    float(np.quantile(ratio, 0.05)),
+                    float(np.quantile(ratio, 0.95)),
+                    float(np.sqrt(inner)),
+                    float(inside.mean()),
+                    p,
+                    of=of,
+                )
+            )
     return out
 
 
@@ -101,7 +134,10 @@ def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:
         q[order[k]] = last
     for s, value in zip(found, q, strict=True):
         s.q = float(value)
-    return sorted([s for s in found if s.q <= rate and s.ratio > 1.2], key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)))
+    return sorted(
+        [s for s in found if s.q <= rate and s.ratio > 1.2],
+        key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)),
+    )
 
 
 def _tail(z: float) -> float:

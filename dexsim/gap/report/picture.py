@@ -13,17 +13,22 @@ PALE, HOT = (247, 243, 236), (196, 38, 46)
 
 
 def pad(error: np.ndarray, marked: set[int], size: float = 15.0) -> str:
-    """One pad's taxels [K] N as its lattice, rows from the joint (below) to the tip, coloured by error; the marked ringed."""
+    """One pad's taxels [K] N as its lattice, rows from the joint (below) to the tip, coloured by error; the marked
+    ringed."""
     from dexsim.assets.xhand import COLUMNS, ROWS
 
     most = max(float(error.max()), 1e-9)
     width, height = COLUMNS * size + 2, ROWS * size + 2
-    out = [f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error of each taxel">']
+    out = [
+        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error of each taxel">'
+    ]
     for k, e in enumerate(error):
         c, r = divmod(k, ROWS)
         x, y = 1 + c * size, 1 + (ROWS - 1 - r) * size
         ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
-        out.append(f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>')
+        out.append(
+            f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>'
+        )
     return "".join(out) + "</svg>"
 
 
@@ -37,8 +42,14 @@ def scale(most: float, unit: str, width: int = 360) -> str:
     """The colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
     left, right, steps = 60, width - 96, 24
     part = (right - left) / steps
-    out = [f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">', text(left - 8, 14, "0", "end")]
-    out += [f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>' for k in range(steps)]
+    out = [
+        f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">',
+        text(left - 8, 14, "0", "end"),
+    ]
+    out += [
+        f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>'
+        for k in range(steps)
+    ]
     return "".join(out) + text(right + 8, 14, f"{number(1e3 * most)} {unit}") + "</svg>"
 
 
@@ -68,7 +79,8 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
 
 
 def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
-    """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side stands."""
+    """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side
+    stands."""
     centred = cloud - cloud.mean(0)
     _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=True)
     front = axes[2]
@@ -81,10 +93,18 @@ def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
     return np.stack([np.cross(up, front), up, front])
 
 
-def mechanism(model: mujoco.MjModel, error: dict[str, float], found: set[str], taxels: np.ndarray | None = None, marked: set[str] = frozenset(),
-              unit: str = "mrad", width: int = 360, height: int = 400) -> str:
-    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where found.
-    taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads."""
+def mechanism(
+    model: mujoco.MjModel,
+    error: dict[str, float],
+    found: set[str],
+    taxels: np.ndarray | None = None,
+    marked: set[str] = frozenset(),
+    unit: str = "mrad",
+    width: int = 360,
+    height: int = 400,
+) -> str:
+    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
+    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads."""
     from scipy.spatial import ConvexHull, QhullError
 
     from dexsim.assets import xhand
@@ -132,7 +152,9 @@ def mechanism(model: mujoco.MjModel, error: dict[str, float], found: set[str], t
             continue
         fill = "#f4d9c0" if int(model.geom_bodyid[g]) in hot else "#e3e8ee"
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in xy)
-        out.append(f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>')
+        out.append(
+            f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>'
+        )
     # links between joints, so that a mechanism without shapes still shows
     for i in joints:
         parent = int(model.body_parentid[int(model.jnt_bodyid[i])])
@@ -140,7 +162,9 @@ def mechanism(model: mujoco.MjModel, error: dict[str, float], found: set[str], t
             inside = [k for k in joints if int(model.jnt_bodyid[k]) == parent]
             if inside:
                 a, b = at(data.xanchor[inside[-1]])[0], at(data.xanchor[i])[0]
-                out.append(f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" stroke-width="2"/>')
+                out.append(
+                    f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" stroke-width="2"/>'
+                )
                 break
             parent = int(model.body_parentid[parent])
     if taxels is not None:
@@ -149,18 +173,28 @@ def mechanism(model: mujoco.MjModel, error: dict[str, float], found: set[str], t
             for k, (x, y) in enumerate(at(p)):
                 mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
                 size = 2.2 if scale < 4000 else 5.0
-                out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} mN</title></circle>')
+                out.append(
+                    f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} mN</title></circle>'
+                )
     top = max([*error.values(), 1e-12])
     labels = []
     for i in joints:
         (x, y) = at(data.xanchor[i])[0]
         small = error[names[i]]
-        ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>' if names[i] in found else ""
-        out.append(f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>')
+        ring = (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>'
+            if names[i] in found
+            else ""
+        )
+        out.append(
+            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>'
+        )
         if names[i] in found:
             labels.append((x, y, names[i]))
     for x, y, name in labels:
         side = "end" if x > 0.62 * width else "start"
         dx = -17 if side == "end" else 17
-        out.append(f'<g stroke="#fff" stroke-width="3" paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>')
+        out.append(
+            f'<g stroke="#fff" stroke-width="3" paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
+        )
     return "".join(out) + "</svg>"

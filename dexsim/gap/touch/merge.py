@@ -51,7 +51,9 @@ def _touch_metric(data: dict, felt: touch.TouchResult) -> None:
     data["held_out"] = {"recordings": felt.recordings, "error": "tactile_rmse_N", "before": b, "after": a, "before_low": bl, "before_high": bh,
                         "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
     gap = b**2 - felt.floor**2
-    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
+    data["unexplained"]["fraction_of_gap"] = (
+        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
+    )
 
 
 def touch_alone(channel, felt: touch.TouchResult, notes, m) -> Diagnosis:

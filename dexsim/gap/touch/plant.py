@@ -2,11 +2,11 @@
 
     depth -> force        stiffness * depth (what simulation believes), or a Mooney-Rivlin foundation under every taxel
     force -> taxels       by area and depth, as `dexsim.tactile` spreads the solver's force
-    taxels -> readings    rubber (standard linear solid) -> neighbours -> gain -> delay, the order of `dexsim.tactile.measure`
-    sliding -> shear      a bristle that slips where it exceeds friction times the normal force
+    taxels -> readings    rubber (standard linear solid) -> neighbours -> gain -> delay, the order of
+    `dexsim.tactile.measure` sliding -> shear      a bristle that slips where it exceeds friction times the normal force
 
-Where a load cell was recorded, the sensor is simulated from its force (a stage with its recorded input), and the contact law is
-judged by the cell alone.
+Where a load cell was recorded, the sensor is simulated from its force (a stage with its recorded input), and the
+contact law is judged by the cell alone.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ PARAMS: dict[str, TouchParam] = {
         TouchParam("zero", 0.0, -1.5e-4, 1.5e-4, "m", 5e-5, True),
         TouchParam("along", 0.0, -6e-4, 6e-4, "m", 2e-4, True),
         TouchParam("across", 0.0, -6e-4, 6e-4, "m", 2e-4, True),
-        TouchParam("spread", 1.0, 0.6, 1.6, "1", 0.1, True),  # factor on REACH: how a force spreads over the taxels is a model's guess
+        TouchParam(
+            "spread", 1.0, 0.6, 1.6, "1", 0.1, True
+        ),  # factor on REACH: how a force spreads over the taxels is a model's guess
         TouchParam("clock", 0.0, -0.006, 0.006, "s", 0.004, True),
         TouchParam("skin", 1.0, 0.01, 100.0, "1", 0.5, True),  # factor on SHEAR_STIFFNESS
     )
@@ -121,7 +123,8 @@ def _contact(run: PadRun, v: dict[str, float], near: np.ndarray) -> tuple[np.nda
 
 
 def relaxed(x: np.ndarray, dt: float, fraction: float, time_constant: float) -> np.ndarray:
-    """Standard linear solid along the first axis: x + fraction (x - state), the state following x (`tactile.measure`)."""
+    """Standard linear solid along the first axis: x + fraction (x - state), the state following x
+    (`tactile.measure`)."""
     if fraction == 0.0:
         return x
     a = float(np.exp(-dt / max(time_constant, 1e-4)))
@@ -129,9 +132,11 @@ def relaxed(x: np.ndarray, dt: float, fraction: float, time_constant: float) -> 
     return np.maximum(x + fraction * (x - state), 0.0)
 
 
-def readings(run: PadRun, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None) -> np.ndarray:
-    """[S, K] N that the taxels read at the recording's touch times. gains [K]: of each taxel; order [K]: which taxel's place each
-    reading comes from."""
+def readings(
+    run: PadRun, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None
+) -> np.ndarray:
+    """[S, K] N that the taxels read at the recording's touch times. gains [K]: of each taxel; order [K]: which taxel's
+    place each reading comes from."""
     force, share = contact(run, v)
     x = share * (force if run.load is None else run.load)[:, None]
     dt = run.grid[1] - run.grid[0]
@@ -151,8 +156,9 @@ def readings(run: PadRun, v: dict[str, float], gains: np.ndarray | None = None, 
 
 
 def shear(run: PadRun, v: dict[str, float]) -> np.ndarray:
-    """[S, 2] N of the skin's tangential force along the recorded sliding: a bristle at every taxel that slips where it exceeds
-    friction times the normal force that the taxel read. Taxels with little to read slip first, so a pad does not slip at once."""
+    """[S, 2] N of the skin's tangential force along the recorded sliding: a bristle at every taxel that slips where it
+    exceeds friction times the normal force that the taxel read. Taxels with little to read slip first, so a pad does
+    not slip at once."""
     live = run.pressed.any(0)
     force = np.where(run.pressed, run.z, 0.0)[:, live]
     k = (SHEAR_STIFFNESS * v["skin"] * run.area[live])[:, None]

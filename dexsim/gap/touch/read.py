@@ -1,7 +1,8 @@
 """What a recording says of touch: each pad's readings beside the distances of its taxels to what it presses.
 
-Where pads are is in the model: bodies named as the taxel layout names them (`dexsim.tactile.layout`). What is pressed is either
-led along `/object_pose` (shape from the recording's attached config) or a body of the model with a primitive geom.
+Where pads are is in the model: bodies named as the taxel layout names them (`dexsim.tactile.layout`). What is pressed
+is either led along `/object_pose` (shape from the recording's attached config) or a body of the model with a primitive
+geom.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.tactile import reference as ref
 
-STIFFNESS, FRICTION = 7000.0, 0.8  # N/m and 1: what is believed of a fingertip's contact where the recording states nothing
+STIFFNESS, FRICTION = (
+    7000.0,
+    0.8,
+)  # N/m and 1: what is believed of a fingertip's contact where the recording states nothing
 ASSUMED_LSB = 0.1  # N a count where nothing is stated; the common scale is then fitted freely
 SHIFT = 3e-4  # m by which the object is moved to learn how distances change
 RATE = 100.0  # Hz of the grid on which touch is simulated
@@ -33,11 +37,12 @@ KINDS = {mujoco.mjtGeom.mjGEOM_SPHERE: "sphere", mujoco.mjtGeom.mjGEOM_BOX: "box
 class PadRun:
     """One pad in one recording, K taxels, on a regular grid of G times and at the S readings.
 
-    grid [G] s; dist [G, K] m signed distance of each taxel to the object (NaN where nothing is known of it); along, across
-    [G, K]: the same with the object moved by SHIFT along the pad's two directions; depth [G] m of the skin's deepest point;
-    slide [G, 2] m: the object's path over the pad, in its tangent plane; t [S] s; z [S, K] N normal readings; shear [S, 2] N
-    their tangential sum in the same plane, or None; load [G] N of a load cell, or None; full [S, K]: readings at the largest
-    count; warm [G] degC above the coldest, or s since the first recording's start where no temperature was logged.
+    grid [G] s; dist [G, K] m signed distance of each taxel to the object (NaN where nothing is known of it); along,
+    across [G, K]: the same with the object moved by SHIFT along the pad's two directions; depth [G] m of the skin's
+    deepest point; slide [G, 2] m: the object's path over the pad, in its tangent plane; t [S] s; z [S, K] N normal
+    readings; shear [S, 2] N their tangential sum in the same plane, or None; load [G] N of a load cell, or None; full
+    [S, K]: readings at the largest count; warm [G] degC above the coldest, or s since the first recording's start where
+    no temperature was logged.
     """
 
     recording: str
@@ -72,14 +77,16 @@ class PadRun:
         """[n] grid points at which the object may touch."""
         if "near" not in self.__dict__:
             close = self.dist.min(1) < 2e-3 + 2 * self.doubt
-            self.__dict__["near"] = np.flatnonzero(close if self.load is None else close | (self.load > 0.02 * self.load.max()))
+            self.__dict__["near"] = np.flatnonzero(
+                close if self.load is None else close | (self.load > 0.02 * self.load.max())
+            )
         return self.__dict__["near"]
 
 
 @dataclass
 class TouchData:
-    """Pads with what is known of them. scale_known: whether counts have newtons. blind: pads that felt something although the
-    object's pose is not known, by recording. thermometer: whether `warm` is in degC."""
+    """Pads with what is known of them. scale_known: whether counts have newtons. blind: pads that felt something
+    although the object's pose is not known, by recording. thermometer: whether `warm` is in degC."""
 
     runs: list[PadRun] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -131,14 +138,18 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
         out.scale_known &= known
         finite = np.isfinite(force)
         if not finite.all():
-            out.notes.append(f"{r.path.name}: {int((~finite).any((1, 2, 3)).sum())} touch samples are not finite and count as 0")
+            out.notes.append(
+                f"{r.path.name}: {int((~finite).any((1, 2, 3)).sum())} touch samples are not finite and count as 0"
+            )
             force = np.where(finite, force, 0.0)
         lsb = (ASSUMED_LSB if not known else r.tactile_lsb) if r.meta["tactile_unit"] == "count" else 0.0
         pressed = [f for f in range(layout.pads) if (force[:, f, :, 2].max(1) > max(2 * lsb, 0.05)).mean() > 0.01]
         things = _things(r, model)
         on = [f for f in pressed if layout.bodies[f] in [model.body(i).name for i in range(model.nbody)]]
         for f in set(pressed) - set(on):
-            out.notes.append(f"{r.path.name}: pad {layout.names[f]} is pressed, but the model has no body '{layout.bodies[f]}' to carry it")
+            out.notes.append(
+                f"{r.path.name}: pad {layout.names[f]} is pressed, but the model has no body '{layout.bodies[f]}' to carry it"
+            )
         if not things:
             out.blind += [(r.path.name, f) for f in pressed]
             continue
@@ -152,7 +163,9 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
         out.notes.append("touch is recorded, but not what was touched (no /object_pose with a shape, no such body in the model): dead, stuck and "
                          "swapped taxels can still be told, forces cannot be predicted")  # fmt: skip
     if out.runs and not out.scale_known:
-        out.notes.append("tactile_lsb is unknown: the common scale of the taxels is fitted, so a gain common to all cannot be told")
+        out.notes.append(
+            "tactile_lsb is unknown: the common scale of the taxels is fitted, so a gain common to all cannot be told"
+        )
     return out
 
 
@@ -220,13 +233,21 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     if np.abs(force[..., :2]).max() > 0:
         # whole counts swallow the shear of taxels that hardly press
         counted = z >= GRIP * lsb
-        sheared = np.einsum("ski,kij->sj", force[keep][:, f, :, :2] * counted[..., None], np.stack([layout.tx[f, :K], layout.ty[f, :K]], 1))
+        sheared = np.einsum(
+            "ski,kij->sj",
+            force[keep][:, f, :, :2] * counted[..., None],
+            np.stack([layout.tx[f, :K], layout.ty[f, :K]], 1),
+        )
         # the taxel shows what the finger exerts on the object, against the object's path
         shear = -sheared @ np.stack([e1, e2], 1)
     load = None
     if r.external_force is not None and len(r.external_force) > 5:
         load = np.interp(grid, r.external_force.t, np.linalg.norm(r.external_force.value[:, :3], axis=1))
-    full = np.abs(r.tactile.value[keep][:, f, :, 2]) >= 255 if r.meta["tactile_unit"] == "count" else np.zeros(z.shape, bool)
+    full = (
+        np.abs(r.tactile.value[keep][:, f, :, 2]) >= 255
+        if r.meta["tactile_unit"] == "count"
+        else np.zeros(z.shape, bool)
+    )
     if coldest is not None:
         warm = np.interp(grid, r.temperature.t, np.nanmean(r.temperature.value, 1)) - coldest
     else:
@@ -240,7 +261,8 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
 
 
 def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
-    """m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5 mrad times its arm."""
+    """m: a tenth of a millimetre and a half, and for every hinge that carries the pad an encoder zero off by 5 mrad
+    times its arm."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body, out = model.body(pad).id, 1.5e-4
@@ -264,7 +286,8 @@ def _stretch(t: np.ndarray, total: np.ndarray) -> tuple[float, float]:
 
 
 def _poses(r: Recording, m: Mechanism, model, grid, things, pad: str):
-    """For every thing: rotation [G, 3, 3] and position [G, 3] that take a point of the pad's body frame to the thing's."""
+    """For every thing: rotation [G, 3, 3] and position [G, 3] that take a point of the pad's body frame to the
+    thing's."""
     data = mujoco.MjData(model)
     address, values = _posture(r, m, model, grid)
     led = any(x.body is None for x in things)
@@ -310,8 +333,8 @@ def _posture(r: Recording, m: Mechanism, model, grid: np.ndarray) -> tuple[list[
 
 
 def _hull_depth(r, m, model, grid, thing: _Thing, pad: str) -> np.ndarray | None:
-    """[G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses (their margin rounds
-    them); None where the pad has none that are convex."""
+    """[G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses (their
+    margin rounds them); None where the pad has none that are convex."""
     body = model.body(pad).id
     tips = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) == body and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
             and (model.geom_margin[g] > 0 or model.geom_contype[g] or model.geom_conaffinity[g])]  # fmt: skip
@@ -323,7 +346,12 @@ def _hull_depth(r, m, model, grid, thing: _Thing, pad: str) -> np.ndarray | None
     for i in range(len(grid)):
         data.qpos[address] = values[i]
         mujoco.mj_kinematics(model, data)
-        out[i] = max(model.geom_margin[g] + model.geom_margin[thing.geom] - mujoco.mj_geomDistance(model, data, g, thing.geom, 0.02, where) for g in tips)
+        out[i] = max(
+            model.geom_margin[g]
+            + model.geom_margin[thing.geom]
+            - mujoco.mj_geomDistance(model, data, g, thing.geom, 0.02, where)
+            for g in tips
+        )
     return out
 
 

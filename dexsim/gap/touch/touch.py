@@ -45,9 +45,10 @@ class PadCurve:
 
 @dataclass
 class TouchResult:
-    """findings as `diagnosis.json` has them; before, after: [N] held-out rms of the taxels' readings (of all judged pads) with
-    90 % intervals (value, low, high), None where no force could be predicted; floor [N]; error [F, K] N rms of each taxel before;
-    structured: whether something is left that no effect explains; pads: by name (before, after, noise)."""
+    """findings as `diagnosis.json` has them; before, after: [N] held-out rms of the taxels' readings (of all judged
+    pads) with 90 % intervals (value, low, high), None where no force could be predicted; floor [N]; error [F, K] N rms
+    of each taxel before; structured: whether something is left that no effect explains; pads: by name (before, after,
+    noise)."""
 
     findings: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -63,11 +64,19 @@ class TouchResult:
     depends_on: list[str] = field(default_factory=list)
     contact: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # by recording: stretches in touch, s
     tactile: bool = False  # whether taxels were recorded at all
-    facts: dict[str, PadFacts] = field(default_factory=dict)  # by name of pad: what `touch_handed` needs beside the findings
+    facts: dict[str, PadFacts] = field(
+        default_factory=dict
+    )  # by name of pad: what `touch_handed` needs beside the findings
 
 
-def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: int = 0, allowed: set[str] | None = None,
-             progress: Callable[[int, int, str], None] | None = None) -> TouchResult:
+def diagnose(
+    recordings: list[Recording],
+    m: Mechanism,
+    held: set[str],
+    seed: int = 0,
+    allowed: set[str] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> TouchResult:
     """Touch of all recordings. held: names of those kept out of the fit."""
     out = TouchResult(contact={r.path.name: s for r in recordings if (s := stretches(r))})
     touching = [r for r in recordings if r.tactile is not None]
@@ -89,7 +98,9 @@ def diagnose(recordings: list[Recording], m: Mechanism, held: set[str], seed: in
         runs = [r for r in data.runs if r.pad == pad]
         seconds = sum(float(np.sum(r.z.sum(1) > 0.1) * np.median(np.diff(r.t))) for r in runs)
         if seconds < SHORT:
-            out.notes.append(f"the {name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least {SHORT:g} s)")
+            out.notes.append(
+                f"the {name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least {SHORT:g} s)"
+            )
             continue
         names = {r.recording for r in runs}
         kept = held & names if held & names and names - held else set()
@@ -145,7 +156,9 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= SET_SHARE][:2]
         earned = float(np.clip((b - a) / (0.1 * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
         if earned <= 0.2:
-            out.notes.append(f"{e} on the {name}'s pad earned its place in training but not on what was kept out; not claimed")
+            out.notes.append(
+                f"{e} on the {name}'s pad earned its place in training but not on what was kept out; not claimed"
+            )
             continue
         taxels, parameters = _parameters(e, best, bounds, search, o.pad)
         fresh.append({
@@ -186,11 +199,22 @@ def _judge(out: TouchResult, search: PadSearch, o: PadOutcome, data: TouchData, 
         p1[:, k] = value
     load = None if run.load is None else np.interp(run.t, run.grid, run.load)
     pick = run.t >= (run.t[0] if kept else run.t[0] + 0.75 * (run.t[-1] - run.t[0]))
-    out.curves.append(PadCurve(name, run.recording, run.t[pick], run.z[pick].sum(1), p0[pick].sum(1), p1[pick].sum(1), None if load is None else load[pick]))
+    out.curves.append(
+        PadCurve(
+            name,
+            run.recording,
+            run.t[pick],
+            run.z[pick].sum(1),
+            p0[pick].sum(1),
+            p1[pick].sum(1),
+            None if load is None else load[pick],
+        )
+    )
 
 
 def _rest(search: PadSearch, t: TouchTrial) -> Fit | None:
-    """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where they do not."""
+    """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where they do
+    not."""
     if t.gains is None:
         return None
     moved = np.zeros(len(t.gains), bool) if t.order is None else t.order != np.arange(len(t.gains))
@@ -198,19 +222,23 @@ def _rest(search: PadSearch, t: TouchTrial) -> Fit | None:
     sure[list(search.silent)] = False
     if sure.sum() < AGREE:
         return None
-    low, value, high = _quantiles(t.gains[sure], _gain_width(search, t)[sure] ** -2.0, (0.05, 0.5, 0.95))  # one barely known counts little
+    low, value, high = _quantiles(
+        t.gains[sure], _gain_width(search, t)[sure] ** -2.0, (0.05, 0.5, 0.95)
+    )  # one barely known counts little
     return (value, low, high) if abs(value - 1) > GAIN_OFF and high - low < abs(value - 1) else None
 
 
 def _quantiles(x: np.ndarray, weight: np.ndarray, at: tuple[float, ...]) -> list[float]:
-    """Quantiles of x [n], each counting by its weight: the least value below or at which that share of the weights lies."""
+    """Quantiles of x [n], each counting by its weight: the least value below or at which that share of the weights
+    lies."""
     order = np.argsort(x)
     share = np.cumsum(weight[order]) / weight.sum()
     return [float(x[order][min(int(np.searchsorted(share, q)), len(x) - 1)]) for q in at]
 
 
 def _chord(search: PadSearch, t: TouchTrial, bounds: dict[str, tuple[float, float]]) -> Fit | None:
-    """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known; None without one."""
+    """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known;
+    None without one."""
     if not any("c10" in TOUCH_EFFECTS[e].fits for e in t.ids):
         return None
     fits = []
@@ -227,7 +255,11 @@ def _readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, fl
     """What constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
     out = {}
     for pad, k in (map(int, t.split(":")) for t in taxels):
-        values = [(float(np.median(np.nan_to_num(newtons(r)[0][:, pad, k, 2]))), 2 * (r.tactile_lsb or 0.0)) for r in recordings if r.tactile.value.ndim == 4]
+        values = [
+            (float(np.median(np.nan_to_num(newtons(r)[0][:, pad, k, 2]))), 2 * (r.tactile_lsb or 0.0))
+            for r in recordings
+            if r.tactile.value.ndim == 4
+        ]
         value, step = max(values)
         out[k] = value if value > max(step, 1e-6) else 0.0
     return out
@@ -269,8 +301,17 @@ def _broken(search: PadSearch, pad: int) -> dict[str, Any] | None:
         return None
     dead = [k for k, v in search.silent.items() if v == 0]
     stuck = [k for k, v in search.silent.items() if v != 0]
-    said = "; ".join(x for x in (f"dead: {', '.join(map(str, dead))}" if dead else "", f"stuck: {', '.join(map(str, stuck))}" if stuck else "") if x)
-    return _taxel_finding([f"{pad}:{k}" for k in sorted(search.silent)], f"constant while they are pressed ({said})", 0.95)
+    said = "; ".join(
+        x
+        for x in (
+            f"dead: {', '.join(map(str, dead))}" if dead else "",
+            f"stuck: {', '.join(map(str, stuck))}" if stuck else "",
+        )
+        if x
+    )
+    return _taxel_finding(
+        [f"{pad}:{k}" for k in sorted(search.silent)], f"constant while they are pressed ({said})", 0.95
+    )
 
 
 def _taxel_finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
@@ -315,7 +356,12 @@ def _parameters(e: str, t: TouchTrial, bounds, search: PadSearch, pad: int) -> t
         out["gain"] = {"value": value, "low": [max(v - float(half[k]), 0.0) for k, v in zip(chosen, value, strict=True)],
                        "high": [v + float(half[k]) for k, v in zip(chosen, value, strict=True)], "unit": "1"}  # fmt: skip
         if len(chosen) == 1 or (len(chosen) and np.ptp(value) < 0.05):
-            out["gain"] = {"value": float(np.mean(value)), "low": float(np.mean(out["gain"]["low"])), "high": float(np.mean(out["gain"]["high"])), "unit": "1"}
+            out["gain"] = {
+                "value": float(np.mean(value)),
+                "low": float(np.mean(out["gain"]["low"])),
+                "high": float(np.mean(out["gain"]["high"])),
+                "unit": "1",
+            }
         out["taxels"] = {"value": ", ".join(names), "low": None, "high": None, "unit": ""}
         if moved:
             pairs = sorted({tuple(sorted((k, int(t.order[k])))) for k in moved})
@@ -413,8 +459,8 @@ def stretches(r: Recording) -> list[tuple[float, float]]:
 
 
 def findings(recordings: list[Recording]) -> list[dict[str, Any]]:
-    """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the pad feel
-    many counts. Their gain is 0."""
+    """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the
+    pad feel many counts. Their gain is 0."""
     worst: dict[int, set[int]] = {}
     seen = False
     for r in recordings:
