@@ -590,7 +590,7 @@ def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:
     o.impratio = sim["impratio"]
     o.iterations, o.ls_iterations = newton_iterations(sim, engine), sim["ls_iterations"]
     o.noslip_iterations = sim["noslip_iterations"]
-    if engine == "warp":  # MuJoCo-Warp adds up a Newton iteration's Hessian in one kernel then, instead of two: 7 % of the step
+    if engine == "warp":  # MuJoCo-Warp then adds up an iteration's Hessian in one kernel, not two: 7 % of the step
         o.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     # one contact a convex pair, so that a fingertip's stiffness is that of one contact
     o.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
