@@ -135,6 +135,17 @@ def test_noise_is_the_actors_alone_and_as_large_as_stated():
     assert float(tau.std()) == pytest.approx(0.01, rel=0.15)
 
 
+def test_the_actor_feels_what_the_sensor_measured(env, monkeypatch):
+    """The force and the centres that a sensor reports, which differ from those the critic is told."""
+    for k, name in enumerate(("force", "centre", "force_clean", "centre_clean")):
+        monkeypatch.setattr(env.touch, name, torch.full_like(getattr(env.touch, name), 1.0 + k))
+    obs = env.observe(advance=False)
+    for group, force, centre in (("actor", 1.0, 2.0), ("critic", 3.0, 4.0)):
+        felt = obs[group][:, SLICES["contact_force"]]
+        torch.testing.assert_close(felt, torch.full_like(felt, force / env.f_max))
+        assert (obs[group][:, SLICES["contact_centre"]] == centre).all(), group
+
+
 def test_a_new_episode_has_felt_nothing(env):
     """No reading of the episode before is seen in the first observation of the next; centres are the pads' own."""
     for _ in range(30):
@@ -409,6 +420,23 @@ def test_pushes_have_no_favoured_direction_and_the_stated_size(env):
     assert torch.allclose((unique.T @ unique) / len(unique), torch.eye(3) / 3, atol=0.1), "no favoured axis"
     d = env.sampler.range("push.duration")
     assert d[0] - 2 * env.dt < min(lengths) and max(lengths) < d[1] + 2 * env.dt
+
+
+def test_a_force_and_a_turned_hand_move_the_object_as_the_evaluation_means_it(env):
+    """An object that touches nothing gains (gravity + force / mass) dt, whichever way gravity has been turned."""
+    env.pushes = False
+    try:
+        gravity = torch.tensor([[0.0, 6.0, 7.0], [0.0, 0.0, 9.81]]).repeat(N // 2, 1)
+        env.outside_force.copy_(2 * 9.81 * env.objects.mass[:, None] * torch.tensor([0.6, -0.8, 0.0]))
+        env.engine.field("opt.gravity").copy_(gravity)
+        before = env.object_velocity[:, :3].clone()
+        env.step(act(env))
+        assert not env.finger_force.any() and not env.palm_force.any()
+        gained = (gravity + env.outside_force / env.objects.mass[:, None]) * env.dt
+        torch.testing.assert_close(env.object_velocity[:, :3] - before, gained, rtol=0.01, atol=0.005)
+    finally:
+        env.pushes = True
+        env.outside_force.zero_()
 
 
 def test_pushes_can_be_turned_off(env):

@@ -12,6 +12,7 @@ from dexsim.assets import xhand
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
+from dexsim.tactile.config import COLUMNS
 from dexsim.tasks import make_env, reality
 
 
@@ -74,6 +75,20 @@ def test_physics_and_drives_are_its_own(env):
     mu = env.engine.field("geom_friction")[:, tip.id, 0]
     world_mu = table["tasks"]["rotate"]["randomize"]["object.friction"]
     assert torch.allclose(mu, torch.full((4,), world_mu * table["contact"]["friction_by_finger"][1]).double(), atol=1e-6)
+
+
+def test_touch_is_its_own(env):
+    """Every imperfection that the world names is what its taxels have, in each task, and differs from what training believes."""
+    own = yaml.safe_load((CONFIGS / "reality" / "bench.yaml").read_text())["tactile"]
+    assert {"threshold", "noise", "gain_spread", "dead", "delay", "hysteresis", "stiffness_scale"} <= set(own)
+    for task in ("rotate", "grasp"):
+        believed = start.for_train([f"task={task}", "device=cpu"], CONFIGS).cfg["tactile"]
+        there = world(f"task={task}")["tactile"]
+        for name, value in own.items():
+            assert there[name] == value != believed[name], (task, name)
+    for name, value in own.items():
+        c = env.touch.cfg
+        assert (c.range(name) == (value, value)) if name in COLUMNS else (getattr(c, name) == value), name
 
 
 def test_sensors_report_counts(env):

@@ -139,6 +139,15 @@ def test_actor_slices_hold_what_they_say():
     assert torch.allclose(critic[:, 146:149], (m @ w[:, 3:, None])[..., 0], atol=1e-5)
 
 
+def test_the_actor_feels_what_the_sensor_measured(env, monkeypatch):
+    """The force and the centres that a sensor reports, which differ from those the critic is told."""
+    for k, name in enumerate(("force", "centre", "force_clean", "centre_clean")):
+        monkeypatch.setattr(env.touch, name, torch.full_like(getattr(env.touch, name), 1.0 + k))
+    obs = env.observe(advance=False)
+    for group, force, centre in (("actor", 1.0, 2.0), ("critic", 3.0, 4.0)):
+        assert (obs[group][:, 30:45] == centre).all() and (obs[group][:, 45:50] == force).all(), group
+
+
 def test_fingertip_velocity_is_that_of_the_link():
     """Linear and angular velocity against MuJoCo's own."""
     import mujoco

@@ -1,0 +1,212 @@
+"""Do the tests bite? Breaks the package one line at a time and says whether the test that should notice does.
+
+    python -m tests.mutations            all of them, about ten seconds each; by hand or nightly
+    python -m tests.mutations grasp_eval those whose file or words hold all that is typed
+
+Each mutation is applied to a temporary copy of the package, never to this one. Ends with status 1 if one survives, or if a
+test fails without any mutation (its word would then say nothing).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+COPIED = ("dexsim", "tests")
+SECONDS = 600
+"""Most that one test may take, s."""
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """file: below the repository's root; old: text that stands in it exactly once; new: what replaces it; test: what must fail then, as
+    pytest names it."""
+
+    breaks: str
+    file: str
+    old: str
+    new: str
+    test: str
+
+
+def _constant(breaks: str, file: str, name: str, old: str, new: str, test: str) -> Mutation:
+    return Mutation(breaks, file, f"{name} = {old}", f"{name} = {new}", test)
+
+
+def _never_drawn(task: str, name: str, instead: str, columns: str = "") -> Mutation:
+    """A range of which every world gets the same value."""
+    drawn = f's.draw("{name}"{columns})'
+    return Mutation(
+        f"{name} of {task} is never drawn",
+        f"dexsim/tasks/{task}.py",
+        drawn,
+        f"(0.0 * {drawn} + {instead})",
+        f"tests/test_drawn.py::test_every_range_is_drawn_over_its_whole_width[{task}]",
+    )
+
+
+GRASP_EVAL, GRASP, ROTATE = "dexsim/tasks/grasp_eval.py", "dexsim/tasks/grasp.py", "dexsim/tasks/rotate.py"
+MUTATIONS = (
+    Mutation(
+        "the evaluated hand is not turned",
+        GRASP_EVAL,
+        "9.81 * _turned(down, axis, _angle(t))",
+        "9.81 * down",
+        "tests/test_grasp_eval.py::test_the_hand_is_turned_by_90_and_by_180_degrees",
+    ),
+    Mutation(
+        "the evaluated object is not pushed",
+        GRASP_EVAL,
+        "torch.where(pushing[:, None], push_force, torch.zeros_like(push_force))",
+        "torch.zeros_like(push_force)",
+        "tests/test_grasp_eval.py::test_every_second_world_is_pushed_by_twice_its_weight_for_half_a_second",
+    ),
+    Mutation(
+        "the evaluation's push does not reach the object",
+        GRASP,
+        "torch.zeros_like(self.push)) + self.outside_force",
+        "torch.zeros_like(self.push))",
+        "tests/test_grasp.py::test_a_force_and_a_turned_hand_move_the_object_as_the_evaluation_means_it",
+    ),
+    Mutation(
+        "an object counts as held 150 mm away",
+        GRASP_EVAL,
+        "SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030",
+        "SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.150",
+        "tests/test_grasp_eval.py::test_held_is_within_30_mm_of_where_it_settled",
+    ),
+    Mutation(
+        "an object counts as held untouched",
+        GRASP_EVAL,
+        "good = alive & touched & near",
+        "good = alive & near",
+        "tests/test_grasp_eval.py::test_held_is_touched_by_the_thumb_and_a_finger",
+    ),
+    Mutation(
+        "only a quarter of the load must be held",
+        GRASP_EVAL,
+        '>= 2 * r["load"]',
+        '>= 8 * r["load"]',
+        "tests/test_grasp_eval.py::test_what_must_be_held_is_what_the_commanded_forces_can_carry",
+    ),
+    _never_drawn("grasp", "contact.stiffness", "7000.0"),
+    _never_drawn("grasp", "contact.damping_ratio", "0.75"),
+    _never_drawn("grasp", "sensors.torque_bias", "0.0", ", 12"),
+    _never_drawn("grasp", "initial.tilt", "0.0"),
+    _never_drawn("rotate", "object.friction", "0.9"),
+    _never_drawn("rotate", "object.mass", "0.08"),
+    _never_drawn("rotate", "contact.stiffness", "7000.0"),
+    _never_drawn("rotate", "imu.tilt", "0.0", ", 3"),
+    Mutation(
+        "the grasp's actor is told the true force",
+        GRASP,
+        "touch_force=self.touch.force,",
+        "touch_force=self.touch.force_clean,",
+        "tests/test_grasp.py::test_the_actor_feels_what_the_sensor_measured",
+    ),
+    Mutation(
+        "the grasp's actor is told the true centres",
+        GRASP,
+        "touch_centre=self.touch.centre,",
+        "touch_centre=self.touch.centre_clean,",
+        "tests/test_grasp.py::test_the_actor_feels_what_the_sensor_measured",
+    ),
+    Mutation(
+        "the rotation's actor is told the true force",
+        ROTATE,
+        "touch_force=self.touch.force,",
+        "touch_force=self.touch.force_clean,",
+        "tests/test_rotate.py::test_the_actor_feels_what_the_sensor_measured",
+    ),
+    Mutation(
+        "the rotation's actor is told the true centres",
+        ROTATE,
+        "centre = self.touch.centre.reshape(n, 15)",
+        "centre = self.touch.centre_clean.reshape(n, 15)",
+        "tests/test_rotate.py::test_the_actor_feels_what_the_sensor_measured",
+    ),
+    Mutation(
+        "the other world feels as training does",
+        "dexsim/tasks/reality.py",
+        'cfg["tactile"].update(world["tactile"])',
+        "pass",
+        "tests/test_reality.py::test_touch_is_its_own",
+    ),
+    Mutation(
+        "a search names what removes nothing",
+        "dexsim/gap/rules.py",
+        '0.12,\n        "share of the squared error on conditions left out',
+        '0.0,\n        "share of the squared error on conditions left out',
+        "tests/test_gap_rules.py::test_an_effect_must_remove_a_least_share",
+    ),
+    _constant(
+        "a name that removes nothing of what was kept out is sure",
+        "dexsim/gap/judge/joint.py",
+        "PART",
+        "0.2",
+        "0.0",
+        "tests/test_gap_least.py::test_an_effect_must_remove_a_part_of_what_was_kept_out",
+    ),
+)
+
+
+def mutated(m: Mutation, root: Path = ROOT) -> str:
+    """The text of a mutation's file with it. Raises ValueError where its old text does not stand there exactly once."""
+    text = (root / m.file).read_text(encoding="utf-8")
+    if text.count(m.old) != 1:
+        raise ValueError(
+            f"{m.file} holds {m.old!r} {text.count(m.old)} times, not once: mend the line of '{m.breaks}' in tests/mutations.py"
+        )
+    return text.replace(m.old, m.new)
+
+
+def copy(folder: Path) -> None:
+    """What tests need: the package and the tests as copies, all else as links."""
+    for path in ROOT.iterdir():
+        if path.name in COPIED:
+            shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("__pycache__"))
+        elif not path.name.startswith("."):
+            (folder / path.name).symlink_to(path)
+
+
+def run(folder: Path, tests: list[str]) -> int:
+    """pytest's status: 0 all passed, 1 some failed, above 1 they could not be run."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"--timeout={SECONDS}", *tests]
+    env = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, check=False).returncode
+
+
+def main(words: list[str]) -> int:
+    """words: only mutations whose file or description hold them all."""
+    chosen = [m for m in MUTATIONS if all(w in f"{m.file} {m.breaks}" for w in words)]
+    if not chosen:
+        print(f"no mutation holds all of: {' '.join(words)}", file=sys.stderr)
+        return 2
+    bad = 0
+    with tempfile.TemporaryDirectory(prefix="dexsim_mutations_") as name:
+        folder = Path(name)
+        copy(folder)
+        if run(folder, sorted({m.test for m in chosen})) != 0:
+            print("broken    the tests themselves: they fail without any mutation")
+            return 1
+        for m in chosen:
+            path = folder / m.file
+            whole = path.read_text(encoding="utf-8")
+            path.write_text(mutated(m), encoding="utf-8")
+            status = run(folder, [m.test])
+            path.write_text(whole, encoding="utf-8")
+            word = {0: "survived", 1: "killed"}.get(status, f"broken ({status})")
+            bad += word != "killed"
+            print(f"{word:9} {m.breaks} ({m.file})", flush=True)
+    print(f"{len(chosen) - bad} of {len(chosen)} killed")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,117 @@
+"""The evaluation of the grasp on a stage: objects lie where the test says, and what the evaluation does to them is noted."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from dexsim.tasks import grasp_eval
+from dexsim.tasks.grasp_eval import HOLD, PUSH_S, SETTLE, STAY_S, TURN_S
+from dexsim.tasks.randomize import Sampler
+
+N, DT = 6, 0.05
+MASS = torch.linspace(0.05, 0.3, N)
+
+
+class Stage:
+    """What the evaluation asks of an environment. From SETTLE on, the object of each world lies `away` [N] m beside its place;
+    touched [N, 5]: which fingers touch it. gravity, force: [steps, N, 3], as they were at each step."""
+
+    def __init__(self, away: torch.Tensor, touched: torch.Tensor):
+        self.num_envs, self.device, self.dt, self.max_episode_length, self.pushes = N, "cpu", DT, 10, True
+        self.rng = torch.Generator().manual_seed(0)
+        self.sampler = Sampler({}, self.rng, N, "cpu")
+        self.objects = SimpleNamespace(mass=MASS, friction=torch.ones(N), variant=torch.zeros(N, dtype=torch.long))
+        self.fixed_command, self.outside_force, self.f_max = None, torch.zeros(N, 3), 8.0
+        self.fields = {"opt.gravity": torch.zeros(N, 3)}
+        self.engine = SimpleNamespace(field=self.fields.__getitem__)
+        self.away, self.object_pose = away, torch.zeros(N, 7)
+        self.finger_force = self.tip_force = touched.float()
+        self.torque, self.gravity, self.force = torch.zeros(N, 12), [], []
+
+    def reset_all(self):
+        self.fields["opt.gravity"].copy_(torch.tensor([0.0, 0.0, -9.81]).expand(N, 3))
+
+    def get_observations(self):
+        return None
+
+    def step(self, actions):
+        self.gravity.append(self.fields["opt.gravity"].clone())
+        self.force.append(self.outside_force.clone())
+        if (len(self.force) - 1) * DT > SETTLE:
+            self.object_pose[:, 0] = self.away
+        return None, None, torch.zeros(N), {}
+
+
+def play(away=0.0, touched=True) -> tuple[Stage, dict]:
+    """One episode in every world of a stage."""
+    stage = Stage(torch.as_tensor(away).expand(N), torch.as_tensor(touched).expand(N, 5))
+    out = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
+    stage.gravity, stage.force = torch.stack(stage.gravity), torch.stack(stage.force)
+    return stage, out
+
+
+def test_the_hand_is_turned_by_90_and_by_180_degrees():
+    """Gravity as the palm has it: down while it is held, across the palm after the first turn, up after the second."""
+    g = play()[0].gravity / 9.81
+    torch.testing.assert_close(g.norm(dim=2), torch.ones(g.shape[:2]))
+    t = DT * torch.arange(len(g))
+    first = SETTLE + HOLD
+    second = first + TURN_S + STAY_S
+    z = g[..., 2]
+    assert (z[t <= first] == -1).all()
+    torch.testing.assert_close(z[(t > first + TURN_S + 1e-6) & (t < second)].abs().max(), torch.tensor(0.0), rtol=0, atol=1e-6)
+    torch.testing.assert_close(z[t > second + TURN_S + 1e-6], torch.ones(1, 1).expand(int((t > second + TURN_S + 1e-6).sum()), N))
+    assert (t > second + TURN_S).sum() * DT >= STAY_S - 2 * DT
+    across = g[int((second - 0.5 * STAY_S) / DT), :, :2]
+    assert float(torch.pdist(across).min()) > 1e-3, "each world is turned about an axis of its own"
+
+
+def test_every_second_world_is_pushed_by_twice_its_weight_for_half_a_second():
+    force = play()[0].force
+    on = force.norm(dim=2) > 0
+    t = DT * torch.arange(len(force))
+    assert not on[:, 1::2].any()
+    for w in range(0, N, 2):
+        mine = on[:, w]
+        assert int(mine.sum()) * DT == pytest.approx(PUSH_S, abs=1.01 * DT)
+        assert SETTLE + 0.5 <= float(t[mine].min()) and float(t[mine].max()) <= SETTLE + HOLD - 0.5
+        torch.testing.assert_close(force[mine, w].norm(dim=1), (2 * 9.81 * MASS[w]).expand(int(mine.sum())))
+    assert float(torch.pdist(force[:, ::2].sum(0) / force[:, ::2].sum(0).norm(dim=1, keepdim=True)).min()) > 0.1, "in random directions"
+
+
+def test_held_is_within_30_mm_of_where_it_settled():
+    away = torch.tensor([0.0, 0.02, 0.029, 0.031, 0.05, 0.14])
+    out = play(away)[1]
+    inside = [True, True, True, False, False, False]
+    for name in ("held", "held90", "held180"):
+        assert out[name].tolist() == inside, name
+    assert out["moved"].tolist() == [not x for x in inside] and not out["untouched"].any()
+
+
+def test_held_is_touched_by_the_thumb_and_a_finger():
+    touched = torch.zeros(N, 5, dtype=torch.bool)
+    touched[0], touched[1, [0, 3]], touched[2, 0], touched[3, 1:] = True, True, True, True
+    out = play(0.0, touched)[1]
+    assert out["held"].tolist() == [True, True, False, False, False, False]
+    assert out["untouched"].tolist() == [False, False, True, True, True, True] and not out["moved"].any()
+
+
+def test_what_must_be_held_is_what_the_commanded_forces_can_carry():
+    """Four fingers of 10 N at command 0.5 are 20 N: with friction 0.8 they carry a load of 8 N, and not more."""
+    r = {"command": np.full(4, 0.5), "friction": np.full(4, 0.8), "load": np.array([4.0, 7.9, 8.1, 20.0])}
+    assert grasp_eval.must_hold(r, 10.0).tolist() == [True, True, False, False]
+    r["mass"] = r["load"] / 9.81
+    assert grasp_eval.can_carry(r, 10.0).tolist() == [True, True, False, False]
+
+
+def test_the_load_is_weight_and_push_together():
+    """Up to three times the weight for those that are pushed (by twice of it), the weight itself for the others."""
+    out = play()[1]
+    weight = 9.81 * MASS.numpy()
+    np.testing.assert_allclose(out["load"][1::2], weight[1::2], rtol=1e-5)
+    ratio = out["load"][::2] / weight[::2]
+    assert (ratio >= 1 - 1e-5).all() and (ratio <= 3 + 1e-5).all() and (abs(ratio - 1) > 1e-3).all()
