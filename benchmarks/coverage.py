@@ -28,6 +28,7 @@ import numpy as np
 import torch
 
 from benchmarks import tools
+from dexsim import intervals
 from dexsim.assets import xhand
 from dexsim.cli import machine, start
 from dexsim.console.ending import guard
@@ -153,8 +154,11 @@ def interval(within: np.ndarray, block: np.ndarray, rng: np.random.Generator) ->
     count, hits = np.bincount(index), np.bincount(index, within)
     if len(count) < 2:
         return None
-    pick = rng.integers(len(count), size=(RESAMPLES, len(count)))
-    return [float(x) for x in np.percentile(hits[pick].sum(1) / count[pick].sum(1), [2.5, 97.5])]
+
+    def rate(h: np.ndarray, c: np.ndarray, axis: int = -1) -> np.ndarray:
+        return h.sum(axis) / c.sum(axis)
+
+    return intervals.bootstrap((hits, count), rate, rng, RESAMPLES).tolist()
 
 
 def halves(ours: Contacts, rng: np.random.Generator) -> tuple[float, float] | None:

@@ -198,7 +198,7 @@ def main(words: list[str]) -> int:
         for m in chosen:
             path = folder / m.file
             whole = path.read_text(encoding="utf-8")
-            path.write_text(mutated(m), encoding="utf-8")
+            path.write_text(mutated(m, folder), encoding="utf-8")
             status = run(folder, [m.test])
             path.write_text(whole, encoding="utf-8")
             word = {0: "survived", 1: "killed"}.get(status, f"broken ({status})")

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
-        "errors paths version rotation",
+        "errors paths version rotation intervals",
         "console files typed",
         "outputs yaml_text",
         "assets",

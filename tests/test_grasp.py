@@ -550,14 +550,17 @@ def test_play_prints_the_papers_columns_of_the_grasp():
 
 
 def test_the_grasps_intervals_are_those_of_theory():
-    """A share of 300 in 400 by its standard error; a correlation of 0.6 in 400 samples by Fisher's z."""
+    """A share of 300 in 400 by its standard error, one of 40 in 40 by Wilson's formula; a correlation of 0.6 in 400 samples by Fisher's z."""
     rng = np.random.default_rng(3)
-    low, high = grasp_eval._rate_interval(np.arange(500) % 4 != 0, np.arange(500) < 400, rng)
+    low, high = grasp_eval._rate_interval(np.arange(500) % 4 != 0, np.arange(500) < 400)
     half = 1.96 * (0.75 * 0.25 / 400) ** 0.5
     assert low == pytest.approx(0.75 - half, abs=0.01) and high == pytest.approx(0.75 + half, abs=0.01)
+    always, never = (grasp_eval._rate_interval(np.full(40, x), np.full(40, True)) for x in (True, False))
+    width = 1.96**2 / (40 + 1.96**2)  # z^2 / (n + z^2)
+    assert always == pytest.approx([1 - width, 1.0], abs=1e-4) and never == pytest.approx([0.0, width], abs=1e-4)
     a, noise = rng.normal(size=(2, 400))
     b = 0.6 * a + 0.8 * noise
     r = np.corrcoef(a, b)[0, 1]
     theory = np.tanh(np.arctanh(r) + np.array([-1.96, 1.96]) / 397**0.5)
-    assert grasp_eval._corr_interval(a, b, rng) == pytest.approx(theory, abs=0.015)
-    assert grasp_eval._rate_interval(a > 0, a > 9, rng) is None and grasp_eval._corr_interval(a, 0 * a, rng) is None
+    assert grasp_eval._corr_interval(a, b) == pytest.approx(theory, abs=0.015)
+    assert grasp_eval._rate_interval(a > 0, a > 9) is None and grasp_eval._corr_interval(a, 0 * a) is None

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.concealed.baselines import LABELS
-from benchmarks.concealed.score import wilson
+from dexsim import intervals
 
 AIMS = {  # line: (to publish, aim), from the project's judging table
     "right effect first, easy": ("85 %", "95 %"), "right effect first, medium": ("70 %", "88 %"),
@@ -165,7 +165,7 @@ def limits(data: dict, path: Path) -> None:
         ([r[4] for r in rows], "#718096", "nothing said"),
     ):
         rate = [v / r[2] for v, r in zip(values, rows, strict=True)]
-        spread = [wilson(v, r[2]) for v, r in zip(values, rows, strict=True)]
+        spread = [intervals.share(v, r[2]) for v, r in zip(values, rows, strict=True)]
         left.errorbar(
             x,
             rate,
@@ -187,7 +187,7 @@ def limits(data: dict, path: Path) -> None:
     bins = [b for b in by_confidence(data["results"]) if b[2]]
     x = [0.5 * (a + b) for a, b, *_ in bins]
     rate = [k / n for *_, n, k in bins]
-    spread = [wilson(k, n) for *_, n, k in bins]
+    spread = [intervals.share(k, n) for *_, n, k in bins]
     right.plot([0, 1], [0, 1], color="#cbd5e0", label="as sure as right")
     right.errorbar(
         x,

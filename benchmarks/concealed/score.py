@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import intervals
+
 SURE = 0.8  # a name is confident from here, when it stands alone
 CLASSES = tuple(
     frozenset(c.split())
@@ -22,22 +24,12 @@ CLASSES = tuple(
 """Effects that recordings may fail to separate: a set within one of them, of three at most, may be an answer."""
 
 
-def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a rate (Wilson 1927)."""
-    if n == 0:
-        return 0.0, 1.0
-    p, d = hits / n, 1 + z * z / n
-    middle, half = (p + z * z / (2 * n)) / d, z / d * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
 def bootstrap(values: list[float], statistic: Callable, count: int = 2000) -> tuple[float, float]:
     """95 % interval of a statistic of `values` by resampling; (nan, nan) without any."""
     if not values:
         return math.nan, math.nan
-    rng, x = np.random.default_rng(0), np.asarray(values)
-    draws = [statistic(x[rng.integers(0, len(x), len(x))]) for _ in range(count)]
-    return tuple(float(v) for v in np.percentile(draws, (2.5, 97.5)))
+    low, high = intervals.bootstrap(*intervals.of_rows(np.asarray(values), statistic), 0, count)
+    return float(low), float(high)
 
 
 def named_right(finding: dict | None, effect: str) -> bool:
@@ -212,7 +204,7 @@ def table(results: list[dict]) -> dict[str, dict]:
     def rate(line: str, values: list) -> None:
         values = [bool(v) for v in values]
         if values:
-            low, high = wilson(sum(values), len(values))
+            low, high = intervals.share(sum(values), len(values))
             lines[line] = {"value": sum(values) / len(values), "low": low, "high": high, "n": len(values)}
 
     def middle(line: str, values: list, statistic: Callable) -> None:

@@ -41,6 +41,7 @@ from scipy.stats import t as student
 
 from benchmarks.loop import presses
 from benchmarks.loop.steps import FAST, KEPT
+from dexsim import intervals
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -617,16 +618,15 @@ def _gap(naive: np.ndarray, truth: np.ndarray) -> dict:
 
 def _ratio(naive: np.ndarray, other: np.ndarray, truth: np.ndarray) -> dict:
     """(mean other - mean naive) / (mean truth - mean naive), with a 95 % interval by resampling seeds."""
-    rng = np.random.default_rng(0)
-    draws = []
-    for _ in range(2000):
-        i = rng.integers(0, len(naive), len(naive))
-        gap = truth[i].mean() - naive[i].mean()
-        if abs(gap) > 1e-9:
-            draws.append((other[i].mean() - naive[i].mean()) / gap)
-    gap = truth.mean() - naive.mean()
-    value = float((other.mean() - naive.mean()) / gap) if abs(gap) > 1e-9 else math.nan
-    low, high = (float(v) for v in np.percentile(draws, (2.5, 97.5))) if draws else (math.nan, math.nan)
+
+    def part(naive: np.ndarray, other: np.ndarray, truth: np.ndarray, axis: int = -1) -> np.ndarray:
+        gap = truth.mean(axis) - naive.mean(axis)
+        there = np.abs(gap) > 1e-9
+        return np.where(there, (other.mean(axis) - naive.mean(axis)) / np.where(there, gap, 1.0), math.nan)
+
+    value, draws = float(part(naive, other, truth)), intervals.draws((naive, other, truth), part, 0, 2000)
+    told = draws[np.isfinite(draws)]
+    low, high = (float(v) for v in np.percentile(told, (2.5, 97.5))) if len(told) else (math.nan, math.nan)
     return {"value": value, "low": low, "high": high, "seeds": len(naive)}
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.real.fold import brief, finger, fold, joint
+from dexsim import intervals
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
@@ -40,9 +41,7 @@ def bam(data: Path, out: Path, jobs: int) -> dict:
     folds.sort(key=lambda f: f["gain"])
     errors = {k: v for f in folds for k, v in f["recordings"].items()}
     x = np.array(list(errors.values()))
-    rng = np.random.default_rng(0)
-    draws = [x[rng.integers(0, len(x), len(x)), 1].mean() for _ in range(2000)]
-    low, high = np.percentile(draws, (2.5, 97.5))
+    low, high = intervals.bootstrap((x[:, 1],), np.mean, 0, 2000)
     return {"benchmark": "bam", "mae_mrad": float(1e3 * x[:, 1].mean()), "mae_low_mrad": float(1e3 * low), "mae_high_mrad": float(1e3 * high),
             "mae_before_mrad": float(1e3 * x[:, 0].mean()), "to_beat_mrad": 52.3, "coulomb_viscous_mrad": 64.1,
             "by_recording_mrad": {k: [round(1e3 * a, 1), round(1e3 * b, 1)] for k, (a, b) in sorted(errors.items())}, "folds": folds}  # fmt: skip

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
+from dexsim import intervals
+
 BOOTSTRAP = 1000
 R2_LEAST, HYSTERESIS_MOST, OFFSET_MOST, BEND_MOST = 0.97, 0.10, 0.10, 0.05
 """A fit is called linear if R2 is at least the first, loading and unloading differ by at most the second share of the
@@ -85,14 +87,9 @@ def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
     slope, offset = _line(x, y)
     ratio = float(x @ y / (x @ x))
     names = np.unique(levels.level)
-    rng = np.random.default_rng(seed)
     rows = [np.flatnonzero(levels.level == k) for k in names]
-    draws = []
-    for _ in range(BOOTSTRAP):
-        pick = np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))])
-        if np.ptp(x[pick]) > 0:
-            draws.append((x[pick] @ y[pick] / (x[pick] @ x[pick]), _line(x[pick], y[pick])[0]))
-    low, high = np.percentile(draws, [2.5, 97.5], axis=0)
+    sums = np.array([(len(k), x[k].sum(), y[k].sum(), x[k] @ x[k], x[k] @ y[k]) for k in rows]).T
+    low, high = intervals.bootstrap(sums, _ratio_and_slope, seed, BOOTSTRAP)
     total = ((y - y.mean()) ** 2).sum()
     r2 = 1 - ((y - slope * x - offset) ** 2).sum() / total
     r2_ratio = 1 - ((y - ratio * x) ** 2).sum() / total
@@ -153,6 +150,16 @@ def reasons(levels: Levels, f: LineFit, bends: bool, unit: str) -> list[str]:
             f"the joint turned by {moved:.2f} rad while pressing, so its lever arm changed: fix the object better"
         )
     return out
+
+
+def _ratio_and_slope(*sums: np.ndarray, axis: int = -1) -> np.ndarray:
+    """(ratio, slope) of levels together, stacked, from the sums of each along an axis: n, x, y, x^2, xy; NaN where x
+    does not vary."""
+    n, x, y, xx, xy = (s.sum(axis) for s in sums)
+    spread = xx - x**2 / n
+    varies = spread > 1e-9 * xx
+    slope = (xy - x * y / n) / np.where(varies, spread, 1.0)
+    return np.where(varies, np.stack([xy / np.maximum(xx, 1e-300), slope]), np.nan)
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

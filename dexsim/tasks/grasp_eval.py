@@ -14,6 +14,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from dexsim import intervals
+
 SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
 TURN_S, STAY_S = 0.75, 1.0
@@ -222,41 +224,36 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         ]
         out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
         out["by_command"] = _by_command(r, held)
-        rng = np.random.default_rng(0)
-        out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held], rng)
+        out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held])
         out["torque_command_correlation_interval"] = _corr_interval(
-            r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1), rng
+            r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1)
         )
-    rng = np.random.default_rng(1)
     for name, part, among in (
         ("hold_rate", r, ~pushed & firm),
         ("hold_rate_pushed", r, pushed & able),
         ("hold_rate_kept_out_shapes", k, k["pushed"].astype(bool) & able_k),
     ):
-        out[f"{name}_interval"] = _rate_interval(part["held"], among, rng)
+        out[f"{name}_interval"] = _rate_interval(part["held"], among)
     return out
 
 
-def _rate_interval(ok: np.ndarray, among: np.ndarray, rng: np.random.Generator) -> list[float] | None:
-    """95 % bootstrap over episodes of `_rate`: resampling yes and no is drawing from a binomial."""
-    rate, count = _rate(ok, among), int(among.sum())
-    return (
-        None
-        if rate is None
-        else [float(x) for x in np.percentile(rng.binomial(count, rate, RESAMPLES) / count, [2.5, 97.5])]
-    )
+def _rate_interval(ok: np.ndarray, among: np.ndarray) -> list[float] | None:
+    """95 % of `_rate` (Wilson's)."""
+    return list(intervals.share(int(ok[among].sum()), int(among.sum()))) if among.any() else None
 
 
-def _corr_interval(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> list[float] | None:
+def _corr_interval(a: np.ndarray, b: np.ndarray) -> list[float] | None:
     """95 % bootstrap over episodes of `_corr`."""
     if _corr(a, b) is None:
         return None
-    # how often each episode is drawn
-    weight = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES) / len(a)
-    ma, mb = (weight @ a)[:, None], (weight @ b)[:, None]
-    both = (weight * (a - ma) * (b - mb)).sum(1)
-    spread = np.sqrt((weight * (a - ma) ** 2).sum(1) * (weight * (b - mb) ** 2).sum(1))
-    return [float(x) for x in np.percentile(both / np.maximum(spread, 1e-12), [2.5, 97.5])]
+    return intervals.bootstrap((a, b), _correlations, 0, RESAMPLES).tolist()
+
+
+def _correlations(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Pearson's correlation along an axis; 0 where one does not vary."""
+    a, b = (x - x.mean(axis, keepdims=True) for x in (a, b))
+    spread = np.sqrt((a**2).sum(axis) * (b**2).sum(axis))
+    return (a * b).sum(axis) / np.maximum(spread, 1e-12)
 
 
 def _by_object(r: dict, env) -> dict[str, float | None]:
@@ -306,7 +303,7 @@ def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
             [(ends("contact_force_range_N"), ends("joint_torque_range_Nm"), value(said[3]), value(said[4]))],
         ),
         (
-            "95 % intervals (bootstrap over episodes)",
+            "95 % intervals (of rates Wilson's, of correlations by bootstrap over episodes)",
             ("quantity", "value", "interval"),
             [(n, value(n), ends(f"{n}_interval", 4)) for n in said],
         ),

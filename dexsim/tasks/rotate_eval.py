@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from dexsim import intervals
+
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
 HEADER = (
     "Contact center",
@@ -65,24 +67,27 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
 def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: float, resamples: int, seed: int) -> dict:
     """Metrics of E trials: successes [E], time [E] s until the fall or the cap, capped [E] bool."""
     successes, time = np.asarray(successes), np.asarray(time, float)
-    rng = np.random.default_rng(seed)
-    pick = rng.integers(len(successes), size=(max(int(resamples), 1), len(successes)))
-    s, t = successes[pick], time[pick]
-    with np.errstate(divide="ignore"):
-        per = t.sum(1) / s.sum(1)  # infinite where a resample has no success
+    average, median, per, fall = intervals.draws((successes, time), _statistics, seed, max(int(resamples), 1))
     total = successes.sum()
     return {
         "episodes": len(successes),
         "consecutive_successes": {
             "average": float(successes.mean()), "median": float(np.median(successes)),
             "all": sorted(int(x) for x in successes),
-            "average_interval": _interval(s.mean(1)), "median_interval": _interval(np.median(s, axis=1)),
+            "average_interval": _interval(average), "median_interval": _interval(median),
         },
         "seconds_per_success": float(time.sum() / total) if total else None,
         "seconds_per_success_interval": _interval(per),
-        "seconds_to_fall": float(time.mean()), "seconds_to_fall_interval": _interval(t.mean(1)),
+        "seconds_to_fall": float(time.mean()), "seconds_to_fall_interval": _interval(fall),
         "capped": int(np.asarray(capped).sum()), "cap_s": cap,
     }  # fmt: skip
+
+
+def _statistics(successes: np.ndarray, time: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Average and median of the successes, seconds a success (infinite where there is none), seconds to fall."""
+    with np.errstate(divide="ignore"):
+        per = time.sum(axis) / successes.sum(axis)
+    return np.stack([successes.mean(axis), np.median(successes, axis), per, time.mean(axis)])
 
 
 def _interval(x: np.ndarray) -> list[float | None]:

@@ -1,0 +1,69 @@
+"""Intervals of what was counted or averaged: Wilson's of a share, the bootstrap's percentiles of anything else. Both
+are SciPy's."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import stats
+
+LEVEL = 0.95
+AT_ONCE = 2_000_000
+"""Numbers that the resamples of one batch hold, about."""
+
+
+def share(hits: int, n: int, level: float = LEVEL) -> tuple[float, float]:
+    """Interval of a share of which `hits` in n were seen (Wilson, 1927). Unlike a bootstrap's it has a width at 0 and
+    at n of n; (0, 1) where n is 0. Raises ValueError unless 0 <= hits <= n."""
+    if n == 0 and hits == 0:
+        return 0.0, 1.0
+    found = stats.binomtest(int(hits), int(n)).proportion_ci(level, method="wilson")
+    return float(found.low), float(found.high)
+
+
+def draws(samples: Sequence[np.ndarray], statistic: Callable, seed, count: int = 1000) -> np.ndarray:
+    """[..., count] values of a statistic of E units drawn anew, with replacement.
+
+    samples: arrays [E], drawn together. statistic(*samples, axis=axis) reduces that axis of arrays [..., E]; it may
+    return several values stacked in front. seed: a number or a generator. One unit alone gives the same value each
+    time."""
+    samples = [np.asarray(s) for s in samples]
+    units = len(samples[0])
+    if units == 1:
+        value = np.asarray(statistic(*samples, axis=-1))
+        return np.repeat(value[..., None], count, -1)
+    with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+        # the interval and standard error that SciPy adds are not used: only they mind a value that is not finite
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        found = stats.bootstrap(
+            tuple(samples),
+            statistic,
+            paired=len(samples) > 1,
+            vectorized=True,
+            n_resamples=count,
+            batch=max(1, AT_ONCE // units),
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        )
+    return np.asarray(found.bootstrap_distribution)
+
+
+def bootstrap(
+    samples: Sequence[np.ndarray], statistic: Callable, seed, count: int = 1000, level: float = LEVEL
+) -> np.ndarray:
+    """[2, ...] ends of the percentile interval of a statistic; see `draws`. Resamples in which it is not a number count
+    for nothing."""
+    ends = 50 * np.array([1 - level, 1 + level])
+    return np.nanpercentile(draws(samples, statistic, seed, count), ends, axis=-1)
+
+
+def of_rows(rows: np.ndarray, statistic: Callable) -> tuple[tuple[np.ndarray], Callable]:
+    """(samples, statistic) as `draws` takes them, of any statistic(rows [E, ...]) that gives one number."""
+    rows = np.asarray(rows)
+
+    def each(index: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.apply_along_axis(lambda i: statistic(rows[i.astype(int)]), axis, index)
+
+    return (np.arange(len(rows)),), each

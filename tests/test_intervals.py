@@ -1,0 +1,57 @@
+"""Intervals: Wilson's by hand, the bootstrap's by theory and as often right as they say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dexsim import intervals
+
+
+def test_a_share_is_wilsons_and_never_of_no_width():
+    assert intervals.share(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert intervals.share(0, 100) == pytest.approx((0.0, 0.0370), abs=1e-4)
+    assert intervals.share(100, 100) == pytest.approx((0.9630, 1.0), abs=1e-4)
+    assert intervals.share(0, 0) == (0.0, 1.0)
+    with pytest.raises(ValueError):
+        intervals.share(3, 2)
+
+
+def test_the_bootstrap_of_an_average_is_its_standard_error():
+    x = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    low, high = intervals.bootstrap((x,), np.mean, 0, 4000)
+    half = 1.96 * x.std() / math.sqrt(400)
+    assert (low, high) == pytest.approx((x.mean() - half, x.mean() + half), abs=0.1 * half)
+    assert intervals.bootstrap((x,), np.mean, 0, 4000).tolist() == [low, high], "the same seed, the same interval"
+
+
+def test_units_are_drawn_together_and_several_values_at_once():
+    """A ratio of two that go together has no spread at all; drawn apart it would have."""
+    x = np.random.default_rng(1).uniform(1, 2, 30)
+
+    def both(a, b, axis=-1):
+        return np.stack([b.sum(axis) / a.sum(axis), a.mean(axis)])
+
+    drawn = intervals.draws((x, 3 * x), both, 0, 500)
+    assert drawn.shape == (2, 500)
+    np.testing.assert_allclose(drawn[0], 3.0)
+    assert drawn[1].std() > 0.01
+
+
+def test_any_statistic_of_rows():
+    rows = np.random.default_rng(2).integers(0, 5, (50, 3))
+    seen = intervals.draws(*intervals.of_rows(rows, lambda r: float(np.median(r[:, 0] - r[:, 2]))), 0, 200)
+    assert seen.shape == (200,) and set(np.unique(seen)) <= set(np.arange(-5, 5.5, 0.5)) and seen.std() > 0
+
+
+def test_one_unit_and_what_is_no_number():
+    assert intervals.bootstrap((np.array([2.0]),), np.mean, 0).tolist() == [2.0, 2.0]
+
+    def broken(x, axis=-1):
+        mean = x.mean(axis)
+        return np.where(mean > 0.5, mean, np.nan)
+
+    low, high = intervals.bootstrap((np.array([0.0, 1.0, 1.0, 1.0]),), broken, 0)
+    assert 0.5 < low < high == 1.0
