@@ -337,7 +337,8 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     data = json.loads((out / "diagnosis.json").read_text())
     assert set(data) == KEYS and data["schema"] == 1
     assert data["verdict"] in ("explained", "partly_explained")
-    assert set(data["noise_floor"]) == {"position_rad", "how"} and data["noise_floor"]["how"] in ("repeats", "split", "quantum")
+    assert set(data["noise_floor"]) == {"position_rad", "how", "joints"} and set(data["noise_floor"]["joints"]) == {"joint"}
+    assert data["noise_floor"]["how"] in ("repeats", "split", "quantum")
     assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"}
     plain = data["baseline"]
     assert set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"} and plain["error"] < 0.1 * plain["error_before"]

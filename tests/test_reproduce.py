@@ -34,7 +34,10 @@ def train_file(path: Path, iteration: int) -> None:
     """A training's checkpoint that says how far it came, and nothing else of use."""
     path.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.save(path, dict.fromkeys((*checkpoint.KEYS, *checkpoint.TRAIN_KEYS), {}) | {
-        "kind": "train", "iteration": iteration, "steps": 100 * iteration, "optimizer": {"state": {0: torch.ones(9)}, "param_groups": []}})
+        "kind": "train", "iteration": iteration, "steps": 100 * iteration,
+        "config": {"agent": {}, "task": {}, "choices": {}}, "git": {"commit": "", "dirty": False},
+        "layout": {"joints": [], "action": [], "observations": {}}, "rng": checkpoint.rng_state(),
+        "optimizer": {"state": {0: {"exp_avg": torch.ones(9)}}, "param_groups": []}})
     (path.parent / "progress.csv").write_text("iteration,steps\n" + "".join(f"{i},{100 * i}\n" for i in range(1, iteration + 1)))
 
 
