@@ -133,8 +133,8 @@ def edited(edit: Callable[[mujoco.MjSpec], None] | None) -> Iterator[None]:
     """Environments made inside get `edit` after their own solver options."""
     own = env_module._solver_options
 
-    def options(spec: mujoco.MjSpec, sim: dict) -> None:
-        own(spec, sim)
+    def options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:
+        own(spec, sim, engine)
         for geom in list(spec.geoms):  # what only a picture needs would come to life
             if not geom.contype and not geom.conaffinity:
                 spec.delete(geom)

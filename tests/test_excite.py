@@ -205,7 +205,7 @@ def test_the_recording_that_a_diagnosis_asks_for(tmp_path):
     (["out=x", "kinds=waltz"], "must be among triangles"),
     (["out=x", "speed=2"], r"speed=2.0: must lie in \[0.01, 1.0\]"),
     (["out=x", "seed=a"], "seed=a: must be a number"),
-    (["out=x", "model=nowhere.xml"], "no such file"),
+    (["out=x", "model=nowhere.xml"], "nowhere.xml does not exist"),
 ])  # fmt: skip
 def test_bad_settings(argv, text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

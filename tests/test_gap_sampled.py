@@ -111,6 +111,6 @@ def test_a_speed_filter_that_is_believed_is_refitted_about_its_belief(believed, 
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1], None, conditions(runs))
-    mine = [p for p in search._nuisances() if p.columns == ("speed_lag",)]
+    mine = [p for p in search.all_nuisances if p.columns == ("speed_lag",)]
     assert len(mine) == 1 and (mine[0].low, mine[0].high) == (pytest.approx(low), pytest.approx(high))
     assert search.case.plant.base()[0, INDEX["speed_lag"]] == value

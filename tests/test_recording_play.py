@@ -237,7 +237,7 @@ def test_a_model_without_its_servo_or_joints(tmp_path):
     model, servo = _saved_pendulum(tmp_path)
     with pytest.raises(UserError, match="say which servo"):
         mech.mechanism(model)
-    with pytest.raises(UserError, match="no such file"):
+    with pytest.raises(UserError, match="no.xml does not exist"):
         mech.mechanism(tmp_path / "no.xml", servo)
     with pytest.raises(UserError, match="joint 'elbow' is not in"):
         mech.mechanism(model, servo, ("elbow",))
