@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+"""Before NumPy is loaded, here and in programs that tests start. Its threads wait for each other by spinning: where other
+work shares the cores, products of small matrices take ten times as long with two threads as with one."""
 
 
 def pytest_configure(config) -> None:
