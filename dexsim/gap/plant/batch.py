@@ -268,7 +268,7 @@ class JointPlant:
                     size = H * len(keep)
                     oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
                     given = recorded(guess, moves, constants, *rest, oq, ot)
-                    wp.launch(pk.plant_kernel(), dim=(H, count), inputs=[0, self.dt, given], device=self.device, block_dim=BLOCK)
+                    wp.launch(pk.plant_kernel(), dim=(count, H), inputs=[0, self.dt, given], device=self.device, block_dim=BLOCK)
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
@@ -307,7 +307,7 @@ class JointPlant:
         kernel = pk.plant_kernel()
 
         def launch(first: int, number: int) -> None:
-            wp.launch(kernel, dim=(number, count), inputs=[first, self.dt, given], device="cpu")
+            wp.launch(kernel, dim=(count, number), inputs=[first, self.dt, given], device="cpu")
 
         if H > 1 and THREADS > 1:
             half = (H + 1) // 2

@@ -408,6 +408,18 @@ def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     return n
 
 
+@wp.func
+def turned(gc: f64, gs: f64, dq: f64):
+    """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated. Near there, where a step mostly is, by
+    Taylor's series, true to 4e-12 and several times as fast."""
+    if wp.abs(dq) > f64(0.15):
+        return gc * wp.cos(dq) + gs * wp.sin(dq)
+    x = dq * dq
+    c = f64(1.0) - x * (f64(0.5) - x * (f64(1.0 / 24.0) - x * f64(1.0 / 720.0)))
+    s = dq * (f64(1.0) - x * (f64(1.0 / 6.0) - x * (f64(1.0 / 120.0) - x * f64(1.0 / 5040.0))))
+    return gc * c + gs * s
+
+
 # -- the drive ---------------------------------------------------------------------------------------------------------
 
 
@@ -637,7 +649,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
     load = n.gravity_cos
     if not p.slide:
         dq = x.q - n.q  # the model was evaluated at the measured pose
-        load = n.gravity_cos * wp.cos(dq) + n.gravity_sin * wp.sin(dq)
+        load = turned(n.gravity_cos, n.gravity_sin, dq)
     load += n.load
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
@@ -758,7 +770,7 @@ def plant_kernel():
 
     @wp.kernel(module="unique", enable_backward=False)
     def plant(first: int, dt: f64, c: Recorded):
-        hh, w = wp.tid()
+        w, hh = wp.tid()  # guesses of one window side by side: what was recorded in it stays in the cache
         h = first + hh
         g0 = c.window[w, 0]
         warm = c.window[w, 2]
