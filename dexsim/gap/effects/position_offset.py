@@ -23,10 +23,14 @@ class PositionOffset(Effect):
     misreads = True
 
     def variants(self, s: Scales) -> list[Variant]:
-        if s.gravity < 0.02 * s.tau:
+        if s.gravity < 0.02 * s.tau and not s.apart:  # a loop's own encoder alone turns all, and gravity alone tells
             return []
         p = param("offset", "position_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
-        return [Variant((p,), ((-0.2,), (-0.07,), (-0.02,), (0.02,), (0.07,), (0.2,)))]
+        starts = ((-0.2,), (-0.07,), (-0.02,), (0.02,), (0.07,), (0.2,))
+        if s.apart:  # of the encoder that reports, or of the loop's own as well
+            read = param("offset", "readout_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
+            return [Variant((read,), starts, "readout"), Variant((p,), starts, "both encoders")]
+        return [Variant((p,), starts)]
 
     def unseen(self, s: Scales) -> str:
         return "" if self.variants(s) else "gravity hardly acts on the joint, so its zero leaves no trace"

@@ -31,6 +31,9 @@ class PositionScale(Effect):
                 "scale",
             )
         ]
+        if s.apart:  # of the encoder that reports alone: the loop does not know
+            read = param("scale", "readout_scale", "set", 0.7, 1.4, 1.0)
+            out.insert(0, Variant((read,), out[0].starts, "scale of the readout"))
         if not s.slide and s.span > 0.5:
             e = min(0.2, 0.3 * s.span)
             params = (

@@ -208,6 +208,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         effort=effort_noise > 0, saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
         base_friction=constants.friction, base_damping=constants.damping, armature=constants.armature,
         own_torque=big(series("own_cos")), own_inertia=float(np.median(series("own_inertia"))), leaf_mass=constants.leaf_mass, own_mass=constants.own_mass,
+        apart=plant.loop == "motor" and plant.position == "joint",
     )  # fmt: skip
     table = runs[0].servo
     ranges, unknown = {}, []

@@ -27,6 +27,8 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),
     ("effort_fresh", 0.0, "1", "0: the shown effort is the one that acts, 1: the one that the loop would ask for at that moment"),
+    ("readout_scale", 1.0, "1", "reported over what the encoder shows, where the loop has another encoder"),
+    ("readout_offset", 0.0, "rad", "added to what is reported, where the loop has another encoder"),
     ("com_out", 0.0, "m", "centre of the added mass, out from the hinge beyond the last link's centre of mass"),
     ("com_across", 0.0, "m", "the same, along the way it turns"),
     ("late_by", 0.0, "s", "some of the commands act later by as much (to see what one command's time does)"),

@@ -85,6 +85,7 @@ XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
 P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
 P_FRESH = INDEX["effort_fresh"]
+P_READSCALE, P_READOFFSET = INDEX["readout_scale"], INDEX["readout_offset"]
 P_FROM, P_REBOUND = INDEX["coupling_from"], INDEX["rebound"]
 P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"], INDEX["deadband_kind"]
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
@@ -119,6 +120,8 @@ FIELDS = ("params", "inits", "consts", "series", "cmd_t", "cmd", "window", "wind
 class Guess:  # the columns of one guess that every step asks for
     kp: f64
     kd: f64
+    read_scale: f64  # of what is reported, where that is not the loop's own encoder
+    read_offset: f64
     scale: f64
     offset: f64
     esin: f64
@@ -220,6 +223,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.kp = c.params[h, P_KP]
     p.kd = c.params[h, P_KD]
     p.scale = c.params[h, P_SCALE]
+    p.read_scale = c.params[h, P_READSCALE]
+    p.read_offset = c.params[h, P_READOFFSET]
     p.offset = c.params[h, P_OFFSET]
     p.esin = c.params[h, P_ESIN]
     p.ecos = c.params[h, P_ECOS]
@@ -296,11 +301,18 @@ def shown_rate(q: f64, p: Guess):
 
 @wp.func
 def position(m: f64, p: Guess):
-    """Where the encoder shows m: its inverse, by two fixed-point steps."""
-    q = (m - p.offset) / p.scale
-    q = (m - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
-    q = (m - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
+    """Where m is reported: its inverse, by two fixed-point steps."""
+    at = unread(m, p)
+    q = (at - p.offset) / p.scale
+    q = (at - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
+    q = (at - p.offset - p.esin * wp.sin(q) - p.ecos * (wp.cos(q) - f64(1.0))) / p.scale
     return q
+
+
+@wp.func
+def unread(m: f64, p: Guess):
+    """What the encoder shows where m is reported: without what the readout alone is off by."""
+    return (m - p.read_offset) / p.read_scale
 
 
 @wp.func
@@ -735,7 +747,7 @@ def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
     """The joint at the begin of a window: where it was measured."""
     x = State()
     x.q = position(c.series[g, XQ], p)
-    x.v = c.series[g, XV] / shown_rate(x.q, p)
+    x.v = c.series[g, XV] / (p.read_scale * shown_rate(x.q, p))
     if warm == 0:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
@@ -749,11 +761,11 @@ def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
 @wp.func
 def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
     """The joint on its recorded motion, while the drive's own state settles; last: it is let go now."""
-    m = c.series[g, XQ]
+    m = unread(c.series[g, XQ], p)
     if p.round_:
         m = m - p.esin * wp.sin(x.q) - p.ecos * (wp.cos(x.q) - f64(1.0))
     x.q = (m - p.offset) / p.scale
-    x.v = c.series[g, XV] / shown_rate(x.q, p)
+    x.v = c.series[g, XV] / (p.read_scale * shown_rate(x.q, p))
     if last:
         x.q += c.inits[h, 0]
         x.v += c.inits[h, 1]
@@ -823,7 +835,7 @@ def plant_kernel():
             elif i < warm:
                 after = reported
             while s < s_end and c.sample_step[s] == i:
-                c.out_q[h, s] = reported + c.sample_part[s] * (after - reported)
+                c.out_q[h, s] = p.read_scale * (reported + c.sample_part[s] * (after - reported)) + p.read_offset
                 c.out_torque[h, s] = x.last - c.params[h, P_FRESH] * x.older
                 s += 1
             t += dt

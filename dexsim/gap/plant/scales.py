@@ -43,3 +43,4 @@ class Scales:
     own_inertia: float = 0.0
     leaf_mass: float = 0.0  # kg: of the last link, and of the joint's own
     own_mass: float = 0.0
+    apart: bool = False  # the loop reads the motor's encoder, and what is reported is the joint's

@@ -21,6 +21,8 @@ WITH_OTHERS = (
     "warmth",
 )
 LATE = 0.75  # periods of its loop by which any drive may act on its commands late
+ZERO = 2.0  # counts of an encoder by which its zero may be off
+EFFORT_ZERO = 0.01  # of the torque limit: what a reading of the effort may be off by at rest
 FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
 
 
@@ -160,7 +162,12 @@ def refitted(case: Case) -> list[Param]:
     if c.constants.damping > 0:
         d = BELIEF * c.constants.damping
         out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
+    if s.apart:  # two encoders have two zeros, set to a count or two
+        z = ZERO * max(c.quantum, c.sigma)
+        out.append(Param("zero", ("readout_offset",), "add", -z, z, 0.0, nuisance=True, sd=0.5 * z))
     if c.sigma_torque > 0:
+        o = EFFORT_ZERO * (s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.tau)
+        out.append(Param("effort_zero", ("effort_offset",), "add", -o, o, 0.0, nuisance=True, sd=0.5 * o))
         out.append(
             Param(
                 "effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF
