@@ -153,6 +153,30 @@ MUTATIONS = (
         "0.0",
         "tests/test_gap_least.py::test_an_effect_must_remove_a_part_of_what_was_kept_out",
     ),
+    _constant(
+        "a touch effect that removes nothing is named",
+        "dexsim/gap/touch/search.py",
+        "LEAST",
+        "0.12",
+        "0.0",
+        "tests/test_gap_least.py::test_a_touch_effect_must_remove_a_least_share",
+    ),
+    _constant(
+        "inverse dynamics name what removes nothing",
+        "dexsim/gap/search/inverse_dynamics.py",
+        "LEAST",
+        "0.12",
+        "0.0",
+        "tests/test_gap_inverse.py::test_further_effects_are_named_one_after_another",
+    ),
+    _constant(
+        "a torque that takes nothing off is offered",
+        "dexsim/gap/judge/residual_fit.py",
+        "LEAST",
+        "0.10",
+        "0.0",
+        "tests/test_gap_least.py::test_a_fitted_residual_must_take_a_least_share_off",
+    ),
 )
 
 

@@ -1,4 +1,4 @@
-"""An effect that removes hardly anything of what was kept out is a hint, however sure the search was of it."""
+"""What removes hardly anything of the error on what was left out is not named, not offered, or a hint only."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge import confidence, errors, residual_fit
 from dexsim.gap.judge.joint import PART, JointAnswer
 from dexsim.gap.judge.verdict import HINTED
+from dexsim.gap.touch.search import PadSearch
 
 ROWS = 400
 
@@ -52,3 +53,30 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(monkeypatch, share, h
     assert (found["confidence"] <= HINTED) is hint
     reasons = answer.evidence[0].reasons
     assert (len(reasons) > 0) is hint and all(f"less than {100 * PART:.0f} %" in r for r in reasons)
+
+
+class Felt(PadSearch):
+    """A search of one pad whose trials say themselves what they lose on the presses left out."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng(0)
+
+    def cross(self, trial):
+        return np.full(20, trial)
+
+
+def test_a_touch_effect_must_remove_a_least_share():
+    assert not Felt()._earns(0.9, 1.0) and Felt()._earns(0.86, 1.0)
+
+
+@pytest.mark.parametrize(("after", "offered"), [(0.99, False), (0.91, False), (0.89, True)])
+def test_a_fitted_residual_must_take_a_least_share_off(monkeypatch, after, offered):
+    """after: rms on what was kept out with the torque that was fitted to what is left, over that without."""
+    n = 200
+    t = 0.01 * np.arange(n)
+    run = SimpleNamespace(t=t, qs=np.sin(9 * t)[:, None], vs=np.cos(7 * t)[:, None])
+    noise = np.random.default_rng(0).normal(size=n)
+    monkeypatch.setattr(residual_fit, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
+    monkeypatch.setattr(residual_fit, "_held_out", lambda *_: (1.0, after))
+    found = residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], [])
+    assert (found is not None) is offered
