@@ -1,5 +1,5 @@
 # make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
-# make test    the tests
+# make test    the tests, a process a core (up to 4): one alone, to debug it: make test ARGS="-n 0 -k name"
 # make lint    ruff over everything, mypy over the public functions
 # make wheel   what `pip install` takes, in dist/
 # make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
@@ -24,7 +24,7 @@ play: $(VENV)/.installed
 	$(PY) play.py $(or $(ARGS),checkpoint=checkpoints/grasp.pt)
 
 test: $(VENV)/.installed-test
-	$(PY) -m pytest -q -m "not slow" $(ARGS)
+	$(PY) -m pytest -q -m "not slow" -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .

@@ -161,7 +161,7 @@ ADDED = (  # file, the line before which (none: at its end), what is added: a co
     ("actuator/kernel.py", "        # The stand-in for what is not known", "        t.end += cable_pull(d.params[w, j, CABLE], q)\n"),
     ("actuator/reference.py", "    of_motor, slope_motor, drawn", '    applied = applied - p["cable"] * q**3\n'),
     ("gap/plant/kernel.py", "f64 = wp.float64", 'from dexsim.actuator.laws import cable_pull\n\nP_CABLE = INDEX["cable"]\n'),
-    ("gap/plant/kernel.py", "                applied += params[h, P_BIAS]", "                applied += cable_pull(params[h, P_CABLE], q)\n"),
+    ("gap/plant/kernel.py", "    applied += p.bias", "    applied += cable_pull(c.params[h, P_CABLE], x.q)\n"),
     ("gap/effects/cable.py", "", CABLE),
     ("gap/effects/catalogue.py", "CATALOGUE: tuple[Effect, ...] = (", "from dexsim.gap.effects.cable import Cable\n\n"),
     ("gap/effects/catalogue.py", "    CoulombFriction(),", "    Cable(),\n"),
