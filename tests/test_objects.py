@@ -88,7 +88,7 @@ def test_loading_needs_no_trimesh():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("name", ["wedge", "peanut"])
+@pytest.mark.parametrize("name", ["wedge", "tee"])
 def test_committed_library_is_what_the_formulas_give(name):
     stored, again = library()[name], shape_from_hulls(name, hulls_of(name), SHAPES[name][1])
     for a, b in zip(stored.hulls, again.hulls, strict=True):
@@ -248,7 +248,7 @@ def test_grid_inside_a_convex_shape_is_the_largest_plane_distance(name):
 @pytest.mark.parametrize("name", GRID_SHAPES)
 def test_grid_against_exact_distance_near_the_surface(name):
     shape = library()[name]
-    p = near_surface(shape, 1500, 2e-3)
+    p = near_surface(shape, 500, 2e-3)
     exact, sampled = signed_distance(shape.hulls, p), shape.grid.sample(p)
     error = np.abs(sampled - exact)
     # Kinks at edges cost up to a third of a cell there; over faces the distance is linear and the grid exact.
