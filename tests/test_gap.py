@@ -339,7 +339,8 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     assert data["verdict"] in ("explained", "partly_explained")
     assert set(data["noise_floor"]) == {"position_rad", "how", "joints"} and set(data["noise_floor"]["joints"]) == {"joint"}
     assert data["noise_floor"]["how"] in ("repeats", "split", "quantum")
-    assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high"}
+    assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high", "not_judged"}
+    assert data["held_out"]["not_judged"] == []
     plain = data["baseline"]
     assert set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"} and plain["error"] < 0.1 * plain["error_before"]
     assert set(plain["joints"]["joint"]) == {"error_before", "error", "parameters"} and plain["handed_on"] == []
