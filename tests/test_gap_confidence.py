@@ -144,3 +144,13 @@ def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():
     apart = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
     confidence.together(apart)
     assert [e.confidence for e in apart] == [0.99, 0.9]
+
+
+def test_what_is_neutral_is_not_believed_to_a_few_percent():
+    """An encoder's scale of 0.97 +- 0.01 is not nothing, a gain of 0.97 +- 0.01 is within what is believed of gains."""
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0, "torque_limit": 2.0}))
+    scale = Param("scale", ("position_scale",), "set", 0.7, 1.4, 1.0)
+    limit = Param("torque", ("torque_limit",), "set", 0.1, 3.0, 2.0)
+    assert not confidence.holds_nothing([scale], {"scale": (0.96, 0.98)}, case)
+    assert confidence.holds_nothing([scale], {"scale": (0.96, 1.01)}, case)
+    assert confidence.holds_nothing([limit], {"torque": (1.92, 1.96)}, case)

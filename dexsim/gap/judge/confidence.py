@@ -19,6 +19,7 @@ from dexsim.gap.plant.columns import INDEX, NEUTRAL
 
 DOUBTED = 0.7  # what a name keeps at most where one reason speaks against it: below what counts as confident
 SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say what an effect is like, not how large it is
+EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
 NEEDED = 1.3  # x the noise: an error within it asks for no effect
 SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
@@ -69,7 +70,9 @@ def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case
     for p in sizes:
         low, high = spread[p.key]
         zero = neutral_of(p, case)
-        give = BELIEF * abs(zero) if p.mode in ("factor", "set") and abs(zero) < 1e8 else 0.0
+        # a figure of the drive is believed to a few percent; an encoder's scale is what it is
+        believed = p.mode in ("factor", "set") and p.columns[0] not in EXACT
+        give = BELIEF * abs(zero) if believed and abs(zero) < 1e8 else 0.0
         # where an effect begins at a bound, the bound is nothing
         begins = p.mode == "set" and ((zero <= p.low and low <= p.low * (1 + 1e-6) + 1e-12) or (zero >= p.high and high >= p.high * (1 - 1e-6)))
         if not begins and not low - give <= zero <= high + give:
@@ -135,6 +138,8 @@ def together(mine: list[Evidence]) -> None:
         alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
         if alike is not None:
             _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
+        if EFFECTS[e.effect].misreads and any(EFFECTS[x.effect].couples for x in mine):
+            e.hint("it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike")
         if len(mine) >= CROWD and k > 0:
             _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
 

@@ -51,7 +51,8 @@ def verdict(findings: Sequence[dict[str, Any]], floor: float, before: float, bef
 
 def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = 0.5) -> tuple[float, float]:
     """90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both at times [n] s on what was
-    kept out: a bootstrap over half-second blocks in stretches of two seconds, paired. (0, 0) without samples."""
+    kept out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the whole error: draws without the few moments
+    in which a limit acts show nothing, not a loss. (0, 0) without samples."""
     if not len(without):
         return 0.0, 0.0
     b = ((times - times.min()) / block).astype(int)
@@ -60,5 +61,5 @@ def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, s
     n, size = len(a), min(4, len(a))
     starts = np.random.default_rng(seed).integers(0, n, (400, -(-n // size)))
     index = ((starts[..., None] + np.arange(size)) % n).reshape(400, -1)
-    share = 1 - c[index].sum(1) / np.maximum(a[index].sum(1), 1e-300)
+    share = (a - c)[index].sum(1) / max(float(a.sum()), 1e-300)
     return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))
