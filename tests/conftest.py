@@ -11,7 +11,10 @@ work shares the cores, products of small matrices take ten times as long with tw
 
 
 def pytest_configure(config) -> None:
-    """Programs that tests start can be interrupted, also where the tests themselves run in the background of a shell without job control,
-    which has SIGINT ignored for them."""
+    """Programs that tests start can be interrupted and hung up, also where the tests themselves run in the background of a
+    shell without job control, or under nohup, which has SIGINT or SIGHUP ignored for them."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGHUP, signal.SIGTERM):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
