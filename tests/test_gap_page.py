@@ -95,3 +95,27 @@ def test_page_is_not_blank(pages, tmp_path):
 
 def test_notes_that_recordings_share_are_said_once():
     assert grouped(["a.mcap: x", "b.mcap: x", "c.mcap: y", "plain: note"]) == ["a.mcap, b.mcap: x", "c.mcap: y", "plain: note"]
+
+
+def test_hints_stand_apart_and_are_not_in_the_first_sentence():
+    from dexsim.gap.report.page import _findings
+    from dexsim.gap.report.sentence import sentence
+    from dexsim.gap.result import Diagnosis, empty
+
+    def found(effect: str, confidence: float, key: str) -> dict:
+        return {"effect": effect, "confidence": confidence, "where": {"joints": ["knee"], "taxels": [], "topics": []}, "regime": "somewhere", "when": [],
+                "alternatives": [], "indistinguishable": [], "separating_experiment": None, "held_out": {"before": 0.02, "after": 0.01},
+                "parameters": {key: {"value": 0.01, "low": 0.005, "high": 0.02, "unit": "s"}}} | ({"hint": True} if confidence < 0.5 else {})  # fmt: skip
+
+    data = empty("partly_explained")
+    data["held_out"] |= {"before": 0.02, "after": 0.01}
+    data["findings"] = [found("command_delay", 0.9, "delay"), found("lag", 0.3, "time_constant")]
+    d = Diagnosis(data, "", [])
+    html = _findings(d)
+    missing, hints = html.split("<h2>Hints</h2>")
+    assert "delay" in missing and "lag" not in missing.lower().replace("lagg", "") and "lag" in hints.lower()
+    said = sentence(data, d, 0.001)
+    assert "later than believed" in said and "more" not in said
+    data["findings"] = data["findings"][1:]
+    data["verdict"] = "unknown"
+    assert "What is missing" not in _findings(d) and "no effect of the catalogue explains" in sentence(data, d, 0.001)

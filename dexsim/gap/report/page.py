@@ -161,7 +161,7 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> str:
     rows, plain = [], d.data["baseline"].get("joints", {})
     order = sorted(d.joints.items(), key=lambda x: -x[1]["before"])
     for j, v in order[:most]:
-        effects = ", ".join(_name(f["effect"]) for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
+        effects = ", ".join(_name(f["effect"]) + " (hint)" * f.get("hint", False) for f in d.data["findings"] if j in f["where"]["joints"]) or "&#8211;"
         rows.append(f'<tr><td>{_t(j)}</td><td>{effects}</td><td class="n">{charts.number(1e3 * v["before"])}</td><td class="n">{charts.number(1e3 * v["after"])}</td>'
                     f'<td class="n">{charts.number(1e3 * plain[j]["error"]) if j in plain else ""}</td><td class="n">{1e3 * v["sigma"]:.2g} {unit}</td></tr>')  # fmt: skip
     from dexsim.assets import xhand
@@ -228,9 +228,9 @@ def _findings(d: Diagnosis) -> str:
     findings = d.data["findings"]
     if not findings:
         return _nearest(d)
-    from dexsim.gap.report.sentence import WEAK, spoken, words_of
+    from dexsim.gap.report.sentence import spoken, words_of
 
-    cards = []
+    cards: dict[bool, list[str]] = {False: [], True: []}  # by whether it is a hint
     ends = _ends(d)
     for f in findings:
         e, h = entry(f), f["held_out"]
@@ -244,12 +244,16 @@ def _findings(d: Diagnosis) -> str:
             names = list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]
             rows = [(n, ends.get(n, max(w["end"] for w in f["when"] if w["recording"] == n)), [(w["start"], w["end"]) for w in f["when"] if w["recording"] == n]) for n in names]
             strip = f"<figure>{charts.strips(rows)}<figcaption>when it acts (dark: more than a quarter of its largest)</figcaption></figure>"
-        kind = "bad" if bad else "set" if f["indistinguishable"] or f["confidence"] < WEAK else ""
+        kind = "bad" if bad else "set" if f["indistinguishable"] or f.get("hint") else ""
         left = _parameters(f)
         body = f'<div class="half"><div>{left}</div><div>{strip}</div></div>' if left and strip else f"{left}{strip}"
-        cards.append(f'<div class="finding {kind}"><header><h3>{_t(_name(f["effect"]))} &#8212; {where}</h3><span class="conf">confidence <b>{100 * f["confidence"]:.0f} %</b></span></header>'
+        cards[f.get("hint", False)].append(f'<div class="finding {kind}"><header><h3>{_t(_name(f["effect"]))} &#8212; {where}</h3><span class="conf">confidence <b>{100 * f["confidence"]:.0f} %</b></span></header>'
                      f"<p>{words}</p>{body}{error}{_lost(f, d)}</div>")  # fmt: skip
-    return f'<section><h2>What is missing</h2>{"".join(cards)}</section>'
+    out = f'<section><h2>What is missing</h2>{"".join(cards[False])}</section>' if cards[False] else _nearest(d)
+    if cards[True]:
+        out += ("<section><h2>Hints</h2><p>Names below 0.5, or that the error on what was kept out does not bear out: they count for nothing in"
+                f" the verdict, and the notes below say why.</p>{''.join(cards[True])}</section>")  # fmt: skip
+    return out
 
 
 def _metric(d: Diagnosis, f: dict) -> str:

@@ -9,7 +9,6 @@ from dexsim.gap.report.charts import number
 from dexsim.gap.result import Diagnosis
 from dexsim.recording.mechanism import Mechanism
 
-WEAK = 0.3  # confidence below which a finding is not in the first sentence
 
 
 def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
@@ -38,14 +37,15 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         of, mine = " of that joint", d.joints[next(iter(alone))]
         before, after = 1e3 * mine["before"], 1e3 * mine["after"]
     parts = []
-    strong = [f for f in named if f["confidence"] >= WEAK] or named[:1]
-    for f in strong[:2]:
+    for f in named[:2]:
         words = words_of(f, d.mechanism)
         others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
         parts.append(f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else ""))
-    parts[0] = parts[0][:1].upper() + parts[0][1:] if not strong[0]["where"]["joints"] or strong[0]["where"]["joints"][0] in spoken(strong[0])[1:] else parts[0]
+    first = named[0]["where"]["joints"]
+    if not first or first[0] in spoken(named[0])[1:]:
+        parts[0] = parts[0][:1].upper() + parts[0][1:]
     left_out = len(named) - len(parts)
-    more = f" ({left_out} more, {'smaller or less sure, ' if len(strong) < len(named) else ''}below)" if left_out else ""
+    more = f" ({left_out} more, below)" if left_out else ""
     it = "it" if len(named) == 1 else "them"
     if h["before"] is None:
         return prefix + "; ".join(parts) + more + "."
