@@ -122,7 +122,7 @@ class JointAnswer:
             "separating_experiment": separating([mm.id, *(e for e, _ in same)]) if same else None,
             "where": {"joints": [case.joint], "taxels": [], "topics": []},
             "regime": mm.effect.shows,
-            "when": errors.intervals_of(active, case, self.kept.runs, self.kept.train),
+            "when": errors.intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
             "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)} if of_effort else
                         {"before": error_without, "after": rms(self.after), "removed_low": round(gain[0], 4), "removed_high": round(gain[1], 4)},
