@@ -277,7 +277,8 @@ def verdict(d) -> str:
         sizes = ", ".join(
             f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
         )
-        lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}: {sizes or f['regime']}")
+        hint = " (a hint)" if f.get("hint") else ""
+        lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}{hint}: {sizes or f['regime']}")
         if f["indistinguishable"]:
             lines.append(f"    cannot be told from {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}: {f['separating_experiment']}")
     if data["next_recording"]:
