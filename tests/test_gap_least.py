@@ -26,7 +26,7 @@ class Judged(JointAnswer):
         self.member = SimpleNamespace(id="lag", effect=effect, variant=SimpleNamespace(fixed=(), note=""))
         self.best, self.none = SimpleNamespace(members=(self.member,), fit=None), SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
         self.case = SimpleNamespace(joint="j")
-        self.kept = SimpleNamespace(runs=[], train=[])
+        self.kept = SimpleNamespace(runs=[], train=[], test=[])
         self.outcome = SimpleNamespace(rivals={})
         self.search = self.whole = self.windows = self.bounds = self.widest = None
         self.measured, self.t = np.zeros(ROWS), 0.01 * np.arange(ROWS)
