@@ -18,7 +18,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "errors paths version rotation intervals",
         "console files typed",
         "outputs yaml_text",
-        "assets",
+        "assets hand",
         "sim",
         "actuator tactile",
         "recording view",

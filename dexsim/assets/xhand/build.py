@@ -103,6 +103,16 @@ def tip_meshes(pad_name: str, lattice: Lattice) -> dict[str, shells.Mesh]:
     }
 
 
+def write_skin(pad_name: str) -> None:
+    """The surface that carries a pad's taxels, to the last bit, for hand.yaml."""
+    finger = next(f for f in xhand.FINGERS if xhand.pad_of(f) == pad_name)
+    vertices, faces = xhand.tip_skin_mesh(finger)
+    lines = ["# dexsim, drawn by dexsim/assets/xhand/build.py; metres: the surface that carries the taxels"]
+    lines += ["v " + " ".join(repr(float(x)) for x in v) for v in vertices]
+    lines += ["f " + " ".join(str(int(k) + 1) for k in f) for f in faces]
+    (xhand.FOLDER / f"skin_{pad_name}_hull.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
 def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
     """Visual shells: name -> (body, material, mesh); the fingers' are listed once, for the middle finger."""
     mm = lambda *p: [[0.001 * x for x in q] for q in p]  # noqa: E731
@@ -167,6 +177,7 @@ def build() -> str:
     meshes: dict[str, shells.Mesh] = {}
     for pad_name in PADS:
         meshes |= tip_meshes(pad_name, write_taxels(pad_name))
+        write_skin(pad_name)
     visuals = shell_meshes()
     meshes |= {name: mesh for name, (_, _, mesh) in visuals.items()}
     folder = xhand.FOLDER / "meshes"

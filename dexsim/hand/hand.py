@@ -1,0 +1,127 @@
+"""What the rest of dexsim knows of a hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dexsim.hand.schema import HandFile, Pad
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True)
+class Finger:
+    """A finger. joints, flexion: indices in the hand's order, root to tip; closes: +1 or -1 for each of flexion, the
+    sign of the motion that closes it; root: body of its first joint; body: the distal one, in whose frame position [3] m
+    (the finger's end) and normal [3] (unit, out of the palmar side) are; geoms: what presses objects."""
+
+    name: str
+    joints: tuple[int, ...]
+    flexion: tuple[int, ...]
+    closes: tuple[int, ...]
+    root: str
+    body: str
+    position: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    geoms: tuple[str, ...]
+    pad: Pad | None
+
+
+@dataclass(frozen=True)
+class Hand:
+    """A hand, checked against its model. Joints [J] in the order on the wire, fingers [F] in the file's.
+
+    limits [J, 2] rad, efforts [J] N m, speeds [J] rad/s; opposing and others: indices of the fingers that press against
+    the others, and of those; palm_body; span m and force N (or None) as in the file; mirror, scale: what was derived.
+    """
+
+    folder: Path
+    file: HandFile
+    mirror: bool
+    scale: float
+    joints: tuple[str, ...]
+    fingers: tuple[Finger, ...]
+    limits: np.ndarray
+    efforts: np.ndarray
+    speeds: np.ndarray
+    opposing: tuple[int, ...]
+    others: tuple[int, ...]
+    span: float
+    force: float | None
+    _spec: mujoco.MjSpec = field(repr=False)
+
+    def spec(self) -> mujoco.MjSpec:
+        """A fresh model of the hand alone, to be extended: world frame = palm frame, no actuators, sensors or lights."""
+        return self._spec.copy()
+
+    @property
+    def name(self) -> str:
+        return self.file.name
+
+    @property
+    def handedness(self) -> str:
+        """right, left or none, mirrored where the hand is."""
+        other = {"right": "left", "left": "right"}
+        return other.get(self.file.handedness, "none") if self.mirror else self.file.handedness
+
+    @property
+    def robot(self) -> str:
+        """What recordings and bundles call it: name and handedness."""
+        scaled = "" if self.scale == 1.0 else f"_x{self.scale:g}"
+        side = "" if self.handedness == "none" else f"_{self.handedness}"
+        return f"{self.name}{side}{scaled}"
+
+    @property
+    def palm_body(self) -> str:
+        return self.file.palm.body
+
+    @property
+    def finger_names(self) -> tuple[str, ...]:
+        return tuple(f.name for f in self.fingers)
+
+    @property
+    def tip_bodies(self) -> tuple[str, ...]:
+        return tuple(f.body for f in self.fingers)
+
+    @property
+    def tip_geoms(self) -> tuple[str, ...]:
+        """Of all fingers, finger by finger."""
+        return tuple(g for f in self.fingers for g in f.geoms)
+
+    @property
+    def touches(self) -> bool:
+        """Whether its fingertips carry touch pads."""
+        return self.fingers[0].pad is not None
+
+    @property
+    def finger_of_joint(self) -> tuple[int, ...]:
+        """Finger of each joint [J], -1 where it belongs to none (a wrist)."""
+        owner = {j: k for k, f in enumerate(self.fingers) for j in f.joints}
+        return tuple(owner.get(j, -1) for j in range(len(self.joints)))
+
+    @property
+    def closing(self) -> np.ndarray:
+        """+1 or -1 of each flexion joint, 0 of every other [J]."""
+        out = np.zeros(len(self.joints))
+        for f in self.fingers:
+            out[list(f.flexion)] = f.closes
+        return out
+
+    @property
+    def servo_path(self) -> Path:
+        return self.folder / self.file.servo
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """What `load_hand` needs to make it again."""
+        return {"hand": str(self.folder), "hand_mirror": self.mirror, "hand_scale": self.scale}
+
+    def pose(self, which: str) -> np.ndarray:
+        """Joint angles [J] rad of the pose "open" or "cupped"."""
+        angles = getattr(self.file.poses, which)
+        return np.array([angles[j] for j in self.joints])

@@ -1,0 +1,187 @@
+"""Read a hand's folder and check that file and model agree."""
+
+from __future__ import annotations
+
+import difflib
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.hand import derive, model, schema
+from dexsim.hand.hand import Finger, Hand
+from dexsim.hand.schema import FILE, HandFile, Pad
+
+HANDS = Path(__file__).parents[1] / "assets"
+"""Folders of the hands that come with dexsim."""
+SCALES = (0.2, 5.0)
+
+
+def load_hand(which: str | Path = "xhand", mirror: bool = False, scale: float = 1.0) -> Hand:
+    """The hand of a folder (or of the hand.yaml in it), or one that comes with dexsim, by name.
+
+    mirror: its mirror image (a right hand becomes a left one); scale: all lengths times this, masses times its cube,
+    motors unchanged. Raises UserError, one line: file, field, value, what must be there.
+    """
+    if isinstance(mirror, bool) is False:
+        raise UserError(f"hand_mirror={mirror}: must be true or false")
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not SCALES[0] <= scale <= SCALES[1]:
+        raise UserError(f"hand_scale={scale}: must lie in [{SCALES[0]}, {SCALES[1]}]")
+    path = _file(which)
+    stamp = path.stat().st_mtime_ns
+    return _load(path, stamp, mirror, float(scale))
+
+
+def known() -> list[str]:
+    """Names of the hands that come with dexsim."""
+    return sorted(p.parent.name for p in HANDS.glob(f"*/{FILE}"))
+
+
+def _file(which: str | Path) -> Path:
+    text = str(which)
+    if text in known():
+        return HANDS / text / FILE
+    path = Path(text).expanduser()
+    if path.is_dir() and (path / FILE).is_file():
+        return (path / FILE).resolve()
+    if path.is_file() and path.name == FILE:
+        return path.resolve()
+    near = difflib.get_close_matches(text, known(), 1)
+    raise UserError(
+        f"hand={text}: must be one of {', '.join(known())}, or a folder with a {FILE}"
+        + (f"; did you mean {near[0]}?" if near else "")
+        + (f"; {path} has no {FILE}: write one, {schema.SEE}" if path.is_dir() else "")
+    )
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
+    file = schema.read(path)
+    where = f"hand {path}"
+    for key, name in (("model", file.model), ("servo", file.servo)):
+        if not (path.parent / name).is_file():
+            raise UserError(f"{where}: {key} ({name}): no such file beside it; give a path relative to {path.parent}")
+    _names(file, where)
+    spec, tips = model.prepared(file, path, where)
+    limits = model.limits(spec, [j.name for j in file.joints], where)
+    _poses(file, limits, where)
+    if mirror or scale != 1.0:
+        spec = derive.derived(spec, mirror, scale)
+        limits = model.limits(spec, [j.name for j in file.joints], where)
+    order = {j.name: k for k, j in enumerate(file.joints)}
+    flip = np.array([1.0, -1.0 if mirror else 1.0, 1.0])
+    fingers = []
+    for entry, geoms in zip(file.fingers, tips, strict=True):
+        normal = np.array(entry.tip.normal) / np.linalg.norm(entry.tip.normal)
+        fingers.append(
+            Finger(
+                name=entry.name,
+                joints=tuple(order[j] for j in entry.joints),
+                flexion=tuple(order[j] for j in entry.flexion),
+                closes=tuple(entry.closes or [1] * len(entry.flexion)),
+                root=model.body_of_joint(spec, entry.joints[0]),
+                body=entry.tip.body,
+                position=_triple(np.array(entry.tip.position) * flip * scale),
+                normal=_triple(normal * flip),
+                geoms=geoms,
+                pad=entry.pad,
+            )
+        )
+    names = [f.name for f in file.fingers]
+    opposing = tuple(names.index(f) for f in file.opposing)
+    return Hand(
+        folder=path.parent,
+        file=file,
+        mirror=mirror,
+        scale=scale,
+        joints=tuple(order),
+        fingers=tuple(fingers),
+        limits=limits,
+        efforts=np.array([j.effort for j in file.joints]),
+        speeds=np.array([j.speed for j in file.joints]),
+        opposing=opposing,
+        others=tuple(k for k in range(len(names)) if k not in opposing),
+        span=file.span * scale,
+        force=file.force,
+        _spec=spec,
+    )
+
+
+def _triple(v: np.ndarray) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def _twice(names: list[str]) -> str | None:
+    return next((n for k, n in enumerate(names) if n in names[:k]), None)
+
+
+def _names(file: HandFile, where: str) -> None:
+    """What can be told without the model."""
+    joints, fingers = [j.name for j in file.joints], [f.name for f in file.fingers]
+    for key, names in (
+        ("joints", joints),
+        ("fingers", fingers),
+        ("fingers.*.tip.body", [f.tip.body for f in file.fingers]),
+        ("fingers.*.joints", [j for f in file.fingers for j in f.joints]),
+        ("opposing", file.opposing),
+    ):
+        if (twice := _twice(names)) is not None:
+            raise UserError(f"{where}: {key}: '{twice}' twice; each must be there once")
+    for f in file.fingers:
+        for j in f.joints:
+            if j not in joints:
+                raise UserError(f"{where}: fingers.{f.name}.joints: '{j}' is not in joints; {_near(j, joints)}")
+        for j in f.flexion:
+            if j not in f.joints:
+                raise UserError(f"{where}: fingers.{f.name}.flexion: '{j}' is not among its joints {f.joints}")
+        if _twice(f.flexion) is not None or f.flexion != [j for j in f.joints if j in f.flexion]:
+            raise UserError(f"{where}: fingers.{f.name}.flexion ({f.flexion}): must be in the order of its joints")
+        if f.closes is not None and len(f.closes) != len(f.flexion):
+            raise UserError(
+                f"{where}: fingers.{f.name}.closes ({f.closes}): must have {len(f.flexion)} entries, one of +1 or -1"
+                " for each joint of flexion"
+            )
+        if not np.linalg.norm(f.tip.normal) > 1e-6:
+            raise UserError(f"{where}: fingers.{f.name}.tip.normal ({f.tip.normal}): must have a length")
+    for f in file.opposing:
+        if f not in fingers:
+            raise UserError(f"{where}: opposing: '{f}' is not a finger; {_near(f, fingers)}")
+    if len(file.opposing) == len(fingers):
+        raise UserError(f"{where}: opposing names every finger; leave out those that they press against")
+    _pads([f.pad for f in file.fingers], fingers, where)
+    forward, normal = np.array(file.palm.forward), np.array(file.palm.normal)
+    if not np.linalg.norm(np.cross(normal, forward)) > 0.1 * np.linalg.norm(normal) * np.linalg.norm(forward) > 0:
+        raise UserError(
+            f"{where}: palm.forward ({file.palm.forward}), palm.normal ({file.palm.normal}): must have lengths and"
+            " differ in direction by 6 degrees or more; best at right angles"
+        )
+
+
+def _pads(pads: list[Pad | None], fingers: list[str], where: str) -> None:
+    bare = [name for name, pad in zip(fingers, pads, strict=True) if pad is None]
+    if bare and len(bare) < len(fingers):
+        raise UserError(
+            f"{where}: fingers.{bare[0]}.pad: has none, but others have; give every finger a pad, or none (pad: null)"
+        )
+
+
+def _near(name: str, names: list[str]) -> str:
+    near = difflib.get_close_matches(name, names, 1)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names[:12])}"
+
+
+def _poses(file: HandFile, limits: np.ndarray, where: str) -> None:
+    joints = [j.name for j in file.joints]
+    for which in ("open", "cupped"):
+        pose = getattr(file.poses, which)
+        for j in pose:
+            if j not in joints:
+                raise UserError(f"{where}: poses.{which}: no joint '{j}'; {_near(j, joints)}")
+        for j, (low, high) in zip(joints, limits, strict=True):
+            if j not in pose:
+                raise UserError(f"{where}: poses.{which}: lacks joint '{j}'; give an angle for each")
+            if not low - 1e-6 <= pose[j] <= high + 1e-6:
+                raise UserError(
+                    f"{where}: poses.{which}.{j} ({pose[j]:g}): the model's range is [{low:.4g}, {high:.4g}] rad"
+                )

@@ -1,0 +1,196 @@
+"""A hand's model as tasks need it: read, checked, put into the palm frame, with the collision bits of dexsim's scenes."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dexsim import files
+from dexsim.errors import UserError
+from dexsim.hand.schema import HandFile
+
+MAX_MODEL = 64 << 20
+"""Bytes of a model file."""
+OBJECT_BIT, HAND_BIT = 1, 2
+"""Collision bits. Colliding hand geoms have contype HAND_BIT and conaffinity OBJECT_BIT, objects' geoms contype
+OBJECT_BIT and conaffinity HAND_BIT; bits 4 and up are the hand's own, about itself."""
+LINK_SOLREF = [0.005, 1.0]
+ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, list[tuple[str, ...]]]:
+    """The model in the palm frame, and the names of each fingertip's geoms. Raises UserError."""
+    at = path.parent / file.model
+    spec = read(at, f"{where}: model ({file.model})")
+    _alone(spec, at, f"{where}: model ({file.model})")
+    _joints(spec, file, where)
+    for group in (spec.actuators, spec.sensors, spec.keys, spec.lights, spec.cameras):
+        for item in list(group):
+            spec.delete(item)
+    tips = _tips(spec, file, where)
+    _collide(spec, {g for names in tips for g in names})
+    _place(spec, file, where)
+    return spec, tips
+
+
+def read(path: Path, where: str) -> mujoco.MjSpec:
+    """The model of an MJCF or URDF file that compiles. Raises UserError."""
+    files.check(path, MAX_MODEL, where)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.copy().compile()
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"{where}: {' '.join(str(error).split())}") from None
+    return spec
+
+
+def limits(spec: mujoco.MjSpec, joints: list[str], where: str) -> np.ndarray:
+    """Position limits [J, 2] of these joints."""
+    m = spec.copy().compile()
+    out = []
+    for name in joints:
+        j = m.joint(name).id
+        low, high = m.jnt_range[j]
+        if not m.jnt_limited[j] or not low < high:
+            raise UserError(
+                f"{where}: joint '{name}' of the model has the range [{low:g}, {high:g}] rad"
+                f"{'' if m.jnt_limited[j] else ', not limited'}; give it two limits, low < high"
+            )
+        out.append((low, high))
+    return np.array(out)
+
+
+def body_of_joint(spec: mujoco.MjSpec, joint: str) -> str:
+    """Name of the body that a joint moves."""
+    return spec.joint(joint).parent.name
+
+
+def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
+    """Refuse what servos on single joints cannot drive, and what is not the hand."""
+    coupled = {
+        "tendon": [t.name for t in spec.tendons],
+        "equality constraint": [e.name or e.name1 for e in spec.equalities],
+    }
+    try:
+        root = ET.parse(path).getroot()
+    except (ET.ParseError, OSError):
+        root = None
+    if root is not None and root.tag == "robot":
+        coupled["mimic joint"] = [j.get("name", "") for j in root.iter("joint") if j.find("mimic") is not None]
+    for kind, names in coupled.items():
+        if names:
+            shown = ", ".join(n or "unnamed" for n in names[:3]) + (" ..." if len(names) > 3 else "")
+            raise UserError(
+                f"{where}: has {len(names)} {kind}{'s' if len(names) > 1 else ''} ({shown}): joints that are coupled"
+                " are not simulated; take them out and drive every joint, or fix those that follow"
+            )
+    for joint in spec.joints:
+        if joint.type not in ONE_DOF:
+            kind = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
+            raise UserError(f"{where}: joint '{joint.name}' is a {kind} joint; a hand has hinges and slides, its base fixed")
+    if list(spec.worldbody.geoms):
+        name = spec.worldbody.geoms[0].name or "unnamed"
+        raise UserError(f"{where}: geom '{name}' belongs to the world, not to the hand (a floor?): take it out")
+    roots = [b.name for b in spec.worldbody.bodies]
+    if len(roots) != 1:
+        raise UserError(f"{where}: {len(roots)} bodies hang on the world ({', '.join(roots[:4])}); must be one, the hand")
+
+
+def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
+    theirs, ours = [j.name for j in spec.joints], [j.name for j in file.joints]
+    for name in ours:
+        if name not in theirs:
+            raise UserError(f"{where}: joints: '{name}' is not in the model; its joints: {', '.join(theirs)}")
+    missing = [n or "(unnamed)" for n in theirs if n not in ours]
+    if missing:
+        raise UserError(
+            f"{where}: joints: lacks '{missing[0]}' of the model ({len(missing)} in all); name every hinge and slide, or"
+            " fix it in the model"
+        )
+    m = spec.copy().compile()
+    for k in range(m.njnt):
+        if not m.dof_M0[m.jnt_dofadr[k]] > 0:
+            raise UserError(f"{where}: joint '{m.joint(k).name}' moves nothing that has mass; give its body an inertia")
+
+
+def _tips(spec: mujoco.MjSpec, file: HandFile, where: str) -> list[tuple[str, ...]]:
+    bodies = {b.name: b for b in spec.bodies}
+    if file.palm.body not in bodies:
+        raise UserError(f"{where}: palm.body ({file.palm.body}): not in the model; it has {', '.join(bodies)}")
+    out = []
+    for finger in file.fingers:
+        field = f"{where}: fingers.{finger.name}"
+        body = bodies.get(finger.tip.body)
+        if body is None:
+            raise UserError(f"{field}.tip.body ({finger.tip.body}): not in the model; it has {', '.join(bodies)}")
+        above = []
+        b = body
+        while b is not None and b.name != "world":
+            above = [j.name for j in b.joints] + above
+            b = b.parent
+        if [j for j in above if j in finger.joints] != finger.joints:
+            raise UserError(
+                f"{field}.joints ({finger.joints}): must lie on the way from the palm to its tip, in this order; there"
+                f" are {above}"
+            )
+        colliding = [g for g in body.geoms if g.contype or g.conaffinity]
+        for k, g in enumerate(colliding):
+            if not g.name:
+                g.name = f"tip_{finger.name}_{k}"
+        names = [g.name for g in colliding]
+        for g in finger.tip.geoms or []:
+            if g not in names:
+                raise UserError(
+                    f"{field}.tip.geoms: '{g}' is not a colliding geom of {body.name}; there are"
+                    f" {', '.join(names) or 'none'}"
+                )
+        chosen = tuple(finger.tip.geoms or names)
+        if not chosen:
+            raise UserError(f"{field}.tip.body ({body.name}): none of its geoms collides: it cannot press anything")
+        out.append(chosen)
+    return out
+
+
+def _collide(spec: mujoco.MjSpec, tips: set[str]) -> None:
+    """Bits and contact settings. A model whose bits are dexsim's already is left as it is, all of it; of another, its
+    bits are about the hand itself: they move up by two, and every geom that collides meets objects too."""
+    colliding = [g for g in spec.geoms if g.contype or g.conaffinity]
+    ours = any(g.contype & HAND_BIT and g.conaffinity & OBJECT_BIT for g in colliding)
+    if ours and not any(g.contype & OBJECT_BIT or g.conaffinity & HAND_BIT for g in colliding):
+        return
+    for g in colliding:
+        g.contype = ((g.contype << 2) & 0x7FFFFFFC) | HAND_BIT
+        g.conaffinity = ((g.conaffinity << 2) & 0x7FFFFFFC) | OBJECT_BIT
+        # of the file's own contact law nothing is kept: the task writes the rubber's stiffness and the friction
+        g.solref, g.solimp = LINK_SOLREF, [0.9, 0.95, 1e-3, 0.5, 2.0]
+        g.condim, g.priority = (4, 1) if g.name in tips else (3, 0)
+        g.margin = g.gap = 0.0
+
+
+def _place(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
+    """Move the root body so that the palm frame, in the open pose, is the world frame."""
+    m = spec.copy().compile()
+    d = mujoco.MjData(m)
+    for name, angle in file.poses.open.items():
+        if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0:
+            d.qpos[m.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(m, d)
+    z = np.array(file.palm.normal) / np.linalg.norm(file.palm.normal)
+    x = np.array(file.palm.forward) - z * np.dot(z, file.palm.forward)
+    x /= np.linalg.norm(x)
+    body = d.body(file.palm.body)
+    turn = body.xmat.reshape(3, 3) @ np.stack([x, np.cross(z, x), z], 1)
+    origin = body.xpos + body.xmat.reshape(3, 3) @ np.array(file.palm.position)
+    if np.abs(turn - np.eye(3)).max() < 1e-7 and np.abs(origin).max() < 1e-9:
+        return  # it lies there already, to the last bit
+    root = spec.worldbody.bodies[0]
+    was = m.body(root.name)
+    quat = np.zeros(4)
+    mat = np.zeros(9)
+    mujoco.mju_quat2Mat(mat, was.quat)
+    mujoco.mju_mat2Quat(quat, (turn.T @ mat.reshape(3, 3)).ravel())
+    root.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    root.pos, root.quat = turn.T @ (was.pos - origin), quat

@@ -1,0 +1,148 @@
+"""`hand.yaml`: its declared types, read and written. What must hold between its fields and the model's is checked by
+`dexsim.hand.load`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import yaml
+
+from dexsim import files, yaml_text
+from dexsim.errors import UserError
+from dexsim.typed import Positive, Real, convert
+
+FORMAT, VERSION = "dexsim-hand", 1
+FILE = "hand.yaml"
+SEE = "see docs/reference/hand.md"
+
+Name = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+Vector = Annotated[list[Real], msgspec.Meta(min_length=3, max_length=3)]
+Metre = Annotated[float, msgspec.Meta(gt=0.01, le=10.0)]
+
+
+class JointEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """A driven joint. effort: N m (N of a slide), speed: rad/s (m/s), the largest of each; its range is the model's."""
+
+    name: Text
+    effort: Positive
+    speed: Positive
+
+
+class Palm(msgspec.Struct, forbid_unknown_fields=True):
+    """The palm frame, in the frame of `body`: origin `position` [m], x along `forward` (made orthogonal to the normal),
+    z along `normal`, out of the palm; y = z x x."""
+
+    body: Text
+    position: Vector
+    forward: Vector
+    normal: Vector
+
+
+class Tip(msgspec.Struct, forbid_unknown_fields=True):
+    """A fingertip, in the frame of its distal `body`: `position` [m] is the finger's end, `normal` points out of the
+    palmar side. geoms: collision geoms that press objects; None: all colliding ones of the body."""
+
+    body: Text
+    position: Vector
+    normal: Vector
+    geoms: Annotated[list[Text], msgspec.Meta(min_length=1, max_length=64)] | None = None
+
+
+class Pad(msgspec.Struct, forbid_unknown_fields=True):
+    """Touch: `taxels`, a CSV file (`dexsim.tactile.layout.load_layout`) in the tip body's frame; kind: the key of
+    `tactile.stiffness`; rows: of the lattice that the taxels form, k = column * rows + row, 0 = none; skin: an OBJ file
+    whose convex hull carries the taxels, None: the hull of the tip's geoms."""
+
+    taxels: Text
+    kind: Text = "finger"
+    rows: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 0
+    skin: Text | None = None
+
+
+class FingerEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """A finger. joints: root to tip; flexion: those that close it, root to tip; closes: the sign of the motion of each
+    that closes it (all +1 without)."""
+
+    name: Name
+    joints: Annotated[list[Text], msgspec.Meta(min_length=1, max_length=32)]
+    flexion: Annotated[list[Text], msgspec.Meta(min_length=1, max_length=32)]
+    tip: Tip
+    pad: Pad | None = None
+    closes: list[Literal[1, -1]] | None = None
+
+
+class Poses(msgspec.Struct, forbid_unknown_fields=True):
+    """Joint angles by name [rad], of every joint. open: ready to catch; cupped: closed around an object in the palm."""
+
+    open: dict[str, Real]
+    cupped: dict[str, Real]
+
+
+class HandFile(msgspec.Struct, forbid_unknown_fields=True):
+    """The file. Paths are relative to its folder. force: N that a fingertip can press with, None: from the servo's
+    torque limits and the levers; span: m, width of what the hand can grasp; guessed: places of this file that a program
+    guessed; source: free."""
+
+    format: Literal["dexsim-hand"]
+    version: Literal[1]
+    name: Name
+    handedness: Literal["right", "left", "none"]
+    model: Text
+    servo: Text
+    joints: Annotated[list[JointEntry], msgspec.Meta(min_length=2, max_length=256)]
+    palm: Palm
+    fingers: Annotated[list[FingerEntry], msgspec.Meta(min_length=2, max_length=32)]
+    opposing: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=31)]
+    poses: Poses
+    span: Metre
+    force: Positive | None = None
+    guessed: list[str] = []
+    source: dict[str, Any] = {}
+
+
+def read(path: Path) -> HandFile:
+    """The file's content, its types checked. Raises UserError naming file, field, value and what must be there."""
+    raw = yaml_text.load(path, "hand")
+    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+        raise UserError(f"hand {path}: format: must be {FORMAT} in its first line; {SEE}")
+    return convert(raw, HandFile, f"hand {path}", SEE)
+
+
+def to_yaml(file: HandFile) -> str:
+    """The file's text, fields in their order; what is at its default and optional is left out."""
+    data = msgspec.to_builtins(file)
+    for finger in data["fingers"]:
+        for name in ("closes", "pad"):
+            if finger[name] is None and name == "closes":
+                del finger[name]
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=116, default_flow_style=False)
+
+
+def write(file: HandFile, path: Path) -> None:
+    """Write the file whole or not at all."""
+    text = to_yaml(file)
+    if len(text.encode()) > files.MAX_YAML:
+        raise UserError(f"hand {path}: {len(text)} characters, at most {files.MAX_YAML} are read")
+    new = path.with_suffix(".yaml.new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers or words, and small mappings, on one line."""
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.Node:
+        flat = all(not isinstance(x, (dict, list)) for x in sequence)
+        return super().represent_sequence(tag, sequence, flow_style=flat)
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.Node:
+        items = list(mapping.values()) if isinstance(mapping, dict) else [v for _, v in mapping]
+        small = len(items) <= 5 and bool(items) and all(not isinstance(x, (dict, list)) for x in items)
+        return super().represent_mapping(tag, mapping, flow_style=small)
+
+
+_Dumper.add_representer(list, lambda d, x: d.represent_sequence("tag:yaml.org,2002:seq", x))
+_Dumper.add_representer(dict, lambda d, x: d.represent_mapping("tag:yaml.org,2002:map", x.items()))
