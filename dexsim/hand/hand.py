@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Finger:
     """A finger. joints, flexion: indices in the hand's order, root to tip; closes: +1 or -1 for each of flexion, the
-    sign of the motion that closes it; root: body of its first joint; body: the distal one, in whose frame position [3] m
-    (the finger's end) and normal [3] (unit, out of the palmar side) are; geoms: what presses objects."""
+    sign of the motion that closes it; root: body of its first joint; body: the distal one, in whose frame position [3]
+    m (the finger's end) and normal [3] (unit, out of the palmar side) are; geoms: what presses objects."""
 
     name: str
     joints: tuple[int, ...]
@@ -56,7 +56,7 @@ class Hand:
     _spec: mujoco.MjSpec = field(repr=False)
 
     def spec(self) -> mujoco.MjSpec:
-        """A fresh model of the hand alone, to be extended: world frame = palm frame, no actuators, sensors or lights."""
+        """A fresh model of the hand alone: world frame = palm frame, no actuators, sensors or lights."""
         return self._spec.copy()
 
     @property

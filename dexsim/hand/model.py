@@ -1,4 +1,4 @@
-"""A hand's model as tasks need it: read, checked, put into the palm frame, with the collision bits of dexsim's scenes."""
+"""A hand's model as tasks need it: read, checked, put into the palm frame, with the collision bits of scenes."""
 
 from __future__ import annotations
 
@@ -90,13 +90,17 @@ def _alone(spec: mujoco.MjSpec, path: Path, where: str) -> None:
     for joint in spec.joints:
         if joint.type not in ONE_DOF:
             kind = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
-            raise UserError(f"{where}: joint '{joint.name}' is a {kind} joint; a hand has hinges and slides, its base fixed")
+            raise UserError(
+                f"{where}: joint '{joint.name}' is a {kind} joint; a hand has hinges and slides, its base fixed"
+            )
     if list(spec.worldbody.geoms):
         name = spec.worldbody.geoms[0].name or "unnamed"
         raise UserError(f"{where}: geom '{name}' belongs to the world, not to the hand (a floor?): take it out")
     roots = [b.name for b in spec.worldbody.bodies]
     if len(roots) != 1:
-        raise UserError(f"{where}: {len(roots)} bodies hang on the world ({', '.join(roots[:4])}); must be one, the hand")
+        raise UserError(
+            f"{where}: {len(roots)} bodies hang on the world ({', '.join(roots[:4])}); must be one, the hand"
+        )
 
 
 def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
@@ -107,8 +111,8 @@ def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
     missing = [n or "(unnamed)" for n in theirs if n not in ours]
     if missing:
         raise UserError(
-            f"{where}: joints: lacks '{missing[0]}' of the model ({len(missing)} in all); name every hinge and slide, or"
-            " fix it in the model"
+            f"{where}: joints: lacks '{missing[0]}' of the model ({len(missing)} in all); name every hinge and slide,"
+            " or fix it in the model"
         )
     m = spec.copy().compile()
     for k in range(m.njnt):
