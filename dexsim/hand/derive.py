@@ -71,6 +71,6 @@ def _plain(item: object, kind: str) -> None:
     """Its orientation as a quaternion: the other notations of MJCF are not rewritten."""
     if item.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         raise UserError(
-            f"hand_mirror, hand_scale: {kind} '{item.name}' states its orientation as euler, axisangle, xyaxes or zaxis;"
+            f"hand_mirror, hand_scale: {kind} '{item.name}' is turned by euler, axisangle, xyaxes or zaxis;"
             " save the model with quat (MuJoCo's `compile` program writes it so)"
         )
