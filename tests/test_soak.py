@@ -1,0 +1,61 @@
+"""The long runs' own parts: what grows is told from what is flat, and each part does its work."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.soak import __main__ as soak
+from tests.soak.watch import Watch, grows, judge
+
+ROOT = Path(__file__).parents[1]
+
+
+def rows(leak_mib: float = 0.0, files: int = 0, n: int = 400) -> list[tuple[float, ...]]:
+    """A run of 200 s whose memory saws by 50 MiB and warms up, and what it loses over the whole of it."""
+    rng, t = np.random.default_rng(0), np.arange(n) * 0.5
+    heap = 400 + 200 * (1 - np.exp(-t / 5)) + 50 * (t % 3) / 3 + rng.normal(0, 2, n) + leak_mib * t / t[-1]
+    opened = 5 + rng.integers(0, 2, n) + np.floor(files * t / t[-1])
+    return [(a, h, h + 300, f, 3, float("nan")) for a, h, f in zip(t, heap, opened, strict=True)]
+
+
+def test_a_leak_is_told_from_what_comes_and_goes():
+    found = judge(rows())
+    assert grows(found) == [] and abs(found["heap_mib"]["growth"]) < 10 and "gpu_mib" not in found
+    assert found["heap_mib"]["low"] <= found["heap_mib"]["growth"] <= found["heap_mib"]["high"]
+    assert grows(judge(rows(leak_mib=60))) == ["heap_mib"] and grows(judge(rows(files=8))) == ["files"]
+    assert judge(rows(n=100)) == {}, "too short to judge"
+
+
+def test_a_child_is_watched_until_it_ends():
+    hold = "import time; f = [open('/dev/null') for _ in range(40)]; x = bytearray(64 << 20); time.sleep(0.8)"
+    watch = Watch(subprocess.Popen([sys.executable, "-c", hold]), every=0.05)
+    watch.join()
+    seen = np.array(watch.rows)
+    assert len(seen) > 5 and seen[:, 1].max() > 64 and seen[:, 3].max() >= 43 and np.isnan(seen[:, 5]).all()
+
+
+def test_amounts_are_shared_out():
+    made = soak.commands(
+        soak.SETTINGS | {"training": "1h", "worlds": "100", "processes": "deploy:4", "diagnoses": "0"}, Path("x")
+    )
+    assert set(made) == {"training", "deploy0", "deploy1", "deploy2", "deploy3", "envs"}
+    assert "iterations=72" in made["training"]  # 3600 s of 100 worlds, 24 steps of 21 ms each: 71.4
+    assert made["deploy2"][2:4] == ["deploy", "6.0"] and made["envs"][2:4] == ["envs", "1000.0"]
+
+
+@pytest.mark.slow
+def test_each_part_does_its_work(tmp_path):
+    small = ["training=0.001h", "worlds=2", "deploy=0.002h", "envs=2", "diagnoses=1", f"out={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.soak", *small], cwd=ROOT, capture_output=True, text=True, timeout=800
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (
+        "2 environments made" in done.stdout and "1 diagnoses" in done.stdout and "0.002 h of the loop" in done.stdout
+    )
+    assert (tmp_path / "run" / "last.pt").exists() and (tmp_path / "soak.json").exists()
