@@ -1,11 +1,13 @@
 """`python -m tests.soak [training=48h] [deploy=24h] [envs=1000] [diagnoses=200] [worlds=256] [device=cpu]
-[processes=deploy:1,envs:1] [minutes=M] [out=FOLDER]`: long runs in little time, each in a process of its own; do memory and handles stay flat?
+[processes=deploy:1,envs:1] [minutes=M] [out=FOLDER]`: long runs in little time, each in a process of its own; do memory
+and handles stay flat?
 
 training: `train.py` for so many hours of simulated time (that of all `worlds` together); deploy: hours of the loop on a
 clock that waits for nobody; envs: environments made, stepped and closed; diagnoses: in one process, with their reports.
-Hours and environments are shared out among so many processes. 0 leaves a part out. minutes: what still runs then is ended, and judged as far as
-it came. Every half second memory, open files and threads of each process are noted (and the first GPU's memory, for a
-training there). Ends with status 1 where something grew or failed. Writes soak.json, NAME.csv and NAME.log.
+Hours and environments are shared out among so many processes. 0 leaves a part out. minutes: what still runs then is
+ended, and judged as far as it came. Every half second memory, open files and threads of each process are noted (and the
+first GPU's memory, for a training there). Ends with status 1 where something grew or failed. Writes soak.json,
+NAME.csv and NAME.log.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ from pathlib import Path
 from .watch import COLUMNS, Watch, grows, judge
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"training": "48h", "deploy": "24h", "envs": "1000", "diagnoses": "200", "worlds": "256", "device": "cpu", "processes": "deploy:1,envs:1", "minutes": "0",
-            "out": "out/soak"}  # fmt: skip
+SETTINGS = {"training": "48h", "deploy": "24h", "envs": "1000", "diagnoses": "200", "worlds": "256", "device": "cpu",
+            "processes": "deploy:1,envs:1", "minutes": "0", "out": "out/soak"}  # fmt: skip
 PERIOD, STEPS = 0.021, 24
 """s between actions, and actions of a world between two updates, as `train.py` has them."""
 
@@ -36,8 +38,8 @@ def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
     hours = float(s["training"].rstrip("h"))
     if hours:
         iterations = math.ceil(3600 * hours / (PERIOD * STEPS * int(s["worlds"])))
-        found["training"] = ["train.py", "task=grasp", f"device={s['device']}", f"worlds={s['worlds']}", f"iterations={iterations}", "final_episodes=0",
-                             "seed=1", f"out={out / 'run'}"]  # fmt: skip
+        found["training"] = ["train.py", "task=grasp", f"device={s['device']}", f"worlds={s['worlds']}",
+                             f"iterations={iterations}", "final_episodes=0", f"out={out / 'run'}"]  # fmt: skip
     shares = dict(part.split(":") for part in s["processes"].split(","))
     for part in ("deploy", "envs", "diagnoses"):
         amount, n = float(s[part].rstrip("h")), int(shares.get(part, 1))
@@ -103,9 +105,8 @@ def main(argv: list[str]) -> int:
         print(f"{name:10s} {what}{', ended early' * (name in cut)}; {said[-1]}")
         for column, f in found.items():
             unit = " MiB" if column.endswith("_mib") else ""
-            print(
-                f"    {column:9s} mean {f['mean']:.6g}, most {f['most']:.6g}, grew {f['growth']:+.3g}{unit} (95 %: {f['low']:+.3g} to {f['high']:+.3g})"
-            )
+            interval = f"(95 %: {f['low']:+.3g} to {f['high']:+.3g})"
+            print(f"  {column:9s} mean {f['mean']:.6g}, most {f['most']:.6g}, grew {f['growth']:+.3g}{unit} {interval}")
     (out / "soak.json").write_text(json.dumps({"settings": s, "parts": result}, indent=1))
     return int(bool(bad))
 

@@ -1,4 +1,4 @@
-"""What is repeated, each in a process of its own: `python -m tests.soak.parts NAME AMOUNT [FOLDER]`. Prints what it did."""
+"""What is repeated, each in its own process: `python -m tests.soak.parts NAME AMOUNT FOLDER`; prints what it did."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ def deploy(hours: float, folder: Path) -> str:
     report = loop.run()
     if report.ended != "done" or report.not_relaxed:
         raise SystemExit(f"the loop ended: {report.ended} {report.not_relaxed}")
-    return f"{hours:g} h of the loop: {report.timing.turns} turns, {report.acts} actions, {report.counts['error_codes']} error codes"
+    did = f"{report.timing.turns} turns, {report.acts} actions, {report.counts['error_codes']} error codes"
+    return f"{hours:g} h of the loop: {did}"
 
 
 def envs(count: float, folder: Path) -> str:

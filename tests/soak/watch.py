@@ -77,8 +77,9 @@ def judge(rows: list[tuple[float, ...]]) -> dict[str, dict[str, float]]:
         line = stats.linregress(x, y)
         half = float(stats.t.ppf(0.975, BLOCKS - 2) * line.stderr) if np.ptp(y) else 0.0
         span = x[-1] - x[0]
-        out[name] = {"mean": float(kept[:, k].mean()), "most": float(kept[:, k].max()), "growth": float(line.slope * span),
-                     "low": float((line.slope - half) * span), "high": float((line.slope + half) * span)}  # fmt: skip
+        out[name] = {"mean": float(kept[:, k].mean()), "most": float(kept[:, k].max()),
+                     "growth": float(line.slope * span), "low": float((line.slope - half) * span),
+                     "high": float((line.slope + half) * span)}  # fmt: skip
     return out
 
 
