@@ -99,7 +99,7 @@ def test_a_bad_channel_is_named_and_the_rest_still_judged(rig, tmp_path, kind, c
     d = judged(rig, tmp_path, change)
     bad = [f for f in d.data["findings"] if f["effect"] == "bad_channel"]
     assert [f["regime"].split(":")[0] for f in bad] == [kind] and bad[0]["where"]["topics"] and bad[0]["when"]
-    assert d.data["verdict"] == "none" and d.data["held_out"]["before"] < (6 if change is repeated else 2) * d.data["noise_floor"]["position_rad"]
+    assert d.data["verdict"] == "explained" and d.data["held_out"]["before"] < (6 if change is repeated else 2) * d.data["noise_floor"]["position_rad"]
     assert "not what it says" in d.sentence
 
 
@@ -123,7 +123,7 @@ def test_one_bad_recording_leaves_the_others(rig, tmp_path):
     write(tmp_path / "wrong.mcap", r)
     s = Settings([*paths[:2], tmp_path / "wrong.mcap"], tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed={"command_delay"})
     d = diagnose(s, say=lambda _: None)
-    assert d.data["verdict"] == "none" and any("wrong.mcap" in n and "left out" in n for n in d.notes)
+    assert d.data["verdict"] == "explained" and any("wrong.mcap" in n and "left out" in n for n in d.notes)
     assert [f["effect"] for f in d.data["findings"]] == ["bad_channel"]
 
 

@@ -9,7 +9,7 @@ from dexsim.gap.search.time_limit import TimeLimit
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
-    return {"where": {"joints": [joint]}, "held_out": {"before": 2.0, "after": 1.0}, "confidence": confidence}
+    return {"effect": "backlash", "where": {"joints": [joint]}, "held_out": {"before": 2.0, "after": 1.0}, "confidence": confidence}
 
 
 def test_names_on_joints_that_need_no_effect_are_hints():
@@ -28,6 +28,13 @@ def test_no_verdict_by_a_whisper(before, after, confidence, word):
     found = [finding(confidence)]
     verdict.settle(found, set())
     assert verdict.verdict(found, 1.0, before, 0.9 * before, after, True) == word
+
+
+@pytest.mark.parametrize(("before", "confidence", "word"), [(1.2, 0.9, "explained"), (1.2, 0.4, "none"), (4.0, 0.9, "unknown")])
+def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):
+    """`none` would say that nothing was amiss; where the rest is not followed either the signal does not explain it."""
+    bad = finding(confidence) | {"effect": "bad_channel", "held_out": None}
+    assert verdict.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
 
 
 def test_the_interval_of_a_gain_holds_it_and_knows_chance():

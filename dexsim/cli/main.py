@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import os
 import sys
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ class Command:
 
     where: str
     about: str
+    # whether joints are searched side by side: threads of the linear algebra would take the cores from them (read by
+    # OpenBLAS when NumPy loads, so it must be said before)
+    side_by_side: bool = False
 
 
 COMMANDS: dict[str, Command] = {
@@ -25,7 +29,9 @@ COMMANDS: dict[str, Command] = {
     "play": Command(
         "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
     ),
-    "diagnose": Command("dexsim.gap.command:main", "find the physics that the simulator leaves out of your recordings"),
+    "diagnose": Command(
+        "dexsim.gap.command:main", "find the physics that the simulator leaves out of your recordings", side_by_side=True
+    ),
     "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
     "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
@@ -82,6 +88,8 @@ def dispatch(argv: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, 1)
         hint = f"did you mean {near[0]}? " if near else f"there are {', '.join(COMMANDS)} "
         raise UserError(f"unknown command '{name}': {hint}(dexsim --help)")
+    if COMMANDS[name].side_by_side:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     module, _, function = COMMANDS[name].where.partition(":")
     status: int = getattr(importlib.import_module(module), function)(argv[1:])
     return status

@@ -34,14 +34,20 @@ def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for f in findings if f["held_out"] and not f.get("hint")]
 
 
+def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The findings that a signal is not what it says, where they are more than hints."""
+    return [f for f in findings if f["effect"] == "bad_channel" and f["confidence"] >= FIRM]
+
+
 def verdict(findings: Sequence[dict[str, Any]], floor: float, before: float, before_low: float, after: float, structured: bool,
             quiet: bool = False) -> str:
     """The one word. findings: after `settle`; floor, before, after: of the error on what was kept out; before_low: of its 90 % interval;
-    structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its own floor."""
+    structured: whether what is left without any effect has structure; quiet: whether every joint is followed to its own floor.
+    Where the rest is followed to the floor a wrong signal is the answer: something was amiss, and it has a name."""
     named = firm(findings)
     if not named:
         if quiet or before <= WITHIN * floor or (before <= FAR * floor and (before_low <= WITHIN * floor or not structured)):
-            return "none"
+            return "explained" if wrong_signals(findings) else "none"
         return "unknown"
     if after <= WITHIN * floor:  # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
         sure = any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named)

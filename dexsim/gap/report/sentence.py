@@ -28,6 +28,8 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     prefix += "".join(f"{spoken(f)[:1].upper() + spoken(f)[1:]} {words_of(f, d.mechanism)}{_size(f)}. " for f in pushed)
     if data["verdict"] == "none":
         return prefix + f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
+    if data["verdict"] == "explained" and not named and bad:
+        return prefix + f"Beside that nothing is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
     if not named:
         depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
         return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
