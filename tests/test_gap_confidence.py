@@ -63,6 +63,14 @@ def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():
     assert confidence.too_small(10.0, 4.0, 1.2, 1.0, False) == ""
 
 
+def test_what_the_encoder_does_not_resolve_is_doubted():
+    """An error of 1.0 that the effect brings down by 0.3 in squares has been moved by 0.55 of a count, or by 0.27 of one."""
+    after = np.sqrt(0.7)
+    assert confidence.unresolved(1.0, after, 1.0) == ""
+    assert "count of the encoder" in confidence.unresolved(1.0, after, 2.0)
+    assert "count of the encoder" in confidence.unresolved(1.0, 1.1, 1.0), "what makes it worse moves nothing for the better"
+
+
 def test_touch_is_doubted_alike():
     findings = [{"effect": "tactile_hysteresis", "confidence": 0.99, "held_out": {"before": 215.0, "after": 40.0}},
                 {"effect": "tactile_crosstalk", "confidence": 0.99, "held_out": {"before": 54.5, "after": 40.0}},

@@ -117,6 +117,13 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
     return ""
 
 
+def unresolved(without: float, after: float, quantum: float) -> str:
+    """Why an effect is below what the encoder resolves: what it does to the motion kept out, rms, is less than half a count (`quantum`, rad
+    or m), so that a reading seldom changes for it; empty where it is not. without, after: rms error without and with the effect."""
+    moved = float(np.sqrt(max(without**2 - after**2, 0.0)))
+    return "" if moved >= 0.5 * quantum else f"what it does to the motion ({1e3 * moved:.2g} mrad or mm) is less than half a count of the encoder"
+
+
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
     """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
     c = e.share * (0.3 + 0.7 * e.earned) * trusted(before, after, noise)

@@ -167,6 +167,7 @@ class JointAnswer:
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
         small = "" if effort_only else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
+        small = small or ("" if effort_only else confidence.unresolved(error_without, after, case.quantum))
         if small:
             evidence.reasons.append(small)
         if mm.id in self.search.unasked:
