@@ -30,7 +30,9 @@ COMMANDS: dict[str, Command] = {
         "dexsim.cli.commands:play", "play a policy (metrics, plots, video, live view) or replay a recording"
     ),
     "diagnose": Command(
-        "dexsim.gap.command:main", "find the physics that the simulator leaves out of your recordings", side_by_side=True
+        "dexsim.gap.command:main",
+        "find the physics that the simulator leaves out of your recordings",
+        side_by_side=True,
     ),
     "calibrate": Command("dexsim.cli.commands:calibrate", "measure torque per current, taxels and rubber"),
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
