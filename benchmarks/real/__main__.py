@@ -129,7 +129,8 @@ def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
 def panda(data: Path, out: Path, jobs: int) -> dict:
     """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
-    from dexsim.gap.diagnosis import KEEP_OUT, Settings, diagnose, save
+    from dexsim.gap.diagnosis import Settings, diagnose, save
+    from dexsim.gap.read.keep_out import KEEP_OUT
 
     made = convert(data, out / "recordings")
     wall, cpu = time.perf_counter(), time.process_time()
