@@ -249,6 +249,11 @@ class Servo:
             self.state.copy_(torch.where(mask[:, None, None], state, self.state))
         self.torque.copy_(self.state[:, :, self.slots["motor"]])
 
+    def memory(self) -> dict[str, torch.Tensor]:
+        """What a step leaves to the next and what randomization draws, live."""
+        names = ("params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home")
+        return {name: getattr(self, name) for name in names}
+
     def _set_mask(self, mask: torch.Tensor | None) -> None:
         if mask is None:
             self._mask_t.fill_(True)

@@ -47,6 +47,8 @@ def check(cfg: dict[str, Any]) -> None:
         value = get(cfg, key)
         if value is not None:
             _number(key, value, low, high, whole)
+    if cfg.get("save_worlds") not in (None, True, False):
+        raise UserError(f"save_worlds={cfg['save_worlds']}: must be true, false or null")
     step, period = get(cfg, "sim.timestep"), get(cfg, "sim.control_period")
     if step and period and (period < step or abs(period / step - round(period / step)) > 1e-6):
         raise UserError(

@@ -75,7 +75,8 @@ def _run(
     runner = Runner(env, cfg, machine.versions(), ranks, start.typed)
     if start.data is not None:
         runner.restore(start.data, str(start.source))
-        print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps")
+        went = f"; {runner.resumed}" if runner.resumed else ""
+        print(f"continuing {start.source} after {runner.iteration} iterations, {count(runner.steps)} steps{went}")
     resume = f"{_command(ranks)} resume={shlex.quote(str(where / 'last.pt'))}"
     ranks.on_loss(f"continue: {resume}")
     log = Log(runner, where, start) if ranks.leader else None

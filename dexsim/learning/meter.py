@@ -67,6 +67,15 @@ class Meter:
         self._steps = 0
         return found
 
+    def state(self) -> dict[str, torch.Tensor]:
+        """Returns and lengths so far of the episodes that go on, copied."""
+        return {"meter.return": self._return.clone(), "meter.length": self._length.clone()}
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on from `state()`."""
+        self._return.copy_(state["meter.return"])
+        self._length.copy_(state["meter.length"])
+
     def drop(self) -> None:
         """Forget a rollout that was broken off."""
         self._sums.zero_()

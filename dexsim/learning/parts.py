@@ -81,6 +81,7 @@ class Train(Policy):
     optimizer: Optimizer
     env: dict[str, Any]
     rng: Random
+    worlds: dict[str, torch.Tensor] | None = None
 
 
 def check(data: dict[str, Any], path: object) -> None:

@@ -16,6 +16,7 @@ from dexsim.learning import checkpoint, names, weights_and_biases
 from dexsim.learning.meter import Meter
 from dexsim.learning.ppo import agent_config, agent_errors
 from dexsim.learning.ranks import Ranks, seed_all
+from dexsim.tasks import worlds
 
 import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
 from rsl_rl.runners import OnPolicyRunner  # isort: skip
@@ -24,11 +25,16 @@ from rsl_rl.utils import check_nan  # isort: skip
 from dexsim.errors import UserError
 
 
+SMALL = 64 << 20
+"""Bytes that all worlds' states may take in a checkpoint where ``save_worlds`` does not say."""
+
+
 class Runner(OnPolicyRunner):
     """PPO on a dexsim environment.
 
     Args:
-        env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``.
+        env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``; for
+        a resume that is the unbroken run, also ``keep_worlds``, ``load_worlds`` (see :mod:`dexsim.tasks.worlds`).
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
         ranks: the processes that learn together, already joined; one alone where not given.
@@ -59,6 +65,8 @@ class Runner(OnPolicyRunner):
         self._meter = Meter(env.num_envs, device)
         self._layout = checkpoint.layout_of(env)
         self._fresh = True
+        self.saves_worlds = self._whether_worlds(cfg.get("save_worlds"))
+        self.resumed = ""  # what became of the worlds at `restore`, in words
 
     def _configure_multi_gpu(self) -> None:
         """Tell rsl-rl about the other ranks. Its own version also starts the group, for GPUs only; ours runs
@@ -71,6 +79,17 @@ class Runner(OnPolicyRunner):
             if ranks.size == 1
             else {"global_rank": ranks.rank, "local_rank": ranks.local, "world_size": ranks.size}
         )
+
+    def _whether_worlds(self, asked: bool | None) -> bool:
+        """Whether checkpoints hold the worlds' states: as asked, else where they are small."""
+        able = hasattr(self.env, "keep_worlds")
+        if asked and self.ranks.size > 1:
+            raise UserError("save_worlds=true: works with one process, not under torchrun; leave it out")
+        if asked and not able:
+            raise UserError("save_worlds=true: this task's environment has no keep_worlds(); leave it out")
+        if asked is not None or not able or self.ranks.size > 1:
+            return bool(asked)
+        return sum(w.numel() * w.element_size() for w in self.env.keep_worlds().values()) <= SMALL
 
     def open_writer(self, folder: Path) -> Any:
         """rsl-rl's writer (``agent.logger``: TensorBoard unless told otherwise) on the run folder."""
@@ -113,11 +132,14 @@ class Runner(OnPolicyRunner):
             if self.is_distributed and self.ranks.any(stop()):
                 return False
             start = time.perf_counter()
+            before = self._moment() if self.saves_worlds else None
             with torch.no_grad():  # not inference_mode: what the environment keeps from here is changed in place later
                 for _ in range(self.cfg["num_steps_per_env"]):
                     if not self.is_distributed and stop():
                         self.alg.storage.clear()
                         self._meter.drop()
+                        if before is not None:
+                            self._go_back(before)
                         return False
                     obs = self._step(obs)
                 self.alg.compute_returns(obs)
@@ -136,6 +158,35 @@ class Runner(OnPolicyRunner):
             row |= {"collect_s": collected - start, "learn_s": time.perf_counter() - collected}
             on_iteration({"iteration": self.iteration, "steps": self.steps} | row)
         return True
+
+    def _moment(self) -> dict[str, Any]:
+        """All that a rollout changes, copied: what was saved in the middle of one that was broken off would not be the
+        run that did not stop."""
+        return {
+            "env": self.env.state_dict(),
+            "worlds": self._worlds(),
+            "rng": checkpoint.rng_state(),
+            "buffers": [b.clone() for b in self._buffers()],
+        }
+
+    def _go_back(self, moment: dict[str, Any]) -> None:
+        """To the moment before a rollout."""
+        self.env.load_state_dict(moment["env"])
+        self._load_worlds(moment["worlds"])
+        checkpoint.set_rng_state(moment["rng"])
+        for buffer, value in zip(self._buffers(), moment["buffers"], strict=True):
+            buffer.copy_(value)
+
+    def _buffers(self) -> list[torch.Tensor]:
+        """What the networks keep beside weights: the observations' running normalization."""
+        return [b for part in (self.alg.actor, self.alg.critic) for b in part.buffers()]
+
+    def _worlds(self) -> dict[str, torch.Tensor]:
+        return self.env.keep_worlds() | self._meter.state()
+
+    def _load_worlds(self, worlds: dict[str, torch.Tensor]) -> None:
+        self._meter.load({k: v for k, v in worlds.items() if k.startswith("meter.")})
+        self.env.load_worlds({k: v for k, v in worlds.items() if not k.startswith("meter.")})
 
     @property
     def steps_per_iteration(self) -> int:
@@ -217,11 +268,12 @@ class Runner(OnPolicyRunner):
             "optimizer": learned["optimizer_state_dict"],
             "env": self.env.state_dict(),
             "rng": checkpoint.rng_state(),
-        }
+        } | ({"worlds": self._worlds()} if self.saves_worlds else {})
 
     def restore(self, data: dict[str, Any], path: str) -> None:
-        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state. The random
-        state is rank 0's; the others begin streams of their own.
+        """Go on from a checkpoint: networks, optimizer, learning rate, counters, environment, random state, and the
+        worlds where it holds them and the settings that make them are the same (``resumed`` says so). The random state
+        is rank 0's; the others begin streams of their own.
 
         Raises UserError when it holds only a policy or does not fit this environment.
         """
@@ -244,11 +296,12 @@ class Runner(OnPolicyRunner):
         self.iteration, self.steps = int(data["iteration"]), int(data["steps"])
         try:
             self.env.load_state_dict(data["env"])
+            self._resume_worlds(data)
             checkpoint.set_rng_state(data["rng"])
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{path}: damaged checkpoint, its env or rng does not fit ({type(error).__name__}: {reason}); use"
+                f"{path}: damaged checkpoint, its env, worlds or rng does not fit ({type(error).__name__}: {reason}); use"
                 " another"
                 " checkpoint of its run folder"
             ) from None
@@ -259,7 +312,23 @@ class Runner(OnPolicyRunner):
             self.env.reset_all()
         # An environment whose state does not hold its episodes began them all anew just now; their ages are then spread
         # as at the first start, or all worlds would time out, and dip in the curves, together.
-        self._fresh = not bool(self.env.episode_length_buf.any())
+        if not self._resumed_worlds:
+            self._fresh = not bool(self.env.episode_length_buf.any())
+
+    def _resume_worlds(self, data: dict[str, Any]) -> None:
+        """The worlds of a checkpoint, if they can be this run's."""
+        self._resumed_worlds = False
+        other = worlds.changed(data["config"], self.full_cfg)
+        if self.ranks.size > 1 or not hasattr(self.env, "load_worlds"):
+            why = "of several ranks" if self.ranks.size > 1 else ""
+        elif "worlds" not in data:
+            why = "the checkpoint does not hold them: save_worlds=true keeps them"
+        elif other:
+            why = f"{other} differs from the checkpoint's"
+        else:
+            self._load_worlds(data["worlds"])
+            self._resumed_worlds, self._fresh, why = True, False, ""
+        self.resumed = "the worlds go on where they were" if self._resumed_worlds else f"episodes begin anew ({why})" if why else ""
 
     def policy(self) -> Any:
         """The actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""

@@ -66,6 +66,8 @@ class Engine:
     """
 
     kind = ""
+    _derived: Sequence[str] = ()  # fields by world that MuJoCo derives from the others
+    _warmstart: torch.Tensor  # [N, nv] accelerations that the solver begins with
 
     def __init__(self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]):
         if worlds < 1:
@@ -139,6 +141,17 @@ class Engine:
         """`set_state` to the model's qpos0 at rest."""
         qpos = torch.as_tensor(self.mjm.qpos0, dtype=self.t.qpos.dtype, device=self.device).expand(self.n, -1)
         self.set_state(mask, qpos, torch.zeros_like(self.t.qvel))
+
+    def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
+        """What one step leaves to the next, live: state, warm start, applied forces, model fields by world. Whole numbers
+        with their lowest and highest."""
+        t = self.t
+        out = {"time": t.time, "qpos": t.qpos, "qvel": t.qvel, "qacc_warmstart": self._warmstart, "qfrc_applied": t.qfrc_applied,
+               "xfrc_applied": t.xfrc_applied}
+        for name in dict.fromkeys((*self.field_names, *self._derived)):
+            field = self.field(name)
+            out[name] = (field, -1, self.mjm.nmesh - 1) if name == "geom_dataid" else field
+        return out
 
     def set_const(self) -> None:
         """Recompute what MuJoCo derives from masses, inertias and sizes (invweight0 and the like) in all worlds."""

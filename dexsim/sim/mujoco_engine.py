@@ -41,6 +41,7 @@ class MujocoEngine(Engine):
     """N worlds on C MuJoCo. See `Engine` for the interface; results do not depend on the number of threads."""
 
     kind = "mujoco"
+    _derived = _DERIVED
 
     def __init__(self, model: mujoco.MjModel, worlds: int, fields: Sequence[str], pairs: Sequence[ContactPair], threads: int,
                  real: type = wp.float64):

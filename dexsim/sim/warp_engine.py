@@ -37,6 +37,7 @@ class WarpEngine(Engine):
     """
 
     kind = "warp"
+    _derived = _DERIVED
 
     def __init__(
         self,
@@ -153,6 +154,10 @@ class WarpEngine(Engine):
         t.flags.masked_fill_(mask, 0)
         if self.narrow is not None:
             self._simplex.masked_fill_(mask[:, None, None], -1)
+
+    def memory(self) -> dict:
+        own = {} if self._simplex is None else {"simplex": (self._simplex, -(2**31), 2**31 - 1)}  # checked where it is used
+        return super().memory() | own
 
     def set_const(self) -> None:
         with wp.ScopedDevice(self.device):

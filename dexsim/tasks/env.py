@@ -30,6 +30,7 @@ from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import xhand_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
+from dexsim.tasks import worlds
 from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
@@ -524,9 +525,24 @@ class HandEnv(VecEnv):
     def action_names(self) -> tuple[str, ...]:
         return tuple(xhand.JOINTS)
 
+    def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
+        """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
+        highest."""
+        names = ("action", "last_action", "target", "q", "qd", "torque", "object_pose", "object_velocity", "tips", "nan")
+        out = {name: getattr(self, name) for name in names}
+        out |= {f"obs_{group}": value for group, value in self.obs.items()}
+        return out | {"episode_length": (self._episode_length, 0, 2**31), "width": self.sampler.width}
+
+    def keep_worlds(self) -> dict[str, torch.Tensor]:
+        """A copy of all worlds: with it, a run goes on as if it had not stopped (`tasks/worlds.py`)."""
+        return worlds.keep(self)
+
+    def load_worlds(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on from `keep_worlds()`. Raises ValueError, and changes nothing, for those of another environment."""
+        worlds.put_back(self, state)
+
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """What a resumed run needs to go on as if it had not stopped: counters and random state (episodes begin
-        anew)."""
+        """What a resumed run needs beside the worlds: counters and random state."""
         return {"rng": self.rng.get_state(), "nan_count": self.nan_count.clone()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:

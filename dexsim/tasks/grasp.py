@@ -199,6 +199,11 @@ class GraspEnv(HandEnv):
         self.push_left.copy_(torch.where(mask, s.draw("push.duration"), self.push_left))
         self.push_wait.copy_(torch.where(mask, s.draw("push.wait"), self.push_wait))
 
+    def memory(self) -> dict:
+        names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen", "z_history")
+        own = {name: getattr(self, name) for name in (*names, "torque_bias", "outside_force")}
+        return super().memory() | own | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
+
     def before_physics(self) -> None:
         self.command_left -= self.dt
         self._new_command(self.command_left <= 0)

@@ -65,6 +65,11 @@ class Objects:
         self.radius = torch.zeros(n, device=dev)
         self.friction_factor: torch.Tensor | None = None  # [G] of each hand geom over the world's friction
 
+    def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
+        """Each world's object, live; the row of the table with its lowest and highest."""
+        names = ("size", "mass", "com", "friction", "stiffness", "damping_ratio", "radius")
+        return {"variant": (self.variant, 0, len(self.kind) - 1)} | {name: getattr(self, name) for name in names}
+
     def primitive_size(self, variant: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
         """MuJoCo sizes [N, 3] m of each world's primitive: its base size times scale [N, 3] (component by
         component)."""
