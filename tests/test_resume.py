@@ -15,7 +15,8 @@ from dexsim.paths import CONFIGS
 from dexsim.tasks import make_env, worlds
 
 torch.set_num_threads(1)
-SMALL = ("agent.actor.hidden_dims=[16,16]", "agent.critic.hidden_dims=[16,16]", "sim.threads=1", "agent.num_steps_per_env=8")
+SMALL = ("agent.actor.hidden_dims=[16,16]", "agent.critic.hidden_dims=[16,16]", "sim.threads=1",
+         "agent.num_steps_per_env=8")  # fmt: skip
 FEELS = ("tactile=full", "randomize.servo.delay=[0.0,0.01]")
 """A sensor with hysteresis, shear, noise and delay, and drives that are late: all memory there is."""
 ENDS = ("task.episode_s=0.3",)
@@ -49,7 +50,8 @@ def resumed(path, task: str, engine: str, *settings: str) -> Runner:
 WARP = pytest.param("grasp", "warp", FEELS, marks=pytest.mark.slow, id="grasp-warp")
 
 
-@pytest.mark.parametrize(("task", "engine", "settings"), [("grasp", "mujoco", FEELS), ("rotate", "mujoco", FEELS), WARP])
+@pytest.mark.parametrize(("task", "engine", "settings"),
+                         [("grasp", "mujoco", FEELS), ("rotate", "mujoco", FEELS), WARP])  # fmt: skip
 def test_resume_is_the_unbroken_run(tmp_path, task, engine, settings):
     settings = (*settings, *ENDS)
     whole, rows = runner(task, engine, *settings), []
@@ -93,8 +95,8 @@ def test_every_part_that_changes_is_kept():
         for k in range(30):
             env.step(torch.full((23, 12), 0.5 * (-1) ** k))
         changed = {k for k, v in own.items() if not torch.equal(v, before[k]) and v.data_ptr() not in kept}
-        computed = {"_action_in", "reward", "done", "time_out", "tip_force", "finger_force", "self_force", "palm_force", "d_rot", "d_pos",
-                    "reached", "dropped", "tipped", "nan_end"}  # fmt: skip
+        computed = {"_action_in", "reward", "done", "time_out", "tip_force", "finger_force", "self_force", "palm_force",
+                    "d_rot", "d_pos", "reached", "dropped", "tipped", "nan_end"}  # fmt: skip
         assert changed <= computed, changed - computed
 
 

@@ -24,7 +24,6 @@ from rsl_rl.utils import check_nan  # isort: skip
 
 from dexsim.errors import UserError
 
-
 SMALL = 64 << 20
 """Bytes that all worlds' states may take in a checkpoint where ``save_worlds`` does not say."""
 
@@ -33,8 +32,8 @@ class Runner(OnPolicyRunner):
     """PPO on a dexsim environment.
 
     Args:
-        env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``; for
-        a resume that is the unbroken run, also ``keep_worlds``, ``load_worlds`` (see :mod:`dexsim.tasks.worlds`).
+        env: an rsl-rl ``VecEnv`` with ``describe``, ``check``, ``state_dict``, ``load_state_dict``, ``action_names``;
+        for a resume that is the unbroken run, also ``keep_worlds``, ``load_worlds`` (see :mod:`dexsim.tasks.worlds`).
         cfg: the resolved config, kept in every checkpoint.
         versions: what :func:`dexsim.cli.machine.versions` says, kept in every checkpoint.
         ranks: the processes that learn together, already joined; one alone where not given.
@@ -301,9 +300,8 @@ class Runner(OnPolicyRunner):
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{path}: damaged checkpoint, its env, worlds or rng does not fit ({type(error).__name__}: {reason}); use"
-                " another"
-                " checkpoint of its run folder"
+                f"{path}: damaged checkpoint, its env, worlds or rng does not fit ({type(error).__name__}: {reason});"
+                " use another checkpoint of its run folder"
             ) from None
         if self.ranks.rank:
             seed = self.ranks.seed(self.full_cfg["seed"], self.iteration)
@@ -328,7 +326,8 @@ class Runner(OnPolicyRunner):
         else:
             self._load_worlds(data["worlds"])
             self._resumed_worlds, self._fresh, why = True, False, ""
-        self.resumed = "the worlds go on where they were" if self._resumed_worlds else f"episodes begin anew ({why})" if why else ""
+        anew = f"episodes begin anew ({why})" if why else ""
+        self.resumed = "the worlds go on where they were" if self._resumed_worlds else anew
 
     def policy(self) -> Any:
         """The actor, deterministic, in evaluation mode: observations TensorDict -> actions [N, A]."""

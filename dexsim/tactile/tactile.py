@@ -221,10 +221,12 @@ class Tactile:
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
         """What a reading leaves to the next and what randomization draws, live. Whole numbers with their lowest and
         highest."""
-        out: dict = {"params": self.params, "shape_id": (self.shape_id, -1, len(self.shapes.names) - 1), "shape_size": self.shape_size}
+        out: dict = {"params": self.params, "shape_size": self.shape_size}
+        out["shape_id"] = self.shape_id, -1, len(self.shapes.names) - 1
         m, most = self._m, 2**31 - 1
         if m is not None:
-            out |= {name: wp.to_torch(getattr(m, name)) for name in ("gain", "last", "state", "anchor", "ring", "ring_shear", "stamps")}
+            names = ("gain", "last", "state", "anchor", "ring", "ring_shear", "stamps")
+            out |= {name: wp.to_torch(getattr(m, name)) for name in names}
             out |= {name: (wp.to_torch(getattr(m, name)), 0, most) for name in ("episode", "tick")}
         if self.by_pad is not None:
             out["pads"] = self.by_pad.values

@@ -528,8 +528,8 @@ class HandEnv(VecEnv):
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
         """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
         highest."""
-        names = ("action", "last_action", "target", "q", "qd", "torque", "object_pose", "object_velocity", "tips", "nan")
-        out = {name: getattr(self, name) for name in names}
+        names = ("action", "last_action", "target", "q", "qd", "torque", "object_pose", "object_velocity", "tips")
+        out = {name: getattr(self, name) for name in (*names, "nan")}
         out |= {f"obs_{group}": value for group, value in self.obs.items()}
         return out | {"episode_length": (self._episode_length, 0, 2**31), "width": self.sampler.width}
 

@@ -200,8 +200,8 @@ class GraspEnv(HandEnv):
         self.push_wait.copy_(torch.where(mask, s.draw("push.wait"), self.push_wait))
 
     def memory(self) -> dict:
-        names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen", "z_history")
-        own = {name: getattr(self, name) for name in (*names, "torque_bias", "outside_force")}
+        names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen")
+        own = {name: getattr(self, name) for name in (*names, "z_history", "torque_bias", "outside_force")}
         return super().memory() | own | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
 
     def before_physics(self) -> None:

@@ -164,8 +164,9 @@ class RotateEnv(HandEnv):
         self.sampler.width.fill_(1.0)
 
     def memory(self) -> dict:
-        names = ("goal", "home", "heading", "heading_rate", "goal_heading", "imu_tilt", "imu_past", "seen", "joint_bias")
-        own: dict = {name: getattr(self, name) for name in (*names, "tip_rot", "tip_last", "tip_velocity")}
+        names = ("goal", "home", "heading", "heading_rate", "goal_heading", "imu_tilt", "imu_past", "seen")
+        names += ("joint_bias", "tip_rot", "tip_last", "tip_velocity")
+        own: dict = {name: getattr(self, name) for name in names}
         own |= {name: (getattr(self, name), 0, 2**31) for name in ("successes", "since", "last_done")}
         own["imu_delay"] = self.imu_delay, 0, self.imu_past.shape[1] - 1
         return super().memory() | own | ({} if self.past is None else {"past": self.past})

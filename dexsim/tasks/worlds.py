@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dexsim.tasks.env import HandEnv
 
 Memory = Mapping[str, "torch.Tensor | tuple[torch.Tensor, int, int]"]
-"""Live tensors by name; whole numbers with their lowest and highest: they index memory, and a file may hold anything."""
+"""Live tensors by name; whole numbers with lowest and highest: they index memory, and a file may hold anything."""
 SAME = ("worlds", "task", "sim", "servo", "tactile", "randomize", "model_file", "reality")
 """Settings that must be as they were: other ones hold for new episodes."""
 
