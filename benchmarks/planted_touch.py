@@ -50,7 +50,8 @@ def main(argv: list[str]) -> int:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
     from dexsim.gap.touch import handed_on as touch_handed
-    from dexsim.gap.touch import press_rig, touch
+    from dexsim.gap.touch import press_rig
+    from dexsim.gap.touch.diagnosis import diagnose
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
     from dexsim.sim.quiet import quiet_warp
@@ -68,7 +69,7 @@ def main(argv: list[str]) -> int:
                 )
                 m = mechanism(model, servo)
                 start = time.perf_counter()
-                out = touch.diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set(), seed)
+                out = diagnose([read(p, joints=m.joints, audit=False) for p in paths], m, set(), seed)
                 seconds.append(time.perf_counter() - start)
                 felt = (
                     ""

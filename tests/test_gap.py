@@ -25,7 +25,7 @@ from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.runs import Run, conditions, local_polynomial
 from dexsim.gap.search.search import JointSearch
-from dexsim.gap.touch import touch
+from dexsim.gap.touch import constant_taxels
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import drive
 
@@ -227,7 +227,7 @@ def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
     z[:, 1, :, 2] = np.round(100 * np.abs(np.sin(t))[:, None] * grid)
     z[:, 1, 5 * 12 + 7, 2] = 0.0
     empty = Series.empty("x", 1)
-    found = touch.findings([Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))])
+    found = constant_taxels.found([Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))])
     assert [f["where"]["taxels"] for f in found] == [["1:67"]]
 
 

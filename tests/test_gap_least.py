@@ -49,7 +49,8 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(monkeypatch, share, h
     answer = Judged(1.0, np.sqrt(1 - share))
     monkeypatch.setattr(errors, "free_run", lambda *_: (answer.without, None))
     monkeypatch.setattr(errors, "intervals_of", lambda *_: [])
-    found = answer.findings(SimpleNamespace(table=None))[0]
+    answer.judge(SimpleNamespace(table=None))
+    found = answer.found[0]
     assert (found["confidence"] <= HINTED) is hint
     reasons = answer.evidence[0].reasons
     assert (len(reasons) > 0) is hint and all(f"less than {100 * PART:.0f} %" in r for r in reasons)

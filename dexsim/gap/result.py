@@ -14,7 +14,7 @@ from dexsim.gap.judge import confidence, full_model, residual_fit
 from dexsim.gap.locate import bins
 from dexsim.gap.search.search import Outcome
 from dexsim.gap.search.time_limit import TimeLimit
-from dexsim.gap.touch.touch import TouchResult
+from dexsim.gap.touch.result import TouchResult
 from dexsim.recording.mechanism import Mechanism
 
 

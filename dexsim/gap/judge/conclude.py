@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,8 @@ from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.locate import bins
-from dexsim.gap.plant.case import Case
 from dexsim.gap.report.sentence import sentence
-from dexsim.gap.result import Diagnosis, Settings, empty
+from dexsim.gap.result import Diagnosis, Settings
 from dexsim.gap.search import baseline
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.search import JointSearch, Outcome
@@ -27,57 +27,60 @@ SIDES = 0.24  # of the squared error that is left: what an effect must remove to
 ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 
 
-def assemble(s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]], kept: Kept, floor: tuple[float, str, dict[str, float]], how: str,
-             channel: list[dict[str, Any]], notes: list[str], plains: Sequence[baseline.Baseline] = ()) -> Diagnosis:
-    """The diagnosis of the joints.
+@dataclass
+class Noise:
+    """The noise floor of the position error: over all joints [rad or m], where it comes from, and of each joint."""
 
-    outcomes: what the search answered of each; floor: of the noise [rad or m], where it comes from, of each joint; how: what was kept out, in words;
-    channel: findings about signals, of all joints; notes: what the page says beside the findings, added to; plains: the plain model of each joint."""
-    data = empty("none")
-    data["noise_floor"] = {"position_rad": float(floor[0]), "how": floor[1], "joints": {k: float(v) for k, v in floor[2].items()}}
-    out = Diagnosis(data, "", notes, mechanism=m)
-    rng = np.random.default_rng(s.seed)
-    answers = [JointAnswer(case, search, outcome, kept) for case, search, outcome in outcomes]
+    floor: float
+    how: str
+    joints: dict[str, float]
+
+
+def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Kept, noise: Noise, how: str, channel: list[dict[str, Any]],
+             plains: Sequence[baseline.Baseline] = ()) -> None:
+    """The joints into a diagnosis that is empty but for its notes and its mechanism.
+
+    answers: of each joint, judged and located; how: what was kept out, in words; channel: findings about signals, of all joints; plains: the
+    plain model of each joint."""
+    data, notes, m = d.data, d.notes, d.mechanism
+    data["verdict"] = "none"
+    data["noise_floor"] = {"position_rad": float(noise.floor), "how": noise.how, "joints": {k: float(v) for k, v in noise.joints.items()}}
     findings: list[dict[str, Any]] = []
-    spots = []
     for a in answers:
         joint = a.case.joint
-        findings += a.findings(m)
-        out.evidence += a.evidence
-        out.spans |= a.spans
-        out.joints[joint] = a.numbers
-        out.mae |= {(joint, name): v for name, v in a.mae().items()}
-        out.outcomes.append(a.outcome)
+        findings += a.found
+        d.evidence += a.evidence
+        d.spans |= a.spans
+        d.joints[joint] = a.numbers
+        d.mae |= {(joint, name): v for name, v in a.mae().items()}
+        d.outcomes.append(a.outcome)
         data["nuisance"] |= a.nuisance
-        mine, depends = a.spots(rng, s.seed)
-        spots += mine
-        data["unexplained"]["depends_on"] += depends
+        data["unexplained"]["depends_on"] += a.depends_on
         if (curve := a.curve()) is not None:
-            out.curves.append(curve)
-    out.spots = bins.control(spots)
-    refuted = _take_back(out, answers, findings)
+            d.curves.append(curve)
+    d.spots = bins.control([x for a in answers for x in a.spots])
+    refuted = _take_back(d, answers, findings)
     findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
-    for joint in _shown_there_alone(out.joints, findings) if s.held_out else ():
-        v = out.joints[joint]
+    for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
+        v = d.joints[joint]
         notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
                      "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
-    worse = baseline.refused(plains, out.joints, fits, kept.train, floor[0])
-    _not_better(out, worse)
+    worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
+    _not_better(d, worse)
     findings.sort(key=lambda f: -_weight(f))
-    _doubts(out, findings, [f for f in channel if not _elsewhere(f, kept)])
-    _hand_on(out, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
+    _doubts(d, findings, [f for f in channel if not _elsewhere(f, kept)])
+    _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
     data["baseline"] = baseline.overall(plains)
     if worse:
-        data["baseline"]["handed_on"] = baseline.hand_on(plains, out.servo, list(worse))
+        data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
-    quiet = {a.case.joint for a in answers if rms(a.before) <= verdict.WITHIN * floor[2][a.case.joint]}
+    quiet = {a.case.joint for a in answers if rms(a.before) <= verdict.WITHIN * noise.joints[a.case.joint]}
     verdict.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     findings.sort(key=lambda f: f.get("hint", False))
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
-    _verdict(out, answers, kept, findings, refuted, floor[0], how, s.seed, len(quiet) == len(answers))
-    out.sentence = sentence(data, out, floor[0])
-    return out
+    _verdict(d, answers, kept, findings, refuted, noise.floor, how, s.seed, len(quiet) == len(answers))
+    d.sentence = sentence(data, d, noise.floor)
 
 
 def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:

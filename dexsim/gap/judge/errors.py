@@ -8,7 +8,7 @@ from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param, expand
-from dexsim.gap.read.runs import Run, same_commands
+from dexsim.gap.read.runs import Run, same_commands, spans
 
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
 FIRST = 0.1  # s tell where and how fast: within
@@ -105,17 +105,7 @@ def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int]
     for r in use:
         rows = case.plant.rows(r)
         t, on = case.plant.t[rows], active[rows]
-        if not on.any():
-            continue
-        edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
-        step = float(np.median(np.diff(t)))
-        start, end = t[edge[::2]], t[edge[1::2] - 1] + step
-        merged = [[start[0], end[0]]]
-        for a, b in zip(start[1:], end[1:], strict=True):
-            if a - merged[-1][1] < join:
-                merged[-1][1] = b
-            else:
-                merged.append([a, b])
+        merged = spans(t, on, join)
         out += [{"recording": runs[r].name, "start": round(float(a), 4), "end": round(float(b), 4)} for a, b in merged]
     out.sort(key=lambda w: w["start"] - w["end"])
     out = out[:400]

@@ -43,7 +43,8 @@ class JointAnswer:
 
     before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at times t (rows,) [s];
     effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 % intervals of the fitted parameters; widest: as
-    they are before it is known how well what was kept out is followed, by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs."""
+    they are before it is known how well what was kept out is followed, by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs; found,
+    evidence: see `judge`; spots, depends_on: see `locate`."""
 
     def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
@@ -67,7 +68,10 @@ class JointAnswer:
         self.nuisance = nuisances(case.joint, self.best)
         self.raw: dict[str, dict[str, float]] = {}
         self.spans: dict[str, float] = {}
+        self.found: list[dict[str, Any]] = []
         self.evidence: list[confidence.Evidence] = []
+        self.spots: list[bins.Spot] = []
+        self.depends_on: list[str] = []
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -85,9 +89,9 @@ class JointAnswer:
                 out[runs[i].name] = tuple(float(np.abs(self.measured - q)[pick].mean()) for q in (self.q_before, self.q_after))
         return out
 
-    def findings(self, m: Mechanism) -> list[dict[str, Any]]:
-        """What was found, as `diagnosis.json` says it; the evidence behind each is kept beside it."""
-        return [self._finding(mm, m) for mm in self.best.members]
+    def judge(self, m: Mechanism) -> None:
+        """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each."""
+        self.found = [self._finding(mm, m) for mm in self.best.members]
 
     def _finding(self, mm, m: Mechanism) -> dict[str, Any]:
         case, best = self.case, self.best
@@ -182,8 +186,8 @@ class JointAnswer:
             evidence.confidence = min(evidence.confidence, verdict.HINTED)
         return evidence
 
-    def spots(self, rng: np.random.Generator, seed: int) -> tuple[list[bins.Spot], list[str]]:
-        """(where the believed simulator's residual lives, what the residual that is left depends on)."""
+    def locate(self, rng: np.random.Generator, seed: int) -> None:
+        """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is left depends on."""
         case, search = self.case, self.search
         n, blocks = search.long.n, search.blocks[: search.long.n]
         regimes = {k: v[search.long.sample_row] for k, v in case.regimes.items()}
@@ -196,7 +200,7 @@ class JointAnswer:
         with search._fix(self.best.members):
             left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
         spots = bins.control(bins.spots(case.joint, left * case.sigma, blocks, regimes, rng))
-        return found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > CLEAR else []
+        self.spots, self.depends_on = found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > CLEAR else []
 
     def curve(self) -> Curve | None:
         """The stretch where the believed simulator is worst."""

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.search.beliefs import unknown
-from dexsim.gap.touch.touch import TouchResult
+from dexsim.gap.touch.result import TouchResult
 
 
 def reasons(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:

@@ -117,3 +117,18 @@ def same_commands(a: Run, b: Run) -> bool:
     x, y = a.command_at(start_a + t), b.command_at(start_b + t)
     span = max(np.ptp(x), np.ptp(y), 1e-6)
     return bool(np.quantile(np.abs(x - y), 0.9) < 0.01 * span + 1e-6)
+
+
+def spans(t: np.ndarray, on: np.ndarray, join: float) -> list[tuple[float, float]]:
+    """Stretches of time (start, end) [s] in which `on` [S] holds at the samples t [S] s, those less than `join` s apart joined."""
+    out: list[tuple[float, float]] = []
+    if not on.any():
+        return out
+    edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
+    step = float(np.median(np.diff(t)))
+    for a, b in zip(t[edge[::2]], t[edge[1::2] - 1] + step, strict=True):
+        if out and a - out[-1][1] < join:
+            out[-1] = (out[-1][0], float(b))
+        else:
+            out.append((float(a), float(b)))
+    return out

@@ -1,1 +1,1 @@
-"""The same steps for touch: taxels and contact."""
+"""Touch through the same steps (`gap.steps`) as the drives: taxels and contact, pad by pad."""

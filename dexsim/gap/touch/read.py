@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from dexsim.gap.plant.case import noise
-from dexsim.gap.read.runs import local_polynomial
+from dexsim.gap.read.runs import local_polynomial, spans
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.tactile import reference as ref
@@ -375,3 +375,18 @@ def _distance(thing: _Thing, point: np.ndarray, R: np.ndarray, p: np.ndarray) ->
         q = np.einsum("gij,nj->gni", R[a : a + chunk], point) + p[a : a + chunk, None]
         out[a : a + chunk] = ref.distance(thing.kind, thing.size, q, thing.grid)
     return out
+
+
+def stretches(r: Recording) -> list[tuple[float, float]]:
+    """Times (start, end) [s] in which something is touched: taxels, or a load cell where there are none."""
+    if r.tactile is not None and r.tactile.value.ndim == 4 and len(r.tactile) > 5:
+        z = np.nan_to_num(newtons(r)[0][..., 2])
+        still = np.ptp(z, axis=0) == 0  # a stuck taxel is no touch
+        t, on = r.tactile.t, np.where(still, 0.0, z).max((1, 2)) > 0.15
+    elif r.external_force is not None and len(r.external_force) > 5:
+        size = np.linalg.norm(np.nan_to_num(r.external_force.value[:, :3]), axis=1)
+        size = size - np.percentile(size, 5)
+        t, on = r.external_force.t, size > max(0.3, 0.05 * float(size.max()))
+    else:
+        return []
+    return [(a, b) for a, b in spans(t, on, 0.3) if b - a > 0.03]

@@ -6,26 +6,49 @@ import numpy as np
 
 from dexsim.gap.judge import verdict
 from dexsim.gap.report.sentence import sentence
-from dexsim.gap.result import Diagnosis, empty
-from dexsim.gap.touch import touch
+from dexsim.gap.result import Diagnosis
+from dexsim.gap.touch.result import TouchResult
 
 
-def _touch_verdict(felt: touch.TouchResult) -> str | None:
+def _verdict(felt: TouchResult) -> str | None:
     """The word for touch alone; None where it was not judged."""
     if felt.before is None:
         return "explained" if felt.findings else None
     for f in felt.findings:
         if f["confidence"] < verdict.FIRM:
             f["hint"] = True
-    named = [{"held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
+    named = [{"effect": f["effect"], "held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
     word = verdict.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
     return "partly_explained" if word == "explained" and felt.structured else word
 
 
-def add_touch(d: Diagnosis, felt: touch.TouchResult) -> None:
-    """Touch into the diagnosis of the joints: findings, the verdict of both, the metric of what was found."""
+def add(d: Diagnosis, felt: TouchResult) -> None:
+    """Touch into a diagnosis: beside the joints, or by itself where none of them is judged (the verdict says so)."""
     d.touch = felt
-    word = _touch_verdict(felt)
+    if d.data["verdict"] == "unusable":
+        _alone(d, felt)
+    else:
+        _beside(d, felt)
+
+
+def _alone(d: Diagnosis, felt: TouchResult) -> None:
+    """Touch where no joint could be judged."""
+    data = d.data
+    data["verdict"] = _verdict(felt) or "unusable"
+    data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
+    data["findings"] = data["findings"] + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] = dict(felt.nuisance)
+    if felt.before is not None:
+        _metric(data, felt)
+    else:
+        data["held_out"]["error"] = "tactile_rmse_N"
+    data["unexplained"]["depends_on"] = felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    d.sentence = sentence(data, d, felt.floor or 0.0)
+
+
+def _beside(d: Diagnosis, felt: TouchResult) -> None:
+    """Findings, the verdict of both, the metric of what was found."""
+    word = _verdict(felt)
     if word is None:
         return
     data = d.data
@@ -41,12 +64,12 @@ def add_touch(d: Diagnosis, felt: touch.TouchResult) -> None:
     elif joints != word:
         data["verdict"] = "partly_explained"
     if not rest and (felt.findings or joints == "none") and felt.before is not None and word != "none":
-        _touch_metric(data, felt)
+        _metric(data, felt)
     data["unexplained"]["depends_on"] += felt.depends_on if data["verdict"] not in ("none", "explained") else []
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
 
 
-def _touch_metric(data: dict, felt: touch.TouchResult) -> None:
+def _metric(data: dict, felt: TouchResult) -> None:
     (b, bl, bh), (a, al, ah) = felt.before, felt.after
     data["held_out"] = {"recordings": felt.recordings, "error": "tactile_rmse_N", "before": b, "after": a, "before_low": bl, "before_high": bh,
                         "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
@@ -54,19 +77,3 @@ def _touch_metric(data: dict, felt: touch.TouchResult) -> None:
     data["unexplained"]["fraction_of_gap"] = (
         round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
     )
-
-
-def touch_alone(channel, felt: touch.TouchResult, notes, m) -> Diagnosis:
-    """A diagnosis of touch where no joint could be judged."""
-    data = empty(_touch_verdict(felt) or "unusable")
-    data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
-    data["findings"] = channel + sorted(felt.findings, key=lambda f: -f["confidence"])
-    data["nuisance"] = dict(felt.nuisance)
-    if felt.before is not None:
-        _touch_metric(data, felt)
-    else:
-        data["held_out"]["error"] = "tactile_rmse_N"
-    data["unexplained"]["depends_on"] = felt.depends_on if data["verdict"] not in ("none", "explained") else []
-    out = Diagnosis(data, "", notes, mechanism=m, touch=felt)
-    out.sentence = sentence(data, out, felt.floor or 0.0)
-    return out

@@ -1,0 +1,180 @@
+"""What a diagnosis is asked and has read: mechanism, recordings, their runs, what is wrong with signals. Every part begins from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.gap.read import channels, inputs
+from dexsim.gap.read.runs import Run
+from dexsim.gap.result import Clock, Settings
+from dexsim.gap.search.time_limit import TimeLimit
+from dexsim.recording.mechanism import Mechanism
+from dexsim.recording.schema import Recording
+
+
+@dataclass
+class Inquiry:
+    """A diagnosis under way: what is asked, and what the recordings hold.
+
+    recordings: as they are, None for one that cannot be read; runs: of those that can be used; held: numbers of the runs that are kept out of
+    the fit; channel: findings about signals; lengths: s, by recording; notes: what the page says beside the findings."""
+
+    settings: Settings
+    say: Callable[[str], None]
+    progress: Callable[[float, int, str], None] | None
+    limit: TimeLimit
+    clock: Clock = field(default_factory=Clock)
+    notes: list[str] = field(default_factory=list)
+    m: Mechanism | None = None
+    names: dict[Path, str] = field(default_factory=dict)
+    recordings: list[Recording | None] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    lengths: dict[str, float] = field(default_factory=dict)
+    runs: list[Run] = field(default_factory=list)
+    held: list[int] = field(default_factory=list)
+    channel: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def readable(self) -> list[Recording]:
+        """The recordings that could be read."""
+        return [r for r in self.recordings if r is not None]
+
+    @property
+    def held_names(self) -> set[str]:
+        """Names of the recordings that are to be kept out of the fit."""
+        return {self.names[p] for p in self.settings.held_out or []}
+
+    def nothing_left(self) -> bool:
+        """Whether no run is left, or none that is fitted."""
+        return not self.runs or bool(self.settings.held_out and len(self.held) == len(self.runs))
+
+
+def read_files(w: Inquiry) -> None:
+    """The mechanism and the recordings, as far as they can be read."""
+    from dexsim.recording import read
+    from dexsim.recording.mechanism import mechanism
+
+    try:
+        w.m = mechanism(w.settings.model, w.settings.servo)
+    except UserError as error:
+        raise UserError(f"{error}{_still(w.settings)}") from None
+    overlap = {p.resolve() for p in w.settings.recordings} & {p.resolve() for p in w.settings.held_out or []}
+    if overlap:
+        raise UserError(
+            f"held_out: {', '.join(sorted(p.name for p in overlap))} is also in recordings; "
+            "what is held out must not be fitted"
+        )
+    paths = [*w.settings.recordings, *(w.settings.held_out or [])]
+    w.names = _unique_names(paths)
+    for path in paths:
+        try:
+            r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints)
+            r.path = Path(w.names[path])
+            w.recordings.append(r)
+        except UserError as error:
+            w.failures.append(str(error))
+            w.recordings.append(None)
+    w.clock.lap("reading and audit")
+    w.lengths = {r.path.name: r.duration for r in w.recordings if r is not None}
+    _copies(w.recordings[: len(w.settings.recordings)], w.recordings[len(w.settings.recordings) :])
+
+
+def to_runs(w: Inquiry) -> None:
+    """The recordings as runs, without what tells nothing of the joints, and findings about signals."""
+    for i, r in enumerate(w.recordings):
+        if r is None:
+            continue
+        try:
+            run = inputs.to_run(r, w.m, w.notes)
+        except inputs.Unusable as error:
+            w.failures.append(str(error))
+            continue
+        if i >= len(w.settings.recordings):
+            w.held.append(len(w.runs))
+        w.runs.append(run)
+    readable = w.readable
+    w.channel = inputs.channel_findings(readable, w.m.joints)
+    w.notes += [
+        f"{r.path.name}: {f.text}"
+        for r in readable
+        for f in r.findings
+        if f.kind == "joint_names" and "left out" in f.text
+    ]
+    w.notes[:0] = [
+        f"{r.path.name}: {f.text}; left out"
+        for r in readable
+        for f in r.findings
+        if f.kind == "nan" and f.joint in ("", *w.m.joints)
+    ]
+    absent = [j for j in w.m.joints if w.runs and not any(j in r.joints for r in w.runs)]
+    if absent:
+        w.notes.append(
+            f"in the model but in no recording: {', '.join(absent)}; nothing can be said of "
+            f"{'it' if len(absent) == 1 else 'them'}, taken to stand at rest"
+        )
+    wrong, out, blind = channels.inspect(w.runs, w.m.spec.compile(), channels.spoiled(readable))
+    w.channel = channels.secondary(w.channel + wrong)
+    before = {id(r): k for k, r in enumerate(w.runs)}
+    w.runs = channels.drop(w.runs, out, w.notes, w.m.spec.compile(), w.held)
+    w.held = [k for k, r in enumerate(w.runs) if before[id(r)] in w.held]
+    if blind:
+        w.runs, w.held = inputs.free_air(
+            w.runs,
+            w.held,
+            inputs.merged_spans(blind),
+            w.notes,
+            "part of it tells nothing (old readings, a pause, or a clock that was set)",
+            "that does",
+            (0.0, 0.0),
+            inputs.SHORTEST,
+        )
+    w.notes += w.failures
+    w.failures += [f"{name}: {joint}: {why}" for (name, joint), why in out.items()] if not w.runs else []
+    if w.failures and w.runs and len(w.held) < len(w.runs):
+        w.say(f"  left out: {'; '.join(w.failures)}")
+
+
+def _unique_names(paths: Sequence[Path]) -> dict[Path, str]:
+    names = [p.name for p in paths]
+    return {p: p.name if names.count(p.name) == 1 else f"{p.parent.name}/{p.name}" for p in paths}
+
+
+def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
+    """UserError where a held-out recording is one of the others under another name."""
+    for h in held:
+        for r in train:
+            a, b = (None if x is None else x.states.position for x in (h, r))
+            if (
+                a is not None
+                and b is not None
+                and len(a) > 20
+                and a.value.shape == b.value.shape
+                and np.array_equal(a.value, b.value, equal_nan=True)
+            ):
+                raise UserError(
+                    f"held_out: {h.path.name} holds the same readings as {r.path.name}; what is held out must not be fitted"
+                )
+
+
+def _still(s: Settings) -> str:
+    """What can be said although the model or the servo cannot be used: of the recordings alone, in one line."""
+    from dexsim.recording import read
+
+    said = []
+    for path in [*s.recordings, *(s.held_out or [])][:6]:
+        try:
+            r = read(path, s.remap, s.meta)
+        except UserError as error:
+            said.append(str(error))
+            continue
+        bad = [f.text for f in r.findings if f.severity == "error"]
+        said.append(
+            f"{path.name}: {r.duration:.1f} s of {len(r.joints)} joint{'s' * (len(r.joints) != 1)}, {'; '.join(bad[:2]) if bad else 'no fault'}"
+        )
+    return f" (of the recordings themselves: {' | '.join(said)})" if said else ""
