@@ -6,6 +6,8 @@ import pytest
 from dexsim.gap.judge import verdict
 from dexsim.gap.read import keep_out
 from dexsim.gap.search.time_limit import TimeLimit
+from dexsim.gap.touch import report as touch_report
+from dexsim.gap.touch.result import TouchResult
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
@@ -94,3 +96,8 @@ def test_a_limit_ends_searches_and_says_which():
     limit.stop()
     assert second.over() and limit.cut == {"b"} and limit.left() == 0.0
     assert TimeLimit(1e-9).share("c", 1.0).over()
+
+
+def test_touch_with_nothing_but_hints_within_its_noise_is_none():
+    felt = TouchResult([{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03)
+    assert touch_report._verdict(felt) == "none" and felt.findings[0]["hint"]
