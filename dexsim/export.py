@@ -119,6 +119,7 @@ def export(
     (out / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
     for text in measured.assumed:
         print(f"note     {text}")
+    print(f"policy   {checkpoints.provenance(data)}")
     print(f"bundle   {out}")
     return out
 

@@ -121,6 +121,7 @@ def test_play_from_a_checkpoint(configs, place, run_folder, capfd):
     assert metrics["about"]["iteration"] == 2 and metrics["about"]["seed"] == 0
     out = capfd.readouterr().out
     assert "mean_return" in out and "by world" in out and "progress_plot.png" in out and "6 worlds" in out
+    assert "policy   iteration 2, " in out and "trained at commit " in out
     assert not Path("o/video.mp4").exists() and Path("o/progress_plot.png").exists()
 
 

@@ -62,6 +62,7 @@ def test_manifest_tables_cover_the_observation(made):
     np.testing.assert_allclose(m["normalization"]["tau_max"], xhand.efforts(), atol=1e-6)
     assert m["rates"]["policy_period_s"] == pytest.approx(0.021) and m["normalization"]["force_max_N"] > 1
     assert set(m["versions"]["exported_with"]) >= {"torch", "onnxruntime"} and m["trained"]["iteration"] == 3
+    assert m["trained"]["git"] == {"commit": "unknown", "dirty": False}
 
 
 def test_check_passes_and_names_largest_differences(made, capsys):

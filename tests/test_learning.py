@@ -10,6 +10,7 @@ import pickle
 import random
 import resource
 import signal
+import subprocess
 
 import dummy_task
 import numpy as np
@@ -318,6 +319,26 @@ def test_random_state_round_trip_through_a_file(tmp_path):
 
 def test_git_state_outside_a_checkout(tmp_path):
     assert checkpoint.git_state(tmp_path) == {"commit": "unknown", "dirty": False}
+
+
+def test_git_state_of_a_checkout_and_in_words(tmp_path):
+    git = lambda *args: subprocess.run(  # noqa: E731
+        ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c", *args], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    code = tmp_path / "__init__.py"
+    code.write_text("")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = git("rev-parse", "HEAD")
+    assert checkpoint.git_state(tmp_path) == {"commit": commit, "dirty": False}
+    code.write_text("changed = True")
+    state = checkpoint.git_state(tmp_path)
+    assert state == {"commit": commit, "dirty": True}
+    data = {"git": state, "iteration": 3, "steps": 4096}
+    assert checkpoint.provenance(data) == f"iteration 3, 4,096 steps, trained at commit {commit[:12]}+changes"
+    data["git"] = checkpoint.git_state(tmp_path / "elsewhere")
+    assert checkpoint.provenance(data).endswith("commit unknown")
 
 
 def test_meter_against_plain_sums():

@@ -26,6 +26,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     env.dump_folder = out  # for worlds that were not finite
     if start.data is not None:
         checkpoint.check_layout(start.data, checkpoint.layout_of(env), str(start.source))
+        print(f"policy   {checkpoint.provenance(start.data)}", flush=True)
         policy = load_policy(start.data, env, str(start.source), start.typed)
         about = {
             "checkpoint": str(start.source),

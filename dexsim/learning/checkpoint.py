@@ -252,6 +252,13 @@ def git_state(folder: Path | None = None) -> dict[str, Any]:
             "dirty": bool(git("status", "--porcelain", "--untracked-files=no"))}
 
 
+def provenance(data: dict[str, Any]) -> str:
+    """A checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where tracked files differed from it."""
+    git = data["git"]
+    commit = git["commit"][:12] + ("+changes" if git["dirty"] else "") if git["commit"] != "unknown" else "unknown"
+    return f"iteration {data['iteration']}, {data['steps']:,} steps, trained at commit {commit}"
+
+
 def rng_state() -> dict[str, Any]:
     """State of every global random generator, as tensors and plain numbers."""
     name, keys, position, has_gauss, cached = np.random.get_state()
