@@ -84,6 +84,11 @@ def export(
         raise UserError(
             f"{checkpoint}: trained on task={task}; the deployed loop knows the observations of {', '.join(BUILDERS)}"
         )
+    if data["config"]["task"].get("mode", "palm") != "palm":
+        raise UserError(
+            f"{checkpoint}: trained on task={task}, whose camera and arm the deployed loop does not read; "
+            f"export a policy of task={' or task='.join(BUILDERS)}"
+        )
     measured = None if calibration is None else Calibration.load(calibration)
     out = Path(out).expanduser()
     if out.is_dir() and any(out.iterdir()):

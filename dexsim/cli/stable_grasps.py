@@ -16,15 +16,21 @@ USAGE = """usage: dexsim stable-grasps [key=value ...]
 
 Let cubes fall into half-open hands, close the fingers, and keep the poses that hold in worlds with other mass,
 friction and drives. Rotation episodes start from them: dexsim train task=rotate task.initial.poses=FILE
+With hold=fingertips, fingertips close on cubes above the palm instead: for task=rotate_fingertips.
 
 settings (key=default):
+  hold=palm                   palm | fingertips: what carries the cube
   out=out/stable_grasps.npz   file to write
   count=2000                  poses wanted
   worlds=256                  hands tried at once, on the CPU
   seed=0                      of everything random
-  sizes=[0.045,0.06]          edges of the cubes [m]: the smallest and the largest, within [0.02, 0.1]
-  any setting of task=rotate  (dexsim train --help)
+  sizes=[0.045,0.06]          edges of the cubes [m]: the smallest and the largest, within [0.02, 0.1];
+                              [0.04,0.065] with hold=fingertips
+  any setting of task=rotate, or task=rotate_fingertips  (dexsim train --help)
 """
+
+TASK = {"palm": ("rotate", [0.045, 0.06]), "fingertips": ("rotate_fingertips", [0.04, 0.065])}
+"""What carries the cube -> task whose episodes start so, usual edges of the cubes [m]."""
 
 
 def main(argv: list[str]) -> int:
@@ -37,7 +43,8 @@ def main(argv: list[str]) -> int:
         "count": 2000,
         "worlds": 256,
         "seed": 0,
-        "sizes": [0.045, 0.06],
+        "sizes": None,
+        "hold": "palm",
     }
     rest = []
     for text in argv:
@@ -46,13 +53,16 @@ def main(argv: list[str]) -> int:
             own[key] = yaml.safe_load(value)
         else:
             rest.append(text)
-    sizes = own["sizes"]
+    if own["hold"] not in TASK:
+        raise UserError(f"hold={own['hold']}: must be {' or '.join(TASK)}")
+    task, usual = TASK[own["hold"]]
+    sizes = usual if own["sizes"] is None else own["sizes"]
     if not (isinstance(sizes, list) and len(sizes) == 2 and 0.02 <= sizes[0] <= sizes[1] <= 0.1):
         raise UserError(f"sizes={sizes}: must be [low, high] edges within [0.02, 0.1] m")
     for key in ("count", "worlds"):
         if not (isinstance(own[key], int) and own[key] >= 1):
             raise UserError(f"{key}={own[key]}: must be a whole number from 1 up")
-    begun = start.for_train(["task=rotate", "device=cpu", f"worlds={own['worlds']}", *rest], CONFIGS)
+    begun = start.for_train([f"task={task}", "device=cpu", f"worlds={own['worlds']}", *rest], CONFIGS)
     if begun is None:
         return 0
     out = Path(str(own["out"])).expanduser()
@@ -60,8 +70,9 @@ def main(argv: list[str]) -> int:
     import torch
 
     from dexsim.sim.quiet import quiet_warp
-    from dexsim.tasks.make_grasps import generate
+    from dexsim.tasks import make_fingertip_grasps, make_grasps
 
+    generate = (make_grasps if own["hold"] == "palm" else make_fingertip_grasps).generate
     torch.set_num_threads(1)
     quiet_warp("cpu")
     grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))

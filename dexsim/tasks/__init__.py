@@ -15,8 +15,12 @@ def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "au
     """
     from dexsim.tasks.grasp import GraspEnv
     from dexsim.tasks.rotate import RotateEnv
+    from dexsim.tasks.rotate_fingertips import FingertipEnv
 
-    tasks = {"grasp": GraspEnv, "rotate": RotateEnv}
+    mode = cfg["task"].get("mode", "palm")
+    if mode not in ("palm", "fingertips"):
+        raise UserError(f"task.mode={mode}: must be palm or fingertips")
+    tasks = {"grasp": GraspEnv, "rotate": RotateEnv if mode == "palm" else FingertipEnv}
     name = cfg["task"]["name"]
     if name not in tasks:
         near = difflib.get_close_matches(name, tasks, 1)

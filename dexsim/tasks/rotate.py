@@ -50,6 +50,10 @@ class RotateEnv(HandEnv):
     successes [N]: goals reached in this episode.
     """
 
+    PERCEPTION: tuple[str, ...] = ("imu", "proprioception")
+    ENDS: tuple[str, ...] = ("dropped", "tipped", "nan")
+    """How a trial can end but for the cap, in the order of `end_kind`."""
+
     def __init__(
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
@@ -107,7 +111,7 @@ class RotateEnv(HandEnv):
 
     def _check(self) -> None:
         t = self.task
-        for key, known in (("perception", ("imu", "proprioception")), ("critic", ("paper", "privileged"))):
+        for key, known in (("perception", self.PERCEPTION), ("critic", ("paper", "privileged"))):
             if t[key] not in known:
                 raise UserError(f"task.{key}={t[key]}: must be {' or '.join(known)}")
         orientation = t["observe"]["orientation"]
@@ -239,6 +243,10 @@ class RotateEnv(HandEnv):
         self.nan_end.copy_(self.nan)
         return {"dropped": self.dropped, "tipped": self.tipped}
 
+    def end_kind(self) -> torch.Tensor:
+        """Index into ENDS [N] of what ended the episodes that `terminated` has just ended."""
+        return torch.where(self.nan_end, 2, torch.where(self.dropped, 0, 1))
+
     def _tilt_from_goal(self) -> torch.Tensor:
         """Angle between the palm axis as the goal's and as the present orientation have it in the object's frame."""
         a = rotation.rotate(rotation.conjugate(self.goal), self.axis.expand(self.num_envs, 3))
@@ -296,12 +304,12 @@ class RotateEnv(HandEnv):
         fresh = self.episode_length_buf == 0
         if advance:
             self._feel_motion(fresh)
-            if t["perception"] == "imu":
+            if t["perception"] != "proprioception":
                 self._read_imu(fresh)
         angle = self.q + self.joint_bias + sense["joint_noise"] * s.normal(12)
-        centre = self.touch.centre.reshape(n, 15) if self.taxel_point is None else self._plain_centre()
+        force, centre = self._felt()
         tips, sent = self.tips.reshape(n, 15), self._last_action()
-        imu = t["perception"] == "imu"
+        imu = t["perception"] != "proprioception"
         past = tips[:, None, :0] if imu else self.past
         actor = observations.build(
             observations.Signals(
@@ -310,7 +318,7 @@ class RotateEnv(HandEnv):
                 orientation=self.seen,
                 goal=self._goal_seen(),
                 sent=sent,
-                touch_force=self.touch.force,
+                touch_force=force,
                 touch_centre=centre,
                 fingertip=tips + sense["tip_noise"] * s.normal(15) if imu else tips,
                 past=past,
@@ -393,6 +401,11 @@ class RotateEnv(HandEnv):
         """R_object^T R_goal as the actor sees it."""
         return observations.relative(self.seen, self._goal_seen(), self.task["observe"]["orientation"])
 
+    def _felt(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Contact force [N, 5] N and centre [N, 15] m as the actor has them."""
+        centre = self.touch.centre.reshape(self.num_envs, 15) if self.taxel_point is None else self._plain_centre()
+        return self.touch.force, centre
+
     def _plain_centre(self) -> torch.Tensor:
         """Contact centres [N, 15] without force weighting: the mean position of the taxels that feel anything."""
         on = (self.touch.raw > 0).float()
@@ -429,6 +442,7 @@ class RotateEnv(HandEnv):
             "lost": "ours: dropped or tipped",
             "velocity": "ours: joint speed",
             "torque": "ours: motor torque",
+            "other": "ours: touched by palm or links",
         }
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in ACTOR] + [row[:3] for row in CRITIC]
         if t["critic"] == "privileged":
@@ -458,6 +472,18 @@ class RotateEnv(HandEnv):
                 f"reached: rotation error below {r['delta_rot']} rad and drift below {r['delta_pos']} m",
             ],
         }
+
+    def trial_facts(self) -> dict[str, torch.Tensor]:
+        """What an evaluation keeps of each trial as it begins, [N] each."""
+        return {}
+
+    def trial_counts(self) -> dict[str, torch.Tensor]:
+        """What an evaluation counts, step by step, while a trial lasts, bool [N] each."""
+        return {}
+
+    def of_trials(self, r: dict) -> dict:
+        """Further metrics of an evaluation, from the arrays [E] of its trials."""
+        return {}
 
     def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
         """Play `episodes` trials; see `tasks/rotate_eval.py`."""

@@ -27,7 +27,6 @@ HEADER = (
     "Time to fall (Ave.) s",
 )
 """Columns of the paper's rotation table."""
-ENDS = ("dropped", "tipped", "nan", "capped")
 
 
 @torch.inference_mode()
@@ -53,7 +52,8 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, env.task["evaluation"]["resamples"], seed)
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
-    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in ENDS}
+    metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.ENDS, "capped")}
+    metrics |= env.of_trials(r)
 
     def successes(ax):
         _successes_plot(ax, r["successes"])
@@ -105,7 +105,9 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     count, last_step = torch.zeros(n, dtype=torch.long, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
     end_step = torch.full((n,), steps, dtype=torch.long, device=dev)
-    how = torch.full((n,), len(ENDS) - 1, dtype=torch.long, device=dev)
+    how = torch.full((n,), len(env.ENDS), dtype=torch.long, device=dev)
+    facts = {k: v.cpu().numpy() for k, v in env.trial_facts().items()}
+    sums: dict[str, torch.Tensor] = {}
     shown = list(range(min(SHOWN, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]
     edge, mass = (2000 * env.objects.size[:, 0]).cpu().numpy(), (1000 * env.objects.mass).cpu().numpy()
@@ -117,8 +119,9 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
         last_step = torch.where(hit, k + 1, last_step)
         ended = dones.bool() & alive
         end_step = torch.where(ended, k + 1, end_step)
-        kind = torch.where(env.nan_end, 2, torch.where(env.dropped, 0, 1))
-        how = torch.where(ended, kind, how)
+        how = torch.where(ended, env.end_kind(), how)
+        for name, seen in env.trial_counts().items():
+            sums[name] = sums.get(name, torch.zeros_like(count)) + (seen & alive)
         alive = alive & ~ended
         if shown and k * dt < SHOWN_S:
             qpos.append(env.engine.t.qpos[shown].double().cpu().numpy())
@@ -132,7 +135,8 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
                 break
     out = {
         "successes": count.cpu().numpy(), "time": end_step.cpu().numpy() * dt, "last": last_step.cpu().numpy() * dt,
-        "end": np.array(ENDS)[how.cpu().numpy()], "frames": None,
+        "end": np.array([*env.ENDS, "capped"])[how.cpu().numpy()], "frames": None,
+        **facts, **{name: total.cpu().numpy() for name, total in sums.items()},
     }  # fmt: skip
     if shown:
         stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in shown]  # the end's own frame is the next trial's

@@ -15,6 +15,8 @@ import torch
 from dexsim.errors import UserError
 
 DEFAULT = Path(__file__).parents[1] / "assets" / "grasps" / "cube.npz"
+FINGERTIPS = DEFAULT.with_name("fingertips.npz")
+"""Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
 
 
 @dataclass

@@ -1,0 +1,193 @@
+"""Train every row of sensors with paired seeds on the task by fingertips, and judge each policy in three worlds.
+
+    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..] [seeds=1,2,3,4,5]
+        [gpus=0,1,..] [each=1] [iterations=300] [seconds=S] [episodes=512] [bench_episodes=64] [cap=60] [save=25]
+        [judged=training,wide,bench] [any other setting of train.py]
+    python -m benchmarks.touch_matters.analysis out=out/touch_matters
+
+`each` trainings share a GPU. `seconds` after the start trainings are ended, saved and judged; all rows are judged at
+the last iteration (a multiple of `save`) that every one has reached. The same command again goes on where it stopped.
+Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's table and
+figure.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks import tools
+from benchmarks.reproduce.jobs import done
+from benchmarks.touch_matters import rows
+from dexsim.errors import UserError
+
+OWN = {"out": "out/touch_matters", "rows": "paper", "seeds": "1,2,3,4,5", "gpus": "null", "each": "1",
+       "iterations": "300", "seconds": "null", "episodes": "512", "bench_episodes": "64", "cap": "60", "save": "25",
+       "judged": "training,wide,bench", "states": "false"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """A row trained from a seed, in a folder of its own."""
+
+    row: rows.Row
+    seed: int
+    folder: Path
+
+
+def chosen(text: str) -> list[rows.Row]:
+    """Rows by name, or a group of them. Raises UserError."""
+    groups = {"paper": rows.PAPER, "taxels": rows.TAXELS, "every": rows.EVERY}
+    if text in groups:
+        return list(groups[text])
+    known = {r.key: r for r in rows.EVERY}
+    wrong = [k for k in text.split(",") if k not in known]
+    if wrong:
+        raise UserError(f"rows={text}: no row '{wrong[0]}'; rows: {', '.join([*groups, *known])}")
+    return [known[k] for k in text.split(",")]
+
+
+def train(job: Job, gpu: str | None, iterations: int, until: float, save: int, extra: Sequence[str]) -> None:
+    """Train to `iterations`, going on from what is there, or until time.monotonic() reaches `until`."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    before = done(job.folder)
+    if before.iteration >= iterations or time.monotonic() >= until:
+        return
+    out = job.folder / f"train_{len(list(job.folder.glob('train_*')))}"
+    settings = ["task=rotate_fingertips", f"seed={job.seed}", *job.row.settings] if before.last is None else [
+        f"resume={before.last}"]  # fmt: skip
+    command = [sys.executable, "train.py", *settings, *extra, f"iterations={iterations}", "final_episodes=0",
+               f"save_interval={save}", f"out={out}"]  # fmt: skip
+    env = os.environ | {"OMP_NUM_THREADS": "1"} | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
+    with open(job.folder / "train.log", "a") as log:
+        child = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=env, cwd=tools.ROOT)
+        try:
+            child.wait(None if math.isinf(until) else max(until - time.monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            child.terminate()  # it saves and ends
+            try:
+                child.wait(60)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+
+
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Iteration -> checkpoint, of those kept while a row was trained."""
+    found = {}
+    for path in folder.glob("train_*/model_*.pt"):
+        found[int(path.stem.removeprefix("model_"))] = path
+    return found
+
+
+def common(jobs: Sequence[Job]) -> int | None:
+    """The last iteration of which every training kept a checkpoint; None where there is none."""
+    kept = [set(checkpoints(j.folder)) for j in jobs]
+    return max(set.intersection(*kept), default=None) if kept else None
+
+
+def judge(job: Job, worlds: Sequence[str], at: int, gpu: str | None, own: dict[str, str], threads: int,
+          extra: Sequence[str]) -> None:  # fmt: skip
+    """Judge the policy of iteration `at` where it has not been."""
+    import json
+
+    def judged(world: str) -> bool:
+        path = job.folder / f"{world}.json"
+        return path.exists() and json.loads(path.read_text())["iteration"] == at
+
+    worlds = [w for w in worlds if not judged(w)]
+    if not worlds:
+        return
+    cpu = all(w in rows.ON_CPU for w in worlds)
+    command = [sys.executable, "-m", "benchmarks.touch_matters.judge", f"checkpoint={checkpoints(job.folder)[at]}",
+               f"row={job.row.key}", f"seed={job.seed}", f"out={job.folder}", f"worlds={','.join(worlds)}",
+               f"episodes={own['bench_episodes' if cpu else 'episodes']}", f"cap={own['cap']}", f"threads={threads}",
+               f"states={own['states']}", *extra]  # fmt: skip
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+    env |= {"CUDA_VISIBLE_DEVICES": ""} if cpu else {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}
+    with open(job.folder / f"judge_{worlds[0]}.log", "w") as log:
+        status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=env, cwd=tools.ROOT).returncode
+    if status:
+        print(f"{job.row.key} seed {job.seed}: judging in {', '.join(worlds)} FAILED, see {log.name}", flush=True)
+
+
+def lanes(work: Sequence[Callable[[str | None], None]], where: Sequence[str | None]) -> list[threading.Thread]:
+    """Threads that do all of `work`, each in a place of `where`; started."""
+    waiting: queue.SimpleQueue = queue.SimpleQueue()
+    for item in work:
+        waiting.put(item)
+
+    def lane(place: str | None) -> None:
+        while True:
+            try:
+                item = waiting.get_nowait()
+            except queue.Empty:
+                return
+            item(place)
+
+    threads = [threading.Thread(target=lane, args=(p,), daemon=True) for p in where]
+    for t in threads:
+        t.start()
+    return threads
+
+
+def main(argv: list[str]) -> None:
+    began = time.monotonic()
+    own, extra = tools.split(argv, OWN)
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    gpus: list[str | None] = [str(i) for i in range(count)] or [None]
+    if own["gpus"] != "null":
+        gpus = [v.strip() for v in own["gpus"].split(",")]
+    out = Path(own["out"]).expanduser().absolute()
+    seeds = tools.numbers(own["seeds"], "seeds")
+    every = chosen(own["rows"])
+    for row in every:  # refuse a slip before an hour of training
+        tools.config(["task=rotate_fingertips", *row.settings, *extra])
+    jobs = [Job(r, s, out / r.key / f"seed{s}") for s in seeds for r in every]
+    iterations, each, save = (tools.numbers(own[k], k)[0] for k in ("iterations", "each", "save"))
+    until = math.inf if own["seconds"] == "null" else began + float(own["seconds"])
+
+    def say(text: str) -> None:
+        print(f"[{time.monotonic() - began:.0f} s] {text}", flush=True)
+
+    say(f"{len(jobs)} trainings of {iterations} iterations, {each} at a time on each of {len(gpus)} devices: {out}")
+
+    def training(job: Job) -> Callable[[str | None], None]:
+        def run(gpu: str | None) -> None:
+            train(job, gpu, iterations, until, save, extra)
+            say(f"{job.row.key} seed {job.seed}: {done(job.folder).steps / 1e6:.1f} M steps")
+
+        return run
+
+    for t in lanes([training(j) for j in jobs], [g for _ in range(each) for g in gpus]):
+        t.join()
+    at = common(jobs)
+    if at is None:
+        raise UserError(f"out={out}: not every training has reached iteration {save}; see its train.log")
+    say(f"judging all at iteration {at}")
+    asked = own["judged"].split(",")
+    on_gpu, on_cpu = [w for w in asked if w not in rows.ON_CPU], [w for w in asked if w in rows.ON_CPU]
+    cores = len(os.sched_getaffinity(0))
+    spare = max(1, cores - 2 * len(gpus))
+    threads = max(1, min(4, spare // max(len(jobs), 1)))
+    judges = [lambda gpu, j=j: judge(j, on_gpu, at, gpu, own, threads, []) for j in jobs]
+    benches = [lambda _, j=j: judge(j, on_cpu, at, None, own, threads, []) for j in jobs] if on_cpu else []
+    running = lanes(judges, gpus if None in gpus else [g for _ in range(3) for g in gpus])
+    running += lanes(benches, [None] * max(1, spare // threads))
+    for t in running:
+        t.join()
+    say("done: python -m benchmarks.touch_matters.analysis out=" + str(out))
+
+
+if __name__ == "__main__":
+    tools.command(main, __doc__)

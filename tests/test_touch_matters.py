@@ -1,0 +1,99 @@
+"""The comparison of sets of sensors: rows differ in what they say, pairs are judged as was fixed."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import tools
+from benchmarks.touch_matters import analysis, rows
+from benchmarks.touch_matters.__main__ import chosen, common
+from dexsim.errors import UserError
+
+
+def test_rows_differ_from_the_first_in_their_settings_only():
+    def flat(node, path=""):
+        for k, v in node.items():
+            if isinstance(v, dict):
+                yield from flat(v, f"{path}{k}.")
+            else:
+                yield f"{path}{k}", str(v)
+
+    first = dict(flat(tools.config(["task=rotate_fingertips", "device=cpu"])))
+    for row in rows.EVERY:
+        own = dict(flat(tools.config(["task=rotate_fingertips", "device=cpu", *row.settings])))
+        assert {k for k in own if own[k] != first.get(k)} == {s.partition("=")[0] for s in row.settings}, row.key
+
+
+def seeds(means, rng, spread=1.0):
+    return [rng.normal(m, spread, 200) for m in means]
+
+
+def test_a_difference_that_seeds_agree_on_is_decided_and_one_that_they_do_not_is_not():
+    rng = np.random.default_rng(1)
+    full = seeds([30, 32, 29, 31, 33], rng)
+    assert analysis.paired(full, seeds([20, 21, 18, 22, 23], rng), rng)["verdict"] == "more"
+    assert analysis.paired(seeds([20, 21, 18, 22, 23], rng), full, rng)["verdict"] == "fewer"
+    mixed = analysis.paired(full, seeds([20, 45, 18, 40, 23], rng), rng)
+    assert mixed["verdict"] == "undecided" and mixed["interval"][0] < 0 < mixed["interval"][1]
+
+
+def test_five_pairs_are_no_narrower_than_students_t():
+    """Bootstrapping five pairs alone is too narrow: 2.78 standard errors, not about 1.8."""
+    rng = np.random.default_rng(2)
+    a, b = seeds([10, 14, 12, 16, 13], rng, 0.01), seeds([10, 10, 10, 10, 10], rng, 0.01)
+    low, high = analysis.paired(a, b, rng)["interval"]
+    error = np.std([0, 4, 2, 6, 3], ddof=1) / np.sqrt(5)
+    assert high - low == pytest.approx(2 * 2.776 * error, rel=0.02)
+
+
+def test_one_pair_is_refused():
+    with pytest.raises(UserError, match="two pairs"):
+        analysis.paired([np.ones(3)], [np.ones(3)], np.random.default_rng(0))
+
+
+def judged(folder, row, seed, world, successes):
+    folder = folder / row / f"seed{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    trial = [[n, 60.0, "capped", "up", 0.05, 0.1, 0.8] for n in successes]
+    metrics = {"trials": trial, "ends": {"dropped": 0, "leaned": 0, "nan": 0, "capped": len(trial)},
+               "seconds_to_fall": 60.0, "touched_by_others": 0.01}  # fmt: skip
+    data = {"row": row, "seed": seed, "world": world, "steps": 10, "iteration": 1, "metrics": metrics}
+    (folder / f"{world}.json").write_text(json.dumps(data))
+
+
+def test_the_page_is_made_of_what_was_judged(tmp_path):
+    for seed in range(1, 6):
+        for world in rows.WORLDS:
+            judged(tmp_path, "full", seed, world, [30 + seed] * 4)
+            judged(tmp_path, "no_touch", seed, world, [10 + seed] * 4)
+            judged(tmp_path, "no_force", seed, world, [30 + (-1) ** seed * 5] * 4)
+    analysis.main([f"out={tmp_path}"])
+    text = (tmp_path / "touch_matters.md").read_text()
+    line = next(x for x in text.splitlines() if x.startswith("| no touch at all"))
+    assert "| 13.0 |" in line and "+20.0 (+20.0 to +20.0), holds" in line
+    assert "undecided" in next(x for x in text.splitlines() if x.startswith("| no contact force"))
+    assert (tmp_path / "touch_matters.png").stat().st_size > 10_000
+    with pytest.raises(UserError, match="nothing judged"):
+        analysis.main([f"out={tmp_path / 'none'}"])
+
+
+def test_rows_are_judged_where_all_have_come(tmp_path):
+    class Job:
+        def __init__(self, folder):
+            self.folder = folder
+
+    for name, kept in (("a", (25, 50, 75)), ("b", (25, 50))):
+        (tmp_path / name / "train_0").mkdir(parents=True)
+        for k in kept:
+            (tmp_path / name / "train_0" / f"model_{k}.pt").touch()
+    assert common([Job(tmp_path / "a"), Job(tmp_path / "b")]) == 50
+    assert common([Job(tmp_path / "a"), Job(tmp_path / "c")]) is None
+
+
+def test_a_row_that_is_not_is_named():
+    assert [r.key for r in chosen("full,no_pose")] == ["full", "no_pose"]
+    with pytest.raises(UserError, match="nonsense"):
+        chosen("full,nonsense")
