@@ -51,7 +51,8 @@ WARP = pytest.param("grasp", "warp", FEELS, marks=pytest.mark.slow, id="grasp-wa
 
 
 @pytest.mark.parametrize(("task", "engine", "settings"),
-                         [("grasp", "mujoco", FEELS), ("rotate", "mujoco", FEELS), WARP])  # fmt: skip
+                         [("grasp", "mujoco", FEELS), ("rotate", "mujoco", FEELS),
+                          ("rotate_fingertips", "mujoco", FEELS), WARP])  # fmt: skip
 def test_resume_is_the_unbroken_run(tmp_path, task, engine, settings):
     settings = (*settings, *ENDS)
     whole, rows = runner(task, engine, *settings), []
