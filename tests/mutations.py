@@ -52,6 +52,7 @@ def _never_drawn(task: str, name: str, instead: str, columns: str = "") -> Mutat
 
 
 GRASP_EVAL, GRASP, ROTATE = "dexsim/tasks/grasp_eval.py", "dexsim/tasks/grasp.py", "dexsim/tasks/rotate.py"
+FINGERTIPS = "dexsim/tasks/rotate_fingertips.py"
 MUTATIONS = (
     Mutation(
         "the evaluated hand is not turned",
@@ -120,16 +121,86 @@ MUTATIONS = (
     Mutation(
         "the rotation's actor is told the true force",
         ROTATE,
-        "touch_force=self.touch.force,",
-        "touch_force=self.touch.force_clean,",
+        "return self.touch.force, centre",
+        "return self.touch.force_clean, centre",
         "tests/test_rotate.py::test_the_actor_feels_what_the_sensor_measured",
     ),
     Mutation(
         "the rotation's actor is told the true centres",
         ROTATE,
-        "centre = self.touch.centre.reshape(n, 15)",
-        "centre = self.touch.centre_clean.reshape(n, 15)",
+        "centre = self.touch.centre.reshape(self.num_envs, 15)",
+        "centre = self.touch.centre_clean.reshape(self.num_envs, 15)",
         "tests/test_rotate.py::test_the_actor_feels_what_the_sensor_measured",
+    ),
+    Mutation(
+        "the fingertip task's palm always looks up",
+        FINGERTIPS,
+        "self.palms = torch.tensor([PALMS.index(p)",
+        "self.palms = torch.tensor([0 * PALMS.index(p)",
+        "tests/test_rotate_fingertips.py::test_the_palm_looks_where_it_is_told",
+    ),
+    Mutation(
+        "goals of the fingertip task turn one way only",
+        FINGERTIPS,
+        "signed = torch.cat([axes, -axes])",
+        "signed = torch.cat([axes, axes])",
+        "tests/test_rotate_fingertips.py::test_goals_turn_about_every_axis_both_ways_and_stay_in_reach",
+    ),
+    Mutation(
+        "goals of the fingertip task have no reach",
+        FINGERTIPS,
+        "far <= self.reach_rad",
+        "far <= 9.0",
+        "tests/test_rotate_fingertips.py::test_goals_turn_about_every_axis_both_ways_and_stay_in_reach",
+    ),
+    Mutation(
+        "the camera is not late",
+        FINGERTIPS,
+        "1, self.camera_delay[:, None, None].expand",
+        "1, 0 * self.camera_delay[:, None, None].expand",
+        "tests/test_rotate_fingertips.py::test_the_pose_is_late_by_its_delay",
+    ),
+    Mutation(
+        "the camera always sees",
+        FINGERTIPS,
+        "sees = (~gone)[:, None]",
+        "sees = (~gone | gone)[:, None]",
+        "tests/test_rotate_fingertips.py::test_a_hidden_pose_stays_as_it_was_and_ages",
+    ),
+    Mutation(
+        "nothing is pushed",
+        FINGERTIPS,
+        "applied[:, self.objects.body, :3] = force.to(applied.dtype)",
+        "pass",
+        "tests/test_rotate_fingertips.py::test_pushes_come_and_are_as_strong_as_they_say",
+    ),
+    Mutation(
+        "the palm may carry the cube",
+        FINGERTIPS,
+        'self.tipped.copy_(self.leaning > limit["lean_s"])',
+        "self.tipped.zero_()",
+        "tests/test_rotate_fingertips.py::test_what_rests_on_the_palm_is_counted_and_ends",
+    ),
+    Mutation(
+        "the palm's touch is not counted",
+        FINGERTIPS,
+        "clamp(min=0).sum(1) + self.palm_force",
+        "clamp(min=0).sum(1)",
+        "tests/test_rotate_fingertips.py::test_what_rests_on_the_palm_is_counted_and_ends",
+    ),
+    Mutation(
+        "the fingertip actor knows the friction",
+        FINGERTIPS,
+        "torch.cat(pose + told, 1)",
+        "torch.cat(pose + told, 1) + self.objects.friction[:, None]",
+        "tests/test_rotate_fingertips.py::test_the_actor_does_not_know_size_mass_or_friction",
+    ),
+    Mutation(
+        "an evaluation gives up goals",
+        FINGERTIPS,
+        "self.patience.fill_(math.inf)",
+        "pass",
+        "tests/test_rotate_fingertips.py::test_a_goal_that_is_not_reached_is_replaced_in_training_only",
     ),
     Mutation(
         "the other world feels as training does",

@@ -119,8 +119,9 @@ class FingertipEnv(RotateEnv):
 
     def memory(self) -> dict:
         names = ("gravity", "start", "leaning", "other_force", "push", "push_left", "push_wait", "past_pose", "age")
-        own: dict = {name: getattr(self, name) for name in (*names, "camera_tilt", "camera_offset", "hidden", "visible")}
-        own |= {"palm": (self.palm, 0, len(PALMS) - 1), "seen_position": self.seen_position}
+        names += ("camera_tilt", "camera_offset", "hidden", "visible", "seen_position")
+        own: dict = {name: getattr(self, name) for name in names}
+        own["palm"] = self.palm, 0, len(PALMS) - 1
         own["camera_delay"] = self.camera_delay, 0, self.past_pose.shape[1] - 1
         return super().memory() | own
 
