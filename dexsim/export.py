@@ -71,6 +71,7 @@ def export(
     typed: frozenset[tuple[str, Any]] = frozenset(),
 ) -> Path:
     """Write the bundle of a checkpoint; returns its folder. typed: see `dexsim.learning.names`. Raises UserError."""
+    from dexsim import outputs
     from dexsim.calibration.file import Calibration
     from dexsim.console import folders
     from dexsim.deploy import bundle
@@ -91,10 +92,14 @@ def export(
         )
     measured = None if calibration is None else Calibration.load(calibration)
     out = Path(out).expanduser()
+    if out.is_dir():
+        outputs.recover(out)  # what an export that was killed left
     if out.is_dir() and any(out.iterdir()):
         raise UserError(f"out={out}: already holds files; choose another folder")
     out = folders.make(out, "out=")
+    import numpy as np
     import torch
+    import yaml
 
     from dexsim.tasks import make_env
 
@@ -106,22 +111,22 @@ def export(
     checkpoints.check_layout(data, checkpoints.layout_of(env), checkpoint)
     policy = load_policy(data, env, str(checkpoint), typed)
     model = policy.as_onnx(verbose=False).eval().to("cpu")
-    path = out / bundle.POLICY
-    with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
-        warnings.simplefilter("ignore")
-        torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False,
-                          opset_version=OPSET,
-                          input_names=["observation"], output_names=["action"],
-                          dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
-    rows = golden(env, policy, model, steps, seed)
-    import numpy as np
-    import yaml
 
-    np.savez_compressed(out / bundle.GOLDEN, **rows)
-    measured = Calibration.default(env.effort.double().numpy()) if measured is None else measured
-    m = manifest(env, data, measured, path, len(rows["observation"]))
-    (out / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
-    (out / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
+    with outputs.staged(out) as part:  # the whole bundle or none
+        path = part / bundle.POLICY
+        with warnings.catch_warnings():  # the exporter in one file is the one that torch calls legacy
+            warnings.simplefilter("ignore")
+            torch.onnx.export(model, (torch.zeros(1, env.obs["actor"].shape[1]),), str(path), dynamo=False,
+                              opset_version=OPSET,
+                              input_names=["observation"], output_names=["action"],
+                              dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
+        rows = golden(env, policy, model, steps, seed)
+        np.savez_compressed(part / bundle.GOLDEN, **rows)
+        measured = Calibration.default(env.effort.double().numpy()) if measured is None else measured
+        m = manifest(env, data, measured, path, len(rows["observation"]))
+        (part / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
+        (part / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
+    (out / outputs.WRITTEN).unlink(missing_ok=True)  # a bundle is never written twice
     for text in measured.assumed:
         print(f"note     {text}")
     print(f"policy   {checkpoints.provenance(data)}")

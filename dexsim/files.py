@@ -1,13 +1,24 @@
-"""Files that come in: only plain ones, and none larger than its kind can be."""
+"""Files that come in: only plain ones, and none larger than its kind can be. Files that go out: written beside their
+place and renamed, so that a kill leaves what was; what it leaves unfinished goes at the next start."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+import shutil
+import socket
 import stat
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from dexsim.errors import UserError
 
+LEFT_S = 86400.0
+"""Age [s] from which an unfinished file is nobody's."""
+HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:60]
+_UNFINISHED = re.compile(r"\..+?\.((?P<host>[A-Za-z0-9-]+)\.)?(?P<pid>[0-9]{1,9})\.tmp")
 MAX_YAML = 4 << 20
 """Bytes of a YAML file that people write (servo, metadata, calibration, touch)."""
 
@@ -40,3 +51,62 @@ def text(path: Path, most: int, what: str) -> str:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise UserError(f"{what} {path} is not UTF-8 text (byte {error.start})") from None
+
+
+def unfinished(path: Path) -> Path:
+    """Where what will be `path` is written first: beside it, named after this process."""
+    return path.with_name(f".{path.name}.{HOST}.{os.getpid()}.tmp")
+
+
+@contextlib.contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Write the file (or the folder) that is given; it becomes `path` when the block ends, and is removed where the
+    block raises. What killed processes left beside `path` is removed first."""
+    sweep(path.parent)
+    part = unfinished(path)
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        _remove(part)
+
+
+def sweep(folder: Path) -> list[int]:
+    """Remove the unfinished files and folders (``.NAME.HOST.PID.tmp``) of killed processes; returns their sizes in
+    bytes. One of another machine, or of a process that lives, is left until it is a day old."""
+    removed = []
+    for path in folder.glob(".*.tmp"):
+        if _UNFINISHED.fullmatch(path.name) is None:
+            continue
+        with contextlib.suppress(OSError):
+            about = path.lstat()
+            if abandoned(path.name) or time.time() - about.st_mtime > LEFT_S:
+                inside = [p.lstat().st_size for p in path.rglob("*")] if stat.S_ISDIR(about.st_mode) else []
+                _remove(path)
+                removed.append(sum(inside) or about.st_size)
+    return removed
+
+
+def abandoned(name: str) -> bool:
+    """Whether a file of this name is what a process of this machine wrote that is no more."""
+    found = _UNFINISHED.fullmatch(name)
+    return found is not None and found["host"] == HOST and not lives(int(found["pid"]))
+
+
+def lives(pid: int) -> bool:
+    """Whether there is a process of this number on this machine."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        pass
+    return True
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()

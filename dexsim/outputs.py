@@ -2,21 +2,25 @@
 there is whole.
 
 Each folder keeps `.dexsim.json`: what was written there, with its SHA-256. A file is ours as long as it is as we wrote
-it. Results are written beside (a folder `.writing-...` in the same place) and renamed once all of them are there: a
-full disk or a kill leaves what was.
+it. Results are written beside (a folder `.results.HOST.PID.tmp` in the same place), noted, and renamed once all of them
+are there: a full disk or a kill leaves what was. A kill between two of the renames leaves some of each; the next start
+there makes the rest, from the note. What a kill before that left is removed then.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import itertools
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from dexsim import files
 from dexsim.console.folders import make
 from dexsim.errors import UserError
 
@@ -27,6 +31,7 @@ def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Pat
     """The folder, made and writable, before the work begins. Raises UserError where it cannot be written, or where one
     of `names` (of a file, or of a folder of files) is there and not ours, or is one of `inputs`."""
     make(folder, setting)
+    recover(folder)
     read = {p.expanduser().resolve() for p in inputs}
     for name in names:
         path = folder / name
@@ -45,18 +50,18 @@ def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
     ours. Where the block raises, `folder` stays as it was. Raises UserError where a file would go over one that is not
     ours, or the disk is full."""
     make(folder, setting)
-    stage = Path(tempfile.mkdtemp(prefix=".writing-", dir=folder))
+    recover(folder)
+    stage = _stage(folder)
     try:
+        stage.mkdir()
         yield stage
-        files = sorted(p for p in stage.rglob("*") if p.is_file())
-        for path in files:
+        made = sorted(p for p in stage.rglob("*") if p.is_file())
+        for path in made:
             _refuse(folder, folder / path.relative_to(stage), setting)
-        sums = {str(p.relative_to(stage)): _sum(p) for p in files}
-        for path in files:
-            to = folder / path.relative_to(stage)
-            to.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(path, to)
-        note(folder, sums)
+        sums = {str(p.relative_to(stage)): _sum(p) for p in made}
+        _write_note(folder, _known(folder), {"stage": stage.name, "files": sums})
+        _move(folder, stage, sums)
+        _write_note(folder, _known(folder) | sums)
     except OSError as error:
         raise UserError(
             f"cannot write into {folder}: {error.strerror or error}; choose another place with {setting}"
@@ -65,28 +70,52 @@ def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
         shutil.rmtree(stage, ignore_errors=True)
 
 
-def note(folder: Path, sums: dict[str, str]) -> None:
-    """Adds files (relative path -> SHA-256) to those that are ours."""
-    data = json.dumps({"files": _known(folder) | sums}, indent=1)
-    part = folder / f"{WRITTEN}.part"
-    part.write_text(data, encoding="utf-8")
-    os.replace(part, folder / WRITTEN)
+def recover(folder: Path) -> None:
+    """Finish the renames that a killed process had noted, and remove what others left unfinished."""
+    pending = _read_note(folder).get("pending")
+    sums = pending.get("files") if isinstance(pending, dict) else None
+    stage = folder / str(pending.get("stage")) if isinstance(pending, dict) else folder
+    if isinstance(sums, dict) and files.abandoned(stage.name) and stage.parent == folder and not stage.is_symlink():
+        left = {str(k): str(v) for k, v in sums.items() if _is(folder, stage / str(k), str(v))}
+        with contextlib.suppress(OSError, UserError):
+            for path in left:
+                _refuse(folder, folder / path, "out=")
+            _move(folder, stage, left)
+            _write_note(folder, _known(folder))
+    files.sweep(folder)
 
 
-def note_paths(folder: Path, paths: Iterable[Path]) -> None:
-    """Adds files in `folder`, and all files of folders in it, to those that are ours."""
-    every = [q for p in paths for q in (p.rglob("*") if p.is_dir() else [p]) if q.is_file()]
-    note(folder, {str(p.relative_to(folder)): _sum(p) for p in every})
+def _move(folder: Path, stage: Path, paths: Iterable[str]) -> None:
+    for path in paths:
+        to = folder / path
+        to.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(stage / path, to)
+
+
+def _is(folder: Path, path: Path, digest: str) -> bool:
+    """Whether this is a file of that SHA-256 within the folder."""
+    return path.is_file() and path.resolve().is_relative_to(folder.resolve()) and _sum(path) == digest
+
+
+def _stage(folder: Path) -> Path:
+    """A folder beside the results that is not there yet."""
+    for k in itertools.count():
+        stage = files.unfinished(folder / (f"results{k}" if k else "results"))
+        if not stage.exists():
+            return stage
+    raise AssertionError("unreachable")
+
+
+def _write_note(folder: Path, known: dict[str, str], pending: dict[str, Any] | None = None) -> None:
+    data = {"files": known} | ({"pending": pending} if pending else {})
+    with files.beside(folder / WRITTEN) as part:
+        part.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 def replace_text(path: Path, text: str) -> None:
     """Writes a text file beside and renames it."""
-    part = path.with_name(f".{path.name}.part")
-    try:
+    with files.beside(path) as part:
         part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _refuse(folder: Path, path: Path, setting: str) -> None:
@@ -104,10 +133,22 @@ def _refuse(folder: Path, path: Path, setting: str) -> None:
 
 
 def _known(folder: Path) -> dict[str, str]:
+    """What is ours: what was noted, and what a process was about to move and has moved."""
+    found = _read_note(folder)
+    known, pending = found.get("files"), found.get("pending")
+    out = {str(k): str(v) for k, v in known.items()} if isinstance(known, dict) else {}
+    moving = pending.get("files") if isinstance(pending, dict) else None
+    for path, digest in moving.items() if isinstance(moving, dict) else ():
+        if _is(folder, folder / str(path), str(digest)):
+            out[str(path)] = str(digest)
+    return out
+
+
+def _read_note(folder: Path) -> dict[str, Any]:
     try:
-        files = json.loads((folder / WRITTEN).read_text(encoding="utf-8"))["files"]
-        return {str(k): str(v) for k, v in files.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        data = json.loads((folder / WRITTEN).read_text(encoding="utf-8"))
+        return data if isinstance(data, dict) else {}
+    except (OSError, ValueError, RecursionError):
         return {}
 
 

@@ -14,6 +14,7 @@ import pytest
 import shell
 import yaml
 
+from dexsim import files
 from dexsim.cli import folder
 from dexsim.console import stop as stops
 from dexsim.console.stop import Stop
@@ -83,7 +84,7 @@ def test_what_killed_runs_left_is_removed_at_the_next_start(place, capsys):
     for _ in range(3):
         killed_inside_a_write(run / "last.pt")
     assert len(list(run.glob(".*.tmp"))) == 3 and (run / "last.pt").read_bytes() == b"whole"
-    keep = [run / f".last.pt.{checkpoint._HOST}.{os.getpid()}.tmp", run / ".last.pt.another-machine.1.tmp", run / "mine.tmp", run / ".notes.tmp"]
+    keep = [run / f".last.pt.{files.HOST}.{os.getpid()}.tmp", run / ".last.pt.another-machine.1.tmp", run / "mine.tmp", run / ".notes.tmp"]
     for path in keep:
         path.write_bytes(b"x")
     gone = run / ".model_10.pt.another-machine.2.tmp"

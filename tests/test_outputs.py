@@ -24,7 +24,7 @@ def test_a_second_diagnosis_replaces_the_first_and_nothing_else(tmp_path):
     assert all(p.is_file() for p in written)
     outputs.claim(tmp_path, "out=", [p.name for p in written])
     save(result(), tmp_path)
-    assert (tmp_path / "notes.txt").read_text() == "mine" and not list(tmp_path.glob(".writing*"))
+    assert (tmp_path / "notes.txt").read_text() == "mine" and not list(tmp_path.glob(".*.tmp"))
 
 
 @pytest.mark.parametrize("name", ["report.html", "diagnosis.json"])
@@ -123,3 +123,73 @@ def test_archives_of_others_stay_and_a_cut_one_leaves_no_half(tmp_path):
     with pytest.raises(UserError, match="cut off"):
         pack.unpack(tmp_path / "cut", tmp_path / "there")
     assert [(p.name, p.stat().st_size) for p in (tmp_path / "there").rglob("*") if p.is_file()] == [("a", 300_000)]
+
+
+def killed(work) -> None:
+    """Run in a child that ends with kill -9 inside `work`."""
+    import os
+
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(1)
+    assert os.waitpid(child, 0)[1] == 9
+
+
+@pytest.mark.parametrize("at", [1, 2, 3, 4, 5])
+def test_a_kill_among_the_renames_is_made_good_at_the_next_start(tmp_path, at):
+    """Notes and results are renamed one by one: after a kill before the k-th of them the next start has all of the old or all of
+    the new, and nothing unfinished."""
+    import os
+    import signal
+
+    names = ("a.json", "b.json", "sub/c.json")
+
+    def write(text):
+        with outputs.staged(tmp_path) as stage:
+            (stage / "sub").mkdir()
+            for name in names:
+                (stage / name).write_text(text)
+
+    write("old")
+    replace, count = os.replace, []
+
+    def work():
+        def kill(a, b):
+            count.append(1)
+            if len(count) == at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(a, b)
+
+        os.replace = kill
+        write("new")
+
+    killed(work)
+    assert list(tmp_path.glob(".results*.tmp")) or at == 5
+    outputs.claim(tmp_path, "out=", names)
+    assert {(tmp_path / name).read_text() for name in names} == {"old" if at == 1 else "new"}
+    assert not list(tmp_path.rglob("*.tmp"))
+    write("again")
+
+
+def test_a_note_of_strangers_moves_nothing(tmp_path):
+    import hashlib
+    import json
+
+    from dexsim import files
+
+    out, other = tmp_path / "out", tmp_path / "other"
+    stage = out / f".results.{files.HOST}.999999999.tmp"
+    stage.mkdir(parents=True)
+    other.mkdir()
+    (other / "x").write_text("mine")
+    (out / "mine").write_text("mine")
+    (stage / "mine").write_text("new")
+    digest = hashlib.sha256(b"new").hexdigest()
+    for pending in ({"stage": "../other", "files": {"x": "0"}}, {"stage": stage.name, "files": {"../../other/x": digest, "mine": digest}},
+                    {"stage": 3, "files": {"a": 1}}, {"stage": stage.name, "files": []}, {"files": {"x": "y"}}, [1]):  # fmt: skip
+        (out / outputs.WRITTEN).write_text(json.dumps({"files": {}, "pending": pending}))
+        outputs.recover(out)
+        assert (other / "x").read_text() == "mine" and (out / "mine").read_text() == "mine" and other.is_dir()

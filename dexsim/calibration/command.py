@@ -50,16 +50,18 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     if s["simulate"]:
         quiet_warp("cpu")
         joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else list(simulate.xhand.JOINTS)
-        where = out / ("presses_realistic" if s["realistic"] else "presses_sim")
-        made = simulate.make(where, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"]))
+        name = "presses_realistic" if s["realistic"] else "presses_sim"
+        with outputs.staged(out) as stage:
+            made = simulate.make(stage / name, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"]))
+        made = [out / p.relative_to(stage) for p in made]
         key = "real" if s["realistic"] else "sim"
         if s[key] is None:
             s[key] = ",".join(str(p) for p in made)
     if s["simulate_touch"]:
         quiet_warp("cpu")
-        made = simulate.make_rolled(out / "pads", True, int(s["seed"]), s["faults"])
-        s["touch"] = s["touch"] or str(made)
-    outputs.note_paths(out, [out / name for name in made_here])
+        with outputs.staged(out) as stage:
+            made = simulate.make_rolled(stage / "pads", True, int(s["seed"]), s["faults"])
+        s["touch"] = s["touch"] or str(out / made.relative_to(stage))
     with outputs.staged(out) as stage:
         assumed = _fits(s, meta, stage, report)
     for text in assumed:

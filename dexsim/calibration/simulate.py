@@ -113,7 +113,7 @@ def make(
         path = out / f"press_{joint}.mcap"
         write(path, recording)
         paths.append(path)
-        say(f"mcap     {path}: {recording.duration:.1f} s")
+        say(f"mcap     {path.parent.name}/{path.name}: {recording.duration:.1f} s")
     return paths
 
 
@@ -216,7 +216,7 @@ def make_rolled(
         recording = delivered(recording, seed)
     path = folders.make(Path(out).expanduser(), "out=") / "rolled.mcap"
     write(path, recording)
-    say(f"mcap     {path}: {recording.duration:.1f} s")
+    say(f"mcap     {path.parent.name}/{path.name}: {recording.duration:.1f} s")
     return path
 
 

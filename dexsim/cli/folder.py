@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from dexsim import files
 from dexsim.console.folders import make
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
@@ -63,7 +64,7 @@ def _claim(folder: Path, setting: str) -> Path:
 
 def tidy(folders: Iterable[Path]) -> None:
     """Remove what killed processes left unfinished in these folders, and say so."""
-    removed = [size for folder in folders for size in checkpoint.sweep(folder)]
+    removed = [size for folder in folders for size in files.sweep(folder)]
     if removed:
         print(f"tidied   {len(removed)} unfinished file(s) of killed runs, {sum(removed) / 2**20:.1f} MiB")
 
@@ -83,12 +84,10 @@ class ProgressFile:
         self._path: Path = path
         self._names: list[str] = []
         if earlier is not None and earlier.is_file():  # a resumed run's past
-            with open(earlier, newline="") as file:
-                rows = [
-                    {k: v for k, v in row.items() if v}
-                    for row in csv.DictReader(file)
-                    if int(row["iteration"]) <= until
-                ]
+            whole = earlier.read_text().splitlines(keepends=True)
+            whole = [line for line in whole if line.endswith("\n")]  # power may have failed within the last one
+            kept = (row for row in csv.DictReader(whole) if int(row["iteration"]) <= until)
+            rows = [{k: v for k, v in row.items() if v} for row in kept]
             self._names = list(dict.fromkeys(k for row in rows for k in row))
             self._write(rows)
 
@@ -110,7 +109,7 @@ class ProgressFile:
             return list(csv.DictReader(file))
 
     def _write(self, rows: list[dict[str, str]]) -> None:
-        with open(self._path, "w", newline="") as file:
+        with files.beside(self._path) as part, open(part, "w", newline="") as file:
             writer = csv.DictWriter(file, self._names, restval="")
             writer.writeheader()
             writer.writerows(rows)

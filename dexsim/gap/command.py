@@ -143,14 +143,14 @@ def main(argv: list[str]) -> int:
 
         outputs.claim(out, "out=", (*RESULTS, "recordings"))
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
-        paths, model, servo, demo = maker.make(out / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle")
-        given |= {"recordings": [str(p) for p in paths], "model": str(model), "servo": str(servo)}
+        with outputs.staged(out) as stage:
+            paths, model, servo, demo = maker.make(stage / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle")
+        made = [str(out / p.relative_to(stage)) for p in (*paths, model, servo)]
+        given |= {"recordings": made[:-2], "model": made[-2], "servo": made[-1]}
     if "recordings" not in given:
         raise UserError("say what to diagnose: recordings='[a.mcap,b.mcap]' (or demo=true; --help lists the settings)")
     settings = settings_of(given, out, device)
     claim(settings)
-    if given.get("demo"):
-        outputs.note_paths(out, [out / "recordings"])
     settings.time_limit = TimeLimit(settings.limit)
     with _interruptible(settings.time_limit):
         result = diagnose(settings, say=lambda text: print(text, flush=True), progress=Progress())

@@ -19,10 +19,7 @@ import json
 import os
 import pickle
 import random
-import re
-import socket
 import subprocess
-import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -30,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.learning import parts
 
@@ -38,10 +36,6 @@ class SaveError(UserError):
     """A checkpoint could not be written; what was there before is whole."""
 
 
-LEFT_S = 86400.0
-"""Age [s] from which an unfinished file is nobody's."""
-_HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:60]
-_UNFINISHED = re.compile(r"\..+?\.((?P<host>[A-Za-z0-9-]+)\.)?(?P<pid>[0-9]{1,9})\.tmp")
 FORMAT = "dexsim-checkpoint"
 VERSION = 1
 KEYS = ("kind", "config", "versions", "git", "layout", "iteration", "steps", "actor")
@@ -67,7 +61,7 @@ def encode(payload: dict[str, Any]) -> bytes:
 def write(path: str | Path, data: bytes) -> Path:
     """Write, sync, rename. Raises SaveError; the file that was at ``path`` before stays whole."""
     path = Path(path)
-    part = path.with_name(f".{path.name}.{_HOST}.{os.getpid()}.tmp")
+    part = files.unfinished(path)
     try:
         with open(part, "wb") as file:
             file.write(data)
@@ -83,33 +77,6 @@ def write(path: str | Path, data: bytes) -> Path:
             raise SaveError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None
         raise SaveError(f"cannot save {path}: {error.strerror}{kept}") from None
     return path
-
-
-def sweep(folder: Path) -> list[int]:
-    """Remove the unfinished files (``.NAME.HOST.PID.tmp``) of killed processes; returns their sizes in bytes. A file of another
-    machine, or of a process that lives, is left until it is a day old."""
-    removed = []
-    for path in folder.glob(".*.tmp"):
-        found = _UNFINISHED.fullmatch(path.name)
-        if found is None:
-            continue
-        with contextlib.suppress(OSError):
-            about = path.stat()
-            ours = found["host"] == _HOST and not _lives(int(found["pid"]))
-            if ours or time.time() - about.st_mtime > LEFT_S:
-                path.unlink()
-                removed.append(about.st_size)
-    return removed
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True
 
 
 def _sync_folder(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.recording import cdr, schema
 from dexsim.recording.schema import Recording
@@ -165,11 +167,22 @@ class Writer:
 
 
 def write(path: str | Path, recording: Recording) -> None:
-    """Write a whole `Recording`, all topics in order of time."""
-    r = recording
-    with Writer(path, r.joints, r.meta | {"joint_names": ",".join(r.joints)}, r.start_ns, r.config) as w:
+    """Write a whole `Recording`, all topics in order of time: beside its place, and renamed. Raises UserError."""
+    r, path = recording, Path(path).expanduser()
+    with _placed(path) as part, Writer(part, r.joints, r.meta | {"joint_names": ",".join(r.joints)}, r.start_ns, r.config) as w:
         for _, _, add, args in sorted(_samples(r, w), key=lambda item: (item[0], item[1])):
             add(*args)
+
+
+@contextmanager
+def _placed(path: Path) -> Iterator[Path]:
+    try:
+        with files.beside(path) as part:
+            yield part
+    except UserError as error:
+        raise UserError(str(error).replace(str(part), str(path))) from None
+    except OSError as error:
+        raise UserError(f"cannot write recording {path}: {error.strerror or error}; choose another place") from None
 
 
 def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]:

@@ -50,7 +50,6 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
         names = [*data, *names]
     if (d.data["next_recording"] or {}).get("commands"):
         names.append(d.data["next_recording"]["commands"])
-        outputs.note_paths(out, [out / names[-1]])
     return [out / name for name in (*names, "report.html")]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from dexsim import outputs
 from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
 from dexsim.gap.effects.effect import Effect
@@ -47,8 +48,8 @@ def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[
     try:
         from dexsim.recording.excitation import next_recording
 
-        s.out.mkdir(parents=True, exist_ok=True)
-        next_recording(s.out / "next_recording.mcap", m, joints, kinds, seed=s.seed)
+        with outputs.staged(s.out) as stage:
+            next_recording(stage / "next_recording.mcap", m, joints, kinds, seed=s.seed)
         data["next_recording"]["commands"] = "next_recording.mcap"
     except UserError as error:
         d.notes.append(f"no commands for the next recording: {error}")
@@ -85,8 +86,8 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
     best = max(sent, key=lambda r: sum(w["end"] - w["start"] for w in f["when"] if w["recording"] == r.path.name))
     meta = {k: v for k, v in best.meta.items() if k in ("robot", "gravity")} | {
         "source": "sim", "effort_is": "none", "effort_sign": "+1", "notes": f"commands to send, not a measurement: those of {best.path.name}"}  # fmt: skip
-    s.out.mkdir(parents=True, exist_ok=True)
-    with Writer(s.out / "next_recording.mcap", best.joints, meta, start_ns=1_000_000_000) as w:
-        for t, row in zip(best.commands.t, best.commands.value, strict=True):
-            w.add_command(float(t), row)
+    with outputs.staged(s.out) as stage:
+        with Writer(stage / "next_recording.mcap", best.joints, meta, start_ns=1_000_000_000) as w:
+            for t, row in zip(best.commands.t, best.commands.value, strict=True):
+                w.add_command(float(t), row)
     d.data["next_recording"]["commands"] = "next_recording.mcap"
