@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from benchmarks.concealed import plant, rigs, touch_cases
+from benchmarks.concealed import laws, plant, rigs, touch_cases
 from benchmarks.concealed.effects import ALL, BY_EFFECT, KINDS, OUTSIDE, Kind, stalled
 from dexsim.recording import Writer
 
@@ -33,7 +33,7 @@ REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_
 BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
 DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
-MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 0, "touch": 0}
+MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0}
 SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
 
@@ -41,9 +41,10 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
     """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
-    noise doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: effects and nothing in turns),
-    touch (a fingertip under a ball: the same). Effects, tiers
-    and shapes take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
+    noise doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: of every six two with nothing
+    missing, three with an effect, one with effects at two joints), touch (a fingertip under a ball: of every four one
+    with nothing missing). Effects, tiers and shapes take turns; one_joint: only rigs of one joint. Raises ValueError
+    for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
     effects, tiers = [str(e) for e in rng.permutation(list(BY_EFFECT))], ("easy", "medium", "hard")
@@ -69,6 +70,8 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
                 entry |= (
                     {"shape": "hand", "tier": tiers[k % 2]} if k % 3 else {"shape": "hand", "kinds": [], "tier": "none"}
                 )
+                if k % 6 == 5:
+                    entry["kinds"].append(BY_EFFECT[effects[(k + len(effects) // 3) % len(effects)]][0])
             elif group == "touch":
                 names = list(touch_cases.KINDS)
                 hidden = k % 4 > 0
@@ -152,15 +155,15 @@ class Bench:
         V, R = len(variants), len(self.command)
         values = {k: np.repeat(np.stack([v[k] for v in variants]), R, 0) for k in plant.DEFAULTS}
         values["warm"] = np.tile(self.warm[:, None] + np.zeros(self.d.joints), (V, 1))
+        begins = np.array([laws.chance_of(k) for k in range(R)], float)
+        values["jitter_from"] = np.tile(begins[:, None] + np.zeros(self.d.joints), (V, 1))
         command = np.tile(self.command, (V, 1, 1)) if commands is None else np.concatenate(commands)
         # at rest at the first target, so that nothing swings in
         start = command[:, :, 0]
         out = plant.simulate(self.d.rig, plant.rows(V * R, self.d.joints, **values), command, q0=start, **kw)
         out["link"] = out["position"]
-        v = {k: values[k][..., None] for k in ("scale", "offset", "eccentric", "eccentric_at")}
-        out["position"] = (
-            v["scale"] * out["link"] + v["offset"] + v["eccentric"] * np.sin(out["link"] + v["eccentric_at"])
-        )
+        encoder = ("scale", "offset", "eccentric", "eccentric_at", "second_harmonic")
+        out["position"] = plant.encoded(out["link"], *(values[k][..., None] for k in encoder))
         return {k: x.reshape(V, R, *x.shape[1:]) for k, x in out.items()}
 
     def changed(
@@ -172,14 +175,17 @@ class Bench:
             out[k][joint] = x
         return out
 
-    def sized(self, kind: Kind | None, joint: int, ratio: float, seed: int) -> tuple[float, dict, dict]:
+    def sized(
+        self, kind: Kind | None, joint: int, ratio: float, seed: int, law: laws.Law | None = None
+    ) -> tuple[float, dict, dict]:
         """(size of the effect, figures, outputs [1, R, J, M] with it): the size at which it changes held-out error in
-        its joint by the ratio."""
+        its joint by the ratio. law: the second law, None for the first."""
         d, true = self.d, {k: float(v[joint]) for k, v in self.base.items()}
         sizes = np.geomspace(*kind.span, SIZES) if kind else np.zeros(0)
         unit, inertia = float(d.unit[joint]), float(d.inertia[joint])
         moves = kind is not None and kind.signal == "position"
-        variants = [self.base] + [self.changed(joint, kind.apply(true, s, unit, inertia)) for s in sizes if moves]
+        apply = law.apply if law is not None else kind.apply if kind is not None else None
+        variants = [self.base] + [self.changed(joint, apply(true, s, unit, inertia)) for s in sizes if moves]
         commands = [self.command] * len(variants)
         if kind is OUTSIDE["bus_stalls"]:
             commands[1:] = [self.stalls(s, seed) for s in sizes]
@@ -212,6 +218,11 @@ class Bench:
             return 0.0, facts, of(0)
         if moves:
             change = np.array([hidden(x - y[0]) for x in y[1:first]])
+        elif law is not None:
+            label, over = "current_gain" if kind is KINDS["current_gain"] else "current_offset", _over(y.shape[-1])
+            change = np.array(
+                [hidden(laws.effort(y[0], laws.HEALTHY | laws.fault(label, True, s, unit), over) - y[0]) for s in sizes]
+            )
         elif kind is KINDS["current_gain"]:
             change = np.array([hidden(s * y[0]) for s in sizes])
         else:
@@ -230,6 +241,11 @@ class Bench:
         return np.stack([stalled(c, size, np.random.default_rng([seed, 7, k])) for k, c in enumerate(self.command)])
 
 
+def _over(count: int) -> np.ndarray:
+    """Share of a recording that is over at each of its samples."""
+    return np.arange(count) / count
+
+
 def metadata(effort: bool, hand: bool) -> dict[str, str]:
     """What every recording states: nothing of it depends on the effect."""
     return {"source": "real", "robot": "xhand_right" if hand else "rig", "gravity": "0 0 -9.81",
@@ -242,8 +258,10 @@ def tier_of(ratio: float) -> str:
     return "silent" if ratio < 1.25 else min(("easy", "medium", "hard"), key=lambda t: abs(np.log(ratio / TIERS[t])))
 
 
-def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
-    """Writes one case to `seen` and its truth to `truth`; returns {name, digest}. The folder's name is drawn too."""
+def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: str = "two") -> dict:
+    """Writes one case to `seen` and its truth to `truth`; returns {name, digest}. The folder's name is drawn too.
+
+    which: "two" draws the law of each effect that has two, "one" takes the first (see `laws`)."""
     rng = np.random.default_rng([seed, 2, number])
     name = hashlib.sha256(f"{seed}/{number}".encode()).hexdigest()[:8]
     d = rigs.draw(rng, entry["shape"])
@@ -257,26 +275,27 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     effort = bool(rng.uniform() < 0.5) | any(k.signal == "effort" for k in kinds)
     joint, source = (int(x) for x in rng.permutation(d.joints)[:2]) if d.joints > 1 else (0, 0)
     joints = [joint] * len(kinds)
-    if len(kinds) == 2 and d.joints > 1 and rng.uniform() < 0.7:
+    if len(kinds) == 2 and d.joints > 1 and (rng.uniform() < 0.7 or group == "hand"):
         joints[1] = source
         source = joint if d.joints == 2 else int(rng.choice([i for i in range(d.joints) if i not in joints]))
     confounding = decoy == "confounded"
     if confounding:
         warm = np.sort(warm)
     bench = Bench(d, command, warm, noise, source)
-    facts, new, sent, current = [], bench.base, command, {"current_gain": 1.0, "current_offset": 0.0}
+    facts, new, sent, current = [], bench.base, command, dict(laws.HEALTHY)
     current_at = joint
-    for kind, label, at in zip(kinds, entry["kinds"], joints, strict=True):
-        size, fact, run = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number)
+    own = [{k: float(v[at]) for k, v in bench.base.items()} for at in joints]
+    drawn = laws.draw(entry["kinds"], own, which, seed, number)
+    for kind, label, at, law, old in zip(kinds, entry["kinds"], joints, drawn, own, strict=True):
+        size, fact, run = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number, law)
         facts.append(fact)
-        old = {k: float(v[at]) for k, v in bench.base.items()}
-        new = bench.changed(at, kind.apply(old, size, float(d.unit[at]), float(d.inertia[at])), new)
+        apply = law.apply if law is not None else kind.apply
+        new = bench.changed(at, apply(old, size, float(d.unit[at]), float(d.inertia[at])), new)
         if label == "bus_stalls":
             sent = bench.stalls(size, number)
-        elif label == "current_gain":
-            current_at, current["current_gain"] = at, 1 + size
-        elif label == "current_offset":
-            current_at, current["current_offset"] = at, size * float(d.unit[at])
+        elif label in ("current_gain", "current_offset"):
+            current_at = at
+            current |= laws.fault(label, law is not None, size, float(d.unit[at]))
     if not kinds:
         _, fact, run = bench.sized(None, joint, 1.0, number)
         facts.append(fact)
@@ -305,24 +324,20 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
     bad = str(rng.choice(["stale", "degrees", "wrap"])) if decoy == "bad_channel" else ""
     effort = effort or bad == "wrap"
     _record(where, d, command, run, rng, quantum, extra, effort, current, current_at, joint, bad)
-    told = {}
     effects = []
-    for kind, label, at, fact in zip(kinds, entry["kinds"], joints, facts, strict=False):
+    for kind, label, at, fact, law, o in zip(kinds, entry["kinds"], joints, facts, drawn, own, strict=False):
         n = {k: float(v[at]) for k, v in new.items()} | current
-        o = {k: float(v[at]) for k, v in bench.base.items()}
         believed = {k: float(v[at]) for k, v in d.believed.items()}
-        told = {
-            k: float(v)
-            for k, v in kind.report(
-                n, o | {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}
-            ).items()
-        }
+        logs = _logs(run, command, at, source)
+        known = {k: believed[k] for k in ("kp", "kd") if k in believed} | {"rotor": believed["rotor"]}
+        told = laws.reported(kind, law, logs, n, o | known)
         if kind.effect == "payload":
             told = {"mass": n["mass"] + n["extra"] - believed["mass"]}
+        strength = law.own if law is not None and law.own is not None else kind.own
         effects.append({"effect": kind.effect, "kind": label, "joint": d.rig.names[at], "parameters": told,
-                        "facts": fact,
+                        "facts": fact, **laws.told(label, law, o),
                         "also": _also(kind, d, at, source),
-                        "when": _when(kind, run, command, d, at, source, n, o)})  # fmt: skip
+                        "when": _when([strength(L, n, o) for L in logs])})  # fmt: skip
     if wrong:
         effects = [
             {
@@ -357,11 +372,10 @@ def _also(kind: Kind, d: rigs.Drawn, j: int, source: int) -> list[str]:
     )
 
 
-def _when(
-    kind: Kind, run: dict, command: np.ndarray, d: rigs.Drawn, j: int, source: int, n: dict, o: dict
-) -> list[list]:
-    """True samples in the recordings to fit: [recording, start, end] s where the effect exceeds 25 % of its maximum."""
-    strength = []
+def _logs(run: dict, command: np.ndarray, j: int, source: int) -> list[dict[str, np.ndarray]]:
+    """Of each recording to fit, what is true of a joint in every millisecond [M]: the plant's outputs at it, its
+    command, the angle of the joint that it may hang on, the others' torque."""
+    out = []
     for k in range(len(RECORDINGS) - HELD):
         L = {key: x[0, k, j].astype(float) for key, x in run.items()}
         L["position"] = L["link"]
@@ -370,7 +384,14 @@ def _when(
             "source": run["link"][0, k, source],
             "others": np.abs(run["torque"][0, k]).sum(0) - np.abs(run["torque"][0, k, j]),
         }
-        strength.append(np.asarray(kind.own(L, n, o), float))
+        out.append(L)
+    return out
+
+
+def _when(strength: list[np.ndarray]) -> list[list]:
+    """True samples in the recordings to fit: [recording, start, end] s where the strength [M] of the effect in each
+    exceeds 25 % of its maximum."""
+    strength = [np.asarray(x, float) for x in strength]
     most = max(float(np.percentile(np.concatenate(strength), 99.9)), 1e-12)
     out = []
     for letter, x in zip(RECORDINGS, strength, strict=False):
@@ -398,7 +419,7 @@ def _record(
 ) -> None:
     for k, letter in enumerate(RECORDINGS):
         tau = run["torque"][0, k].copy()
-        tau[current_at] = current["current_gain"] * tau[current_at] + current["current_offset"]
+        tau[current_at] = laws.effort(tau[current_at], current, _over(tau.shape[-1]))
         t, (angle, torque, heat) = plant.log(
             [run["position"][0, k], tau, run["temperature"][0, k].astype(float)], rng, 100.0, 1e-3
         )
@@ -428,14 +449,14 @@ def _record(
                     w.add_temperature(x, np.round(heat[:, i]))
 
 
-def once(job: tuple[dict, int, int, Path]) -> dict:
+def once(job: tuple[dict, int, int, Path, str]) -> dict:
     """{name, digest, settings}: the case as it was made before, or made now. job: entry of the plan, number, seed,
-    folder."""
-    entry, number, seed, root = job
+    folder, laws."""
+    entry, number, seed, root, which = job
     stub = root / "made" / f"{number}.json"
     if not stub.is_file():
         make = touch_cases.build if entry["shape"] == "touch" else build
-        made = make(entry, number, seed, root / "cases", root / "truth")
+        made = make(entry, number, seed, root / "cases", root / "truth", which)
         stub.parent.mkdir(parents=True, exist_ok=True)
         stub.write_text(json.dumps(made), encoding="utf-8")
     return json.loads(stub.read_text(encoding="utf-8"))

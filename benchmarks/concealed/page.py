@@ -11,6 +11,7 @@ import json
 import sys
 from pathlib import Path
 
+from benchmarks.concealed import score
 from benchmarks.concealed.baselines import LABELS
 from dexsim import intervals
 
@@ -42,7 +43,7 @@ def value(line: str, x: float) -> str:
 
 
 def tables(data: dict) -> str:
-    """Markdown: the judging table, the effects, the baselines."""
+    """Markdown: the judging table, rates by law and by confidence, the effects, the baselines."""
     out = ["| | reached | 95 % interval | cases | to publish | aim |", "|---|---|---|---|---|---|"]
     for line, v in data["lines"].items():
         least, aim = AIMS.get(line, ("", ""))
@@ -51,6 +52,7 @@ def tables(data: dict) -> str:
             f"| {name} | {value(line, v['value'])} | {value(line, v['low'])} to {value(line, v['high'])} |"
             f" {v['n']} | {least} | {aim} |"
         )
+    out += by_law(data["results"]) + asked(data["results"])
     out += ["", "| hidden | easy | medium | hard | when not named, taken for |", "|---|---|---|---|---|"]
     for effect, row in effects(data["results"]).items():
         cells = []
@@ -77,6 +79,39 @@ def tables(data: dict) -> str:
                 f" {v['seconds']:.0f} s | {number} |"
             )
     return "\n".join(out) + "\n"
+
+
+def by_law(results: list[dict]) -> list[str]:
+    """Rows: effects that have two laws, by the law that was drawn, and those that have one."""
+    out = ["", "| | first law | second law | effects of one law |", "|---|---|---|---|"]
+    for line, of in score.by_law(results).items():
+        cells = []
+        for law in ("first", "second", "only"):
+            v = of.get(law)
+            if v is None:
+                cells.append("-")
+                continue
+            x, low, high = (value(line, v[k]) for k in ("value", "low", "high"))
+            cells.append(f"{x} ({low} to {high}, {v['n']})")
+        out.append(f"| {line} | " + " | ".join(cells) + " |")
+    return out if len(out) > 3 else []  # answers of before laws were drawn do not say
+
+
+def asked(results: list[dict]) -> list[str]:
+    """Rows: cases with one effect whose hidden effect was named first, by the confidence asked of the name."""
+    mine = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "touch")]
+    out = ["", "| | " + " | ".join(f"{t} ({sum(r['tier'] == t for r in mine)})" for t in score.TIERS) + " |"]
+    out.append("|---|" + "---|" * len(score.TIERS))
+    rows = [("right effect first, alone or in a set", lambda r: r["right"])]
+    rows += [(f"named alone, at {least:g} or more" if least else "named alone, at any confidence",
+              lambda r, least=least: score.alone_at(r, least)) for least in (0.0, *score.LEAST)]  # fmt: skip
+    for name, holds in rows:
+        cells = []
+        for tier in score.TIERS:
+            hits = [bool(holds(r)) for r in mine if r["tier"] == tier]
+            cells.append(f"{100 * sum(hits) / len(hits):.0f} % ({sum(hits)})" if hits else "-")
+        out.append(f"| {name} | " + " | ".join(cells) + " |")
+    return out
 
 
 def effects(results: list[dict]) -> dict[str, dict[str, list[dict]]]:

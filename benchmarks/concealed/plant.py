@@ -18,6 +18,7 @@ LOOP = 10  # integration steps in one firmware period (1 kHz)
 TICK = DT * LOOP
 AMBIENT = 25.0  # degC; torque constant and friction are those of here
 REST = 0.02  # rad/s: slower than this a joint dwells
+MESSAGE = 10  # ms between two commands
 
 # Every parameter of a joint and its value where the effect is absent.
 DEFAULTS: dict[str, float] = {
@@ -42,6 +43,24 @@ DEFAULTS: dict[str, float] = {
     "mount": 0.0, "mount_inertia": 1e-3,  # compliance of what the motor is screwed to [rad/N.m], its inertia [kg.m2]
     "tooth": 0.0, "tooth_at": 0.3, "tooth_width": 0.04,  # a damaged tooth: resistance [N.m] about one angle
     "bristle": 1.0,  # 1: LuGre; 0: ideal dry friction, to see what the law itself changes
+    # second laws: other physics under the same name (`laws.py`); at these values there is none of it
+    "peak_power": 2.0,  # the Stribeck peak falls as exp(-(|v| / peak_speed) ** peak_power)
+    "shear": 0.0, "shear_speed": 1.5,  # grease that thins: N.m.s/rad at rest, rad/s at which half of it is left
+    "load_power": 1.0, "load_unit": 1.0,  # load friction: fraction * unit [N.m] * (|load| / unit) ** power
+    "impact": 1.0,  # share of the transmission's damping that is there: little of it and the teeth rebound
+    "hardening": 0.0,  # N.m: load by which the transmission's spring has become twice as stiff as at none (secant)
+    "jitter": 0.0, "jitter_from": 0.0,  # share by which a message's delay varies; where its row of chance begins
+    "lag_order": 1.0, "speed_order": 1.0,  # equal first-order stages that share the time constant
+    "knee": 0.0,  # 0: the limit is sharp; else the exponent of a soft one, see `soft_limit`
+    "corner": 0.0,  # 1: full torque up to half of the no-load speed, then down to none; 0: a line from rest on
+    "sag_duty": 0.0,  # share of the supply lost per N.m of the others' torque times their duty (what the bus feels)
+    "sawtooth": 0.0,  # 1: the ripple rises evenly and drops
+    "core": 0.0, "core_time": 3.0,  # the winding over the logged housing: degC per (N.m)^2 held, s
+    "exponential": 0.0,  # 1: friction follows exp(thermal_friction * warming), 0: the line
+    "arm": 0.0,  # 1: what couples two joints pulls on a lever: by the sine of the other one's angle
+    "bulk": 0.0,  # radius of the added mass (a ball) over the distance of the link's centre
+    "second_harmonic": 0.0,  # of the eccentric encoders, over the first
+    "subtract": 0.0,  # 1: beyond the deadband the error counts from its edge, 0: whole
 }  # fmt: skip
 
 
@@ -122,12 +141,40 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
+def soft_limit(x: np.ndarray, limit: np.ndarray | float, knee: np.ndarray | float) -> np.ndarray:
+    """x within a limit that is approached, not hit: x / (1 + |x / limit|^knee)^(1 / knee)."""
+    limit = np.maximum(limit, 1e-9)
+    return x / (1 + np.abs(x / limit) ** knee) ** (1 / np.asarray(knee))
+
+
+def encoded(
+    q: np.ndarray, scale: np.ndarray, offset: np.ndarray, eccentric: np.ndarray, at: np.ndarray, second: np.ndarray
+) -> np.ndarray:
+    """What an eccentric encoder makes of an angle [rad]; second: amplitude of its second harmonic over the first."""
+    seen = scale * q + offset + eccentric * np.sin(q + at)
+    return seen + eccentric * second * np.sin(2 * (q + at)) if np.any(second) else seen
+
+
+def arrivals(delay: float, jitter: float, start: int, count: int) -> np.ndarray:
+    """[count] times [s] at which messages sent every MESSAGE ms arrive: late by the delay, more or less by a share of
+    it that varies evenly from message to message, and never before an earlier one (a queue)."""
+    chance = np.random.default_rng(11).uniform(-1, 1, 4096)[(start + np.arange(count)) % 4096]
+    return np.maximum.accumulate(np.arange(count) * MESSAGE * TICK + delay * (1 + jitter * chance))
+
+
 def dynamics(
-    rig: Rig, mass: np.ndarray, extra: np.ndarray, reach: np.ndarray, q: np.ndarray, v: np.ndarray, gravity: np.ndarray
+    rig: Rig,
+    mass: np.ndarray,
+    extra: np.ndarray,
+    reach: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    gravity: np.ndarray,
+    radius: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mass matrix [B, C, D, D] and the torque [B, C, D] that gravity and the motion itself ask of each hinge.
 
-    mass, extra, reach, q, v: [B, C, D]; gravity [B, 3].
+    mass, extra, reach, q, v: [B, C, D]; gravity [B, 3]; radius [B, C, D]: of the added mass, m; None: a point.
     """
     B, C, D = q.shape
     R = np.broadcast_to(np.eye(3), (B, C, 3, 3))
@@ -152,6 +199,8 @@ def dynamics(
         here = p + arm
         m = (mass + extra)[:, :, d]
         I = (R @ rig.spread[:, d] @ np.swapaxes(R, -1, -2)) * mass[:, :, d, None, None]  # noqa: E741
+        if radius is not None:
+            I = I + (0.4 * extra[:, :, d] * radius[:, :, d] ** 2)[..., None, None] * np.eye(3)  # noqa: E741
         force = m[..., None] * (acc + _cross(a, arm) + _cross(w, _cross(w, arm)) - gravity[:, None])
         Iw = np.einsum("bcij,bcj->bci", I, w)
         moment = np.einsum("bcij,bcj->bci", I, a) + _cross(w, Iw)
@@ -179,7 +228,7 @@ def simulate(
 
     Returns, each [B, J, M] at the start of every millisecond: position (link), torque (motor), speed (motor), load
     (through the transmission), slip (friction over its level), asked (before any limit), free (1 where the teeth do not
-    touch), temperature.
+    touch), temperature; where a law needs them, supply (share of the nominal) and winding (its temperature).
     """
     B, J, steps = command.shape
     C, D = rig.com.shape[:2]
@@ -200,13 +249,18 @@ def simulate(
     source = np.zeros((B, S), int)
     source[:, slots] = slots[p["couple_from"].astype(int)]
     has = {k: bool((P[k] != DEFAULTS[k]).any()) for k in DEFAULTS}
-    motor = q - P["couple"] * np.take_along_axis(q, source, 1)
+    lever = P["arm"] > 0.5
+    first = np.take_along_axis(q, source, 1)
+    motor = q - P["couple"] * (np.where(lever, np.sin(first), first) if has["arm"] else first)
     v, vm, z, rest, tau = (np.zeros((B, S)) for _ in range(5))
     locked = np.diag((~there).astype(float) * 1.0)
     base, base_v = np.zeros((B, S)), np.zeros((B, S))
+    apart = np.zeros((C, D))
+    apart[rig.place[:, 0], rig.place[:, 1]] = np.linalg.norm(rig.com, axis=-1)[rig.place[:, 0], rig.place[:, 1]]
+    radius = grid(P["bulk"]) * apart * reach if has["bulk"] else None
 
     def terms() -> tuple[np.ndarray, np.ndarray]:
-        M, h = dynamics(rig, mass, extra, reach, grid(q + base), grid(v + base_v), g)
+        M, h = dynamics(rig, mass, extra, reach, grid(q + base), grid(v + base_v), g, radius)
         for c in range(C):
             M[:, c] += locked[c * D : (c + 1) * D, c * D : (c + 1) * D]
         return np.linalg.inv(M) if D > 1 else 1 / M, h.reshape(B, S)
@@ -215,7 +269,7 @@ def simulate(
     link = 1 / np.stack([inverse[:, s // D, s % D, s % D] for s in range(S)], 1)
     reduced = link * P["rotor"] / (link + P["rotor"])
     spring = np.minimum(P["spring"], reduced / (16 * DT * DT))  # the mode stays slow beside the step
-    loss = 0.6 * np.sqrt(spring * reduced)
+    loss = 0.6 * np.sqrt(spring * reduced) * P["impact"]
     half = 0.5 * P["play"]
     strongest = P["coulomb"] + P["peak"] + P["dwell"] + 1e-6
     sigma0 = np.clip(strongest / 4e-4, 5.0, 0.05 * P["rotor"] / (DT * DT))
@@ -224,17 +278,28 @@ def simulate(
     whole = np.floor(late).astype(int)
     part = late - whole  # of a millisecond, by mixing two targets
     settle = lambda T: np.where(T > 0, 1 - np.exp(-TICK / np.maximum(T, 1e-6)), 1.0)  # noqa: E731
-    rate, speed_rate = settle(P["lag"]), np.where(P["speed_lag"] > 0, settle(P["speed_lag"]), 0.8)
+    rate, speed_rate = (
+        settle(P["lag"] / P["lag_order"]),
+        np.where(P["speed_lag"] > 0, settle(P["speed_lag"] / P["speed_order"]), 0.8),
+    )
     full = np.zeros((B, S, steps))
     full[:, slots] = command
     push_in = None
     if external is not None:
         push_in = np.zeros((B, S, steps))
         push_in[:, slots] = external
+    stage, speed_stage, winding = np.zeros((B, S)), np.zeros((B, S)), np.zeros((B, S))  # winding: over the housing
+    uneven = np.argwhere((P["jitter"] > 0) & there) if has["jitter"] else np.zeros((0, 2), int)
+    sent = np.zeros((len(uneven), steps), int)  # the millisecond whose target acts
+    for row, (b, s) in enumerate(uneven):
+        at = arrivals(P["delay"][b, s], P["jitter"][b, s], int(P["jitter_from"][b, s]), steps // MESSAGE + 1)
+        sent[row] = MESSAGE * np.maximum(np.searchsorted(at, np.arange(steps) * TICK + 1e-9, "right") - 1, 0)
+    sent = np.minimum(sent, steps - 1)
     filtered, carried, last = np.zeros((B, S)), np.zeros((B, S)), None
     warm, previous = P["warm"].copy(), bias
     b_index, s_index = np.arange(B)[:, None], np.arange(S)[None]
     keys = ("position", "torque", "speed", "load", "slip", "asked", "free", "temperature")
+    keys += ("supply",) * has["sag_duty"] + ("winding",) * has["core"]
     out = {k: np.empty((B, J, steps), np.float32 if k not in ("position", "torque") else float) for k in keys}
     ideal = P["bristle"] < 0.5
     some_ideal = bool(ideal.any())
@@ -246,36 +311,63 @@ def simulate(
     for k in range(steps):
         # firmware: reads its encoder, filters the speed, and asks for a torque that holds one millisecond
         true = np.where(P["motor_side"] > 0.5, motor, q)
-        seen = P["scale"] * true + P["offset"]
         if has["eccentric"]:
-            seen = seen + P["eccentric"] * np.sin(true + P["eccentric_at"])
+            seen = encoded(true, P["scale"], P["offset"], P["eccentric"], P["eccentric_at"], P["second_harmonic"])
+        else:
+            seen = P["scale"] * true + P["offset"]
         seen = np.floor(seen / unit) * unit
         if last is not None:
-            filtered = filtered + speed_rate * ((seen - last) / TICK - filtered)
+            fresh = (seen - last) / TICK
+            if has["speed_order"]:
+                speed_stage = speed_stage + speed_rate * (fresh - speed_stage)
+                fresh = np.where(P["speed_order"] > 1.5, speed_stage, fresh)
+            filtered = filtered + speed_rate * (fresh - filtered)
         last = seen
         i = np.maximum(k - whole, 0)
         target = full[b_index, s_index, i] * (1 - part) + full[b_index, s_index, np.maximum(i - 1, 0)] * part
+        if len(uneven):
+            target[uneven[:, 0], uneven[:, 1]] = full[uneven[:, 0], uneven[:, 1], sent[:, k]]
         error = target - seen
-        raw = np.where(np.abs(error) < P["deadband"], 0.0, P["kp"] * error) - P["kd"] * filtered
+        counts = error - np.sign(error) * P["deadband"] * P["subtract"] if has["subtract"] else error
+        raw = np.where(np.abs(error) < P["deadband"], 0.0, P["kp"] * counts) - P["kd"] * filtered
         supply = 1.0
-        if has["sag"]:
+        if has["sag"] or has["sag_duty"]:
             use = np.abs(tau)
-            supply = np.maximum(1 - P["sag"] * (use.sum(1, keepdims=True) - use), 0.05)
+            drop = P["sag"] * (use.sum(1, keepdims=True) - use)
+            if has["sag_duty"]:
+                bus = use * np.minimum(use / P["torque_limit"] + np.abs(vm) / P["no_load_speed"], 1.0)
+                drop = drop + P["sag_duty"] * (bus.sum(1, keepdims=True) - bus)
+            supply = np.maximum(1 - drop, 0.05)
         room = np.maximum(supply - np.abs(filtered) / P["no_load_speed"], 0.0)
-        asked = np.where(P["voltage"] > 0.5,
-                         P["torque_limit"] * (np.clip(raw, -1, 1) * supply - vm / P["no_load_speed"]),
-                         np.clip(raw, -P["torque_limit"] * room, P["torque_limit"] * room))  # fmt: skip
+        if has["corner"]:
+            room = np.where(P["corner"] > 0.5, np.minimum(2 * room, 1.0), room)
+        duty, given = np.clip(raw, -1, 1), np.clip(raw, -P["torque_limit"] * room, P["torque_limit"] * room)
+        if has["knee"]:
+            is_soft, knee = P["knee"] > 0, np.maximum(P["knee"], 1.0)
+            duty = np.where(is_soft, soft_limit(raw, 1.0, knee), duty)
+            given = np.where(is_soft, soft_limit(raw, P["torque_limit"] * room, knee), given)
+        asked = np.where(P["voltage"] > 0.5, P["torque_limit"] * (duty * supply - vm / P["no_load_speed"]), given)
+        if has["lag_order"]:
+            stage = stage + rate * (asked - stage)
+            asked = np.where(P["lag_order"] > 1.5, stage, asked)
         tau = tau + rate * (asked - tau) if driven else np.zeros((B, S))
         drive = tau
         rub = 1.0
         if has["thermal_torque"]:
-            drive = tau * np.maximum(1 + P["thermal_torque"] * (warm - AMBIENT), 0.05)
+            drive = tau * np.maximum(1 + P["thermal_torque"] * (warm + winding - AMBIENT), 0.05)
         if has["thermal_friction"]:
             rub = np.maximum(1 + P["thermal_friction"] * (warm - AMBIENT), 0.05)
+            if has["exponential"]:
+                rub = np.where(P["exponential"] > 0.5, np.exp(P["thermal_friction"] * (warm - AMBIENT)), rub)
         for name, value in (("position", q), ("torque", tau), ("speed", vm), ("load", push),
                             ("slip", friction / level), ("asked", raw), ("free", free),
                             ("temperature", warm)):  # fmt: skip
             out[name][:, :, k] = value[:, slots]
+        if has["sag_duty"]:
+            out["supply"][:, :, k] = np.broadcast_to(supply, (B, S))[:, slots]
+        if has["core"]:
+            out["winding"][:, :, k] = (warm + winding)[:, slots]
+            winding = winding + TICK * (P["core"] * tau * tau - winding) / P["core_time"]
         warm = warm + TICK * (P["heat"] * tau * tau - (warm - AMBIENT)) / P["cooling"]
         grown = 0.0
         if has["dwell"]:
@@ -289,9 +381,16 @@ def simulate(
             twist, rate_of = motor - q, vm - v
             if has["couple"]:
                 drag, drag_v = np.take_along_axis(q, source, 1), np.take_along_axis(v, source, 1)
+                if has["arm"]:
+                    pulls = np.where(lever, np.cos(drag), 1.0)
+                    drag, drag_v = np.where(lever, np.sin(drag), drag), pulls * drag_v
                 twist, rate_of = twist + P["couple"] * drag, rate_of + P["couple"] * drag_v
             deep = twist - np.clip(twist, -half, half)
-            push = np.where(deep != 0, spring * deep + loss * rate_of, 0.0)
+            elastic = spring * deep
+            if has["hardening"]:
+                stiffer = (elastic / np.where(P["hardening"] > 0, P["hardening"], np.inf)) ** 2
+                elastic = elastic * (1 + stiffer)
+            push = np.where(deep != 0, elastic + loss * rate_of, 0.0)
             push = np.where(deep * push < 0, 0.0, push)  # a tooth cannot pull
             carried = carried * decay + (1 - decay) * push
             speed = np.abs(vm)
@@ -299,9 +398,13 @@ def simulate(
             if has["asymmetry"]:
                 level = level * (1 + 0.5 * P["asymmetry"] * np.sign(vm))
             if has["peak"]:
-                level = level + P["peak"] * np.exp(-((speed / P["peak_speed"]) ** 2))
+                fall = (speed / P["peak_speed"]) ** (P["peak_power"] if has["peak_power"] else 2)
+                level = level + P["peak"] * np.exp(-fall)
             if has["load"] or has["load_back"]:
-                level = level + np.where(carried * vm >= 0, P["load"], P["load_back"]) * np.abs(carried)
+                press = np.abs(carried)
+                if has["load_power"]:
+                    press = P["load_unit"] * (press / P["load_unit"]) ** P["load_power"]
+                level = level + np.where(carried * vm >= 0, P["load"], P["load_back"]) * press
             if has["tooth"]:
                 level = level + P["tooth"] * np.exp(-(((motor - P["tooth_at"]) / P["tooth_width"]) ** 2))
             level = level * rub + 1e-7
@@ -314,11 +417,16 @@ def simulate(
                 friction = np.where(ideal, np.clip(held, -level, level), friction)
             net = drive - push - friction
             if has["ripple"]:
-                net = net + P["ripple"] * np.sin(P["per_turn"] * motor + P["phase"])
-            vm = (vm + DT * net / P["rotor"]) / (1 + DT * P["viscous"] * rub / P["rotor"])
+                angle = P["per_turn"] * motor + P["phase"]
+                wave = np.sin(angle)
+                if has["sawtooth"]:
+                    wave = np.where(P["sawtooth"] > 0.5, np.mod(angle + np.pi, 2 * np.pi) / np.pi - 1, wave)
+                net = net + P["ripple"] * wave
+            thick = P["viscous"] + P["shear"] / (1 + speed / P["shear_speed"]) if has["shear"] else P["viscous"]
+            vm = (vm + DT * net / P["rotor"]) / (1 + DT * thick * rub / P["rotor"])
             pull = push - bias
             if has["couple"]:  # what drags is held back
-                reaction = P["couple"] * push
+                reaction = P["couple"] * push * (pulls if has["arm"] else 1.0)
                 for s in slots:
                     pull[np.arange(B), source[:, s]] -= reaction[:, s]
             if has["cable"]:

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.concealed import laws, touch_cases
 from dexsim import intervals
 
 SURE = 0.8  # a name is confident from here, when it stands alone
+LEAST = (0.5, SURE)  # confidences that a name may be asked for
+TIERS = ("easy", "medium", "hard")
 CLASSES = tuple(
     frozenset(c.split())
     for c in (
@@ -119,6 +122,13 @@ def _removed(d: dict, effects: list[dict], joints: int) -> float | None:
     )
 
 
+def law_of(effect: dict) -> str:
+    """Which law a true effect follows: "first", "second", or "only" where it has one. Truths of before laws were drawn
+    do not say: they are all of the first."""
+    two = laws.SECOND.keys() | touch_cases.SECOND.keys()
+    return effect.get("law") or ("first" if effect["kind"] in two else "only")
+
+
 def one(truth: dict, d: dict) -> dict:
     """What the table needs of one case: truth and `diagnosis.json`. Missing figures are absent."""
     findings = list(d["findings"])  # in the tool's own order: its first name counts
@@ -128,6 +138,7 @@ def one(truth: dict, d: dict) -> dict:
     out = {"name": truth["name"], "group": truth["group"], "decoy": truth["decoy"], "shape": truth["shape"],
            "tier": truth["tier"],
            "hidden": [(e["effect"] or e["kind"], e["joint"]) for e in effects], "kinds": [e["kind"] for e in effects],
+           "laws": [law_of(e) for e in effects], "confidence": first["confidence"] if first else 0.0,
            "verdict": d["verdict"],
            "said": [(f["effect"], (f["where"]["joints"] or f["where"]["topics"] or ["-"])[0],
                      round(f["confidence"], 2), sorted(set(f.get("indistinguishable") or [])))
@@ -177,6 +188,7 @@ def one(truth: dict, d: dict) -> dict:
         out["removed"] = _removed(d, effects, truth["joints"]) if len(effects) == 1 else None
     elif group in ("none", "noise") or (group in ("hand", "touch") and not effects):
         out["false_alarm"] = bool(findings) or d["verdict"] == "failed"
+        out["alarm"] = 1.0 if d["verdict"] == "failed" else max((f["confidence"] for f in findings), default=-1.0)
     elif group == "outside":
         out["humble"] = d["verdict"] not in ("explained", "failed") and not confident
         out["wrong_sure"] = bool(confident)
@@ -197,54 +209,97 @@ def one(truth: dict, d: dict) -> dict:
     return out
 
 
+def rate(values: list) -> dict | None:
+    """{value, low, high, n} of a share; None without cases."""
+    values = [bool(v) for v in values]
+    if not values:
+        return None
+    low, high = intervals.share(sum(values), len(values))
+    return {"value": sum(values) / len(values), "low": low, "high": high, "n": len(values)}
+
+
+def middle(values: list, statistic: Callable) -> dict | None:
+    """{value, low, high, n} of a statistic; None without cases."""
+    if not values:
+        return None
+    low, high = bootstrap(values, statistic)
+    return {"value": float(statistic(values)), "low": low, "high": high, "n": len(values)}
+
+
+def alone_at(r: dict, least: float) -> bool:
+    """Whether the hidden effect was named first, alone, with at least this confidence."""
+    return r["alone"] and r.get("confidence", r["said"][0][2] if r["said"] else 0.0) >= least
+
+
+def by_law(results: list[dict]) -> dict[str, dict[str, dict]]:
+    """Figures of the cases with one effect that has two laws, {line: {"first" or "second": {value, low, high, n}}};
+    and of those with but one ("only")."""
+    lines: dict[str, dict[str, dict]] = {}
+    for law in ("first", "second", "only"):
+        mine = [r for r in results if "right" in r and r.get("laws") == [law]]
+        found: dict[str, dict | None] = {}
+        for tier in TIERS:
+            found[f"right effect first, {tier}"] = rate([r["right"] for r in mine if r["tier"] == tier])
+        found["right effect first, all"] = rate([r["right"] for r in mine])
+        found[f"named alone at {SURE:g} or more, all"] = rate([alone_at(r, SURE) for r in mine])
+        found["confident and wrong"] = rate([r["wrong_sure"] for r in mine])
+        found["parameter error, median"] = middle([e for r in mine for e in r["parameter_errors"]], np.median)
+        found["90 % interval covers the truth"] = rate([c for r in mine for c in r["covered"]])
+        for line, value in found.items():
+            if value is not None:
+                lines.setdefault(line, {})[law] = value
+    return lines
+
+
 def table(results: list[dict]) -> dict[str, dict]:
     """The lines of the table: {line: {value, low, high, n}}; a line without cases is left out."""
     lines: dict[str, dict] = {}
 
-    def rate(line: str, values: list) -> None:
-        values = [bool(v) for v in values]
-        if values:
-            low, high = intervals.share(sum(values), len(values))
-            lines[line] = {"value": sum(values) / len(values), "low": low, "high": high, "n": len(values)}
-
-    def middle(line: str, values: list, statistic: Callable) -> None:
-        if values:
-            low, high = bootstrap(values, statistic)
-            lines[line] = {"value": float(statistic(values)), "low": low, "high": high, "n": len(values)}
+    def put(line: str, value: dict | None) -> None:
+        if value is not None:
+            lines[line] = value
 
     def f1(line: str, counts: list) -> None:
-        if counts:
-            middle(line, counts, lambda x: _f1(*np.sum(np.asarray(x), 0)))
+        put(line, middle(counts, lambda x: _f1(*np.sum(np.asarray(x), 0))))
 
     hidden = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "touch")]
-    for tier in ("easy", "medium", "hard"):
-        rate(f"right effect first, {tier}", [r["right"] for r in hidden if r["tier"] == tier])
-    for tier in ("easy", "medium", "hard"):
-        rate(f"  of them named alone, {tier}", [r["alone"] for r in hidden if r["tier"] == tier])
+    for tier in TIERS:
+        put(f"right effect first, {tier}", rate([r["right"] for r in hidden if r["tier"] == tier]))
+    for tier in TIERS:
+        put(f"  of them named alone, {tier}", rate([r["alone"] for r in hidden if r["tier"] == tier]))
+    for least in LEAST:
+        for tier in TIERS:
+            these = [alone_at(r, least) for r in hidden if r["tier"] == tier]
+            put(f"  named alone at {least:g} or more, {tier}", rate(these))
     f1("right joint (F1), rigs of several", [r["joint_f1"] for r in hidden if r.get("joint_f1")])
-    rate(
-        "regime: overlap >= 0.5, where named right",
-        [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None and r["alone"]],
-    )
-    rate("regime: overlap >= 0.5, all", [r["overlap"] >= 0.5 for r in hidden if r.get("overlap") is not None])
+    timed = [r for r in hidden if r.get("overlap") is not None]
+    put("regime: overlap >= 0.5, where named right", rate([r["overlap"] >= 0.5 for r in timed if r["alone"]]))
+    put("regime: overlap >= 0.5, all", rate([r["overlap"] >= 0.5 for r in timed]))
     f1("several effects at once (F1)", [r["f1"] for r in results if r["group"] == "pair"])
-    middle("parameter error, median", [e for r in hidden for e in r["parameter_errors"]], np.median)
-    rate("90 % interval covers the truth", [c for r in hidden for c in r["covered"]])
-    middle("held-out error removed, mean", [r["removed"] for r in hidden if r.get("removed") is not None], np.mean)
-    middle("held-out error removed, median", [r["removed"] for r in hidden if r.get("removed") is not None], np.median)
-    rate(
-        "false alarm, nothing missing",
-        [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] in ("none", "noise")],
-    )
-    rate("  with doubled noise", [r["false_alarm"] for r in results if r["group"] == "noise"])
-    rate("false alarm, xHand", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "hand"])
-    rate("touch and contact: right effect first", [r["right"] for r in hidden if r["group"] == "touch"])
-    rate("  false alarm", [r["false_alarm"] for r in results if "false_alarm" in r and r["group"] == "touch"])
-    rate("outside the catalogue: not claimed", [r["humble"] for r in results if r["group"] == "outside"])
-    rate("decoys seen through", [r["caught"] for r in results if r["group"] == "decoy"])
+    put("parameter error, median", middle([e for r in hidden for e in r["parameter_errors"]], np.median))
+    put("90 % interval covers the truth", rate([c for r in hidden for c in r["covered"]]))
+    removed = [r["removed"] for r in hidden if r.get("removed") is not None]
+    put("held-out error removed, mean", middle(removed, np.mean))
+    put("held-out error removed, median", middle(removed, np.median))
+    empty = [r for r in results if "false_alarm" in r]
+    nothing = [r for r in empty if r["group"] in ("none", "noise")]
+    put("false alarm, nothing missing", rate([r["false_alarm"] for r in nothing]))
+    put("  with doubled noise", rate([r["false_alarm"] for r in nothing if r["group"] == "noise"]))
+    for least in LEAST:
+        put(f"  a name of {least:g} or more", rate([r["alarm"] >= least for r in nothing if "alarm" in r]))
+    hand = [r for r in results if r["group"] == "hand"]
+    put("xHand: right effect first", rate([r["right"] for r in hand if "right" in r]))
+    put(f"  named alone at {SURE:g} or more", rate([alone_at(r, SURE) for r in hand if "right" in r]))
+    f1("  effects at two joints (F1)", [r["f1"] for r in hand if len(r["hidden"]) > 1])
+    put("  confident and wrong", rate([r["wrong_sure"] for r in hand]))
+    put("false alarm, xHand", rate([r["false_alarm"] for r in empty if r["group"] == "hand"]))
+    put("touch and contact: right effect first", rate([r["right"] for r in hidden if r["group"] == "touch"]))
+    put("  false alarm", rate([r["false_alarm"] for r in empty if r["group"] == "touch"]))
+    put("outside the catalogue: not claimed", rate([r["humble"] for r in results if r["group"] == "outside"]))
+    put("decoys seen through", rate([r["caught"] for r in results if r["group"] == "decoy"]))
     for decoy in sorted({r["decoy"] for r in results if r["decoy"]}):
-        rate(f"  {decoy.replace('_', ' ')}", [r["caught"] for r in results if r["decoy"] == decoy])
-    rate("confident and wrong, all cases", [r["wrong_sure"] for r in results])
+        put(f"  {decoy.replace('_', ' ')}", rate([r["caught"] for r in results if r["decoy"] == decoy]))
+    put("confident and wrong, all cases", rate([r["wrong_sure"] for r in results]))
     return lines
 
 
@@ -254,7 +309,7 @@ def by_effect(results: list[dict]) -> list[tuple[str, str]]:
     for effect in sorted({r["hidden"][0][0] for r in results if "right" in r}):
         mine = [r for r in results if "right" in r and r["hidden"][0][0] == effect]
         parts = []
-        for tier in ("easy", "medium", "hard"):
+        for tier in TIERS:
             these = [r for r in mine if r["tier"] == tier]
             parts.append(f"{sum(r['right'] for r in these)}/{len(these)}" if these else "-")
         taken: dict[str, int] = {}
@@ -279,7 +334,12 @@ def show(lines: dict[str, dict], results: list[dict], cases: bool = True) -> str
         out.append(f"{'case':<10}{'group':<9}{'rig':<8}{'tier':<8}{'hidden':<44}{'verdict':<18}said")
         for r in results:
             hidden = (
-                " + ".join(f"{k}@{j}" for k, (_, j) in zip(r["kinds"], r["hidden"], strict=True)) or r["decoy"] or "-"
+                " + ".join(
+                    f"{k}{' (2nd law)' * (law == 'second')}@{j}"
+                    for k, law, (_, j) in zip(r["kinds"], r["laws"], r["hidden"], strict=True)
+                )
+                or r["decoy"]
+                or "-"
             )
             said = (
                 "; ".join(f"{e}@{j} {c:.2f}" + (f" {{{' '.join(g)}}}" if g else "") for e, j, c, g in r["said"][:3])
@@ -292,4 +352,12 @@ def show(lines: dict[str, dict], results: list[dict], cases: bool = True) -> str
     out += [f"{e:<22}{text}" for e, text in by_effect(results)]
     out += ["", f"{'figure':<44}{'value':>8}   {'95 % interval':<18}{'n':>4}"]
     out += [f"{k:<44}{v['value']:>8.3f}   {v['low']:.3f} .. {v['high']:<10.3f}{v['n']:>4}" for k, v in lines.items()]
+    out += ["", f"{'effects that have two laws':<38}{'first law':>26}{'second law':>26}{'(one law only)':>26}"]
+    for k, of in by_law(results).items():
+        cells = [_cell(of.get(law)) for law in ("first", "second", "only")]
+        out.append(f"{k:<38}" + "".join(f"{c:>26}" for c in cells))
     return "\n".join(out)
+
+
+def _cell(v: dict | None) -> str:
+    return f"{v['value']:.3f} ({v['low']:.2f}-{v['high']:.2f}) {v['n']:>4}" if v else "-"

@@ -16,6 +16,9 @@ DEFAULTS: dict[str, float] = {
     "stiffness": 7000.0, "power": 1.9, "reach": 1.0e-3,
     "zero": 0.0, "along": 0.0, "across": 0.0,  # m: the pad is not quite where it is believed
     "gain": 1.0, "fraction": 0.0, "time_constant": 0.3, "crosstalk": 0.0, "delay": 0.0,
+    # second laws (`touch_cases`): 2: half of the relaxation is eight times as fast; 2: a third of what neighbours get
+    # goes on to theirs; 1: what is read is the mean over twice the delay
+    "branches": 1.0, "rings": 1.0, "window": 0.0,
     "kp": 4000.0, "kd": 40.0, "mass_press": 0.1, "mass_slide": 0.2,
 }  # fmt: skip
 NEIGHBOUR = 4.6e-3  # m: taxels nearer than this are beside one another
@@ -57,6 +60,7 @@ class Pad:
         self.start, self.press, self.slide, self.radius, self.gravity = start, press, slide, radius, gravity
         d = np.linalg.norm(points[:, None] - points[None], axis=-1)
         near = (d < NEIGHBOUR) & (d > 0)
+        # what goes to each neighbour, of what each taxel gives away
         self.beside = near / np.maximum(near.sum(0, keepdims=True), 1)
         # depth over the two joints, once on a grid: the contact is quasi-static
         self.grid_press, self.grid_slide = np.linspace(-1e-3, 6e-3, 71), np.linspace(-6e-3, 6e-3, 25)
@@ -111,16 +115,38 @@ def readings(pad: Pad, p: dict[str, float], q: np.ndarray, force: np.ndarray) ->
     level = np.maximum(d.min(1) + p["reach"], 0.0)
     w = pad.areas * np.maximum(level[:, None] - d, 0.0) ** p["power"]
     x = np.where(force[:, None] > 0, w / np.maximum(w.sum(1, keepdims=True), 1e-30), 0.0) * force[:, None]
-    if p["fraction"]:
-        a, state, y = np.exp(-1e-3 / p["time_constant"]), np.zeros(x.shape[1]), np.empty_like(x)
-        for k in range(len(x)):  # a Maxwell branch beside the spring
-            state = a * state + (1 - a) * x[k]
-            y[k] = np.maximum(x[k] + p["fraction"] * (x[k] - state), 0.0)
-        x = y
+    if p["fraction"]:  # Maxwell branches beside the spring
+        x = np.maximum(x + relaxing(p, x), 0.0)
     if p["crosstalk"]:
-        x = (1 - p["crosstalk"]) * x + p["crosstalk"] * x @ pad.beside.T
+        given = p["crosstalk"] * x @ pad.beside.T
+        if p["rings"] > 1:
+            given = 2 / 3 * given + 1 / 3 * given @ pad.beside.T
+        x = (1 - p["crosstalk"]) * x + given
     x = p["gain"] * x
     late = p["delay"] / 1e-3
-    at = np.maximum(np.arange(len(x)) - late, 0)
+    if p["window"] and late:
+        now = np.arange(len(x))
+        total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(0.5 * (x[1:] + x[:-1]), 0)])
+        before = np.maximum(2 * late - now, 0)[:, None] * x[0]
+        return (total - _at(total, now - 2 * late) + before) / (2 * late)
+    return _at(x, np.arange(len(x)) - late)
+
+
+def relaxing(p: dict[str, float], x: np.ndarray) -> np.ndarray:
+    """[M, K] what the branches add to forces x [M, K] of every millisecond: their fraction of what x has not held long
+    enough for them to let go."""
+    if p["branches"] > 1:
+        half = p | {"fraction": p["fraction"] / 2, "branches": 1.0}
+        return relaxing(half, x) + relaxing(half | {"time_constant": p["time_constant"] / 8}, x)
+    a, state, y = np.exp(-1e-3 / p["time_constant"]), np.zeros(x.shape[1]), np.empty_like(x)
+    for k in range(len(x)):
+        state = a * state + (1 - a) * x[k]
+        y[k] = p["fraction"] * (x[k] - state)
+    return y
+
+
+def _at(x: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """x [M, K] at fractional samples, the first before it begins."""
+    at = np.maximum(at, 0)
     i = np.minimum(np.floor(at).astype(int), len(x) - 2)
     return x[i] * (1 - (at - i))[:, None] + x[i + 1] * (at - i)[:, None]

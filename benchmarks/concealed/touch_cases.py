@@ -4,6 +4,7 @@ size or none."""
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +54,41 @@ KINDS: dict[str, TouchKind] = {
     "soft_contact": TouchKind("contact_stiffness", (0.06, 0.85), lambda p, s: {"stiffness": p["stiffness"] * (1 - s)},
                               lambda n: {"stiffness": n["stiffness"]}, lambda f, n: f),
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TouchLaw:
+    """The second law of a form of an effect. first, second: both in words. more: parameters of it beside those of
+    `TouchKind.apply`. report(pad, force, n): values that take the place of those of `TouchKind.report`; force: [M] N of
+    each fitted recording."""
+
+    first: str
+    second: str
+    more: dict[str, float]
+    report: Callable = lambda pad, force, n: {}
+
+
+def _one_branch(pad: touch.Pad, force: list[np.ndarray], n: dict) -> dict[str, float]:
+    """Fraction and time constant of the one branch that adds most nearly what the two add in the recorded force."""
+    of = lambda p: np.concatenate([touch.relaxing(p, f[:, None])[:, 0] for f in force])  # noqa: E731
+    truth = of(n)
+    best = (np.inf, 0.0, 0.0)
+    for time_constant in np.geomspace(n["time_constant"] / 10, n["time_constant"] * 1.2, 50):
+        x = of({"fraction": 1.0, "time_constant": time_constant, "branches": 1.0})
+        fraction = float(x @ truth / max(x @ x, 1e-12))
+        best = min(best, (float(((truth - fraction * x) ** 2).sum()), fraction, float(time_constant)))
+    return {"fraction": best[1], "time_constant": best[2]}
+
+
+SECOND: dict[str, TouchLaw] = {
+    "hysteresis": TouchLaw("one branch", "two, one eight times as fast; the nearest one told", {"branches": 2.0},
+                           _one_branch),
+    # what a taxel gives away and does not get back by its neighbours' neighbours
+    "crosstalk": TouchLaw("neighbours", "neighbours and theirs", {"rings": 2.0}, lambda pad, force, n:
+                          {"fraction": n["crosstalk"] * (1 - float(np.mean(np.diag(pad.beside @ pad.beside))) / 3)}),
+    # the mean of what comes evenly over twice the delay is late by the delay
+    "touch_delay": TouchLaw("a delay", "a mean over twice the delay", {"window": 1.0}),
+}  # fmt: skip
 REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across": 6e-4}
 
 
@@ -99,7 +135,7 @@ def motion(rng: np.random.Generator) -> np.ndarray:
     return np.repeat(q, 10, 1)
 
 
-def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
+def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: str = "two") -> dict:
     """Writes one touch case and its truth, as `generate.build` does for joints."""
     from benchmarks.concealed.generate import HELD, RECORDINGS, START_NS, TIERS, commit, tier_of
 
@@ -152,13 +188,17 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
 
     floor = float(np.hypot(LSB / np.sqrt(12), NOISE))
     floor = float(np.hypot(floor, hidden(base * (1 - 1 / own_gain))))
+    law, pair = None, SECOND.get(entry["kinds"][0]) if kind else None
+    if pair is not None and which == "two" and np.random.default_rng([seed, 3, number]).uniform() < 0.5:
+        law = pair
+    more = law.more if law is not None else {}
     p, facts = dict(true), {"floor": floor, "noise": NOISE}
     if kind:
         sizes = np.geomspace(*kind.span, SIZES)
-        change = np.array([hidden(stack(run(true | kind.apply(true, s))) - base) for s in sizes])
+        change = np.array([hidden(stack(run(true | more | kind.apply(true, s))) - base) for s in sizes])
         reached = np.hypot(change, floor) / floor
         pick = int(np.nanargmin(np.abs(np.log(reached / TIERS[entry["tier"]]))))
-        p = true | kind.apply(true, sizes[pick])
+        p = true | more | kind.apply(true, sizes[pick])
         facts |= {
             "ratio": float(reached[pick]),
             "size": float(sizes[pick]),
@@ -208,8 +248,14 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path) -> dict:
                 [letter, round(float(a) * 1e-3, 3), round(float(b) * 1e-3, 3)]
                 for a, b in zip(edge[::2], edge[1::2], strict=True)
             ]
+    told = {k: float(v) for k, v in kind.report(p).items()} if kind else {}
+    if law is not None:
+        told |= law.report(pad, [f for _, f, _ in done[: len(RECORDINGS) - HELD]], p)
+    which_law = {"law": "only"}
+    if pair is not None:
+        which_law = {"law": "second" if law else "first", "law_is": pair.second if law else pair.first}
     effects = [] if not kind else [{"effect": kind.effect, "kind": entry["kinds"][0], "joint": "pad",
-                                    "parameters": {k: float(v) for k, v in kind.report(p).items()},
+                                    "parameters": told, **which_law,
                                     "facts": facts, "also": [], "when": when}]  # fmt: skip
     answer = {"name": name, "group": "touch", "decoy": "", "bad": "", "asked_tier": entry["tier"],
               "tier": tier_of(facts["ratio"]) if kind else "none", "shape": "touch",
