@@ -216,21 +216,19 @@ MUTATIONS = (
         '0.0,\n        "share of the squared error on conditions left out',
         "tests/test_gap_rules.py::test_an_effect_must_remove_a_least_share",
     ),
-    _constant(
+    Mutation(
         "a name that removes nothing of what was kept out is sure",
-        "dexsim/gap/judge/joint.py",
-        "PART",
-        "0.2",
-        "0.0",
+        "dexsim/gap/rules.py",
+        '0.2,\n        "share of the squared error on what was kept out',
+        '0.0,\n        "share of the squared error on what was kept out',
         "tests/test_gap_least.py::test_an_effect_must_remove_a_part_of_what_was_kept_out",
     ),
-    _constant(
+    Mutation(
         "a touch effect that removes nothing is named",
-        "dexsim/gap/touch/search.py",
-        "LEAST",
-        "0.12",
-        "0.0",
-        "tests/test_gap_least.py::test_a_touch_effect_must_remove_a_least_share",
+        "dexsim/gap/rules.py",
+        '0.12,\n        "share of the squared error on presses left out',
+        '0.0,\n        "share of the squared error on presses left out',
+        "tests/test_gap_rules.py::test_a_touch_effect_must_remove_a_least_share",
     ),
     _constant(
         "inverse dynamics name what removes nothing",
@@ -240,13 +238,12 @@ MUTATIONS = (
         "0.0",
         "tests/test_gap_inverse.py::test_further_effects_are_named_one_after_another",
     ),
-    _constant(
+    Mutation(
         "a torque that takes nothing off is offered",
-        "dexsim/gap/judge/residual_fit.py",
-        "LEAST",
-        "0.10",
-        "0.0",
-        "tests/test_gap_least.py::test_a_fitted_residual_must_take_a_least_share_off",
+        "dexsim/gap/rules.py",
+        '0.10,\n        "share of the held-out error that a stand-in',
+        '0.0,\n        "share of the held-out error that a stand-in',
+        "tests/test_gap_rules.py::test_a_stand_in_must_take_a_least_share_off",
     ),
 )
 

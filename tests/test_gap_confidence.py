@@ -10,10 +10,12 @@ import pytest
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.thermal import temperature_follows
 from dexsim.gap.judge import confidence, verdict
-from dexsim.gap.judge.confidence import DOUBTED, Evidence
+from dexsim.gap.judge.confidence import Evidence
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param
+from dexsim.gap.rules import JUDGE
 
+DOUBTED = JUDGE.doubted
 CASE = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0}))
 
 

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, errors, residual_fit
-from dexsim.gap.judge.joint import PART, JointAnswer
-from dexsim.gap.judge.verdict import HINTED
-from dexsim.gap.touch.search import PadSearch
+from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge.joint import JointAnswer
+from dexsim.gap.rules import JUDGE
 
 ROWS = 400
 
@@ -43,41 +42,19 @@ class Judged(JointAnswer):
         return ""
 
 
+def judged(answer: Judged) -> dict:
+    """The finding of an answer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(errors, "free_run", lambda *_: (answer.without, None))
+        patch.setattr(errors, "intervals_of", lambda *_: [])
+        answer.judge(SimpleNamespace(table=None))
+    return answer.found[0]
+
+
 @pytest.mark.parametrize(("share", "hint"), [(0.02, True), (0.1, True), (0.19, True), (0.21, False), (0.6, False)])
-def test_an_effect_must_remove_a_part_of_what_was_kept_out(monkeypatch, share, hint):
+def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
     """share: of the squared error on what was kept out."""
     answer = Judged(1.0, np.sqrt(1 - share))
-    monkeypatch.setattr(errors, "free_run", lambda *_: (answer.without, None))
-    monkeypatch.setattr(errors, "intervals_of", lambda *_: [])
-    answer.judge(SimpleNamespace(table=None))
-    found = answer.found[0]
-    assert (found["confidence"] <= HINTED) is hint
+    assert (judged(answer)["confidence"] <= JUDGE.hinted) is hint
     reasons = answer.evidence[0].reasons
-    assert (len(reasons) > 0) is hint and all(f"less than {100 * PART:.0f} %" in r for r in reasons)
-
-
-class Felt(PadSearch):
-    """A search of one pad whose trials say themselves what they lose on the presses left out."""
-
-    def __init__(self):
-        self.rng = np.random.default_rng(0)
-
-    def cross(self, trial):
-        return np.full(20, trial)
-
-
-def test_a_touch_effect_must_remove_a_least_share():
-    assert not Felt()._earns(0.9, 1.0) and Felt()._earns(0.86, 1.0)
-
-
-@pytest.mark.parametrize(("after", "offered"), [(0.99, False), (0.91, False), (0.89, True)])
-def test_a_fitted_residual_must_take_a_least_share_off(monkeypatch, after, offered):
-    """after: rms on what was kept out with the torque that was fitted to what is left, over that without."""
-    n = 200
-    t = 0.01 * np.arange(n)
-    run = SimpleNamespace(t=t, qs=np.sin(9 * t)[:, None], vs=np.cos(7 * t)[:, None])
-    noise = np.random.default_rng(0).normal(size=n)
-    monkeypatch.setattr(residual_fit, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
-    monkeypatch.setattr(residual_fit, "_held_out", lambda *_: (1.0, after))
-    found = residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], [])
-    assert (found is not None) is offered
+    assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)

@@ -10,9 +10,10 @@ from scipy.optimize import lsq_linear
 
 from dexsim.gap.command import Progress
 from dexsim.gap.judge import conclude, errors, verdict
-from dexsim.gap.judge.joint import STRETCHED, stretched
+from dexsim.gap.judge.joint import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.param import Param
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import parallel
 from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, subset
@@ -140,7 +141,7 @@ def test_intervals_follow_how_well_what_was_kept_out_is_followed():
     f = Fitted(params, np.array([2.0, 50.0]), np.zeros(4), np.zeros((4, 2)), np.zeros(4, int), 1.0, np.zeros(1))
     bounds = np.array([[1.0, 2.5], [40.0, 60.0]])
     width = lambda left: np.diff(stretched(bounds, f, left))[:, 0]  # noqa: E731
-    assert np.allclose(width(1.0), STRETCHED[0] * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)
+    assert np.allclose(width(1.0), JUDGE.stretch_least * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)
     assert np.allclose(stretched(bounds, f, 50.0), [[0.0, 3.0], [10.0, 90.0]])  # no farther than is physical, and than was seen to be needed
     assert stretched(bounds, f, 0.0) is bounds  # nothing was kept out
 

@@ -12,6 +12,7 @@ from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
 from dexsim.gap.judge import confidence
 from dexsim.gap.read import inputs
 from dexsim.gap.read.runs import Run
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import plant as touch_plant
 from dexsim.gap.touch import press_rig
 from dexsim.gap.touch import read as touch_read
@@ -219,7 +220,7 @@ def test_a_little_crosstalk_may_be_the_law_of_the_contact():
         confidence.of_touch([f], 0.06, 0.03)
         return f["confidence"]
 
-    assert said(0.08) == confidence.DOUBTED and said(0.2) == 0.99
+    assert said(0.08) == JUDGE.doubted and said(0.2) == 0.99
 
 
 @pytest.mark.parametrize("spread", [0.8, 1.25])

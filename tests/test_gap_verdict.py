@@ -5,6 +5,7 @@ import pytest
 
 from dexsim.gap.judge import verdict
 from dexsim.gap.read import keep_out
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.time_limit import TimeLimit
 from dexsim.gap.touch import report as touch_report
 from dexsim.gap.touch.result import TouchResult
@@ -18,7 +19,7 @@ def test_names_on_joints_that_need_no_effect_are_hints():
     found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
     verdict.settle(found, quiet={"a"})
     assert [f.get("hint", False) for f in found] == [True, False, True]
-    assert found[0]["confidence"] < verdict.FIRM and found[1]["confidence"] == 0.9
+    assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
     assert verdict.firm(found) == [found[1]]
 
 

@@ -22,6 +22,7 @@ from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain
 from dexsim.gap.report.next_experiment import rival_of
 from dexsim.gap.result import Diagnosis
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import baseline, external_force, torque_told
 from dexsim.gap.search.parallel import lanes, together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
@@ -265,7 +266,7 @@ class Drives(Steps):
         """Stand-ins for joints of which something is left that no effect explains."""
         p = self.parts
         for case, search, outcome in self.outcomes:
-            if d.joints[case.joint]["after"] < 1.5 * self.noise.floor:
+            if d.joints[case.joint]["after"] < JUDGE.unexplained * self.noise.floor:
                 continue
             claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
             trial = search.polish(outcome.best if claimed else outcome.none)

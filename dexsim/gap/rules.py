@@ -95,17 +95,315 @@ class SearchRules:
     clear: float = _rule(
         0.11,
         "share of the squared error that an effect must remove where the error is within the noise without it",
-        "set above LEAST on benchmarks.planted: there is less to tell effects by",
+        "set above `least` on benchmarks.planted: there is less to tell effects by",
         "",
     )
     most: int = _rule(4, "effects on one joint", "by judgement: more of them can imitate anything", "")
 
 
-SEARCH = SearchRules()
+@dataclass(frozen=True)
+class JudgeRules:
+    """What the verdict and the confidence of a name of the drives are decided by; touch has its own beside the verdict's."""
+
+    within: float = _rule(
+        1.3,
+        "x the noise floor: an error within it asks for no effect",
+        "by judgement",
+        "test_an_error_within_the_noise_asks_for_nothing",
+    )
+    far: float = _rule(
+        5.0,
+        "x the noise floor: an error that large is not nothing, though only a few moments show it",
+        "by judgement",
+        "test_a_large_error_is_never_nothing",
+    )
+    removed: float = _rule(
+        0.3,
+        "share of the gap between error and floor that names must remove to count as a part of the answer",
+        "by judgement",
+        "test_what_counts_as_a_part_of_the_answer",
+    )
+    firm: float = _rule(
+        0.5,
+        "confidence from which a name counts; below it is a hint",
+        "by judgement: at a half a name is as likely wrong as right",
+        "test_names_below_firm_are_hints",
+    )
+    hinted: float = _rule(
+        0.45,
+        "confidence that a name keeps at most which the error on what was kept out does not bear out",
+        "below `firm`, so that it is a hint",
+        "test_what_is_not_borne_out_keeps_little",
+    )
+    doubted: float = _rule(
+        0.7,
+        "confidence that a name keeps at most where one reason speaks against it",
+        "below `sure`: a doubted name is not a confident one",
+        "test_one_reason_against_a_name_makes_it_doubted",
+    )
+    sure_of_one: float = _rule(
+        0.75,
+        "confidence of at least one name, or a set, without which nothing counts as explained",
+        "between `doubted` and `sure`",
+        "test_nothing_is_explained_by_doubtful_names_alone",
+    )
+    sure: float = _rule(
+        0.8,
+        "confidence from which a name stands alone: below it training is also given what was believed before",
+        "of names below, about half are true (docs/results/concealed.md)",
+        "test_what_is_not_sure_is_handed_on_with_what_was_believed",
+    )
+    unearned: float = _rule(
+        0.3,
+        "share of its confidence that a name keeps which removes nothing of the error kept out",
+        "by judgement",
+        "test_what_removes_nothing_keeps_a_share",
+    )
+    earns: float = _rule(
+        0.1,
+        "share of the error kept out that a name must cost when dropped to keep all of its confidence",
+        "by judgement: a name that explains less may be an accident",
+        "test_a_name_earns_its_confidence_by_what_it_removes",
+    )
+    helps: float = _rule(
+        0.98,
+        "x the error before on what was kept out: findings that leave more are asked what else speaks for them",
+        "by judgement",
+        "test_findings_that_do_not_help_are_taken_back",
+    )
+    neutral: float = _rule(
+        1.015,
+        "x the error before on what was kept out: not more than this is not against a finding",
+        "by judgement",
+        "test_what_was_kept_out_may_side_with_neither",
+    )
+    sides: float = _rule(
+        0.24,
+        "share of the squared error that an effect must remove to be doubted only, where a free run does not show it",
+        "by judgement: twice SEARCH.least",
+        "test_what_was_kept_out_may_side_with_neither",
+    )
+    alone: float = _rule(
+        2.0,
+        "x the error where it was fitted: beyond it what was kept out shows something that the rest does not",
+        "by judgement",
+        "test_what_shows_in_what_was_kept_out_alone",
+    )
+    crowd: int = _rule(
+        3,
+        "effects on one joint from which on the smaller ones are taken for a series of likenesses",
+        "by judgement",
+        "test_many_effects_on_one_joint_are_doubted",
+    )
+    trifle: float = _rule(
+        0.04,
+        "of the squared error before: a further effect that removes less may be what the first one's law gets wrong",
+        "a law that is off by a fifth leaves as much",
+        "test_a_trifle_beside_another_effect_is_doubted",
+    )
+    left_free: float = _rule(
+        0.05,
+        "share of the squared error that may stay unexplained without a doubt",
+        "by judgement",
+        "test_what_stays_unexplained_costs_confidence",
+    )
+    left_span: float = _rule(
+        0.28,
+        "share beyond that over which a name loses half of its confidence",
+        "by judgement: half from a third on",
+        "test_what_stays_unexplained_costs_confidence",
+    )
+    set_share: float = _rule(
+        0.06,
+        "share of the bootstraps: a rival of the same class with as much belongs to the set",
+        "by judgement",
+        "test_a_rival_of_the_same_class_makes_a_set",
+    )
+    part: float = _rule(
+        0.2,
+        "share of the squared error on what was kept out that an effect removes at least that is more than a hint",
+        "by judgement: a tenth of the error itself",
+        "test_an_effect_must_remove_a_part_of_what_was_kept_out",
+    )
+    slack: float = _rule(
+        0.05,
+        "share of the squared error that may be lost where an effect does not act, by what was refitted beside it",
+        "by judgement",
+        "test_an_effect_may_lose_little_where_it_does_not_act",
+    )
+    harm: float = _rule(
+        0.05,
+        "share of the draws of recordings in which an effect may do more harm than good",
+        "the customary 5 %",
+        "test_an_effect_that_harms_some_recordings_is_a_hint",
+    )
+    stretch: float = _rule(
+        0.5,
+        "intervals grow by this, times the square of what is left of what was kept out over the noise",
+        "coverage of 90 % intervals on concealed cases (docs/concepts/gap.md)",
+        "test_intervals_grow_with_what_is_left",
+    )
+    stretch_least: float = _rule(
+        0.5,
+        "the least factor on intervals",
+        "coverage on concealed cases",
+        "test_intervals_grow_with_what_is_left",
+    )
+    stretch_most: float = _rule(
+        4.0,
+        "the largest factor on intervals",
+        "coverage on concealed cases",
+        "test_intervals_grow_with_what_is_left",
+    )
+    clear: float = _rule(
+        1.5,
+        "x the noise squared that windows keep after the fit, from which on what it depends on is said",
+        "by judgement",
+        "",
+    )
+    apart: float = _rule(
+        1.3,
+        "x: the engine that trains confirms the search's plant where it leaves no more than so much of what that leaves",
+        "by judgement",
+        "test_the_engine_that_trains_confirms",
+    )
+    little: float = _rule(
+        0.1,
+        "share of the error before that the engine may leave beside what the plant leaves, in squares",
+        "by judgement",
+        "test_the_engine_that_trains_confirms",
+    )
+    mostly: float = _rule(
+        0.3,
+        "share of the error before that the engine may leave for the answer to hold there in the main",
+        "by judgement",
+        "test_the_engine_that_trains_confirms_in_the_main",
+    )
+    unexplained: float = _rule(
+        1.5,
+        "x the noise floor: a joint that keeps as much is offered a stand-in torque",
+        "by judgement",
+        "",
+    )
+    standin: float = _rule(
+        0.10,
+        "share of the held-out error that a stand-in torque must take away to be offered",
+        "by judgement",
+        "test_a_stand_in_must_take_a_least_share_off",
+    )
+
+
+@dataclass(frozen=True)
+class TouchRules:
+    """What the search of one pad and its judgement decide by."""
+
+    least: float = _rule(
+        0.12,
+        "share of the squared error on presses left out that an effect must remove",
+        "as of the drives (SEARCH.least)",
+        "test_a_touch_effect_must_remove_a_least_share",
+    )
+    chance: float = _rule(
+        0.03,
+        "share of the bootstraps in which an effect may be of no use to the presses left out",
+        "as of the drives",
+        "test_a_touch_effect_must_help_in_nearly_all_bootstraps",
+    )
+    enough: float = _rule(
+        1.2,
+        "x the noise: an error within it needs no effect",
+        "by judgement",
+        "",
+    )
+    most: int = _rule(4, "effects on one pad", "by judgement: more of them can imitate anything", "")
+    map_price: float = _rule(
+        1.5,
+        "x the squared error that a gain for every taxel must stay below to be taken before one number",
+        "by judgement: 120 numbers follow noise, too",
+        "",
+    )
+    map_better: float = _rule(
+        0.7,
+        "x the squared error of one gain for the pad: a gain for every taxel must leave less to be tried",
+        "by judgement",
+        "",
+    )
+    close: float = _rule(
+        0.03,
+        "of the loss on presses left out: nearer than this, what follows the fitted presses better is taken",
+        "by judgement: half of what tells rivals apart",
+        "",
+    )
+    told_apart: float = _rule(
+        0.03,
+        "of the loss on presses left out: a rival that loses by as much has 1/e of the weight",
+        "by judgement",
+        "",
+    )
+    set_share: float = _rule(
+        0.12,
+        "share of the bootstraps: a rival of the same class with as much belongs to the set",
+        "by judgement",
+        "",
+    )
+    earned: float = _rule(
+        0.2,
+        "of what keeps all confidence: an effect that earns no more on what was kept out is not claimed",
+        "2 % of the error: within what the plant is off by",
+        "",
+    )
+    agree: int = _rule(
+        5,
+        "taxels with one gain from which on those that hardly felt anything are taken to have it too",
+        "by judgement",
+        "test_taxels_that_agree_speak_for_the_rest",
+    )
+    gain_off: float = _rule(
+        0.08,
+        "a taxel whose gain is less than this off is not listed",
+        "by judgement",
+        "test_taxels_that_agree_speak_for_the_rest",
+    )
+    swapped: float = _rule(
+        0.35,
+        "x its own place's squared error: what each of two exchanged taxels must leave in the other's place",
+        "by judgement: neighbours feel alike",
+        "",
+    )
+    short: float = _rule(
+        3.0,
+        "s of touch on a pad, at least, before anything but constant taxels is looked for",
+        "by judgement",
+        "test_a_pad_must_be_touched_for_a_while",
+    )
+    plant: float = _rule(
+        0.02, "of a reading: finer than that the plant is not to be trusted", "by judgement", ""
+    )
+    law: float = _rule(
+        0.1,
+        "of a size that hangs on how a force spreads over taxels: what that law may be off by",
+        "by judgement",
+        "",
+    )
+    timing: float = _rule(
+        3e-3, "s by which a reading's time is uncertain", "by judgement: between two positions of the joints the contact is a guess", ""
+    )
+    gain_prior: float = _rule(0.3, "standard deviation of a taxel's gain, before anything is seen", "by judgement", "")
+    structured: float = _rule(
+        2.0,
+        "x the noise, of what was fitted and of what was kept out: what is left has structure",
+        "by judgement",
+        "",
+    )
+
+
+SEARCH, JUDGE, TOUCH = SearchRules(), JudgeRules(), TouchRules()
 
 
 def described() -> list[tuple[str, float, str, str, str]]:
-    """(name, value, meaning, source, test) of every rule."""
+    """(name such as "search.least", value, meaning, source, test) of every rule."""
     return [
-        (f.name, getattr(SEARCH, f.name), *(f.metadata[k] for k in ("means", "source", "test"))) for f in fields(SEARCH)
+        (f"{room}.{f.name}", getattr(rules, f.name), *(f.metadata[k] for k in ("means", "source", "test")))
+        for room, rules in (("search", SEARCH), ("judge", JUDGE), ("touch", TOUCH))
+        for f in fields(rules)
     ]

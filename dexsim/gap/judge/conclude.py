@@ -17,14 +17,10 @@ from dexsim.gap.locate import bins
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings
 from dexsim.gap.search import baseline
-from dexsim.gap.rules import SEARCH
+from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
-DOUBTED = 0.8  # confidence below which training is also given what was believed before: of such names about half are true (docs/results/concealed.md)
-NEUTRAL = 1.015  # x the error before on what was kept out: not more than this is not against a finding
-SIDES = 0.24  # of the squared error that is left: what an effect must remove to be doubted only, where a free run over what was kept out does not show it
-ALONE = 2.0  # x the error where it was fitted: beyond it what was kept out shows something that the rest does not
 
 
 @dataclass
@@ -75,7 +71,7 @@ def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Ke
     if worse:
         data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
-    quiet = {a.case.joint for a in answers if rms(a.before) <= verdict.WITHIN * noise.joints[a.case.joint]}
+    quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
     verdict.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     findings.sort(key=lambda f: f.get("hint", False))
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
@@ -90,7 +86,7 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
         for e in d.evidence:
             if e.joint == joint and not EFFECTS[e.effect].effort_only:
                 e.reasons.append(reason)
-                e.confidence = min(e.confidence, verdict.HINTED)
+                e.confidence = min(e.confidence, JUDGE.hinted)
 
 
 def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:
@@ -100,14 +96,14 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
         joint = a.case.joint
         mine = [f for f in findings if joint in f["where"]["joints"] and not EFFECTS[f["effect"]].effort_only]
         v = d.joints[joint]
-        if not mine or v["after"] < 0.98 * v["before"]:
+        if not mine or v["after"] < JUDGE.helps * v["before"]:
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
         if reason:
             for e in d.evidence:
                 if e.joint == joint and not EFFECTS[e.effect].effort_only:
                     e.reasons.append(reason)
-                    e.confidence = min(e.confidence, confidence.DOUBTED)
+                    e.confidence = min(e.confidence, JUDGE.doubted)
             continue
         refuted.add(joint)
         d.notes += [f"{f['effect']} on {joint} earned its place on the training conditions but not on what was kept out; not claimed" for f in mine]
@@ -127,7 +123,7 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
     members = {(a.case.joint, mm.id): (a.case, mm) for a in answers for mm in a.outcome.best.members}
     for f in findings:
         joint, effect = f["where"]["joints"][0], f["effect"]
-        if f["confidence"] < DOUBTED and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"], earned(f)):
+        if f["confidence"] < JUDGE.sure and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"], earned(f)):
             d.notes.append(f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed")
     d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
 
@@ -141,16 +137,16 @@ def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings:
     slide = all(x.case.constants.slide for x in answers)
     data["held_out"] = {"recordings": [kept.runs[i].name for i in kept.test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
                         "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}  # fmt: skip
-    structured = any(x.outcome.none.fit.loss > 1.3**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
+    structured = any(x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
     data["verdict"] = verdict.verdict(data["findings"], floor, b, bl, a, structured, quiet)
-    findings = [f for f in findings if f["confidence"] >= verdict.FIRM]
+    findings = [f for f in findings if f["confidence"] >= JUDGE.firm]
     if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
         squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
         eb, ea = (float(np.sqrt(np.concatenate([x for x in xs if x is not None]).mean())) for xs in squares)
         data["held_out"] |= {"error": "effort_rmse_Nm", "before": eb, "after": ea, "before_low": eb, "before_high": eb, "after_low": ea, "after_high": ea}
     gap = b**2 - floor**2
-    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * floor else 0.0
+    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * floor else 0.0
     if data["verdict"] in ("none", "explained"):
         data["unexplained"]["depends_on"] = []
 
@@ -159,7 +155,7 @@ def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[
     """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing (a limit, a sag) shows
     there alone, and what is kept out must not be fitted."""
     found = {j for f in findings for j in f["where"]["joints"]}
-    return [j for j, v in joints.items() if j not in found and v["before"] > max(verdict.FAR * v["sigma"], ALONE * v["fitted"])]
+    return [j for j, v in joints.items() if j not in found and v["before"] > max(JUDGE.far * v["sigma"], JUDGE.alone * v["fitted"])]
 
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
@@ -169,10 +165,10 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
-    if before > SEARCH.enough**2 and after < (1 - SIDES) * before:
+    if before > SEARCH.enough**2 and after < (1 - JUDGE.sides) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
-    sides_with_neither = ratio < NEUTRAL and after < NEUTRAL**2 * before
-    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= SIDES
+    sides_with_neither = ratio < JUDGE.neutral and after < JUDGE.neutral**2 * before
+    plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= JUDGE.sides
     return "what was kept out does not show it" if sides_with_neither and plain else ""
 
 

@@ -13,16 +13,12 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
-from dexsim.gap.judge.verdict import HINTED
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
+from dexsim.gap.rules import JUDGE
 
-DOUBTED = 0.7  # what a name keeps at most where one reason speaks against it: below what counts as confident
 SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say what an effect is like, not how large it is
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
-CROWD = 3  # effects on one joint from which on the smaller ones are taken for a series of likenesses
-NEEDED = 1.3  # x the noise: an error within it asks for no effect
-SMALL = 0.04  # of the squared error before: a further effect that removes less may be what the first one's law gets wrong (a fifth)
 
 
 @dataclass
@@ -47,7 +43,7 @@ class Evidence:
     def hint(self, reason: str) -> None:
         """Makes it a hint."""
         self.reasons.append(reason)
-        self.confidence = min(self.confidence, HINTED)
+        self.confidence = min(self.confidence, JUDGE.hinted)
 
     def plain(self) -> dict:
         """As it is written."""
@@ -96,23 +92,23 @@ def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
 
 
 def left_over(after: float, before: float, noise: float) -> float:
-    """Share of a squared error `before` that stays, above 1.3 x the noise."""
-    base = (1.3 * noise) ** 2
+    """Share of a squared error `before` that stays, above `JUDGE.within` x the noise."""
+    base = (JUDGE.within * noise) ** 2
     return max(after**2 - base, 0.0) / max(before**2 - base, after**2, 1e-30)
 
 
 def trusted(before: float, after: float, noise: float) -> float:
     """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a twentieth,
     half from a third on. What follows only half of a gap may be another effect's likeness."""
-    return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - 0.05) / 0.28, 0.0, 1.0))
+    return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - JUDGE.left_free) / JUDGE.left_span, 0.0, 1.0))
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
     """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing is asked for,
     or is a trifle beside what others removed of the error before; empty where it is not."""
-    if without <= NEEDED * noise:
+    if without <= JUDGE.within * noise:
         return "without it the error kept out is hardly above the noise"
-    if not alone and without**2 - after**2 < SMALL * max(before, without) ** 2:
+    if not alone and without**2 - after**2 < JUDGE.trifle * max(before, without) ** 2:
         return "it is a trifle beside what another effect explains, whose law need not be exact"
     return ""
 
@@ -124,12 +120,17 @@ def unresolved(without: float, after: float, quantum: float) -> str:
     return "" if moved >= 0.5 * quantum else f"what it does to the motion ({1e3 * moved:.2g} mrad or mm) is less than half a count of the encoder"
 
 
+def kept(earned: float) -> float:
+    """Share of its confidence that a name keeps by what it earned (0 to 1) on what was kept out."""
+    return JUDGE.unearned + (1.0 - JUDGE.unearned) * earned
+
+
 def weigh(e: Evidence, before: float, after: float, without: float, noise: float) -> float:
     """The confidence of one finding by itself: its share, what it earned, what stays unexplained, and its reasons."""
-    c = e.share * (0.3 + 0.7 * e.earned) * trusted(before, after, noise)
+    c = e.share * kept(e.earned) * trusted(before, after, noise)
     if e.members > 1:  # of what the others leave it has to explain most
         c *= trusted(without, after, noise)
-    return float(min(c, 0.99, DOUBTED if e.reasons else 1.0))
+    return float(min(c, 0.99, JUDGE.doubted if e.reasons else 1.0))
 
 
 def together(mine: list[Evidence]) -> None:
@@ -139,7 +140,7 @@ def together(mine: list[Evidence]) -> None:
         e.place = k
         if e.of_pose and len(slow) > 1:
             _doubt(e, f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on the pose")
-        doubtful = next((x for x in mine[:k] if x.confidence < DOUBTED), None)
+        doubtful = next((x for x in mine[:k] if x.confidence < JUDGE.doubted), None)
         if doubtful is not None:
             _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
         alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
@@ -147,13 +148,13 @@ def together(mine: list[Evidence]) -> None:
             _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
         if EFFECTS[e.effect].misreads and any(EFFECTS[x.effect].couples for x in mine):
             e.hint("it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike")
-        if len(mine) >= CROWD and k > 0:
+        if len(mine) >= JUDGE.crowd and k > 0:
             _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
 
 
 def _doubt(e: Evidence, reason: str) -> None:
     e.reasons.append(reason)
-    e.confidence = min(e.confidence, DOUBTED)
+    e.confidence = min(e.confidence, JUDGE.doubted)
 
 
 def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
@@ -165,7 +166,7 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
         reason = too_small(before, h["before"], h["after"], noise, len(findings) == 1) if h else ""
         reason = reason or TOUCH_EFFECTS[f["effect"]].doubt(f)
         if reason:
-            f["confidence"] = min(f["confidence"], DOUBTED)
+            f["confidence"] = min(f["confidence"], JUDGE.doubted)
             said.append(f"{f['effect']} is not sure: {reason}")
     return said
 

@@ -15,6 +15,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.plant.param import Param
+from dexsim.gap.rules import JUDGE
 
 
 def handed(p: Param, case: Case) -> bool:
@@ -82,7 +83,7 @@ def earned(finding: dict[str, Any]) -> float:
     error, others = finding.get("held_out") or {}, sum(float(x["confidence"]) for x in finding.get("alternatives") or ())
     if not error or error["before"] is None or error["after"] is None:
         return 0.0
-    less = float(np.clip((error["before"] - error["after"]) / (0.1 * error["before"] + 1e-12), 0.0, 1.0))
+    less = float(np.clip((error["before"] - error["after"]) / (JUDGE.earns * error["before"] + 1e-12), 0.0, 1.0))
     return less * max(1.0 - others, 0.0)
 
 

@@ -29,6 +29,7 @@ from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX
 from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
@@ -38,9 +39,6 @@ REPLAY = ("mujoco", "warp", "none")
 TASKS = 0.007  # s: the step at which the tasks train (configs/config.yaml)
 WARM_EVERY = 0.1  # s: how often a drive's temperature is renewed
 BEFORE = 0.6  # s: commands sent so long before the first sample are sent, for they may still act
-APART = 1.3  # x: the two simulations agree where neither leaves so much more than the other, or both are within it of the floor
-LITTLE = 0.1  # of the error before: what the engine may leave beside what the plant leaves, added in squares
-MOSTLY = 0.3  # of the error before: what the engine may leave for the answer to hold there in the main
 MOST = 8.0  # s of what was kept out that is replayed: a step of the engine is a turn of Python
 
 
@@ -99,7 +97,7 @@ class Confirmation:
             together = ", all joints at once," if len(self.joints) > 1 else ""
             return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
         believed = next(iter(self.errors.values()))[0]
-        if not self.missing and len(self.errors) > 1 and engine <= MOSTLY * believed:
+        if not self.missing and len(self.errors) > 1 and engine <= JUDGE.mostly * believed:
             return f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, more than in the search's own plant."
         because = f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
         return f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own plant leaves {1e3 * plant:.3g} ({because})."
@@ -358,6 +356,6 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
 
 
 def agree(engine: float, plant: float, floor: float, before: float) -> bool:
-    """Whether the engine's replay confirms the plant's: it leaves no more than APART times as much, or what it leaves beyond that is
-    LITTLE beside the error before (the figures by which the plant absorbs its own inaccuracy are not handed on)."""
-    return engine <= max(APART * max(plant, floor), math.hypot(plant, LITTLE * before))
+    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.apart times as much, or what it leaves beyond that is
+    JUDGE.little beside the error before (the figures by which the plant absorbs its own inaccuracy are not handed on)."""
+    return engine <= max(JUDGE.apart * max(plant, floor), math.hypot(plant, JUDGE.little * before))

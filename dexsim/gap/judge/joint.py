@@ -14,17 +14,12 @@ from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
 from dexsim.gap.result import Curve
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import jitter
 from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
 
-SET_SHARE = 0.06  # of the bootstraps: a rival of the same class with as much belongs to the set
-STRETCH, STRETCHED = 0.5, (0.5, 4.0)  # of the intervals: by the square of what is left of what was kept out, over the noise
-PART = 0.2  # of the squared error on what was kept out: what an effect removes at least that is more than a hint
-SLACK = 0.05  # of the squared error: what may be lost where an effect does not act, by what was refitted beside it
-HARM = 0.05  # of the draws of recordings in which an effect may do more harm than good
-CLEAR = 1.5  # x the noise squared that windows keep after the fit, from which on what it depends on is said
 
 
 @dataclass
@@ -105,15 +100,15 @@ class JointAnswer:
         evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
         gain = verdict.gain_interval((self.measured - q) ** 2, self.after, self.t)
         was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if effort_only and self.effort_after is not None else (error_without, rms(self.after))
-        if left**2 > (1 - PART) * was**2:
-            evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * PART:.0f} %")
-        elif not effort_only and gain[0] < -SLACK:
+        if left**2 > (1 - JUDGE.part) * was**2:
+            evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * JUDGE.part:.0f} %")
+        elif not effort_only and gain[0] < -JUDGE.slack:
             evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(trial)):
             evidence.hint(harmed)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
-        same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= SET_SHARE][:2]
+        same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.set_share][:2]
         signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
@@ -145,7 +140,7 @@ class JointAnswer:
             return ""
         pick = np.random.default_rng(0).integers(0, len(runs), (400, len(runs)))
         gained, of = (lost - mine)[runs][pick].sum(1), lost[runs][pick].sum(1)
-        harms = float(np.mean(gained < -SLACK * of)) > HARM
+        harms = float(np.mean(gained < -JUDGE.slack * of)) > JUDGE.harm
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
     def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
@@ -163,7 +158,7 @@ class JointAnswer:
     def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, effort_only: bool) -> confidence.Evidence:
         """How sure the name is, and every reason to doubt it."""
         case, outcome, before, after = self.case, self.outcome, rms(self.before), rms(self.after)
-        earned = 1.0 if effort_only else float(np.clip((error_without - after) / (0.1 * error_without + 1e-12), 0.0, 1.0))
+        earned = 1.0 if effort_only else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, case.sigma),
             confidence.left_over(after, error_without, case.sigma), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
@@ -183,7 +178,7 @@ class JointAnswer:
         evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, case.sigma)
         if nothing or small:
-            evidence.confidence = min(evidence.confidence, verdict.HINTED)
+            evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         return evidence
 
     def locate(self, rng: np.random.Generator, seed: int) -> None:
@@ -200,7 +195,7 @@ class JointAnswer:
         with search._fix(self.best.members):
             left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
         spots = bins.control(bins.spots(case.joint, left * case.sigma, blocks, regimes, rng))
-        self.spots, self.depends_on = found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > CLEAR else []
+        self.spots, self.depends_on = found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.clear else []
 
     def curve(self) -> Curve | None:
         """The stretch where the believed simulator is worst."""
@@ -220,7 +215,7 @@ def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
         return bounds
     low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
     x, least = fit.x[:, None], traded(fit)[:, None] * np.array([-1.0, 1.0])
-    by = np.clip(STRETCH * left**2, *STRETCHED) * (bounds - x)
+    by = np.clip(JUDGE.stretch * left**2, JUDGE.stretch_least, JUDGE.stretch_most) * (bounds - x)
     return np.clip(x + np.where(np.abs(by) < np.abs(least), least, by), low, high)
 
 

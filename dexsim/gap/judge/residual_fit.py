@@ -17,10 +17,10 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.plant.param import expand
 from dexsim.gap.read.runs import Run
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 
 COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")
-LEAST = 0.10  # of the held-out error: what it must take away to be offered
 BLOCK = 0.5  # s
 
 
@@ -99,7 +99,7 @@ def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def fit(case: Case, runs: list[Run], trial: Trial, train: list[int], test: list[int], span_train=None, span_test=None, seed: int = 0) -> StandIn | None:
-    """The stand-in of one joint; None where it would not take LEAST off the held-out error."""
+    """The stand-in of one joint; None where it would not take JUDGE.standin off the held-out error."""
     x, y, block = [], [], []
     for r in train:
         torque, on = residual_torque(case, runs, trial, r)
@@ -129,7 +129,7 @@ def fit(case: Case, runs: list[Run], trial: Trial, train: list[int], test: list[
     draws = np.array([solve(rng.integers(0, count, count)) for _ in range(200)])
     low, high = np.quantile(draws, 0.05, 0), np.quantile(draws, 0.95, 0)
     before, after = _held_out(case, runs, trial, value, test, span_test)
-    if not after < (1 - LEAST) * before:
+    if not after < (1 - JUDGE.standin) * before:
         return None
     return StandIn(case.joint, value, np.minimum(low, value), np.maximum(high, value), before, after)
 

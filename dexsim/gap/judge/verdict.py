@@ -10,22 +10,18 @@ from typing import Any
 
 import numpy as np
 
-WITHIN = 1.3  # x the floor: an error within it asks for no effect
-FAR = 5.0  # x the floor: an error before that large is not nothing, though only a few moments show it
-FIRM = 0.5  # confidence from which on a name counts; below it is a hint
-SURE_ENOUGH = 0.75  # confidence of at least one name, or a set, without which nothing counts as explained
-HINTED = 0.45  # what a name keeps at most that the error on what was kept out does not bear out
-REMOVED = 0.3  # of the gap between error and floor: what counts as partly explained
+from dexsim.gap.rules import JUDGE
+
 
 
 def settle(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
-    """Marks the findings of joints that are hints: names below `FIRM`, and those on joints that are followed to their floor without any
+    """Marks the findings of joints that are hints: names below `JUDGE.firm`, and those on joints that are followed to their floor without any
     effect (`quiet`), whose confidence goes below it."""
     for f in findings:
         joints = f["where"]["joints"]
         if joints and set(joints) <= quiet and f["held_out"]:
-            f["confidence"] = min(f["confidence"], HINTED)
-        if f["held_out"] and f["confidence"] < FIRM:
+            f["confidence"] = min(f["confidence"], JUDGE.hinted)
+        if f["held_out"] and f["confidence"] < JUDGE.firm:
             f["hint"] = True
 
 
@@ -36,7 +32,7 @@ def firm(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def wrong_signals(findings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The findings that a signal is not what it says, where they are more than hints."""
-    return [f for f in findings if f["effect"] == "bad_channel" and f["confidence"] >= FIRM]
+    return [f for f in findings if f["effect"] == "bad_channel" and f["confidence"] >= JUDGE.firm]
 
 
 def verdict(findings: Sequence[dict[str, Any]], floor: float, before: float, before_low: float, after: float, structured: bool,
@@ -46,13 +42,13 @@ def verdict(findings: Sequence[dict[str, Any]], floor: float, before: float, bef
     Where the rest is followed to the floor a wrong signal is the answer: something was amiss, and it has a name."""
     named = firm(findings)
     if not named:
-        if quiet or before <= WITHIN * floor or (before <= FAR * floor and (before_low <= WITHIN * floor or not structured)):
+        if quiet or before <= JUDGE.within * floor or (before <= JUDGE.far * floor and (before_low <= JUDGE.within * floor or not structured)):
             return "explained" if wrong_signals(findings) else "none"
         return "unknown"
-    if after <= WITHIN * floor:  # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
-        sure = any(f.get("confidence", 1.0) >= SURE_ENOUGH or f.get("indistinguishable") for f in named)
+    if after <= JUDGE.within * floor:  # where every name is doubtful and none stands for a set, an error that is gone is not yet explained
+        sure = any(f.get("confidence", 1.0) >= JUDGE.sure_of_one or f.get("indistinguishable") for f in named)
         return "explained" if sure else "partly_explained"
-    return "partly_explained" if (before - after) / max(before - floor, 1e-12) >= REMOVED else "unknown"
+    return "partly_explained" if (before - after) / max(before - floor, 1e-12) >= JUDGE.removed else "unknown"
 
 
 def gain_interval(without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = 0.5) -> tuple[float, float]:

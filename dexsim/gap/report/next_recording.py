@@ -13,6 +13,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.report import next_experiment
 from dexsim.gap.report.sentence import place
 from dexsim.gap.result import Diagnosis, Settings
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
@@ -21,7 +22,7 @@ def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
     named = [f for f in data["findings"] if modelled(f)]
-    unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < 0.8]
+    unsure = [f for f in named if f["indistinguishable"] or f["confidence"] < JUDGE.sure]
     kinds, joints, why = None, None, ""
     if unsure and not unsure[0]["where"]["joints"]:
         _next_touch(d, s, m, unsure[0], recordings)

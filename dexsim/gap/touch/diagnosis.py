@@ -14,6 +14,7 @@ from dexsim.assets import xhand
 from dexsim.gap.judge import confidence
 from dexsim.gap.judge.errors import rms_interval
 from dexsim.gap.result import Diagnosis
+from dexsim.gap.rules import TOUCH
 from dexsim.gap.steps import Steps
 from dexsim.gap.touch import constant_taxels, locate, report
 from dexsim.gap.touch.handed_on import handed
@@ -25,7 +26,6 @@ from dexsim.gap.touch.settings import PadFacts
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 
-SHORT = 3.0  # s of touch on a pad, at least, before anything but constant taxels is looked for
 
 
 @dataclass
@@ -78,9 +78,9 @@ class Touch(Steps):
         for pad in self.pads:
             runs = pad.runs
             seconds = sum(float(np.sum(r.z.sum(1) > 0.1) * np.median(np.diff(r.t))) for r in runs)
-            if seconds < SHORT:
+            if seconds < TOUCH.short:
                 pad.notes.append(
-                    f"the {pad.name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least {SHORT:g} s)"
+                    f"the {pad.name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least {TOUCH.short:g} s)"
                 )
                 continue
             names = {r.recording for r in runs}

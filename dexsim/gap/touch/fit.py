@@ -10,14 +10,12 @@ from scipy.optimize import least_squares
 from dexsim.calibration.taxels import neighbours
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.plant.case import noise
+from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
 BLOCK = 0.5  # s
-MODEL = 0.02  # of a reading: finer than that the plant is not to be trusted
-LAW, OF_LAW = 0.1, ("stiffness", "neighbours", "fraction", "c10", "c01")  # how a force spreads over taxels is a model: sizes that hang on it
-TIMING = 3e-3  # s by which a reading's time is uncertain: between two positions of the joints the contact is a guess
-PRIOR = 0.3  # standard deviation of a taxel's gain, before anything is seen
+OF_LAW = ("stiffness", "neighbours", "fraction", "c10", "c01")  # sizes that hang on how a force spreads over taxels
 PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
 
 
@@ -112,11 +110,11 @@ class PadFit:
             quiet = 1.0 * r.lsb
             mask = ((r.z > quiet) | (expected > quiet)) & ~r.full
             mask[:, list(self.silent)] = False
-            sigma = np.sqrt(self.noise**2 + (MODEL * np.maximum(r.z, 0.0)) ** 2 + (TIMING * _rate(r.t, r.z)) ** 2)
+            sigma = np.sqrt(self.noise**2 + (TOUCH.plant * np.maximum(r.z, 0.0)) ** 2 + (TOUCH.timing * _rate(r.t, r.z)) ** 2)
             out.append(self._sample(r, i, "taxels", mask, sigma, r.t, held))
             if self.load:
                 touched = (r.load > 0.05 * r.load.max()) | (cell(r, v) > 0.05)
-                wide = np.sqrt(self.load_noise**2 + (MODEL * r.load) ** 2 + (TIMING * _rate(r.grid, r.load)) ** 2)
+                wide = np.sqrt(self.load_noise**2 + (TOUCH.plant * r.load) ** 2 + (TOUCH.timing * _rate(r.grid, r.load)) ** 2)
                 # the grid is denser than the readings: neighbours say the same
                 mine = touched & (np.arange(len(r.grid)) % 2 == 0)
                 out.append(self._sample(r, i, "cell", mine, wide, r.grid, held))
@@ -216,7 +214,7 @@ class PadFit:
             a += n
         # readings of one press are alike: they count as fewer
         independent = 0.1
-        return (independent * up + 1 / PRIOR**2) / (independent * down + 1 / PRIOR**2)
+        return (independent * up + 1 / TOUCH.gain_prior**2) / (independent * down + 1 / TOUCH.gain_prior**2)
 
     def loss(self, res: np.ndarray) -> np.ndarray:
         """[B] squared (Huber) residuals by block, stages weighed so that each counts alike per residual."""
@@ -291,7 +289,7 @@ class PadFit:
         out = {}
         for k, s in zip(fitted.keys, variance, strict=True):
             x = trial.values[k]
-            half = 1.645 * float(np.sqrt(s + ((LAW if k in OF_LAW else 0.015) * x) ** 2))
+            half = 1.645 * float(np.sqrt(s + ((TOUCH.law if k in OF_LAW else 0.015) * x) ** 2))
             low, high = self._bounds(k)
             out[k] = (max(x - half, low), min(x + half, high))
         return {k: v for k, v in out.items() if k in keys}

@@ -17,12 +17,12 @@ import yaml
 
 from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch.settings import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.tactile.config import COLUMNS
 from dexsim.tactile.file import RANGES
 from dexsim.tactile.pads import PAD_COLUMNS
 
-SURE = 0.8  # confidence from which a finding stands alone, unless it is one of a set
 SHARED = ("object.friction", "contact.stiffness")  # a world has one for all fingertips
 
 HEAD = """\
@@ -42,7 +42,7 @@ class Handed:
 
 
 def doubted(finding: dict[str, Any]) -> bool:
-    return finding["confidence"] < SURE or bool(finding["indistinguishable"])
+    return finding["confidence"] < JUDGE.sure or bool(finding["indistinguishable"])
 
 
 def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts]) -> Handed:

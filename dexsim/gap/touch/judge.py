@@ -9,6 +9,8 @@ import numpy as np
 from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.effect import word
+from dexsim.gap.judge.confidence import kept
+from dexsim.gap.rules import JUDGE, TOUCH
 from dexsim.gap.touch import constant_taxels, locate
 from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.handed_on import chord
@@ -16,9 +18,6 @@ from dexsim.gap.touch.plant import PARAMS, contact, readings
 from dexsim.gap.touch.search import PadOutcome, PadSearch
 from dexsim.gap.touch.settings import Fit, PadFacts
 
-SET_SHARE = 0.12  # of the bootstraps: a rival of the same class with as much belongs to the set
-AGREE = 5  # taxels with one gain from which on those that hardly felt anything are taken to have it too
-GAIN_OFF = 0.08  # a taxel whose gain is less than this off is not listed
 
 
 class PadAnswer:
@@ -70,15 +69,15 @@ class PadAnswer:
         less = search.without(best, e) if len(best.ids) > 1 else self.none
         b, a = held_out(search, less, stage)[0], held_out(search, best, stage)[0]
         rivals, share = self.outcome.rivals[e], self.outcome.confidence[e]
-        same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= SET_SHARE][:2]
-        earned = float(np.clip((b - a) / (0.1 * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
-        if earned <= 0.2:
+        same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= TOUCH.set_share][:2]
+        earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
+        if earned <= TOUCH.earned:
             self.notes.append(f"{e} on the {self.name}'s pad earned its place in training but not on what was kept out; not claimed")
             return None
         taxels, parameters = self._parameters(e)
         return {
             "effect": e,
-            "confidence": round(float(min(share * (0.3 + 0.7 * earned), 0.99)), 3),
+            "confidence": round(float(min(share * kept(earned), 0.99)), 3),
             "alternatives": [{"effect": x, "confidence": round(c, 3)} for x, c in rivals[:3]],
             "indistinguishable": [e, *(x for x, _ in same)] if same else [],
             "separating_experiment": effect.experiment if same else None,
@@ -109,7 +108,7 @@ class PadAnswer:
         """Whether something is left that no effect explains."""
         search = self.search
         loss = float(search.cross(self.best).sum()) / max(int(search.train.sum()), 1)
-        return loss > 2.0**2 and self.left > 2.0 * self.floor
+        return loss > TOUCH.structured**2 and self.left > TOUCH.structured * self.floor
 
     def _rest(self) -> Fit | None:
         """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where they do not."""
@@ -120,11 +119,11 @@ class PadAnswer:
         width = search.gain_width(t)
         sure = (width < 0.1) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
         sure[list(search.silent)] = False
-        if sure.sum() < AGREE:
+        if sure.sum() < TOUCH.agree:
             return None
         # one barely known counts little
         low, value, high = _quantiles(t.gains[sure], width[sure] ** -2.0, (0.05, 0.5, 0.95))
-        return (value, low, high) if abs(value - 1) > GAIN_OFF and high - low < abs(value - 1) else None
+        return (value, low, high) if abs(value - 1) > TOUCH.gain_off and high - low < abs(value - 1) else None
 
     def _chord(self) -> Fit | None:
         """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known; None without one."""
@@ -162,7 +161,7 @@ class PadAnswer:
         g = t.gains
         moved = [] if t.order is None else [int(k) for k in np.flatnonzero(t.order != np.arange(len(g)))]
         half = self.search.gain_width(t)
-        off = [int(k) for k in np.flatnonzero(np.abs(g - 1) > np.maximum(GAIN_OFF, half))]
+        off = [int(k) for k in np.flatnonzero(np.abs(g - 1) > np.maximum(TOUCH.gain_off, half))]
         chosen = sorted(set(off) | set(moved))
         names = [f"{pad}:{k}" for k in chosen]
         value = [round(float(g[k]), 4) for k in chosen]

@@ -7,6 +7,7 @@ import numpy as np
 from dexsim.gap.judge import verdict
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch.result import TouchResult
 
 
@@ -15,7 +16,7 @@ def _verdict(felt: TouchResult) -> str | None:
     if felt.before is None:
         return "explained" if felt.findings else None
     for f in felt.findings:
-        if f["confidence"] < verdict.FIRM:
+        if f["confidence"] < JUDGE.firm:
             f["hint"] = True
     named = [{"effect": f["effect"], "held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
     word = verdict.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
@@ -75,5 +76,5 @@ def _metric(data: dict, felt: TouchResult) -> None:
                         "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
     gap = b**2 - felt.floor**2
     data["unexplained"]["fraction_of_gap"] = (
-        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > 1.3 * felt.floor else 0.0
+        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * felt.floor else 0.0
     )

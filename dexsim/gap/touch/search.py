@@ -9,14 +9,11 @@ import numpy as np
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
 from dexsim.gap.effects.tactile_gain import TactileGain
 from dexsim.gap.effects.touch_effect import TouchEffect
+from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.plant import PARAMS, readings
 
-LEAST = 0.12  # of the squared error on presses left out: what an effect must remove
-MOST = 4  # effects on one pad
-MAP_PRICE = 1.5  # on the squared error of a gain for every taxel
 BOOTSTRAPS = 300
-CLOSE = 0.03  # of the loss on presses left out: nearer than this the one that follows the presses themselves better is taken
 
 
 @dataclass
@@ -40,8 +37,8 @@ class PadSearch(PadFit):
         current = none
         notes: list[str] = []
         trials: dict[frozenset, TouchTrial] = {frozenset(): none}
-        for _ in range(MOST):
-            if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < 1.2**2:
+        for _ in range(TOUCH.most):
+            if float(self.cross(current).sum()) / max(int(self.train.sum()), 1) < TOUCH.enough**2:
                 break
             listed = self.scan(current)
             if any(x.widens for x in listed):
@@ -58,9 +55,9 @@ class PadSearch(PadFit):
             if not good:
                 break
             # a gain for every taxel must do clearly better than one number
-            priced = lambda t, had=current.gains is not None: self.cross(t).sum() * (1.0 if t.gains is None or had else MAP_PRICE)  # noqa: E731
+            priced = lambda t, had=current.gains is not None: self.cross(t).sum() * (1.0 if t.gains is None or had else TOUCH.map_price)  # noqa: E731
             least = min(map(priced, good))
-            current = min((t for t in good if priced(t) <= (1 + CLOSE) * least), key=lambda t: self.size(t.res) * priced(t))
+            current = min((t for t in good if priced(t) <= (1 + TOUCH.close) * least), key=lambda t: self.size(t.res) * priced(t))
         current = self._drop(current, trials)
         if current.ids and current.gains is None:  # the numbers, to their end
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
@@ -104,7 +101,7 @@ class PadSearch(PadFit):
                     best = max(best, (2 * c * float(d @ clean) - c * c * dd) / max(total, 1e-12))
             found.append((1.0 if effect.by_taxel else best, effect))
         found.sort(key=lambda f: -f[0])
-        return [e for g, e in found[:most] if g > 0.25 * LEAST]
+        return [e for g, e in found[:most] if g > 0.25 * TOUCH.least]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """The hypothesis with one effect more; None where it cannot be there."""
@@ -130,7 +127,7 @@ class PadSearch(PadFit):
             if self.scale_known:
                 tries.append(self._common(current, 60))
             # a map where one number does not: a third less error, beside the price of its 120 numbers
-            if len(tries) == 2 and self.size(tries[0].res) > 0.7 * self.size(tries[1].res):
+            if len(tries) == 2 and self.size(tries[0].res) > TOUCH.map_better * self.size(tries[1].res):
                 tries = tries[1:]
             return tries[0]
         starts = sorted(effect.begin(self), key=lambda s: self.size(self.residual(current.values | s, current.gains, current.order)))
@@ -162,7 +159,7 @@ class PadSearch(PadFit):
         out, used = np.arange(K), set()
         gain = own[:, None] + own[None] - left - left.T
         # each of the two must fit the other's place far better than its own
-        good = (left < 0.35 * own[:, None]) & (left.T < 0.35 * own[None]) & (gain > 200 * self.noise**2)
+        good = (left < TOUCH.swapped * own[:, None]) & (left.T < TOUCH.swapped * own[None]) & (gain > 200 * self.noise**2)
         pairs = sorted(((gain[i, j], i, j) for i, j in zip(*np.nonzero(np.triu(good, 1)), strict=True)), reverse=True)
         for _, i, j in pairs:
             if i not in used and j not in used:
@@ -172,9 +169,9 @@ class PadSearch(PadFit):
 
     def _earns(self, new: TouchTrial, old: TouchTrial) -> bool:
         a, b = self.cross(old), self.cross(new)
-        if 1 - b.sum() / max(a.sum(), 1e-12) < LEAST:
+        if 1 - b.sum() / max(a.sum(), 1e-12) < TOUCH.least:
             return False
-        return bool(np.quantile(self._boot(a - b), 0.03) > 0)
+        return bool(np.quantile(self._boot(a - b), TOUCH.chance) > 0)
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
         n = len(x)
@@ -234,7 +231,7 @@ class PadSearch(PadFit):
         start = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
         index = ((start[..., None] + np.arange(size)) % n).reshape(BOOTSTRAPS, -1)
         sums = table[:, index].sum(-1)
-        weight = np.exp(-np.clip((sums / sums.min(0) - 1) / 0.03, 0, 50))
+        weight = np.exp(-np.clip((sums / sums.min(0) - 1) / TOUCH.told_apart, 0, 50))
         shares = (weight / weight.sum(0)).mean(1)
         rows = sorted(((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1])
         return rows, float(shares[0])
