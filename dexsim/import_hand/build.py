@@ -1,0 +1,216 @@
+"""The hand's own model, written anew: what the source says of bodies and joints, with dexsim's collision shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from dexsim.import_hand import geometry
+from dexsim.import_hand.figures import Figures
+from dexsim.import_hand.shapes import MARGIN, Capsule, Shapes
+from dexsim.import_hand.tree import Tree
+
+OBJECT_BIT, HAND_BIT = 1, 2  # as dexsim.hand.model has them: the bits above are the hand's own, about itself
+FIRST_OWN = 2
+SOLREF = "0.005 1"
+PLAIN = "0.62 0.64 0.67 1"
+
+
+@dataclass
+class Model:
+    """xml: the text of model.xml; meshes: OBJ text by file name, in meshes/; tip_geoms: name of each finger's."""
+
+    xml: str
+    meshes: dict[str, str] = field(default_factory=dict)
+    tip_geoms: list[str] = field(default_factory=list)
+
+    def compile(self) -> mujoco.MjModel:
+        """The model, without files."""
+        return mujoco.MjModel.from_xml_string(self.xml, {f"meshes/{n}": t.encode() for n, t in self.meshes.items()})
+
+    def write(self, folder: Path, name: str = "model.xml") -> None:
+        """Write the model and its meshes into a folder."""
+        (folder / "meshes").mkdir(parents=True, exist_ok=True)
+        for file, text in self.meshes.items():
+            (folder / "meshes" / file).write_text(text, encoding="ascii")
+        (folder / name).write_text(self.xml, encoding="utf-8")
+
+
+def build(
+    name: str, m: mujoco.MjModel, tree: Tree, shapes: Shapes, figures: Figures, excluded: list[tuple[str, str]], note: str
+) -> Model:
+    """MJCF of the hand: its root is the palm, which stands in the world's origin.
+
+    Links meet those of other fingers and objects; a tip meets objects with its mesh and the hand with a capsule inside.
+    excluded: pairs of bodies that do not meet each other.
+    """
+    out = Model("")
+    owner = {}  # body -> finger
+    for k, finger in enumerate(tree.fingers):
+        b = finger.tip
+        while b != tree.palm:
+            owner.setdefault(b, k)
+            b = int(m.body_parentid[b])
+    kept = _subtree(m, tree.palm)
+    for b in kept:
+        if b != tree.palm and b not in owner:
+            parent = int(m.body_parentid[b])
+            owner[b] = owner.get(parent, -1)
+    fingers = len(tree.fingers)
+    bits = [1 << (FIRST_OWN + min(k, 27)) for k in range(fingers)] + [1 << (FIRST_OWN + min(fingers, 28))]
+    everyone = 0
+    for bit in bits:
+        everyone |= bit
+
+    def own(body: int) -> int:
+        return bits[owner[body]] if owner.get(body, -1) >= 0 else bits[-1]
+
+    files: list[str] = []
+    lines: list[str] = []
+    tip_of = {f.tip: k for k, f in enumerate(tree.fingers)}
+
+    def emit(b: int, depth: int) -> None:
+        pad = "  " * depth
+        at = "" if b == tree.palm else f' pos="{_n(m.body_pos[b])}" quat="{_n(m.body_quat[b])}"'
+        lines.append(f'{pad}<body name="{_t(m.body(b).name)}"{at}>')
+        inner = pad + "  "
+        if m.body_mass[b] > 0:
+            lines.append(
+                f'{inner}<inertial pos="{_n(m.body_ipos[b])}" quat="{_n(m.body_iquat[b])}" mass="{_n(m.body_mass[b])}"'
+                f' diaginertia="{_n(m.body_inertia[b])}"/>'
+            )
+        for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) if b != tree.palm else ():
+            joint = m.joint(j).name
+            kind = "" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else ' type="slide"'
+            lines.append(
+                f'{inner}<joint name="{_t(joint)}"{kind} pos="{_n(m.jnt_pos[j])}" axis="{_n(m.jnt_axis[j])}"'
+                f' range="{_n(m.jnt_range[j])}" armature="{_n(figures.armature[joint])}"'
+                f' damping="{_n(figures.damping[joint])}"/>'
+            )
+        for n, c in enumerate(c for c in shapes.capsules if c.body == b):
+            others = everyone & ~own(b)
+            lines.append(inner + _capsule(f"link_{m.body(b).name}_{n}", c, HAND_BIT | own(b), OBJECT_BIT | others))
+        if b in tip_of:
+            k = tip_of[b]
+            finger = tree.fingers[k].name
+            out.meshes[f"tip_{finger}.obj"] = hull_obj(shapes.cores[k])
+            files.append(f"tip_{finger}.obj")
+            out.tip_geoms.append(f"tip_{finger}")
+            lines.append(
+                f'{inner}<geom class="tip" name="tip_{finger}" mesh="tip_{finger}" contype="{HAND_BIT}"'
+                f' conaffinity="{OBJECT_BIT}"/>'
+            )
+            others = everyone & ~own(b)
+            for n, c in enumerate(c for c in shapes.proxies if c.body == b):
+                lines.append(inner + _capsule(f"self_{finger}_{n}", c, own(b), others))
+        for n, g in enumerate(geometry.seen(m, b)):
+            vertices, faces = geometry.geom_surface(m, g)
+            if not len(faces):
+                continue
+            file = f"{_safe(m.body(b).name)}_{n}.obj"
+            out.meshes[file] = obj(vertices, faces)
+            files.append(file)
+            lines.append(
+                f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'
+                f' rgba="{_colour(m, g)}"/>'
+            )
+        for c in kept:
+            if m.body_parentid[c] == b:
+                emit(c, depth + 1)
+        lines.append(f"{pad}</body>")
+
+    emit(tree.palm, 2)
+    order = {f"tip_{f.name}": k for k, f in enumerate(tree.fingers)}
+    out.tip_geoms.sort(key=lambda g: order[g])
+    assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
+    apart = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
+    out.xml = _TEMPLATE.format(
+        name=_t(name), note=note.replace("--", "-"), assets=assets, bodies="\n".join(lines), solref=SOLREF, margin=MARGIN,
+        contact=f"\n  <contact>\n{apart}\n  </contact>" if apart else "",
+    )  # fmt: skip
+    return out
+
+
+def _subtree(m: mujoco.MjModel, root: int) -> list[int]:
+    out = [root]
+    for b in range(root + 1, m.nbody):
+        if m.body_parentid[b] in out:
+            out.append(b)
+    return out
+
+
+def _capsule(name: str, c: Capsule, contype: int, conaffinity: int) -> str:
+    bits = f'contype="{contype}" conaffinity="{conaffinity}"'
+    if np.linalg.norm(c.b - c.a) < 1e-4:
+        return f'<geom class="link" name="{_t(name)}" type="sphere" pos="{_n(c.a)}" size="{_n(c.radius)}" {bits}/>'
+    return f'<geom class="link" name="{_t(name)}" type="capsule" fromto="{_n([*c.a, *c.b])}" size="{_n(c.radius)}" {bits}/>'
+
+
+def _colour(m: mujoco.MjModel, g: int) -> str:
+    k = m.geom_matid[g]
+    rgba = m.mat_rgba[k] if k >= 0 else m.geom_rgba[g]
+    if k < 0 and np.allclose(rgba, [0.5, 0.5, 0.5, 1]):
+        return PLAIN
+    return _n([*np.clip(rgba[:3], 0.12, 1), 1.0])
+
+
+def hull_obj(points: np.ndarray) -> str:
+    """OBJ text of the convex hull of points [V, 3] m, outward."""
+    hull = ConvexHull(points)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = points[used]
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return obj(vertices, faces)
+
+
+def obj(vertices: np.ndarray, faces: np.ndarray) -> str:
+    """Wavefront OBJ text, metres."""
+    return "".join(
+        [f"v {x:.7g} {y:.7g} {z:.7g}\n" for x, y, z in vertices + 0.0] + [f"f {a} {b} {c}\n" for a, b, c in faces + 1]
+    )
+
+
+def _n(values) -> str:
+    return " ".join(f"{float(x) + 0.0:.8g}" for x in np.atleast_1d(values))
+
+
+def _t(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+
+
+def _safe(text: str) -> str:
+    return "".join(c if c.isalnum() or c in "_-" else "_" for c in text)
+
+
+_TEMPLATE = """\
+<!-- {note} -->
+<mujoco model="{name}">
+  <compiler angle="radian" meshdir="meshes" autolimits="true"/>
+  <option timestep="0.005" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <default>
+    <default class="visual">
+      <geom type="mesh" contype="0" conaffinity="0" group="2" mass="0"/>
+    </default>
+    <default class="link">
+      <geom group="3" mass="0" condim="3" friction="0.8 0.003 0.0001" solref="{solref}" rgba="0.9 0.5 0.2 0.4"/>
+    </default>
+    <default class="tip">
+      <geom type="mesh" group="3" mass="0" condim="4" priority="1" friction="0.9 0.003 0.0001" solref="{solref}"
+        margin="{margin}" rgba="0.2 0.7 0.4 0.5"/>
+    </default>
+  </default>
+  <asset>
+{assets}
+  </asset>
+  <worldbody>
+{bodies}
+  </worldbody>{contact}
+</mujoco>
+"""

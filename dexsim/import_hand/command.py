@@ -1,0 +1,138 @@
+"""`dexsim import-hand model.urdf out=hands/mine`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dexsim import yaml_text
+from dexsim.errors import UserError
+
+USAGE = """usage: dexsim import-hand MODEL out=FOLDER [key=value ...]     MODEL: a URDF or MJCF file
+       dexsim import-hand check FOLDER [key=value ...]
+
+Make a hand of a robot's file: find its palm, fingers and tips, guess the palm's frame, an open and a cupped pose, give
+it collision shapes and touch pads, and write a folder that every task takes: dexsim train task=grasp hand=FOLDER
+
+  FOLDER/hand.yaml      what no model file says, every guess marked: correct it, run the same command again
+  FOLDER/model.xml      the hand with its collision shapes; meshes/
+  FOLDER/servo.yaml     its drives, from efforts and speeds
+  FOLDER/taxels_*.csv   its touch pads; skin_*.obj: the surfaces that carry them
+  FOLDER/picture.png    the hand, frames, joint names, open and cupped, shapes, pads
+
+A second run keeps what you corrected in hand.yaml and every file that you changed. `check` moves each joint in turn,
+says what it does, and films it: FOLDER/check.mp4 and check.png.
+
+settings (key=default):
+  name=             of the hand (default: the model's file name)
+  palm=             body to take for the palm (default: the last one that all fingers share)
+  pads=8x6          taxels of a fingertip, rows (along the finger) x columns; pads=none; pads=FILE.csv with columns
+                    finger,x,y,z,nx,ny,nz (m, in the tip body's frame)
+  effort= speed=    N m and rad/s of the joints for which the file says none
+  density=          kg/m3 of links without an inertia
+  coupled=refuse    joints tied by tendons, mimic or equality: refuse, or independent: a motor for each
+  holes=refuse      a fingertip's mesh with a hole: refuse, or hull: take its convex hull
+  packages=         folders in which package:// is looked for, separated by commas
+  picture=true      false: do not render
+  PLACE=VALUE       any place of hand.yaml, e.g. palm.normal=[0,0,1] poses.cupped.j1=0.8 fingers.thumb.closes=[1,-1]
+"""
+KEYS = ("out", "name", "palm", "pads", "effort", "speed", "density", "coupled", "holes", "packages", "picture")
+PLACES = ("palm.", "poses.", "fingers.", "joints.", "opposing", "handedness", "span", "force")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Returns the exit status. Raises UserError."""
+    if not argv or argv[0] in ("-h", "--help", "help") or "--help" in argv:
+        print(USAGE, end="")
+        return 0 if argv else 2
+    if argv[0] == "check":
+        from dexsim.import_hand import moves
+
+        return moves.main(argv[1:])
+    model, given, said = arguments(argv)
+    if "out" not in given:
+        raise UserError("say where to write: out=FOLDER, e.g. out=hands/mine")
+    from dexsim.import_hand.importing import import_hand
+
+    out = Path(given["out"]).expanduser()
+    result = import_hand(
+        Path(model).expanduser(), out, settings(given, said), say=lambda text: print(text, flush=True),
+        picture=_yes(given.get("picture", "true")),
+    )  # fmt: skip
+    if result.corrected:
+        print(f"kept     your corrections: {', '.join(c for c in result.corrected if c != 'joint order')}")
+    for name in result.kept:
+        print(f"kept     {name}, which you changed or added (delete it to have it written anew)")
+    guesses = [p for p in result.hand["guessed"]]
+    print(f"\n{out}/hand.yaml holds {len(guesses)} guesses. Look at {out}/picture.png, correct hand.yaml, run this again.")
+    print(f"Then: dexsim import-hand check {out}, and dexsim train task=grasp hand={out}")
+    return 0
+
+
+def arguments(argv: Sequence[str]) -> tuple[str, dict[str, str], dict[str, Any]]:
+    """The model's file, settings, and places of hand.yaml with their values."""
+    models, given, said = [], {}, {}
+    for text in argv:
+        key, equals, value = text.partition("=")
+        if not equals:
+            models.append(text)
+        elif key in KEYS:
+            given[key] = value
+        elif key.startswith(PLACES):
+            said[key] = yaml_text.parse(value, key)
+        else:
+            raise UserError(f"'{text}': no such setting; there are {', '.join(KEYS)}, and places of hand.yaml (palm.normal=...)")
+    if len(models) != 1:
+        raise UserError(
+            f"one model file is needed, {len(models)} given{': ' + ', '.join(models) if models else ''}:"
+            " dexsim import-hand model.urdf out=hands/mine"
+        )
+    return models[0], given, said
+
+
+def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
+    """The settings as `dexsim.import_hand.importing.Settings`."""
+    from dexsim.import_hand.importing import Settings
+
+    for key, allowed in (("coupled", ("refuse", "independent")), ("holes", ("refuse", "hull"))):
+        if given.get(key, allowed[0]) not in allowed:
+            raise UserError(f"{key}={given[key]}: must be {' or '.join(allowed)}")
+    out = Settings(said=said)
+    out.coupled, out.holes = given.get("coupled", "refuse"), given.get("holes", "refuse")
+    out.palm, out.name = given.get("palm") or None, given.get("name") or None
+    for key, low, high, unit in (("effort", 0.001, 100.0, "N m"), ("speed", 0.01, 200.0, "rad/s"), ("density", 1.0, 3e4, "kg/m3")):
+        if given.get(key):
+            setattr(out, key, _number(key, given[key], low, high, unit))
+    if given.get("packages"):
+        out.packages = [Path(p.strip()).expanduser() for p in given["packages"].split(",")]
+        for p in out.packages:
+            if not p.is_dir():
+                raise UserError(f"packages={p}: no such folder")
+    pads = given.get("pads", "8x6")
+    if pads == "none":
+        out.pads = None
+    elif pads.endswith(".csv"):
+        out.pads = Path(pads).expanduser()
+    else:
+        rows, x, columns = pads.partition("x")
+        if not (x and rows.isdigit() and columns.isdigit() and 1 <= int(rows) <= 40 and 1 <= int(columns) <= 40):
+            raise UserError(f"pads={pads}: must be ROWSxCOLUMNS (1 to 40 each, e.g. 8x6), none, or a .csv file")
+        out.pads = (int(rows), int(columns))
+    return out
+
+
+def _number(key: str, text: str, low: float, high: float, unit: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not low <= value <= high:
+        raise UserError(f"{key}={text}: must be a number from {low:g} to {high:g} {unit}")
+    return value
+
+
+def _yes(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise UserError(f"picture={text}: must be true or false")
+    return text == "true"

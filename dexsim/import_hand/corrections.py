@@ -1,0 +1,79 @@
+"""What a person corrected in a hand.yaml that a program wrote: told apart from guesses, and kept.
+
+The importer notes beside the file what it wrote. What differs from that now is a person's, and stays; so does what a
+person took out of `guessed` without changing it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+NOTE = ".import.json"
+
+
+@dataclass
+class Corrections:
+    """values: place -> what a person says there ("palm.normal", "poses.open.j1", "fingers.thumb.tip.position")."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    used: set[str] = field(default_factory=set)
+
+    def pick(self, place: str, guess: Any) -> Any:
+        """A person's value of a place, or the guess."""
+        if place in self.values:
+            self.used.add(place)
+            return self.values[place]
+        return guess
+
+    def has(self, place: str) -> bool:
+        """Whether a person has said it."""
+        return place in self.values
+
+
+def flat(data: Any, place: str = "") -> dict[str, Any]:
+    """Leaves of a hand.yaml by place; fingers and joints by their names, lists of numbers or words whole."""
+    out: dict[str, Any] = {}
+    if isinstance(data, dict):
+        for key, value in data.items():
+            if place == "" and key in ("guessed", "source"):
+                continue
+            out |= flat(value, f"{place}.{key}" if place else str(key))
+    elif isinstance(data, list) and data and all(isinstance(x, dict) and "name" in x for x in data):
+        for x in data:
+            out |= flat({k: v for k, v in x.items() if k != "name"}, f"{place}.{x['name']}")
+    else:
+        out[place] = data
+    return out
+
+
+def read(now: dict[str, Any], written: dict[str, Any]) -> Corrections:
+    """now: the file's content; written: what the importer wrote there (its content too)."""
+    before, here = flat(written), flat(now)
+    guessed = set(map(str, now.get("guessed") or []))
+    confirmed = set(map(str, written.get("guessed") or [])) - guessed
+    values = {}
+    for place, value in here.items():
+        changed = place not in before or not _same(before[place], value)
+        if changed or any(place == c or place.startswith(c + ".") for c in confirmed):
+            values[place] = value
+    return Corrections(values)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)) and not isinstance(a, bool):
+        return abs(a - b) <= 1e-9 * max(abs(a), abs(b), 1.0)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b))
+    return a == b
+
+
+def written(folder: Path) -> dict[str, Any] | None:
+    """What the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no note."""
+    try:
+        data = json.loads((folder / NOTE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return data if isinstance(data, dict) and isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict) else None

@@ -1,0 +1,150 @@
+"""Masses, inertias, limits, efforts: what is missing or absurd, one clear line each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.import_hand import geometry
+from dexsim.import_hand.frame import Motion
+from dexsim.import_hand.source import Source
+from dexsim.import_hand.tree import Tree
+
+PRESS = 5.0  # N, what a fingertip is taken to press with where no file says the motor's torque
+SPEED = 6.0  # rad/s, of a small geared motor, where no file says it
+REACH = (0.015, 0.6)  # m from a finger's root to its tip
+LINK_MASS = (1e-4, 3.0)  # kg
+TORQUE = (0.005, 50.0)  # N m
+TURN_SPEED = (0.05, 100.0)  # rad/s
+# Order of magnitude of a small motor's rotor seen at the joint (g cm2 times a gear ratio of 100 to 200 squared), per N m
+# of its largest torque; without one, the light links of a hand are stiffer than a physics step can follow.
+ROTOR = 4.5e-4  # kg m2 per N m
+DAMPING = 0.01  # N m s/rad per N m
+
+
+@dataclass
+class Figures:
+    """By joint name: effort [N m], speed [rad/s], armature [kg m2], damping [N m s/rad]; guessed: joints whose effort or
+    speed no file says; warnings: one line each."""
+
+    effort: dict[str, float]
+    speed: dict[str, float]
+    armature: dict[str, float]
+    damping: dict[str, float]
+    guessed_effort: list[str] = field(default_factory=list)
+    guessed_speed: list[str] = field(default_factory=list)
+    guessed_armature: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def check(
+    source: Source, tree: Tree, motions: list[Motion], effort: float | None = None, speed: float | None = None
+) -> Figures:
+    """The hand's figures. effort, speed: for every joint whose file says none.
+
+    Raises UserError for what no hand has: a size that is not in metres, joints without limits, angles in degrees.
+    """
+    m, where = source.model, f"model {source.path}"
+    _size(motions, where)
+    for j in tree.joints:
+        _limits(m, j, where)
+    out = Figures({}, {}, {}, {})
+    for x in motions:
+        for j in x.finger.joints:
+            name = m.joint(j).name
+            if name in out.effort:
+                continue
+            out.effort[name] = _stated(source.efforts, name, effort, out.guessed_effort, PRESS * x.reach)
+            out.speed[name] = _stated(source.speeds, name, speed, out.guessed_speed, SPEED)
+            for what, value, (low, high), unit in (
+                ("effort", out.effort[name], TORQUE, "N m"), ("speed", out.speed[name], TURN_SPEED, "rad/s"),
+            ):  # fmt: skip
+                if not low <= value <= high:
+                    out.warnings.append(
+                        f"joint '{name}': {what} {value:g} {unit} is unusual for a hand ({low:g} to {high:g}): check it"
+                    )
+            dof = int(m.jnt_dofadr[j])
+            out.armature[name] = float(m.dof_armature[dof])
+            if out.armature[name] <= 0:
+                out.armature[name] = ROTOR * out.effort[name]
+                out.guessed_armature.append(name)
+            out.damping[name] = float(m.dof_damping[dof]) or DAMPING * out.effort[name]
+    out.warnings += _inertias(m, tree)
+    return out
+
+
+def _stated(stated: dict[str, float], name: str, given: float | None, guessed: list[str], guess: float) -> float:
+    value = stated.get(name) or given
+    if not value:
+        guessed.append(name)
+        return float(f"{guess:.2g}")
+    return float(value)
+
+
+def _size(motions: list[Motion], where: str) -> None:
+    reach = max(x.reach for x in motions)
+    if REACH[0] <= reach <= REACH[1]:
+        return
+    fix = "state lengths in metres"
+    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
+        if REACH[0] <= reach * factor <= REACH[1]:
+            fix = f"the file is probably in {unit}: a mesh has scale=\"0.001 0.001 0.001\" and every origin is in metres"
+            break
+    raise UserError(
+        f"{where}: its longest finger is {reach:.3g} m, allowed {REACH[0]:g} to {REACH[1]:g} m; {fix}"
+    )
+
+
+def _limits(m: mujoco.MjModel, j: int, where: str) -> None:
+    name, (low, high) = m.joint(j).name, m.jnt_range[j]
+    if not m.jnt_limited[j] or not low < high:
+        state = f"limits {low:g} to {high:g} rad" if m.jnt_limited[j] else "no limits"
+        raise UserError(
+            f"{where}: joint '{name}' has {state}; give it two, low < high"
+            ' (URDF: <limit lower= upper=>, MJCF: range=), or make it fixed'
+        )
+    if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and max(abs(low), abs(high)) > 2 * np.pi + 0.01:
+        raise UserError(
+            f"{where}: joint '{name}' has limits {low:g} to {high:g} rad, more than a turn: in degrees?"
+            ' (MJCF: <compiler angle="degree">; URDF: radians)'
+        )
+
+
+def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
+    """Masses and inertias against the shapes that carry them."""
+    out = []
+    bodies = {b for f in tree.fingers for j in f.joints for b in [int(m.jnt_bodyid[j])]}
+    for b in sorted(bodies):
+        name, mass, inertia = m.body(b).name, m.body_mass[b], m.body_inertia[b]
+        below = sum(m.body_mass[c] for c in range(b, m.nbody) if m.body_rootid[c] == m.body_rootid[b] and _under(m, c, b))
+        if below < LINK_MASS[0]:
+            out.append(f"link '{name}': mass {mass:g} kg: nothing that moves is so light; in tonnes or grams?")
+        elif mass > LINK_MASS[1]:
+            out.append(f"link '{name}': mass {mass:g} kg: heavy for a finger; in grams?")
+        points = geometry.joined([geometry.geom_surface(m, g) for g in geometry.solid(m, b)])[0]
+        if mass <= 0 or len(points) < 4:
+            continue
+        size = np.linalg.norm(np.ptp(points, axis=0))
+        gyration = np.sqrt(inertia.max() / mass)
+        if gyration > size:
+            out.append(
+                f"link '{name}': inertia {inertia.max():.2g} kg m2 is that of a thing {1e3 * 3.5 * gyration:.0f} mm long;"
+                f" its shape is {1e3 * size:.0f} mm: check the units"
+            )
+        elif gyration < 0.02 * size:
+            out.append(
+                f"link '{name}': inertia {inertia.max():.2g} kg m2 is too small for its {1e3 * size:.0f} mm and"
+                f" {1e3 * mass:.0f} g (about {mass * size**2 / 20:.1g}): check the units"
+            )
+        if np.linalg.norm(m.body_ipos[b] - points.mean(0)) > 1.5 * size:
+            out.append(f"link '{name}': its centre of mass lies {1e3 * np.linalg.norm(m.body_ipos[b]):.0f} mm off its shape")
+    return out
+
+
+def _under(m: mujoco.MjModel, body: int, top: int) -> bool:
+    while body > top:
+        body = int(m.body_parentid[body])
+    return body == top

@@ -1,0 +1,238 @@
+"""Which way a finger closes, where its tip is, and the palm's frame: guesses from joints' axes, limits and surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dexsim.import_hand import geometry
+from dexsim.import_hand.tree import Finger, Tree
+
+PARALLEL = 0.8
+"""Cosine from which on a joint's axis counts as that of the distal joint: they bend the finger in one plane."""
+
+SNAP = np.cos(np.radians(12.0))
+
+
+@dataclass
+class Motion:
+    """How a finger moves. flexion: ids of the joints that close it, root to tip; closes: +1 or -1 each; position [3] m,
+    normal [3]: of its tip, in the tip body's frame; reach: m from its root to its tip, stretched; straight: angle of
+    each flexion joint [rad] there."""
+
+    finger: Finger
+    flexion: list[int]
+    closes: list[int]
+    position: np.ndarray
+    normal: np.ndarray
+    reach: float
+    straight: np.ndarray
+
+
+@dataclass
+class Palm:
+    """In the frame of the palm's body: position [3] m, forward [3], normal [3] unit and at right angles."""
+
+    position: np.ndarray
+    forward: np.ndarray
+    normal: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Columns: the palm frame's x, y, z."""
+        return np.stack([self.forward, np.cross(self.normal, self.forward), self.normal], 1)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """v [..., 3] at length 1; zero stays."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
+def neutral(m: mujoco.MjModel) -> np.ndarray:
+    """Every joint at 0, or at the nearest of its limits [nq]."""
+    return np.clip(np.zeros(m.nq), m.jnt_range[:, 0], m.jnt_range[:, 1])
+
+
+def motion(m: mujoco.MjModel, finger: Finger, flexion: list[int] | None = None, closes: list[int] | None = None) -> Motion:
+    """A finger's motion; flexion, closes: where a person has said them.
+
+    The joints that bend a finger have the axis of the distal one (within 37 degrees) where all joints are at 0; a joint
+    closes towards the side on which it has more room. The tip lies on the axis of the distal link, three quarters out.
+    """
+    d = mujoco.MjData(m)
+    d.qpos[:] = neutral(m)
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    distal = finger.joints[-1]
+    if flexion is None:
+        flexion = [j for j in finger.joints if abs(d.xaxis[j] @ d.xaxis[distal]) > PARALLEL and m.jnt_type[j] == 3]
+        flexion = flexion or [distal]
+    if closes is None:
+        closes = []
+        for j in flexion:
+            low, high = m.jnt_range[j]
+            closes.append(1 if high >= -low else -1)
+        if m.jnt_type[distal] == 3:  # joints with as much room on both sides follow the others
+            signs = np.array([s * np.sign(d.xaxis[j] @ d.xaxis[distal]) for s, j in zip(closes, flexion, strict=True)])
+            lean = np.array([abs(m.jnt_range[j].sum()) / max(np.ptp(m.jnt_range[j]), 1e-9) for j in flexion])
+            if lean.max() > 0.2:
+                main = np.sign((signs * lean).sum()) or 1.0
+                closes = [
+                    s if lean[k] > 0.2 else int(main * np.sign(d.xaxis[j] @ d.xaxis[distal]))
+                    for k, (s, j) in enumerate(zip(closes, flexion, strict=True))
+                ]
+    points = geometry.joined([geometry.geom_surface(m, g) for g in finger.geoms])[0]
+    world = d.xmat[finger.tip].reshape(3, 3)
+    points = points @ world.T + d.xpos[finger.tip]
+    along = points.mean(0) - d.xanchor[distal]
+    hinge = m.jnt_type[flexion[-1]] == 3
+    axis = d.xaxis[flexion[-1]] if hinge else np.zeros(3)
+    along = unit(along - axis * (axis @ along))
+    reach = (points - d.xanchor[distal]) @ along
+    low, high = reach.min(), reach.max()
+    outer = points[reach >= high - 0.5 * (high - max(low, 0.0))]
+    middle = 0.5 * (outer.min(0) + outer.max(0))
+    tip = middle + along * (max(low, 0.0) + 0.75 * (high - max(low, 0.0)) - (middle - d.xanchor[distal]) @ along)
+    closing = closes[-1] * (np.cross(axis, tip - d.xanchor[flexion[-1]]) if hinge else d.xaxis[flexion[-1]])
+    normal = unit(closing - along * (along @ closing))
+    position = world.T @ (tip - d.xpos[finger.tip])
+    straight, longest = _stretched(m, finger, flexion, position)
+    return Motion(finger, list(flexion), list(closes), position, world.T @ normal, longest, straight)
+
+
+def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: np.ndarray) -> tuple[np.ndarray, float]:
+    """Flexion angles at which the tip is farthest from the finger's first flexion joint, and how far."""
+    d = mujoco.MjData(m)
+    q = neutral(m)
+    root = flexion[0]
+
+    def far() -> float:
+        d.qpos[:] = q
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        return float(np.linalg.norm(tip_at(d, finger.tip, position) - d.xanchor[root]))
+
+    best = far()
+    for _ in range(2):
+        for j in flexion[1:]:
+            kept = q[j]
+            for angle in np.linspace(*m.jnt_range[j], 41):
+                q[j] = angle
+                if (reach := far()) > best + 1e-6:
+                    best, kept = reach, angle
+            q[j] = kept
+    return q[flexion].copy(), best
+
+
+def tip_at(d: mujoco.MjData, body: int, position: np.ndarray) -> np.ndarray:
+    """A point of a body in the world."""
+    return d.xmat[body].reshape(3, 3) @ position + d.xpos[body]
+
+
+def stretched(m: mujoco.MjModel, motions: list[Motion]) -> np.ndarray:
+    """Every finger stretched [nq]."""
+    q = neutral(m)
+    for x in motions:
+        q[x.flexion] = x.straight
+    return q
+
+
+def opposing(m: mujoco.MjModel, tree: Tree, motions: list[Motion]) -> list[int]:
+    """Which finger presses against the others: the one called thumb, or the one that points and closes least like them.
+    One that closes against the others' direction joins it."""
+    for k, x in enumerate(motions):
+        if x.finger.name == "thumb":
+            return [k]
+    d = mujoco.MjData(m)
+    d.qpos[:] = stretched(m, motions)
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    roots = np.array([d.xanchor[x.flexion[0]] for x in motions])
+    tips = np.array([tip_at(d, x.finger.tip, x.position) for x in motions])
+    normals = np.array([d.xmat[x.finger.tip].reshape(3, 3) @ x.normal for x in motions])
+    spread = max(np.ptp(roots, axis=0).max(), 1e-6)
+    score = []
+    for k in range(len(motions)):
+        others = [n for n in range(len(motions)) if n != k]
+        pointing = 1 - unit(tips - roots)[k] @ unit(unit(tips - roots)[others].mean(0))
+        closing = 1 - normals[k] @ unit(normals[others].mean(0))
+        apart = np.linalg.norm(roots[k] - roots[others].mean(0)) / spread
+        score.append(pointing + closing + 0.5 * apart)
+    return [int(np.argmax(score))]
+
+
+def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]) -> Palm:
+    """The palm's frame: forward along the stretched fingers that do not oppose, the normal along their tips' way as
+    they close, the origin in the middle of the palm's surface points."""
+    d = mujoco.MjData(m)
+    d.qpos[:] = stretched(m, motions)
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    fingers = [x for k, x in enumerate(motions) if k not in thumbs]
+    tips = np.array([tip_at(d, x.finger.tip, x.position) for x in fingers])
+    roots = np.array([d.xanchor[x.flexion[0]] for x in fingers])
+    axes = np.array([d.xaxis[x.flexion[0]] for x in fingers])
+    along = tips - roots  # an anchor may lie anywhere on its axis
+    along -= axes * np.einsum("fi,fi->f", along, axes)[:, None]
+    forward = unit(unit(along).mean(0))
+    normals = np.array([d.xmat[x.finger.tip].reshape(3, 3) @ x.normal for x in fingers])
+    normal = normals.mean(0)
+    if np.linalg.norm(normal) < 0.3:  # fingers around a centre (a gripper): they close towards it, it faces forward
+        every = np.array([tip_at(d, x.finger.tip, x.position) for x in motions])
+        normal = forward
+        forward = every[thumbs[0]] - every.mean(0)
+    body = d.xmat[tree.palm].reshape(3, 3)
+    # authors draw a palm along its own axes: take those where they are near
+    normal = body @ _snapped(body.T @ unit(normal))
+    forward = body @ _snapped(body.T @ unit(forward - normal * (normal @ forward)))
+    forward = unit(forward - normal * (normal @ forward))
+    points = palm_points(m, tree.palm)
+    if len(points):
+        middle = 0.5 * (points.min(0) + points.max(0)) if len(points) < 8 else points.mean(0)
+    else:
+        middle = body.T @ (roots.mean(0) - d.xpos[tree.palm])
+    return Palm(middle, body.T @ forward, body.T @ normal)
+
+
+def _snapped(v: np.ndarray) -> np.ndarray:
+    """The nearest axis of the frame, where it is within SNAP."""
+    k = int(np.abs(v).argmax())
+    return np.sign(v[k]) * np.eye(3)[k] if abs(v[k]) > SNAP else v
+
+
+def palm_points(m: mujoco.MjModel, body: int, count: int = 4000) -> np.ndarray:
+    """Points on the palm and on what is fixed to it, in its frame."""
+    d = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, d)
+    fixed = [body]
+    for b in range(body + 1, m.nbody):
+        if m.body_parentid[b] in fixed and not m.body_jntnum[b]:
+            fixed.append(b)
+    surfaces = []
+    turn = d.xmat[body].reshape(3, 3)
+    for b in fixed:
+        v, f = geometry.joined([geometry.geom_surface(m, g) for g in geometry.solid(m, b)])
+        surfaces.append(((v @ d.xmat[b].reshape(3, 3).T + d.xpos[b] - d.xpos[body]) @ turn, f))
+    surface = geometry.joined(surfaces)
+    return geometry.points_on(surface, count) if len(surface[1]) else np.zeros((0, 3))
+
+
+def handedness(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int], frame: Palm) -> str:
+    """right: seen with the fingers up and the palm towards you, the thumb is on your right; left; or none, where it
+    stands in the middle or there are two fingers."""
+    if len(motions) < 3:
+        return "none"
+    d = mujoco.MjData(m)
+    d.qpos[:] = stretched(m, motions)
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    y = d.xmat[tree.palm].reshape(3, 3) @ frame.matrix[:, 1]
+    # where its first moving link begins and where it ends, against the row of the others
+    side = np.array([y @ (d.xanchor[x.finger.joints[0]] + tip_at(d, x.finger.tip, x.position)) / 2 for x in motions])
+    others = np.delete(side, thumbs)
+    away = side[thumbs].mean() - others.mean()
+    if abs(away) < 0.15 * max(np.ptp(others), 1e-3):
+        return "none"
+    return "right" if away < 0 else "left"

@@ -1,0 +1,439 @@
+"""From a model file to a hand's folder: every step, its guesses, and what a person says instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+
+from dexsim import yaml_text
+from dexsim.errors import UserError
+from dexsim.import_hand import build, corrections, figures, folder, frame, geometry, poses, shapes, source, taxels, tree
+from dexsim.import_hand.corrections import Corrections
+from dexsim.import_hand.text import yaml_text as hand_text
+
+SWEEP = 0.28  # rad of error at which a motor gives its full torque: the servo's stiffness where nothing is known
+
+
+@dataclass
+class Settings:
+    """packages: where package:// is looked for; palm: body to take for the palm; coupled: "refuse" or "independent";
+    density: kg/m3 of links without inertia; effort N m, speed rad/s: of joints whose file says none; pads: (rows,
+    columns), None for none, or a CSV file; holes: "refuse" or "hull"; name of the hand; said: places of hand.yaml and
+    their values."""
+
+    packages: Sequence[Path] = ()
+    palm: str | None = None
+    coupled: str = "refuse"
+    density: float | None = None
+    effort: float | None = None
+    speed: float | None = None
+    pads: tuple[int, int] | Path | None = (8, 6)
+    holes: str = "refuse"
+    name: str | None = None
+    said: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Result:
+    """folder; hand: content of hand.yaml; lines: what was found, for a person; kept: files a person changed; corrected:
+    places whose values a person gave."""
+
+    folder: Path
+    hand: dict[str, Any]
+    lines: list[str]
+    kept: list[str]
+    corrected: list[str]
+
+
+def import_hand(
+    model: Path, out: Path, settings: Settings | None = None, say: Callable[[str], None] = lambda text: None,
+    picture: bool = True,
+) -> Result:  # fmt: skip
+    """Read the robot in `model` (URDF or MJCF) and write the hand's folder `out`.
+
+    say: is given every line of what was found, as it is found. Raises UserError, one line, with nothing written.
+    """
+    settings = settings or Settings()
+    note = folder.claim(out)
+    lines: list[str] = []
+
+    def tell(text: str) -> None:
+        lines.append(text)
+        say(text)
+
+    robot = source.read(model, settings.packages, settings.coupled, settings.density)
+    where, m = f"model {model}", robot.model
+    found = tree.find(m, where, settings.palm)
+    fixes = _corrections(out, note, found, m, settings)
+    guessed: list[str] = []
+
+    def pick(place: str, guess: Any, sure: bool = False) -> Any:
+        value = fixes.pick(place, guess)
+        if not fixes.has(place) and not sure:
+            guessed.append(place)
+        return value
+
+    for text in robot.notes:
+        tell(text)
+    for text in robot.coupled:
+        tell(f"taken apart: {text}: each of these joints has a motor of its own here")
+    if found.left:
+        tell(f"fixed: {', '.join(found.left)} (before the palm '{m.body(found.palm).name}')")
+
+    motions = [_motion(m, f, fixes, pick) for f in found.fingers]
+    said = fixes.pick("opposing", None)
+    names = [f.name for f in found.fingers]
+    if said is not None and (not isinstance(said, list) or not said or any(n not in names for n in said)):
+        raise UserError(f"{out / folder.HAND}: opposing ({said}): must name fingers; there are {', '.join(names)}")
+    thumbs = [names.index(n) for n in said] if said is not None else frame.opposing(m, found, motions)
+    if said is None:
+        guessed.append("opposing")
+    palm = frame.palm(m, found, motions, thumbs)
+    palm = _palm(palm, pick)
+    tell(f"palm     {m.body(found.palm).name}: forward {_axis(palm.forward)}, normal {_axis(palm.normal)} of it;"
+         f" {frame.handedness(m, found, motions, thumbs, palm)} hand")  # fmt: skip
+    for k, x in enumerate(motions):
+        bend = [m.joint(j).name for j in x.flexion]
+        side = [m.joint(j).name for j in x.finger.joints if j not in x.flexion]
+        tell(f"finger   {x.finger.name + ('*' if k in thumbs else ''):<9}tip {m.body(x.finger.tip).name}, bends:"
+             f" {' '.join(bend)}{'; turns: ' + ' '.join(side) if side else ''}; {1e3 * x.reach:.0f} mm")  # fmt: skip
+    tell(f"         * presses against the others: {', '.join(names[k] for k in thumbs)}")
+
+    known = figures.check(robot, found, motions, settings.effort, settings.speed)
+    for what, missing, guess, unit in (
+        ("effort", known.guessed_effort, known.effort, "N m"), ("speed", known.guessed_speed, known.speed, "rad/s"),
+    ):  # fmt: skip
+        if missing:
+            values = sorted({guess[j] for j in missing})
+            shown = f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
+            tell(f"missing: {what} of {len(missing)} joints ({', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}):"
+                 f" guessed {shown} {unit}; say {what}=NUMBER, or correct joints in hand.yaml")  # fmt: skip
+    if known.guessed_armature:
+        tell(f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2 per N m")
+    for text in known.warnings:
+        tell(f"check:   {text}")
+
+    made = shapes.make(m, found, motions, palm)
+    name = settings.name or _word(fixes.pick("name", robot.name))
+    text = f"{name}: written by dexsim import-hand from {model.name}"
+    apart = poses.near_the_palm(m, found)
+    own = build.build(name, m, found, made, known, apart, text)
+    search = _search(own, m, found, motions, thumbs, palm)
+    drawn = poses.drawn_together(search)
+    if drawn:
+        own = build.build(name, m, found, made, known, apart + drawn, text)
+        search = _search(own, m, found, motions, thumbs, palm)
+    never, meet = poses.meetings(search)
+    tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of at most {shapes.CORNERS} corners;"
+         f" {1e3 * made.error[0]:.1f} mm off the links on average; {meet} pairs of links can meet")  # fmt: skip
+
+    order = [str(j) for j in fixes.pick("joint order", [m.joint(j).name for j in found.joints])]
+    closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
+    own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text)
+
+    pads = _pads(m, motions, made, settings, where, tell)
+    hand = _hand(name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, own, fixes, pick)
+    hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
+    hand["source"] = {"file": model.name, "written by": "dexsim import-hand"}
+    kept: list[str] = []
+    with folder.staged(out, note, kept) as stage:
+        own.write(stage)
+        for finger, pad in pads.items():
+            (stage / f"taxels_{finger}.csv").write_text(pad.csv(), encoding="ascii")
+        if pads:
+            for finger, skin in zip(names, made.skins, strict=True):
+                (stage / f"skin_{finger}.obj").write_text(build.hull_obj(skin), encoding="ascii")
+        (stage / "servo.yaml").write_text(_servo(name, hand), encoding="utf-8")
+        (stage / folder.HAND).write_text(hand_text(hand, hand["guessed"]), encoding="utf-8")
+        if picture:
+            _picture(stage, tell)
+        else:
+            _loads(stage)
+        folder.write_note(stage, hand, {"model": str(model.resolve())})
+    return Result(out, hand, lines, kept, sorted(fixes.used))
+
+
+def _corrections(
+    out: Path, note: dict[str, Any] | None, found: tree.Tree, m: mujoco.MjModel, settings: Settings
+) -> Corrections:
+    """What a person said: in the hand.yaml that is there, and in the command."""
+    fixes = Corrections()
+    file = out / folder.HAND
+    if note is not None and file.is_file():
+        from dexsim.hand import schema
+
+        schema.read(file)  # refuses what is no hand.yaml, with the place
+        now, before = yaml_text.load(file, "hand"), note["hand"]
+        new = {f["joints"][-1]: f["name"] for f in now["fingers"]}
+        old = {f["name"]: new.get(f["joints"][-1], f["name"]) for f in before["fingers"]}
+        for finger in before["fingers"]:
+            finger["name"] = old[finger["name"]]
+        before["opposing"] = [old.get(n, n) for n in before["opposing"]]
+        before["guessed"] = [_renamed(p, old) for p in before.get("guessed") or []]
+        for f in found.fingers:
+            f.name = new.get(m.joint(f.joints[-1]).name, f.name)
+        first = [f["name"] for f in now["fingers"]]
+        found.fingers.sort(key=lambda f: first.index(f.name) if f.name in first else len(first))
+        fixes = corrections.read(now, before)
+        wire = [j["name"] for j in now["joints"]]
+        if set(wire) == {m.joint(j).name for j in found.joints}:
+            fixes.values["joint order"] = wire
+    fixes.values |= settings.said
+    return fixes
+
+
+def _renamed(place: str, names: dict[str, str]) -> str:
+    parts = place.split(".")
+    return ".".join(["fingers", names.get(parts[1], parts[1]), *parts[2:]]) if parts[0] == "fingers" and len(parts) > 2 else place
+
+
+def _motion(m: mujoco.MjModel, finger: tree.Finger, fixes: Corrections, pick: Callable[..., Any]) -> frame.Motion:
+    base = f"fingers.{finger.name}"
+    flexion = fixes.pick(f"{base}.flexion", None)
+    if flexion is not None:
+        theirs = [m.joint(j).name for j in finger.joints]
+        if not isinstance(flexion, list) or not flexion or any(j not in theirs for j in flexion):
+            raise UserError(f"{base}.flexion ({flexion}): must name joints of the finger: {', '.join(theirs)}")
+        flexion = [m.joint(j).id for j in flexion]
+    closes = fixes.pick(f"{base}.closes", None)
+    if closes is not None and flexion is not None and len(closes) != len(flexion):
+        closes = None
+    x = frame.motion(m, finger, flexion, closes)
+    pick(f"{base}.flexion", None)
+    pick(f"{base}.closes", None)
+    x.position = _vector(pick(f"{base}.tip.position", x.position), f"{base}.tip.position")
+    x.normal = frame.unit(_vector(pick(f"{base}.tip.normal", x.normal), f"{base}.tip.normal"))
+    return x
+
+
+def _vector(value: Any, place: str) -> np.ndarray:
+    try:
+        out = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        out = np.zeros(0)
+    if out.shape != (3,) or not np.isfinite(out).all():
+        raise UserError(f"{place} ({value}): must be three numbers")
+    return out
+
+
+def _palm(guess: frame.Palm, pick: Callable[..., Any]) -> frame.Palm:
+    position = _vector(pick("palm.position", guess.position), "palm.position")
+    normal = frame.unit(_vector(pick("palm.normal", guess.normal), "palm.normal"))
+    forward = _vector(pick("palm.forward", guess.forward), "palm.forward")
+    forward = forward - normal * (normal @ forward)
+    if np.linalg.norm(forward) < 1e-3:
+        raise UserError(f"palm.forward ({forward}): must differ in direction from palm.normal")
+    return frame.Palm(position, frame.unit(forward), normal)
+
+
+def _search(
+    own: build.Model, m: mujoco.MjModel, found: tree.Tree, motions: list[frame.Motion], thumbs: list[int], palm: frame.Palm
+) -> poses.Search:
+    """The search over the hand's own model, whose ids differ from the source's."""
+    new = own.compile()
+    moved = []
+    for x in motions:
+        finger = tree.Finger(x.finger.name, [new.joint(m.joint(j).name).id for j in x.finger.joints],
+                             new.body(m.body(x.finger.tip).name).id)  # fmt: skip
+        flexion = [new.joint(m.joint(j).name).id for j in x.flexion]
+        moved.append(frame.Motion(finger, flexion, x.closes, x.position, x.normal, x.reach, x.straight))
+    points = frame.palm_points(m, found.palm)
+    ground = float(np.quantile((points - palm.position) @ palm.normal, 0.95)) if len(points) else 0.0
+    return poses.Search(new, moved, thumbs, palm, 1, ground)
+
+
+def _poses(
+    s: poses.Search, order: list[str], fixes: Corrections, pick: Callable[..., Any], out: Path, where: str,
+    tell: Callable[[str], None],
+) -> tuple[dict[str, float], dict[str, float]]:  # fmt: skip
+    """Cupped and open pose by joint name."""
+    ids = {j: s.m.joint(j).id for j in order}
+
+    def said(pose: str) -> np.ndarray:
+        out_ = np.full(s.m.nq, np.nan)
+        for j, k in ids.items():
+            if fixes.has(f"poses.{pose}.{j}"):
+                value = fixes.pick(f"poses.{pose}.{j}", 0.0)
+                low, high = s.m.jnt_range[k]
+                if not isinstance(value, (int, float)) or not low - 1e-6 <= value <= high + 1e-6:
+                    raise UserError(f"poses.{pose}.{j} ({value}): the joint's range is [{low:.4g}, {high:.4g}] rad")
+                out_[k] = value
+        return out_
+
+    fixed = said("cupped")
+    if np.isnan(fixed).any():
+        closed, miss = poses.cupped(s, keep=fixed)
+        if miss > 1.0:
+            tell(f"check:   no cupped pose with every fingertip around a ball was found (off by {miss:.1f}): see the picture")
+    else:
+        closed = fixed
+    fixed = said("open")
+    opened = poses.opened(s, closed)
+    opened = np.where(np.isnan(fixed), opened, fixed)
+    for pose, q in (("open", opened), ("cupped", closed)):
+        deep = [(a, b, d) for a, b, d in s.overlaps(q) if d > 2 * poses.TOUCH]
+        if deep:
+            a, b, d = max(deep, key=lambda x: x[2])
+            raise UserError(
+                f"{where}: self-collision at the {pose} pose: '{a}' and '{b}' overlap by {1e3 * d:.1f} mm; give another with"
+                f" poses.{pose}.JOINT=ANGLE (rad; in the command, or in {out / folder.HAND} once it is there)"
+            )
+    result = []
+    for pose, q in (("cupped", closed), ("open", opened)):
+        if any(not fixes.has(f"poses.{pose}.{j}") for j in order):
+            pick(f"poses.{pose}", None)
+        result.append({j: round(float(q[k]), 4) for j, k in ids.items()})
+    tips = s.tips(closed)[0]
+    others = [k for k in range(len(s.motions)) if k not in s.thumbs]
+    gap = np.linalg.norm(tips[s.thumbs].mean(0) - tips[others].mean(0))
+    wide = np.linalg.norm((t := s.tips(opened)[0])[s.thumbs].mean(0) - t[others].mean(0))
+    tell(f"poses    fingertips {1e3 * wide:.0f} mm apart open, {1e3 * gap:.0f} mm cupped; no link in another")
+    return result[0], result[1]
+
+
+def _pads(
+    m: mujoco.MjModel, motions: list[frame.Motion], made: shapes.Shapes, settings: Settings, where: str,
+    tell: Callable[[str], None],
+) -> dict[str, taxels.Pad]:  # fmt: skip
+    if settings.pads is None:
+        return {}
+    if isinstance(settings.pads, Path):
+        pads = taxels.read(settings.pads)
+        names = [x.finger.name for x in motions]
+        for finger in pads:
+            if finger not in names:
+                raise UserError(f"taxels {settings.pads}: no finger '{finger}'; there are {', '.join(names)}")
+        bare = [n for n in names if n not in pads]
+        if bare:
+            raise UserError(f"taxels {settings.pads}: none for finger {', '.join(bare)}; every finger has a pad, or none has")
+    else:
+        pads = {}
+        d = mujoco.MjData(m)
+        d.qpos[:] = frame.neutral(m)
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+        for x, skin in zip(motions, made.skins, strict=True):
+            surface = geometry.joined([geometry.geom_surface(m, g) for g in x.finger.geoms])
+            if settings.holes == "hull" or len(x.finger.geoms) > 1:
+                surface = taxels._hull(skin)
+            anchor = d.xmat[x.finger.tip].reshape(3, 3).T @ (d.xanchor[x.finger.joints[-1]] - d.xpos[x.finger.tip])
+            axis = d.xmat[x.finger.tip].reshape(3, 3).T @ d.xaxis[x.flexion[-1]]
+            along = x.position - anchor
+            along -= axis * (axis @ along)
+            pads[x.finger.name] = taxels.paint(x.finger.name, surface, x.position, x.normal, along, settings.pads)
+    for (finger, pad), skin in zip(((x.finger.name, pads[x.finger.name]) for x in motions), made.skins, strict=True):
+        taxels.check(finger, pad, skin, where)
+        note = f"; {pad.note}" if pad.note else ""
+        tell(f"pad      {finger:<9}{len(pad.point)} taxels on {1e4 * pad.area.sum():.2f} cm2{note}")
+    return {x.finger.name: pads[x.finger.name] for x in motions}
+
+
+def _hand(
+    name: str, model: Path, m: mujoco.MjModel, found: tree.Tree, motions: list[frame.Motion], thumbs: list[int],
+    palm: frame.Palm, known: figures.Figures, order: list[str], open_: dict[str, float], closed: dict[str, float],
+    search: poses.Search, pads: dict[str, taxels.Pad], own: build.Model, fixes: Corrections, pick: Callable[..., Any],
+) -> dict[str, Any]:  # fmt: skip
+    """Content of hand.yaml."""
+
+    def number(place: str, guess: float, missing: list[str], joint: str) -> float:
+        return float(pick(place, float(f"{guess:.4g}"), sure=joint not in missing))
+
+    joints = [
+        {"name": j, "effort": number(f"joints.{j}.effort", known.effort[j], known.guessed_effort, j),
+         "speed": number(f"joints.{j}.speed", known.speed[j], known.guessed_speed, j)}
+        for j in order
+    ]  # fmt: skip
+    fingers = []
+    for x in motions:
+        n = x.finger.name
+        pad = None
+        if n in pads:
+            pad = {"taxels": f"taxels_{n}.csv", "kind": fixes.pick(f"fingers.{n}.pad.kind", "finger"), "rows": pads[n].rows,
+                   "skin": f"skin_{n}.obj"}  # fmt: skip
+        fingers.append({
+            "name": n, "joints": [m.joint(j).name for j in x.finger.joints], "flexion": [m.joint(j).name for j in x.flexion],
+            "closes": [int(c) for c in x.closes],
+            "tip": {"body": m.body(x.finger.tip).name, "position": _list(x.position), "normal": _list(x.normal),
+                    "geoms": [f"tip_{n}"]},
+            "pad": pad,
+        })  # fmt: skip
+    ids = [search.m.joint(j).id for j in order]
+    qo, qc = np.zeros(search.m.nq), np.zeros(search.m.nq)
+    qo[ids], qc[ids] = [open_[j] for j in order], [closed[j] for j in order]
+    return {
+        "format": "dexsim-hand", "version": 1, "name": name,
+        "handedness": pick("handedness", frame.handedness(m, found, motions, thumbs, palm)),
+        "model": "model.xml", "servo": fixes.pick("servo", "servo.yaml"),
+        "joints": joints,
+        "palm": {"body": m.body(found.palm).name, "position": _list(palm.position), "forward": _list(palm.forward),
+                 "normal": _list(palm.normal)},
+        "fingers": fingers, "opposing": [found.fingers[k].name for k in thumbs],
+        "poses": {"open": open_, "cupped": closed},
+        "span": float(pick("span", round(poses.span(search, qo, qc), 4))),
+        "force": fixes.pick("force", None),
+    }  # fmt: skip
+
+
+def _list(v: np.ndarray) -> list[float]:
+    return [round(float(x), 6) + 0.0 for x in v]
+
+
+def _servo(name: str, hand: dict[str, Any]) -> str:
+    """A servo table from efforts and speeds alone."""
+    head = (
+        f"# The drives of {name}, from the efforts and speeds of hand.yaml alone. Guesses, until a diagnosis of the real hand\n"
+        f"# replaces them: kp (full torque at {SWEEP:g} rad of error), kd, delay (a 100 Hz bus), friction (2 % of the torque).\n"
+    )
+    joints = {
+        j["name"]: {
+            "kp": float(f"{j['effort'] / SWEEP:.3g}"), "kd": float(f"{0.025 * j['effort'] / SWEEP:.3g}"),
+            "torque_limit": j["effort"], "no_load_speed": j["speed"], "delay": 0.01,
+            "coulomb_friction": float(f"{0.02 * j['effort']:.2g}"),
+        }
+        for j in hand["joints"]
+    }  # fmt: skip
+    data = {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint", "position_encoder": "joint"}
+    return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
+
+
+def _word(text: str) -> str:
+    """A hand's name: letters, digits, _ and -."""
+    out = "".join(c if c.isalnum() and c.isascii() or c in "_-" else "_" for c in str(text)).strip("_-")[:48]
+    return out or "hand"
+
+
+def _axis(v: np.ndarray) -> str:
+    """A direction in words: +x, or its three numbers."""
+    k = int(np.abs(v).argmax())
+    return f"{'-' if v[k] < 0 else '+'}{'xyz'[k]}" if abs(v[k]) > 0.999 else f"({v[0]:.2f} {v[1]:.2f} {v[2]:.2f})"
+
+
+def _rank(hand: dict[str, Any]) -> Callable[[str], int]:
+    order = list(hand)
+    return lambda place: order.index(place.split(".")[0]) if place.split(".")[0] in order else len(order)
+
+
+def _loads(stage: Path) -> Any:
+    from dexsim.hand import load_hand
+
+    try:
+        return load_hand(stage)
+    except UserError as error:  # the name of the folder that is only being written helps nobody
+        raise UserError(str(error).replace(str(stage / folder.HAND), folder.HAND).replace(str(stage), ".")) from None
+
+
+def _picture(stage: Path, tell: Callable[[str], None]) -> None:
+    from dexsim.import_hand import picture
+    from dexsim.view.video import NoRenderer
+
+    hand = _loads(stage)
+    try:
+        picture.draw(hand, stage / "picture.png")
+    except NoRenderer as error:
+        tell(f"no picture: {error}")

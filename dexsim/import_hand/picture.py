@@ -1,0 +1,134 @@
+"""The picture of a hand that was read: its palm's frame, joints and tips, open and cupped, its collision shapes, its pads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.hand import Hand
+from dexsim.view.stills import Shot, render
+
+AXES = (("x forward", "#d62728"), ("y", "#2ca02c"), ("z normal", "#1f77b4"))
+LABEL = {"fontsize": 6.5, "color": "black", "bbox": {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75}}
+
+
+def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
+    """Joint angles [J] in the hand's order as the model's qpos [nq]."""
+    out = np.zeros(model.nq)
+    out[[int(model.joint(j).qposadr[0]) for j in hand.joints]] = angles
+    return out
+
+
+def posed(model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
+    """The model's data in a pose."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data
+
+
+def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
+    """Middle [3] m of what is drawn, and the radius [m] of a sphere that holds it."""
+    spheres = [(data.geom_xpos[g], model.geom_rbound[g]) for g in range(model.ngeom)]
+    low = np.min([c - r for c, r in spheres], axis=0)
+    high = np.max([c + r for c, r in spheres], axis=0)
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+
+
+def draw(hand: Hand, path: Path) -> None:
+    """Write the picture (PNG). Raises `dexsim.view.video.NoRenderer` where nothing can be rendered."""
+    from matplotlib.figure import Figure
+
+    model = hand.spec().compile()
+    poses = {name: qpos(hand, model, hand.pose(name)) for name in ("open", "cupped")}
+    data = {name: posed(model, q) for name, q in poses.items()}
+    middle, radius = bounds(model, data["open"])
+    far = 3.0 * radius
+    shots, titles = [], []
+    for name in ("open", "cupped"):
+        for what, azimuth, elevation in (("onto the palm", 180.0, -89.0), ("from the fingers' side", 140.0, -25.0), ("from its side", 90.0, -5.0)):  # fmt: skip
+            shots.append(Shot(0, poses[name], middle, far, azimuth, elevation))
+            titles.append(f"{name}, {what}")
+    shots.append(Shot(0, poses["cupped"], middle, far, 140.0, -25.0, groups=(3,)))
+    titles.append("collision shapes, cupped")
+    layout = hand.layout()
+    for finger in hand.fingers if layout is not None else ():
+        body = model.body(finger.body).id
+        turn = data["open"].xmat[body].reshape(3, 3)
+        at, normal = data["open"].xpos[body] + turn @ np.array(finger.position), turn @ np.array(finger.normal)
+        azimuth = float(np.degrees(np.arctan2(-normal[1], -normal[0])))
+        elevation = float(np.clip(np.degrees(np.arcsin(np.clip(-normal[2], -1, 1))), -89, 89))
+        shots.append(Shot(0, poses["open"], at, 0.35 * radius, azimuth, elevation, (320, 320)))
+        titles.append(f"pad of {finger.name}")
+    images = render([model], shots)
+    columns = 3
+    rows = -(-len(shots) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.9 * rows), dpi=100, layout="tight")
+    for k, (shot, image, title) in enumerate(zip(shots, images, titles, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[], xlim=(0, shot.size[0]), ylim=(shot.size[1], 0))
+        axes.set_title(title, fontsize=9)
+        d = data["open" if k < 3 or k > 6 else "cupped"]
+        if k < 6:
+            _frame(axes, shot, 0.35 * radius)
+            _tips(axes, shot, hand, model, d)
+        if k == 0:
+            _joints(axes, shot, hand, model, d)
+        if k > 6 and layout is not None:
+            _taxels(axes, shot, model, d, layout, k - 7)
+    figure.suptitle(
+        f"{hand.name}: {len(hand.joints)} joints, {len(hand.fingers)} fingers ({', '.join(hand.fingers[k].name for k in hand.opposing)}"
+        f" opposing), {hand.file.handedness} hand; span {1e3 * hand.span:.0f} mm", fontsize=11,
+    )  # fmt: skip
+    figure.savefig(path)
+
+
+def _frame(axes: Any, shot: Shot, length: float) -> None:
+    ends = shot.project(np.vstack([np.zeros(3), length * np.eye(3)]))
+    for k, (name, colour) in enumerate(AXES):
+        if np.linalg.norm(ends[k + 1] - ends[0]) < 8:  # it points at the camera
+            continue
+        axes.annotate("", ends[k + 1], ends[0], arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8})
+        axes.text(*ends[k + 1], name, fontsize=7, color=colour, weight="bold", clip_on=True)
+
+
+def _tips(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData) -> None:
+    for finger in hand.fingers:
+        body = model.body(finger.body).id
+        turn = d.xmat[body].reshape(3, 3)
+        at = d.xpos[body] + turn @ np.array(finger.position)
+        ends = shot.project(np.stack([at, at + 0.25 * np.linalg.norm(hand.span) * turn @ np.array(finger.normal)]))
+        axes.plot(*ends[0], "o", ms=4, color="#ff7f0e")
+        axes.annotate("", ends[1], ends[0], arrowprops={"arrowstyle": "->", "color": "#ff7f0e", "lw": 1.3})
+
+
+def _joints(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData) -> None:
+    """Joint names beside the picture, each with a line to its joint."""
+    at = shot.project(np.array([d.xanchor[model.joint(j).id] for j in hand.joints]))
+    width, height = shot.size
+    left = at[:, 0] < np.median(at[:, 0])
+    for side, x, align in ((left, 4, "left"), (~left, width - 4, "right")):
+        order = np.flatnonzero(side)[np.argsort(at[side, 1])]
+        for slot, k in enumerate(order):
+            y = height * (slot + 0.7) / (len(order) + 0.4)
+            axes.plot([x, at[k, 0]], [y, at[k, 1]], color="black", lw=0.4, alpha=0.6)
+            axes.plot(*at[k], "o", ms=2.5, color="black")
+            axes.text(x, y, hand.joints[k], ha=align, va="center", **LABEL)
+
+
+def _taxels(axes: Any, shot: Shot, model: mujoco.MjModel, d: mujoco.MjData, layout: Any, pad: int) -> None:
+    body = model.body(layout.bodies[pad]).id
+    turn = d.xmat[body].reshape(3, 3)
+    count = int(layout.count[pad])
+    points = layout.point[pad, :count] @ turn.T + d.xpos[body]
+    ends = shot.project(points + 0.002 * layout.normal[pad, :count] @ turn.T)
+    at = shot.project(points)
+    axes.plot(*at.T, ".", ms=4, color="#d62728")
+    for a, b in zip(at, ends, strict=True):
+        axes.plot(*np.stack([a, b]).T, lw=0.7, color="#d62728")
+    axes.set_xlabel(f"{count} taxels, {1e4 * layout.area[pad].sum():.2f} cm2", fontsize=8)

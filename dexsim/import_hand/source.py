@@ -1,0 +1,209 @@
+"""The robot as its author wrote it: one tree of bodies, read from URDF or MJCF and stripped of what a hand is not."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dexsim import files
+from dexsim.errors import UserError
+from dexsim.import_hand import urdf
+
+ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+@dataclass
+class Source:
+    """model: of the hand alone. efforts, speeds: by joint, where the file says them (N m, rad/s). bare: moving bodies
+    whose inertia the file does not give. notes: what was left out, a line each. coupled: what was taken apart."""
+
+    path: Path
+    model: mujoco.MjModel
+    efforts: dict[str, float]
+    speeds: dict[str, float]
+    bare: list[str]
+    notes: list[str] = field(default_factory=list)
+    coupled: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+
+def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", density: float | None = None) -> Source:
+    """The robot in a URDF or MJCF file. packages: where package:// is looked for. coupled: "refuse" joints that move
+    together, or "independent": drive each by itself. density: kg/m3 of the shapes of links without an inertia.
+
+    Raises UserError, one line, for what cannot be a hand: not XML, missing meshes, free or ball joints, coupled joints,
+    links without inertia, limits that are none.
+    """
+    files.check(path, urdf.MAX_MODEL, "model")
+    scratch = tempfile.TemporaryDirectory(prefix="dexsim_import_")
+    try:
+        speeds: dict[str, float] = {}
+        bare: list[str] = []
+        if urdf.is_urdf(path):
+            text = urdf.read(path, packages, scratch)
+            speeds, bare = text.speeds, text.bare
+            spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
+        else:
+            spec = _parsed(path, lambda: mujoco.MjSpec.from_file(str(path)))
+            _meshes_there(spec, path)
+        notes: list[str] = []
+        _one_tree(spec, path, notes)
+        taken = _coupled(spec, path, coupled)
+        efforts = _strip(spec, path, notes)
+        if bare and density is None:
+            raise UserError(
+                f"model {path}: link{'s' if len(bare) > 1 else ''} {', '.join(bare[:5])}{' ...' if len(bare) > 5 else ''}"
+                " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
+            )
+        for body in spec.bodies:
+            if body.name in bare:
+                for geom in body.geoms:
+                    geom.density = density or 0.0
+        model = _compiled(spec, path, notes)
+    finally:
+        scratch.cleanup()
+    for j in range(model.njnt):
+        if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
+            efforts.setdefault(model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max()))
+    return Source(path, model, efforts, speeds, bare, notes, taken)
+
+
+def _parsed(path: Path, read) -> mujoco.MjSpec:
+    try:
+        return read()
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"model {path}: {_said(error)}") from None
+
+
+def _said(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    if "repeated name" in text:
+        text += "; every link and joint needs a name of its own"
+    return text
+
+
+def _meshes_there(spec: mujoco.MjSpec, path: Path) -> None:
+    for mesh in spec.meshes:
+        if not mesh.file:
+            continue
+        name = Path(mesh.file).name if spec.strippath else mesh.file
+        at = Path(spec.modelfiledir or path.parent) / (spec.meshdir or "") / name
+        if not at.is_file() and not Path(mesh.file).is_file():
+            raise UserError(f"model {path}: mesh '{mesh.name or mesh.file}': no such file {at}")
+
+
+def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
+    """Leave one tree with hinges: objects, floors and tables are not the hand."""
+
+    def joints(body) -> list:
+        return [*body.joints, *(j for b in body.bodies for j in joints(b))]
+
+    trees = {b.name or f"body {k}": (b, joints(b)) for k, b in enumerate(spec.worldbody.bodies)}
+    hands = [n for n, (_, js) in trees.items() if sum(j.type in ONE_DOF for j in js) >= 2]
+    if not hands:
+        raise UserError(
+            f"model {path}: has no tree of bodies with two hinges or more; "
+            f"{len(trees)} bodies, {len(list(spec.joints))} joints: this is not a hand"
+        )
+    if len(hands) > 1:
+        raise UserError(f"model {path}: {len(hands)} trees with hinges ({', '.join(hands)}): leave one hand in the file")
+    for name, (body, _) in trees.items():
+        if name != hands[0]:
+            notes.append(f"left out: '{name}' (another tree)")
+            spec.delete(body)
+    for geom in list(spec.worldbody.geoms):
+        notes.append(f"left out: geom '{geom.name or 'unnamed'}' of the world (a floor?)")
+        spec.delete(geom)
+
+
+def _coupled(spec: mujoco.MjSpec, path: Path, coupled: str) -> list[str]:
+    """What ties joints together: refused, or taken out on request."""
+    found, things = [], []
+    groups: dict[tuple[str, ...], str] = {}
+    for tendon in spec.tendons:
+        things.append(tendon)
+        joints, routed = [], False
+        for wrap in tendon.path:
+            try:
+                target = wrap.target
+            except (AttributeError, TypeError, ValueError):  # a pulley has none
+                continue
+            if isinstance(target, mujoco.MjsJoint):
+                joints.append(target.name)
+            else:
+                routed = True
+        if routed or len(set(joints)) > 1:  # one over a single joint is a spring or a limit of that joint
+            groups.setdefault(tuple(sorted(set(joints))) or (tendon.name,), tendon.name)
+    found += [f"tendon '{name}' ({', '.join(joints)})" for joints, name in groups.items()]
+    for equality in spec.equalities:
+        both = ", ".join(n for n in (equality.name1, equality.name2) if n)
+        kind = "mimic or joint equality" if equality.type == mujoco.mjtEq.mjEQ_JOINT else "equality"
+        found.append(f"{kind} ({both})")
+        things.append(equality)
+    if found and coupled != "independent":
+        raise UserError(
+            f"model {path}: joints that move together are not simulated: {'; '.join(found[:6])}"
+            f"{f'; {len(found) - 6} more' if len(found) > 6 else ''}: fix those that follow in the file, or"
+            " coupled=independent drives each joint by a motor of its own (another hand than the real one)"
+        )
+    for thing in things:
+        spec.delete(thing)
+    return found
+
+
+def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> dict[str, float]:
+    """Take out what is not the hand's body; the largest torques [N m] that its actuators say."""
+    efforts: dict[str, float] = {}
+    for actuator in list(spec.actuators):
+        reach = np.abs(actuator.forcerange).max() * max(abs(actuator.gear[0]), 1e-9)
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.forcelimited != 0 and reach > 0:
+            efforts[actuator.target] = max(efforts.get(actuator.target, 0.0), float(reach))
+        spec.delete(actuator)
+    for group in (spec.sensors, spec.keys, spec.lights, spec.cameras, spec.excludes, spec.pairs, spec.skins, spec.sites):
+        for item in list(group):
+            spec.delete(item)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    if list(spec.flexes):
+        raise UserError(f"model {path}: has soft bodies (flex); only rigid links are simulated")
+    for k, body in enumerate(spec.bodies):
+        if not body.name:
+            body.name = f"body_{k}"
+        for n, joint in enumerate(body.joints):
+            if joint.type not in ONE_DOF:
+                kind = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
+                raise UserError(f"model {path}: joint '{joint.name}' is a {kind} joint; a hand has hinges and slides")
+            if not joint.name:
+                joint.name = f"{body.name}_joint{n or ''}"
+                notes.append(f"joint without a name on '{body.name}': called '{joint.name}'")
+    return efforts
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except (ValueError, RuntimeError) as error:
+        said = _said(error)
+    if "volume" in said or "orient" in said.lower():
+        # Volume and winding matter only where an inertia is to be had from the mesh.
+        for mesh in spec.meshes:
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        try:
+            model = spec.compile()
+            notes.append(f"a mesh is not a closed, outward surface ({said[:120]}); taken as a thin shell")
+            return model
+        except (ValueError, RuntimeError) as error:
+            said = _said(error)
+    if "mjMINVAL" in said or "mass and inertia" in said:
+        said += ": a moving link without mass; give its <inertial>"
+    raise UserError(f"model {path}: {said}")

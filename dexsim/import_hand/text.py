@@ -1,0 +1,83 @@
+"""The text of a hand.yaml for a person to read and correct: every field with a word on what it is, every guess marked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+HEAD = """\
+# {name}: a hand as dexsim reads it, written by `dexsim import-hand`. Lengths in m, angles in rad.
+# What is marked "guess" was not in the model's file: look at picture.png, correct it here, and run the import again: what
+# you changed stays. A place taken out of `guessed` (at the end) counts as confirmed.
+"""
+ABOUT = {
+    "joints": "every driven joint, in the order of commands and readings on the wire; effort N m, speed rad/s: its largest",
+    "palm": "the palm's frame, in the frame of `body`: x forward along the fingers, z = normal out of the palm",
+    "fingers": "joints root to tip; flexion: those that close it, closes: the sign of the motion that does",
+    "opposing": "fingers that press against the others",
+    "poses": "open: ready to catch; cupped: closed around an object in the palm",
+    "span": "largest distance of the opposing fingertips to the others' mean",
+    "force": "N a fingertip can press with; null: from the motors' torques and the levers",
+}
+
+
+def yaml_text(hand: dict[str, Any], guessed: list[str]) -> str:
+    """hand: plain data as `dexsim.hand.schema.HandFile` has it."""
+    out = [HEAD.format(name=hand["name"])]
+    for key, value in hand.items():
+        if key in ABOUT:
+            out.append(f"\n# {ABOUT[key]}\n")
+        out.append(_entry(key, value, key, 0, set(guessed)))
+    return "".join(out)
+
+
+def _entry(key: str, value: Any, place: str, depth: int, guessed: set[str]) -> str:
+    pad = "  " * depth
+    mark = "  # guess" if place in guessed else ""
+    if isinstance(value, dict) and not _small(value):
+        return f"{pad}{key}:{mark}\n" + "".join(
+            _entry(k, v, f"{place}.{k}", depth + 1, guessed) for k, v in value.items()
+        )
+    if isinstance(value, dict):
+        inside = [k for k in value if f"{place}.{k}" in guessed]
+        mark = mark or (f"  # guess: {', '.join(inside)}" if inside else "")
+        return f"{pad}{key}: {_flow(value)}{mark}\n"
+    if isinstance(value, list) and value and all(isinstance(x, dict) for x in value):
+        lines = [f"{pad}{key}:{mark}\n"]
+        for x in value:
+            here = f"{place}.{x['name']}" if "name" in x else place
+            if _small(x):
+                inside = [k for k in x if f"{here}.{k}" in guessed]
+                lines.append(f"{pad}  - {_flow(x)}{'  # guess: ' + ', '.join(inside) if inside else ''}\n")
+                continue
+            body = "".join(_entry(k, v, f"{here}.{k}", depth + 2, guessed) for k, v in x.items())
+            lines.append(f"{pad}  - {body.lstrip()}")
+        return "".join(lines)
+    if isinstance(value, list) and depth == 0 and sum(len(_flow(x)) for x in value) > 90:
+        return f"{pad}{key}:\n" + "".join(f"{pad}  - {_flow(x)}\n" for x in value)
+    return f"{pad}{key}: {_flow(value)}{mark}\n"
+
+
+def _small(value: dict[str, Any]) -> bool:
+    plain = all(not isinstance(v, (dict, list)) for v in value.values())
+    return plain and len(value) <= 4
+
+
+def _flow(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        text = f"{value + 0.0:.6g}"
+        # YAML 1.1 takes 1e-05 for text
+        return text if any(c in text for c in ".n") or "e" not in text else text.replace("e", ".0e")
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_flow(str(k))}: {_flow(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_flow(x) for x in value) + "]"
+    text = str(value)
+    plain = text and all(c.isalnum() or c in "_-./" for c in text) and not text[0].isdigit() and text[0] not in "-."
+    words = ("null", "true", "false", "yes", "no", "on", "off", "y", "n")
+    return text if plain and text.lower() not in words else '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

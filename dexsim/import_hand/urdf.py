@@ -1,0 +1,140 @@
+"""A URDF as MuJoCo should read it: meshes found, frames and visuals kept; and what MuJoCo does not read of it."""
+
+from __future__ import annotations
+
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dexsim import files
+from dexsim.errors import UserError
+
+MAX_MODEL = 64 << 20
+"""Bytes of a model file."""
+READS = (".stl", ".obj", ".msh")
+"""Mesh files that MuJoCo reads."""
+
+
+@dataclass
+class Urdf:
+    """text: for MuJoCo, mesh files as absolute paths; speeds: rad/s by joint, of its limits; bare: moving links without
+    an inertia."""
+
+    text: str
+    speeds: dict[str, float] = field(default_factory=dict)
+    bare: list[str] = field(default_factory=list)
+
+
+def is_urdf(path: Path) -> bool:
+    """Whether a model file's root element is `robot`. Raises UserError for one that is neither URDF nor MJCF."""
+    return _root(path).tag == "robot"
+
+
+def _root(path: Path) -> ET.Element:
+    text = files.text(path, MAX_MODEL, "model")
+    if "<!ENTITY" in text:  # nothing that a robot needs, and a few of them can fill the memory
+        raise UserError(f"model {path}: defines XML entities; write their values out")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        what = "a xacro program's input? run xacro on it first" if path.suffix == ".xacro" else "URDF or MJCF is needed"
+        raise UserError(f"model {path}: is not XML ({error}); {what}") from None
+    if root.tag not in ("robot", "mujoco", "mujocoinclude"):
+        raise UserError(f"model {path}: its root element is <{root.tag}>; a robot's is <robot> (URDF) or <mujoco> (MJCF)")
+    return root
+
+
+def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirectory) -> Urdf:
+    """The URDF at `path`. packages: folders in which package://NAME/ is looked for, beside those above the file;
+    scratch: where meshes go that MuJoCo does not read. Raises UserError for missing meshes."""
+    root = _root(path)
+    out = Urdf("")
+    if any(e.tag.startswith("{") and "xacro" in e.tag for e in root.iter()):
+        raise UserError(f"model {path}: has xacro macros in it; run xacro on it first: xacro {path.name} > robot.urdf")
+    converted: dict[Path, Path] = {}
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename") or ""
+        found = _find(path, name, packages)
+        if found.suffix.lower() not in READS or _ascii_stl(found):
+            if found not in converted:
+                converted[found] = _convert(found, Path(scratch.name) / f"{found.stem}_{len(converted)}.obj")
+            found = converted[found]
+        mesh.set("filename", str(found))
+    for element in root.findall("mujoco"):
+        root.remove(element)
+    options = ET.SubElement(ET.SubElement(root, "mujoco"), "compiler")
+    for key in ("fusestatic", "discardvisual", "strippath"):
+        options.set(key, "false")
+    for material in root.iter("material"):  # a texture is only looks, and often not there
+        for texture in material.findall("texture"):
+            material.remove(texture)
+    moved = set()
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type", "")
+        child, limit = joint.find("child"), joint.find("limit")
+        if kind != "fixed" and child is not None:
+            moved.add(child.get("link", ""))
+        if kind == "continuous":
+            raise UserError(
+                f"model {path}: joint '{name}' is continuous: it turns without end; a hand's joints have limits:"
+                ' type="revolute" and <limit lower= upper=>'
+            )
+        if limit is not None and _number(limit.get("velocity")) > 0:
+            out.speeds[name] = _number(limit.get("velocity"))
+    out.bare = [
+        link.get("name", "") for link in root.findall("link") if link.get("name") in moved and link.find("inertial") is None
+    ]
+    out.text = ET.tostring(root, encoding="unicode")
+    return out
+
+
+def _find(path: Path, name: str, packages: Sequence[Path]) -> Path:
+    """The mesh file that a URDF names: package://, file://, relative to the file."""
+    if not name:
+        raise UserError(f"model {path}: a <mesh> without filename=")
+    plain = name.removeprefix("file://")
+    places = [*packages, path.parent, *path.parent.parents]
+    if name.startswith("package://"):
+        package, _, rest = name.removeprefix("package://").partition("/")
+        tries = [p / package / rest for p in places] + [p / rest for p in places]
+    else:
+        tries = [path.parent / plain, *(p / plain for p in packages)]
+    for there in tries:
+        if there.is_file():
+            return there.resolve()
+    hint = "packages=FOLDER says where packages are" if name.startswith("package://") else "paths are relative to the file"
+    raise UserError(f"model {path}: mesh {name}: no such file (looked first at {tries[0]}); {hint}")
+
+
+def _ascii_stl(path: Path) -> bool:
+    if path.suffix.lower() != ".stl":
+        return False
+    with open(path, "rb") as file:
+        head = file.read(512)
+    return head[:5] == b"solid" and b"facet" in head
+
+
+def _convert(path: Path, to: Path) -> Path:
+    """A mesh file that MuJoCo does not read, as OBJ."""
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, force="mesh")
+        if not len(mesh.faces):
+            raise ValueError("it holds no triangles")
+        mesh.export(to, include_texture=False)
+    except Exception as error:  # trimesh raises whatever its reader for the format does
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(
+            f"mesh {path}: cannot be read ({reason[:120]}); save it as .stl or .obj (Blender: File > Export)"
+        ) from None
+    return to
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or 0.0)
+    except ValueError:
+        return 0.0
