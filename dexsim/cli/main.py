@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
     "excite": Command("dexsim.excite:main", "write safe motions that show what a hand's drives do"),
     "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
     "convert": Command("dexsim.recording.convert:main", "write a log (CSV, NPZ, a bag) as a recording"),
+    "import-hand": Command("dexsim.import_hand.command:main", "make a hand of a robot's URDF or MJCF file"),
     "export": Command("dexsim.export:main", "write a policy as one folder that a robot can run"),
     "deploy": Command("dexsim.cli.deploy:main", "run an exported policy on a hand, real or simulated"),
     "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from"),

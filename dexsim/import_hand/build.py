@@ -41,7 +41,13 @@ class Model:
 
 
 def build(
-    name: str, m: mujoco.MjModel, tree: Tree, shapes: Shapes, figures: Figures, excluded: list[tuple[str, str]], note: str
+    name: str,
+    m: mujoco.MjModel,
+    tree: Tree,
+    shapes: Shapes,
+    figures: Figures,
+    excluded: list[tuple[str, str]],
+    note: str,
 ) -> Model:
     """MJCF of the hand: its root is the palm, which stands in the world's origin.
 
@@ -107,7 +113,10 @@ def build(
             others = everyone & ~own(b)
             for n, c in enumerate(c for c in shapes.proxies if c.body == b):
                 lines.append(inner + _capsule(f"self_{finger}_{n}", c, own(b), others))
-        for n, g in enumerate(geometry.seen(m, b)):
+        drawn = geometry.seen(m, b)
+        if b in tip_of and len(tree.fingers[tip_of[b]].geoms) < len(geometry.solid(m, b)):
+            drawn = [*drawn, *(g for g in tree.fingers[tip_of[b]].geoms if g not in drawn)]  # a rubber tip of its own
+        for n, g in enumerate(drawn):
             vertices, faces = geometry.geom_surface(m, g)
             if not len(faces):
                 continue
@@ -129,7 +138,8 @@ def build(
     assets = "\n".join(f'    <mesh name="{f.removesuffix(".obj")}" file="{f}" inertia="shell"/>' for f in files)
     apart = "\n".join(f'    <exclude body1="{_t(a)}" body2="{_t(b)}"/>' for a, b in excluded)
     out.xml = _TEMPLATE.format(
-        name=_t(name), note=note.replace("--", "-"), assets=assets, bodies="\n".join(lines), solref=SOLREF, margin=MARGIN,
+        name=_t(name), note=note.replace("--", "-"), assets=assets, bodies="\n".join(lines), solref=SOLREF,
+        margin=MARGIN,
         contact=f"\n  <contact>\n{apart}\n  </contact>" if apart else "",
     )  # fmt: skip
     return out
@@ -147,7 +157,8 @@ def _capsule(name: str, c: Capsule, contype: int, conaffinity: int) -> str:
     bits = f'contype="{contype}" conaffinity="{conaffinity}"'
     if np.linalg.norm(c.b - c.a) < 1e-4:
         return f'<geom class="link" name="{_t(name)}" type="sphere" pos="{_n(c.a)}" size="{_n(c.radius)}" {bits}/>'
-    return f'<geom class="link" name="{_t(name)}" type="capsule" fromto="{_n([*c.a, *c.b])}" size="{_n(c.radius)}" {bits}/>'
+    ends = _n([*c.a, *c.b])
+    return f'<geom class="link" name="{_t(name)}" type="capsule" fromto="{ends}" size="{_n(c.radius)}" {bits}/>'
 
 
 def _colour(m: mujoco.MjModel, g: int) -> str:
@@ -155,7 +166,7 @@ def _colour(m: mujoco.MjModel, g: int) -> str:
     rgba = m.mat_rgba[k] if k >= 0 else m.geom_rgba[g]
     if k < 0 and np.allclose(rgba, [0.5, 0.5, 0.5, 1]):
         return PLAIN
-    return _n([*np.clip(rgba[:3], 0.12, 1), 1.0])
+    return _n([*np.clip(rgba[:3], 0.3, 1), 1.0])
 
 
 def hull_obj(points: np.ndarray) -> str:

@@ -22,7 +22,7 @@ it collision shapes and touch pads, and write a folder that every task takes: de
   FOLDER/picture.png    the hand, frames, joint names, open and cupped, shapes, pads
 
 A second run keeps what you corrected in hand.yaml and every file that you changed. `check` moves each joint in turn,
-says what it does, and films it: FOLDER/check.mp4 and check.png.
+says what it does, and shows it: FOLDER/check.png (film=true: check.mp4 too).
 
 settings (key=default):
   name=             of the hand (default: the model's file name)
@@ -61,11 +61,13 @@ def main(argv: Sequence[str]) -> int:
         picture=_yes(given.get("picture", "true")),
     )  # fmt: skip
     if result.corrected:
-        print(f"kept     your corrections: {', '.join(c for c in result.corrected if c != 'joint order')}")
+        print(f"kept     your corrections: {', '.join(result.corrected)}")
     for name in result.kept:
         print(f"kept     {name}, which you changed or added (delete it to have it written anew)")
-    guesses = [p for p in result.hand["guessed"]]
-    print(f"\n{out}/hand.yaml holds {len(guesses)} guesses. Look at {out}/picture.png, correct hand.yaml, run this again.")
+    print(
+        f"\n{out}/hand.yaml holds {len(result.hand['guessed'])} guesses. Look at {out}/picture.png, correct hand.yaml,"
+        " run this again."
+    )
     print(f"Then: dexsim import-hand check {out}, and dexsim train task=grasp hand={out}")
     return 0
 
@@ -82,7 +84,9 @@ def arguments(argv: Sequence[str]) -> tuple[str, dict[str, str], dict[str, Any]]
         elif key.startswith(PLACES):
             said[key] = yaml_text.parse(value, key)
         else:
-            raise UserError(f"'{text}': no such setting; there are {', '.join(KEYS)}, and places of hand.yaml (palm.normal=...)")
+            raise UserError(
+                f"'{text}': no such setting; there are {', '.join(KEYS)}, and places of hand.yaml (palm.normal=...)"
+            )
     if len(models) != 1:
         raise UserError(
             f"one model file is needed, {len(models)} given{': ' + ', '.join(models) if models else ''}:"
@@ -101,7 +105,11 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
     out = Settings(said=said)
     out.coupled, out.holes = given.get("coupled", "refuse"), given.get("holes", "refuse")
     out.palm, out.name = given.get("palm") or None, given.get("name") or None
-    for key, low, high, unit in (("effort", 0.001, 100.0, "N m"), ("speed", 0.01, 200.0, "rad/s"), ("density", 1.0, 3e4, "kg/m3")):
+    for key, low, high, unit in (
+        ("effort", 0.001, 100.0, "N m"),
+        ("speed", 0.01, 200.0, "rad/s"),
+        ("density", 1.0, 3e4, "kg/m3"),
+    ):
         if given.get(key):
             setattr(out, key, _number(key, given[key], low, high, unit))
     if given.get("packages"):

@@ -7,6 +7,7 @@ person took out of `guessed` without changing it.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,11 +50,12 @@ def flat(data: Any, place: str = "") -> dict[str, Any]:
     return out
 
 
-def read(now: dict[str, Any], written: dict[str, Any]) -> Corrections:
-    """now: the file's content; written: what the importer wrote there (its content too)."""
+def read(now: dict[str, Any], written: dict[str, Any], said: Iterable[str] = ()) -> Corrections:
+    """now: the file's content; written: what the importer wrote there (its content too); said: places that were a
+    person's already then (back in `guessed` they are guesses again)."""
     before, here = flat(written), flat(now)
     guessed = set(map(str, now.get("guessed") or []))
-    confirmed = set(map(str, written.get("guessed") or [])) - guessed
+    confirmed = (set(map(str, written.get("guessed") or [])) | set(said)) - guessed
     values = {}
     for place, value in here.items():
         changed = place not in before or not _same(before[place], value)
@@ -76,4 +78,8 @@ def written(folder: Path) -> dict[str, Any] | None:
         data = json.loads((folder / NOTE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return data if isinstance(data, dict) and isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict) else None
+    return (
+        data
+        if isinstance(data, dict) and isinstance(data.get("hand"), dict) and isinstance(data.get("files"), dict)
+        else None
+    )

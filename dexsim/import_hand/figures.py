@@ -19,16 +19,16 @@ REACH = (0.015, 0.6)  # m from a finger's root to its tip
 LINK_MASS = (1e-4, 3.0)  # kg
 TORQUE = (0.005, 50.0)  # N m
 TURN_SPEED = (0.05, 100.0)  # rad/s
-# Order of magnitude of a small motor's rotor seen at the joint (g cm2 times a gear ratio of 100 to 200 squared), per N m
-# of its largest torque; without one, the light links of a hand are stiffer than a physics step can follow.
+# Order of magnitude of a small motor's rotor seen at the joint (g cm2 times a gear ratio of 100 to 200 squared), per
+# N m of its largest torque; without one, the light links of a hand are stiffer than a physics step can follow.
 ROTOR = 4.5e-4  # kg m2 per N m
 DAMPING = 0.01  # N m s/rad per N m
 
 
 @dataclass
 class Figures:
-    """By joint name: effort [N m], speed [rad/s], armature [kg m2], damping [N m s/rad]; guessed: joints whose effort or
-    speed no file says; warnings: one line each."""
+    """By joint name: effort [N m], speed [rad/s], armature [kg m2], damping [N m s/rad]; guessed: joints whose
+    effort or speed no file says; warnings: one line each."""
 
     effort: dict[str, float]
     speed: dict[str, float]
@@ -91,11 +91,9 @@ def _size(motions: list[Motion], where: str) -> None:
     fix = "state lengths in metres"
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         if REACH[0] <= reach * factor <= REACH[1]:
-            fix = f"the file is probably in {unit}: a mesh has scale=\"0.001 0.001 0.001\" and every origin is in metres"
+            fix = f'the file is probably in {unit}: a mesh has scale="0.001 0.001 0.001" and every origin is in metres'
             break
-    raise UserError(
-        f"{where}: its longest finger is {reach:.3g} m, allowed {REACH[0]:g} to {REACH[1]:g} m; {fix}"
-    )
+    raise UserError(f"{where}: its longest finger is {reach:.3g} m, allowed {REACH[0]:g} to {REACH[1]:g} m; {fix}")
 
 
 def _limits(m: mujoco.MjModel, j: int, where: str) -> None:
@@ -104,7 +102,7 @@ def _limits(m: mujoco.MjModel, j: int, where: str) -> None:
         state = f"limits {low:g} to {high:g} rad" if m.jnt_limited[j] else "no limits"
         raise UserError(
             f"{where}: joint '{name}' has {state}; give it two, low < high"
-            ' (URDF: <limit lower= upper=>, MJCF: range=), or make it fixed'
+            " (URDF: <limit lower= upper=>, MJCF: range=), or make it fixed"
         )
     if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and max(abs(low), abs(high)) > 2 * np.pi + 0.01:
         raise UserError(
@@ -119,7 +117,9 @@ def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
     bodies = {b for f in tree.fingers for j in f.joints for b in [int(m.jnt_bodyid[j])]}
     for b in sorted(bodies):
         name, mass, inertia = m.body(b).name, m.body_mass[b], m.body_inertia[b]
-        below = sum(m.body_mass[c] for c in range(b, m.nbody) if m.body_rootid[c] == m.body_rootid[b] and _under(m, c, b))
+        below = sum(
+            m.body_mass[c] for c in range(b, m.nbody) if m.body_rootid[c] == m.body_rootid[b] and _under(m, c, b)
+        )
         if below < LINK_MASS[0]:
             out.append(f"link '{name}': mass {mass:g} kg: nothing that moves is so light; in tonnes or grams?")
         elif mass > LINK_MASS[1]:
@@ -131,7 +131,7 @@ def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
         gyration = np.sqrt(inertia.max() / mass)
         if gyration > size:
             out.append(
-                f"link '{name}': inertia {inertia.max():.2g} kg m2 is that of a thing {1e3 * 3.5 * gyration:.0f} mm long;"
+                f"link '{name}': inertia {inertia.max():.2g} kg m2 is that of a thing {3500 * gyration:.0f} mm long;"
                 f" its shape is {1e3 * size:.0f} mm: check the units"
             )
         elif gyration < 0.02 * size:
@@ -140,7 +140,9 @@ def _inertias(m: mujoco.MjModel, tree: Tree) -> list[str]:
                 f" {1e3 * mass:.0f} g (about {mass * size**2 / 20:.1g}): check the units"
             )
         if np.linalg.norm(m.body_ipos[b] - points.mean(0)) > 1.5 * size:
-            out.append(f"link '{name}': its centre of mass lies {1e3 * np.linalg.norm(m.body_ipos[b]):.0f} mm off its shape")
+            out.append(
+                f"link '{name}': its centre of mass lies {1e3 * np.linalg.norm(m.body_ipos[b]):.0f} mm off its shape"
+            )
     return out
 
 

@@ -61,13 +61,6 @@ def staged(folder: Path, note: dict[str, Any] | None, kept: list[str]) -> Iterat
         shutil.rmtree(stage, ignore_errors=True)
 
 
-def changed(folder: Path, note: dict[str, Any] | None, name: str) -> bool:
-    """Whether a person changed a file that the importer wrote."""
-    if note is None or not (folder / name).is_file() or name not in note["files"]:
-        return False
-    return sha(folder / name) != note["files"][name]
-
-
 def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
     for path in sorted(p for p in old.rglob("*") if p.is_file() and not p.is_symlink()):
         name = str(path.relative_to(old))
@@ -80,10 +73,10 @@ def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
             kept.append(name)
 
 
-def write_note(folder: Path, hand: dict[str, Any], command: dict[str, Any]) -> None:
-    """Notes what the importer wrote: content of hand.yaml, sums of the files, and what it was asked."""
+def write_note(folder: Path, hand: dict[str, Any], said: list[str]) -> None:
+    """Notes what the importer wrote: content of hand.yaml, sums of the files, and the places that a person said."""
     sums = {str(p.relative_to(folder)): sha(p) for p in sorted(folder.rglob("*")) if p.is_file()}
-    data = {"hand": hand, "files": sums, "command": command}
+    data = {"hand": hand, "files": sums, "said": said}
     (folder / corrections.NOTE).write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 

@@ -55,7 +55,9 @@ def neutral(m: mujoco.MjModel) -> np.ndarray:
     return np.clip(np.zeros(m.nq), m.jnt_range[:, 0], m.jnt_range[:, 1])
 
 
-def motion(m: mujoco.MjModel, finger: Finger, flexion: list[int] | None = None, closes: list[int] | None = None) -> Motion:
+def motion(
+    m: mujoco.MjModel, finger: Finger, flexion: list[int] | None = None, closes: list[int] | None = None
+) -> Motion:
     """A finger's motion; flexion, closes: where a person has said them.
 
     The joints that bend a finger have the axis of the distal one (within 37 degrees) where all joints are at 0; a joint

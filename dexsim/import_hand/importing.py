@@ -112,10 +112,14 @@ def import_hand(
         if missing:
             values = sorted({guess[j] for j in missing})
             shown = f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"
-            tell(f"missing: {what} of {len(missing)} joints ({', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}):"
+            first = ", ".join(missing[:4]) + (" ..." if len(missing) > 4 else "")
+            tell(f"missing: {what} of {len(missing)} joints ({first}):"
                  f" guessed {shown} {unit}; say {what}=NUMBER, or correct joints in hand.yaml")  # fmt: skip
     if known.guessed_armature:
-        tell(f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2 per N m")
+        tell(
+            f"missing: rotor inertia (armature) of {len(known.guessed_armature)} joints: put at {figures.ROTOR:g} kg m2"
+            " per N m"
+        )
     for text in known.warnings:
         tell(f"check:   {text}")
 
@@ -130,15 +134,17 @@ def import_hand(
         own = build.build(name, m, found, made, known, apart + drawn, text)
         search = _search(own, m, found, motions, thumbs, palm)
     never, meet = poses.meetings(search)
-    tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of at most {shapes.CORNERS} corners;"
-         f" {1e3 * made.error[0]:.1f} mm off the links on average; {meet} pairs of links can meet")  # fmt: skip
+    tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
+         f" corners at most; {1e3 * made.error[0]:.1f} mm off the links on average; {meet} pairs of links can meet")  # fmt: skip
 
     order = [str(j) for j in fixes.pick("joint order", [m.joint(j).name for j in found.joints])]
     closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
     own = build.build(name, m, found, made, known, sorted(set(apart + drawn + never)), text)
 
     pads = _pads(m, motions, made, settings, where, tell)
-    hand = _hand(name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, own, fixes, pick)
+    hand = _hand(
+        name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, own, fixes, pick
+    )
     hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
     hand["source"] = {"file": model.name, "written by": "dexsim import-hand"}
     kept: list[str] = []
@@ -155,7 +161,7 @@ def import_hand(
             _picture(stage, tell)
         else:
             _loads(stage)
-        folder.write_note(stage, hand, {"model": str(model.resolve())})
+        folder.write_note(stage, hand, sorted(p for p in fixes.used if " " not in p))
     return Result(out, hand, lines, kept, sorted(fixes.used))
 
 
@@ -180,9 +186,10 @@ def _corrections(
             f.name = new.get(m.joint(f.joints[-1]).name, f.name)
         first = [f["name"] for f in now["fingers"]]
         found.fingers.sort(key=lambda f: first.index(f.name) if f.name in first else len(first))
-        fixes = corrections.read(now, before)
+        fixes = corrections.read(now, before, [_renamed(p, old) for p in note.get("said") or []])
         wire = [j["name"] for j in now["joints"]]
-        if set(wire) == {m.joint(j).name for j in found.joints}:
+        theirs = [m.joint(j).name for j in found.joints]
+        if set(wire) == set(theirs) and wire != theirs:
             fixes.values["joint order"] = wire
     fixes.values |= settings.said
     return fixes
@@ -190,7 +197,11 @@ def _corrections(
 
 def _renamed(place: str, names: dict[str, str]) -> str:
     parts = place.split(".")
-    return ".".join(["fingers", names.get(parts[1], parts[1]), *parts[2:]]) if parts[0] == "fingers" and len(parts) > 2 else place
+    return (
+        ".".join(["fingers", names.get(parts[1], parts[1]), *parts[2:]])
+        if parts[0] == "fingers" and len(parts) > 2
+        else place
+    )
 
 
 def _motion(m: mujoco.MjModel, finger: tree.Finger, fixes: Corrections, pick: Callable[..., Any]) -> frame.Motion:
@@ -233,7 +244,12 @@ def _palm(guess: frame.Palm, pick: Callable[..., Any]) -> frame.Palm:
 
 
 def _search(
-    own: build.Model, m: mujoco.MjModel, found: tree.Tree, motions: list[frame.Motion], thumbs: list[int], palm: frame.Palm
+    own: build.Model,
+    m: mujoco.MjModel,
+    found: tree.Tree,
+    motions: list[frame.Motion],
+    thumbs: list[int],
+    palm: frame.Palm,
 ) -> poses.Search:
     """The search over the hand's own model, whose ids differ from the source's."""
     new = own.compile()
@@ -270,7 +286,10 @@ def _poses(
     if np.isnan(fixed).any():
         closed, miss = poses.cupped(s, keep=fixed)
         if miss > 1.0:
-            tell(f"check:   no cupped pose with every fingertip around a ball was found (off by {miss:.1f}): see the picture")
+            tell(
+                f"check:   no cupped pose with every fingertip around a ball was found (off by {miss:.1f}): see the"
+                " picture"
+            )
     else:
         closed = fixed
     fixed = said("open")
@@ -281,8 +300,8 @@ def _poses(
         if deep:
             a, b, d = max(deep, key=lambda x: x[2])
             raise UserError(
-                f"{where}: self-collision at the {pose} pose: '{a}' and '{b}' overlap by {1e3 * d:.1f} mm; give another with"
-                f" poses.{pose}.JOINT=ANGLE (rad; in the command, or in {out / folder.HAND} once it is there)"
+                f"{where}: self-collision at the {pose} pose: '{a}' and '{b}' overlap by {1e3 * d:.1f} mm; give another"
+                f" with poses.{pose}.JOINT=ANGLE (rad; in the command, or in {out / folder.HAND} once it is there)"
             )
     result = []
     for pose, q in (("cupped", closed), ("open", opened)):
@@ -311,7 +330,9 @@ def _pads(
                 raise UserError(f"taxels {settings.pads}: no finger '{finger}'; there are {', '.join(names)}")
         bare = [n for n in names if n not in pads]
         if bare:
-            raise UserError(f"taxels {settings.pads}: none for finger {', '.join(bare)}; every finger has a pad, or none has")
+            raise UserError(
+                f"taxels {settings.pads}: none for finger {', '.join(bare)}; every finger has a pad, or none has"
+            )
     else:
         pads = {}
         d = mujoco.MjData(m)
@@ -354,11 +375,11 @@ def _hand(
         n = x.finger.name
         pad = None
         if n in pads:
-            pad = {"taxels": f"taxels_{n}.csv", "kind": fixes.pick(f"fingers.{n}.pad.kind", "finger"), "rows": pads[n].rows,
-                   "skin": f"skin_{n}.obj"}  # fmt: skip
+            pad = {"taxels": f"taxels_{n}.csv", "kind": fixes.pick(f"fingers.{n}.pad.kind", "finger"),
+                   "rows": pads[n].rows, "skin": f"skin_{n}.obj"}  # fmt: skip
         fingers.append({
-            "name": n, "joints": [m.joint(j).name for j in x.finger.joints], "flexion": [m.joint(j).name for j in x.flexion],
-            "closes": [int(c) for c in x.closes],
+            "name": n, "joints": [m.joint(j).name for j in x.finger.joints],
+            "flexion": [m.joint(j).name for j in x.flexion], "closes": [int(c) for c in x.closes],
             "tip": {"body": m.body(x.finger.tip).name, "position": _list(x.position), "normal": _list(x.normal),
                     "geoms": [f"tip_{n}"]},
             "pad": pad,
@@ -387,8 +408,9 @@ def _list(v: np.ndarray) -> list[float]:
 def _servo(name: str, hand: dict[str, Any]) -> str:
     """A servo table from efforts and speeds alone."""
     head = (
-        f"# The drives of {name}, from the efforts and speeds of hand.yaml alone. Guesses, until a diagnosis of the real hand\n"
-        f"# replaces them: kp (full torque at {SWEEP:g} rad of error), kd, delay (a 100 Hz bus), friction (2 % of the torque).\n"
+        f"# The drives of {name}, from efforts and speeds of hand.yaml alone. Guesses, until a diagnosis of the real\n"
+        f"# hand replaces them: kp (full torque at {SWEEP:g} rad of error), kd, delay (100 Hz), friction (2 % of the\n"
+        "# torque).\n"
     )
     joints = {
         j["name"]: {
@@ -398,7 +420,13 @@ def _servo(name: str, hand: dict[str, Any]) -> str:
         }
         for j in hand["joints"]
     }  # fmt: skip
-    data = {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint", "position_encoder": "joint"}
+    data = {
+        "drive": "torque",
+        "joints": joints,
+        "current_per_torque": "unknown",
+        "loop_encoder": "joint",
+        "position_encoder": "joint",
+    }
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
 
 

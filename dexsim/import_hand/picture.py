@@ -1,4 +1,4 @@
-"""The picture of a hand that was read: its palm's frame, joints and tips, open and cupped, its collision shapes, its pads."""
+"""The picture of a hand that was read: palm's frame, joints and tips, open and cupped, collision shapes, pads."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ import mujoco
 import numpy as np
 
 from dexsim.hand import Hand
+from dexsim.tactile.layout import load_layout
 from dexsim.view.stills import Shot, render
 
 AXES = (("x forward", "#d62728"), ("y", "#2ca02c"), ("z normal", "#1f77b4"))
-LABEL = {"fontsize": 6.5, "color": "black", "bbox": {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75}}
+VIEWS = (("onto the palm", 0.0, -89.0), ("from the fingers' side", 140.0, -25.0), ("from its side", 90.0, -5.0))
+LABEL = {
+    "fontsize": 6.5,
+    "color": "black",
+    "bbox": {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+}
 
 
 def qpos(hand: Hand, model: mujoco.MjModel, angles: np.ndarray) -> np.ndarray:
@@ -47,16 +53,16 @@ def draw(hand: Hand, path: Path) -> None:
     poses = {name: qpos(hand, model, hand.pose(name)) for name in ("open", "cupped")}
     data = {name: posed(model, q) for name, q in poses.items()}
     middle, radius = bounds(model, data["open"])
-    far = 3.0 * radius
+    far = 2.6 * radius
     shots, titles = [], []
     for name in ("open", "cupped"):
-        for what, azimuth, elevation in (("onto the palm", 180.0, -89.0), ("from the fingers' side", 140.0, -25.0), ("from its side", 90.0, -5.0)):  # fmt: skip
-            shots.append(Shot(0, poses[name], middle, far, azimuth, elevation))
+        for what, azimuth, elevation in VIEWS:
+            away = far * (1.15 if elevation < -80 else 1.0)
+            shots.append(Shot(0, poses[name], middle, away, azimuth, elevation))
             titles.append(f"{name}, {what}")
     shots.append(Shot(0, poses["cupped"], middle, far, 140.0, -25.0, groups=(3,)))
     titles.append("collision shapes, cupped")
-    layout = hand.layout()
-    for finger in hand.fingers if layout is not None else ():
+    for finger in hand.fingers if hand.touches else ():
         body = model.body(finger.body).id
         turn = data["open"].xmat[body].reshape(3, 3)
         at, normal = data["open"].xpos[body] + turn @ np.array(finger.position), turn @ np.array(finger.normal)
@@ -67,7 +73,7 @@ def draw(hand: Hand, path: Path) -> None:
     images = render([model], shots)
     columns = 3
     rows = -(-len(shots) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.9 * rows), dpi=100, layout="tight")
+    figure = Figure(figsize=(4.6 * columns, 3.9 * rows), dpi=100, layout="constrained")
     for k, (shot, image, title) in enumerate(zip(shots, images, titles, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
         axes.imshow(image)
@@ -79,12 +85,14 @@ def draw(hand: Hand, path: Path) -> None:
             _tips(axes, shot, hand, model, d)
         if k == 0:
             _joints(axes, shot, hand, model, d)
-        if k > 6 and layout is not None:
-            _taxels(axes, shot, model, d, layout, k - 7)
+        if k > 6:
+            _taxels(axes, shot, hand, model, d, k - 7)
+    thumbs = ", ".join(hand.fingers[k].name for k in hand.opposing)
     figure.suptitle(
-        f"{hand.name}: {len(hand.joints)} joints, {len(hand.fingers)} fingers ({', '.join(hand.fingers[k].name for k in hand.opposing)}"
-        f" opposing), {hand.file.handedness} hand; span {1e3 * hand.span:.0f} mm", fontsize=11,
-    )  # fmt: skip
+        f"{hand.name}: {len(hand.joints)} joints, {len(hand.fingers)} fingers ({thumbs} opposing),"
+        f" {hand.file.handedness} hand; span {1e3 * hand.span:.0f} mm",
+        fontsize=12,
+    )
     figure.savefig(path)
 
 
@@ -121,14 +129,15 @@ def _joints(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.
             axes.text(x, y, hand.joints[k], ha=align, va="center", **LABEL)
 
 
-def _taxels(axes: Any, shot: Shot, model: mujoco.MjModel, d: mujoco.MjData, layout: Any, pad: int) -> None:
-    body = model.body(layout.bodies[pad]).id
+def _taxels(axes: Any, shot: Shot, hand: Hand, model: mujoco.MjModel, d: mujoco.MjData, k: int) -> None:
+    finger = hand.fingers[k]
+    assert finger.pad is not None
+    pad = load_layout(hand.folder / finger.pad.taxels, finger.body)
+    body = model.body(finger.body).id
     turn = d.xmat[body].reshape(3, 3)
-    count = int(layout.count[pad])
-    points = layout.point[pad, :count] @ turn.T + d.xpos[body]
-    ends = shot.project(points + 0.002 * layout.normal[pad, :count] @ turn.T)
-    at = shot.project(points)
+    points = pad["point"] @ turn.T + d.xpos[body]
+    at, ends = shot.project(points), shot.project(points + 0.002 * pad["normal"] @ turn.T)
     axes.plot(*at.T, ".", ms=4, color="#d62728")
     for a, b in zip(at, ends, strict=True):
         axes.plot(*np.stack([a, b]).T, lw=0.7, color="#d62728")
-    axes.set_xlabel(f"{count} taxels, {1e4 * layout.area[pad].sum():.2f} cm2", fontsize=8)
+    axes.set_xlabel(f"{len(points)} taxels, {1e4 * pad['area'].sum():.2f} cm2", fontsize=8)

@@ -1,4 +1,4 @@
-"""An open and a cupped pose, by search: fingertips around a ball before the palm, facing it, links clear of each other."""
+"""An open and a cupped pose, by search: fingertips around a ball before the palm, links clear of each other."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ BALL = 0.25
 OPEN = 0.3  # of the way from stretched to cupped
 TOUCH = 0.001  # m that two links may overlap before it counts
 STARTS = 6
+GOOD = 0.35  # of a cupped pose: no further start is tried
 
 
 @dataclass
@@ -130,13 +131,15 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
         found = least_squares(residuals, x0, bounds=bounds, x_scale=scale, diff_step=1e-4, max_nfev=30)
         if found.cost < cost:
             best, cost = pose(found.x), float(found.cost)
+        if np.sqrt(2 * cost / len(s.motions)) < GOOD:
+            break
     return np.clip(best, m.jnt_range[:, 0], m.jnt_range[:, 1]), float(np.sqrt(2 * cost / len(s.motions)))
 
 
 def opened(s: Search, closed: np.ndarray) -> np.ndarray:
-    """The cupped hand with its fingers let go: bending joints OPEN of the way from stretched, farther or nearer where
-    links would overlap."""
-    bent = [j for x in s.motions for j in x.flexion]
+    """The cupped hand with its fingers let go: OPEN of the way from stretched, farther or nearer where links would
+    overlap; an opposing finger stays turned as it is."""
+    bent = [j for k, x in enumerate(s.motions) for j in (x.flexion if k in s.thumbs else x.finger.joints)]
     best, least = None, np.inf
     for share in (OPEN, 0.4, 0.2, 0.5, 0.1, 0.6, 0.0, 0.7):
         q = closed.copy()
@@ -165,7 +168,9 @@ def near_the_palm(m: mujoco.MjModel, tree: Tree) -> list[tuple[str, str]]:
     for finger in tree.fingers:
         moving = list(dict.fromkeys(int(m.jnt_bodyid[j]) for j in finger.joints))
         near = moving[: (len(moving) + 1) // 2]
-        fixed = [b for b in range(1, m.nbody) if not m.body_jntnum[b] and m.body_parentid[b] in near and b != finger.tip]
+        fixed = [
+            b for b in range(1, m.nbody) if not m.body_jntnum[b] and m.body_parentid[b] in near and b != finger.tip
+        ]
         out += [(m.body(tree.palm).name, m.body(b).name) for b in [*near, *fixed]]
     return list(dict.fromkeys(out))
 

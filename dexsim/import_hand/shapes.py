@@ -15,8 +15,8 @@ from dexsim.import_hand.frame import Motion, Palm, palm_points
 from dexsim.import_hand.tree import Tree
 
 MARGIN = 0.0015
-"""Rounding of a fingertip [m]: its mesh is the tip shrunk by this, its geom's `margin` adds it back (the mesh itself then
-never overlaps an object, so that the collision of convex shapes stays a distance query)."""
+"""Rounding of a fingertip [m]: its mesh is the tip shrunk by this, its geom's `margin` adds it back (the mesh itself
+then never overlaps an object, so that the collision of convex shapes stays a distance query)."""
 CORNERS = 64  # of a tip's core
 
 
@@ -147,7 +147,9 @@ def core(skin: np.ndarray, margin: float = MARGIN, most: int = CORNERS) -> np.nd
     points = np.unique(points[np.isfinite(points).all(axis=1)].round(8), axis=0)
     if len(points) <= most:
         return points[ConvexHull(points).vertices]
-    chosen = sorted({int(i) for d in np.vstack([np.eye(3), [[1, 1, 1]]]) for i in ((points @ d).argmin(), (points @ d).argmax())})
+    chosen = sorted(
+        {int(i) for d in np.vstack([np.eye(3), [[1, 1, 1]]]) for i in ((points @ d).argmin(), (points @ d).argmax())}
+    )
     while len(chosen) < 4 or np.linalg.matrix_rank(points[chosen] - points[chosen[0]], tol=1e-5) < 3:
         chosen.append(int(np.random.default_rng(len(chosen)).integers(len(points))))
     while len(chosen) < most:
@@ -179,7 +181,9 @@ def palm_row(m: mujoco.MjModel, tree: Tree, palm: Palm) -> list[Capsule]:
         if len(strip) < 8:
             continue
         cells = np.floor((strip[:, 0] - low[0]) / radius).astype(int)
-        front = np.array([[strip[cells == c, 0].mean(), np.quantile(strip[cells == c, 2], 0.95)] for c in np.unique(cells)])
+        front = np.array(
+            [[strip[cells == c, 0].mean(), np.quantile(strip[cells == c, 2], 0.95)] for c in np.unique(cells)]
+        )
         if len(front) > 2 and np.ptp(front[:, 0]) > radius:
             slope = np.polyfit(front[:, 0], front[:, 1], 1)
             if abs(slope[0]) > 0.6:  # steeper than a palm is: an edge, not a face

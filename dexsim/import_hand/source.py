@@ -59,14 +59,16 @@ def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", den
         taken = _coupled(spec, path, coupled)
         efforts = _strip(spec, path, notes)
         if bare and density is None:
+            first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
             raise UserError(
-                f"model {path}: link{'s' if len(bare) > 1 else ''} {', '.join(bare[:5])}{' ...' if len(bare) > 5 else ''}"
+                f"model {path}: link{'s' if len(bare) > 1 else ''} {first}"
                 " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
             )
         for body in spec.bodies:
             if body.name in bare:
-                for geom in body.geoms:
-                    geom.density = density or 0.0
+                geoms = [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
+                for geom in body.geoms:  # what is drawn and what collides is one body, not two
+                    geom.density = density if geom in geoms else 0.0
         model = _compiled(spec, path, notes)
     finally:
         scratch.cleanup()
@@ -114,7 +116,9 @@ def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
             f"{len(trees)} bodies, {len(list(spec.joints))} joints: this is not a hand"
         )
     if len(hands) > 1:
-        raise UserError(f"model {path}: {len(hands)} trees with hinges ({', '.join(hands)}): leave one hand in the file")
+        raise UserError(
+            f"model {path}: {len(hands)} trees with hinges ({', '.join(hands)}): leave one hand in the file"
+        )
     for name, (body, _) in trees.items():
         if name != hands[0]:
             notes.append(f"left out: '{name}' (another tree)")
@@ -167,7 +171,16 @@ def _strip(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> dict[str, float
         if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.forcelimited != 0 and reach > 0:
             efforts[actuator.target] = max(efforts.get(actuator.target, 0.0), float(reach))
         spec.delete(actuator)
-    for group in (spec.sensors, spec.keys, spec.lights, spec.cameras, spec.excludes, spec.pairs, spec.skins, spec.sites):
+    for group in (
+        spec.sensors,
+        spec.keys,
+        spec.lights,
+        spec.cameras,
+        spec.excludes,
+        spec.pairs,
+        spec.skins,
+        spec.sites,
+    ):
         for item in list(group):
             spec.delete(item)
     for material in spec.materials:

@@ -46,7 +46,12 @@ class Pad:
 
 
 def paint(
-    finger: str, surface: geometry.Surface, position: np.ndarray, normal: np.ndarray, along: np.ndarray, size: tuple[int, int]
+    finger: str,
+    surface: geometry.Surface,
+    position: np.ndarray,
+    normal: np.ndarray,
+    along: np.ndarray,
+    size: tuple[int, int],
 ) -> Pad:
     """A grid of size (rows, columns) on the side of `surface` that `normal` looks out of.
 
@@ -59,8 +64,8 @@ def paint(
     holes = geometry.open_edges(surface)
     if holes:
         raise UserError(
-            f"finger {finger}: the mesh of its tip is not closed, {holes} edges border a hole; close it (Blender: Mesh >"
-            " Clean Up > Fill Holes), or holes=hull takes its convex hull"
+            f"finger {finger}: the mesh of its tip is not closed, {holes} edges border a hole; close it (Blender: Mesh"
+            " > Clean Up > Fill Holes), or holes=hull takes its convex hull"
         )
     hull = _hull(surface[0])
     normal = unit(normal)
@@ -119,7 +124,9 @@ def read(path: Path) -> dict[str, Pad]:
     need = ("finger", "x", "y", "z", "nx", "ny", "nz")
     missing = [c for c in need if not rows or c not in rows[0]]
     if missing:
-        raise UserError(f"taxels {path}: no column {', '.join(missing)}; needed: {', '.join(need)} (m, tip body's frame)")
+        raise UserError(
+            f"taxels {path}: no column {', '.join(missing)}; needed: {', '.join(need)} (m, tip body's frame)"
+        )
     by: dict[str, list[list[float]]] = {}
     for line, row in enumerate(rows, 2):
         try:

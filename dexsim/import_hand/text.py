@@ -1,4 +1,4 @@
-"""The text of a hand.yaml for a person to read and correct: every field with a word on what it is, every guess marked."""
+"""The text of a hand.yaml for a person to correct: every field with a word on what it is, every guess marked."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Any
 
 HEAD = """\
 # {name}: a hand as dexsim reads it, written by `dexsim import-hand`. Lengths in m, angles in rad.
-# What is marked "guess" was not in the model's file: look at picture.png, correct it here, and run the import again: what
-# you changed stays. A place taken out of `guessed` (at the end) counts as confirmed.
+# What is marked "guess" was not in the model's file: look at picture.png, correct it here, and run the import again:
+# what you changed stays. A place taken out of `guessed` (at the end) counts as confirmed.
 """
 ABOUT = {
-    "joints": "every driven joint, in the order of commands and readings on the wire; effort N m, speed rad/s: its largest",
+    "joints": "every driven joint, in the order of commands and readings on the wire; effort N m, speed rad/s",
     "palm": "the palm's frame, in the frame of `body`: x forward along the fingers, z = normal out of the palm",
     "fingers": "joints root to tip; flexion: those that close it, closes: the sign of the motion that does",
     "opposing": "fingers that press against the others",

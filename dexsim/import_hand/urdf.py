@@ -42,7 +42,9 @@ def _root(path: Path) -> ET.Element:
         what = "a xacro program's input? run xacro on it first" if path.suffix == ".xacro" else "URDF or MJCF is needed"
         raise UserError(f"model {path}: is not XML ({error}); {what}") from None
     if root.tag not in ("robot", "mujoco", "mujocoinclude"):
-        raise UserError(f"model {path}: its root element is <{root.tag}>; a robot's is <robot> (URDF) or <mujoco> (MJCF)")
+        raise UserError(
+            f"model {path}: its root element is <{root.tag}>; a robot's is <robot> (URDF) or <mujoco> (MJCF)"
+        )
     return root
 
 
@@ -53,6 +55,11 @@ def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirect
     out = Urdf("")
     if any(e.tag.startswith("{") and "xacro" in e.tag for e in root.iter()):
         raise UserError(f"model {path}: has xacro macros in it; run xacro on it first: xacro {path.name} > robot.urdf")
+    for tag in ("link", "joint"):
+        names = [e.get("name", "") for e in root.findall(tag)]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise UserError(f"model {path}: two {tag}s have the name '{twice[0]}'; every {tag} needs a name of its own")
     converted: dict[Path, Path] = {}
     for mesh in root.iter("mesh"):
         name = mesh.get("filename") or ""
@@ -84,7 +91,9 @@ def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirect
         if limit is not None and _number(limit.get("velocity")) > 0:
             out.speeds[name] = _number(limit.get("velocity"))
     out.bare = [
-        link.get("name", "") for link in root.findall("link") if link.get("name") in moved and link.find("inertial") is None
+        link.get("name", "")
+        for link in root.findall("link")
+        if link.get("name") in moved and link.find("inertial") is None
     ]
     out.text = ET.tostring(root, encoding="unicode")
     return out
@@ -104,7 +113,9 @@ def _find(path: Path, name: str, packages: Sequence[Path]) -> Path:
     for there in tries:
         if there.is_file():
             return there.resolve()
-    hint = "packages=FOLDER says where packages are" if name.startswith("package://") else "paths are relative to the file"
+    hint = (
+        "packages=FOLDER says where packages are" if name.startswith("package://") else "paths are relative to the file"
+    )
     raise UserError(f"model {path}: mesh {name}: no such file (looked first at {tries[0]}); {hint}")
 
 

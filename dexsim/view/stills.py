@@ -1,6 +1,6 @@
 """Pictures of models in poses, rendered in a process of their own (MuJoCo fixes its OpenGL backend at import).
 
-    MUJOCO_GL=egl python -m dexsim.view.stills FOLDER
+MUJOCO_GL=egl python -m dexsim.view.stills FOLDER
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
         folder = Path(name)
         for k, model in enumerate(models):
             mujoco.mj_saveModel(model, str(folder / f"{k}.mjb"), None)
-        plain = [asdict(s) | {"qpos": [float(x) for x in s.qpos], "lookat": [float(x) for x in s.lookat]} for s in shots]
+        plain = [
+            asdict(s) | {"qpos": [float(x) for x in s.qpos], "lookat": [float(x) for x in s.lookat]} for s in shots
+        ]
         (folder / "shots.json").write_text(json.dumps(plain))
         asked = os.environ.get("MUJOCO_GL", "").lower()
         reasons = []
@@ -71,7 +73,9 @@ def render(models: Sequence[Any], shots: Sequence[Shot]) -> list[np.ndarray]:
                 return [np.load(folder / f"{k}.npy") for k in range(len(shots))]
             said = (done.stdout + done.stderr).strip().splitlines()
             reasons.append(f"{backend}: {said[-1] if said else f'status {done.returncode}'}")
-    raise video.NoRenderer(f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {video.INSTALL}")
+    raise video.NoRenderer(
+        f"no picture: no OpenGL for offscreen rendering ({'; '.join(reasons)}); install one: {video.INSTALL}"
+    )
 
 
 def main(folder: Path) -> int:
@@ -95,7 +99,11 @@ def main(folder: Path) -> int:
         model.vis.global_.offwidth = max(s.size[0] for _, s in own)
         model.vis.global_.offheight = max(s.size[1] for _, s in own)
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 4, 2048
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:], model.vis.headlight.specular[:] = 0.45, 0.55, 0.1
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:], model.vis.headlight.specular[:] = (
+            0.45,
+            0.55,
+            0.1,
+        )
         model.vis.map.znear = 0.01
         data = mujoco.MjData(model)
         renderers: dict[tuple[int, int], Any] = {}

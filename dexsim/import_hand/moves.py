@@ -1,0 +1,219 @@
+"""`dexsim import-hand check FOLDER`: every joint in turn, through its range and back, told, filmed and drawn."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.hand import Hand, load_hand
+from dexsim.import_hand import folder, picture
+from dexsim.import_hand.frame import tip_at
+
+USAGE = """usage: dexsim import-hand check FOLDER [out=FOLDER] [seconds=1] [film=true]
+
+Move each joint of a hand through its range, from the open pose and back, and say what it does: how far it takes its
+fingertip, whether a joint that should close the finger does, and where links touch. Writes check.png, each joint at
+both its limits; with film=true also check.mp4 (seconds: of each joint's move).
+"""
+STEPS = 25  # poses each way
+RATE = 12  # pictures a second
+
+
+@dataclass
+class Move:
+    """One joint moved alone. finger: index, -1: none; role: what hand.yaml says of it; travel: m that the fingertip
+    goes between the limits; closer: m that it comes nearer to the fingers it presses against as the joint closes;
+    touches: the first pair of links that overlap on the way, and the angle."""
+
+    joint: str
+    finger: int
+    role: str
+    travel: float
+    closer: float
+    touches: tuple[str, str, float] | None
+
+
+def moves(hand: Hand) -> list[Move]:
+    """Every joint's move."""
+    model = hand.spec().compile()
+    data = mujoco.MjData(model)
+    start = picture.qpos(hand, model, hand.pose("open"))
+    owner = {j: k for k, f in enumerate(hand.fingers) for j in f.joints}
+    out = []
+
+    def tips(q: np.ndarray) -> np.ndarray:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        return np.array([tip_at(data, model.body(f.body).id, np.array(f.position)) for f in hand.fingers])
+
+    def overlap() -> tuple[str, str] | None:
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        for c in data.contact[: data.ncon]:
+            if c.dist < -0.001:
+                a, b = (model.body(model.geom_bodyid[g]).name for g in c.geom)
+                return a, b
+        return None
+
+    for j, name in enumerate(hand.joints):
+        finger = owner.get(j, -1)
+        at = int(model.joint(name).qposadr[0])
+        first = None
+        for angle in np.linspace(*hand.limits[j], STEPS):
+            q = start.copy()
+            q[at] = angle
+            tips(q)
+            if first is None and (pair := overlap()) is not None:
+                first = (*pair, float(angle))
+        role, closer = "turns", 0.0
+        ends = []
+        for angle in hand.limits[j]:
+            q = start.copy()
+            q[at] = angle
+            ends.append(tips(q))
+        travel = float(np.linalg.norm(ends[1][finger] - ends[0][finger])) if finger >= 0 else 0.0
+        if finger >= 0 and j in hand.fingers[finger].flexion:
+            sign = hand.fingers[finger].closes[hand.fingers[finger].flexion.index(j)]
+            role = f"bends, closes to {'+' if sign > 0 else '-'}"
+            goal = hand.others if finger in hand.opposing else hand.opposing
+            middle = tips(start)[list(goal)].mean(0)
+            q = start.copy()
+            step = 0.25 * (hand.limits[j, 1] - hand.limits[j, 0])
+            q[at] = np.clip(start[at] + sign * step, *hand.limits[j])
+            closer = float(np.linalg.norm(tips(start)[finger] - middle) - np.linalg.norm(tips(q)[finger] - middle))
+        out.append(Move(name, finger, role, travel, closer, first))
+    return out
+
+
+def main(argv: Sequence[str]) -> int:
+    """Returns the exit status: 1 where a joint that should close its finger opens it. Raises UserError."""
+    if not argv or any(a in ("-h", "--help", "help") for a in argv):
+        print(USAGE, end="")
+        return 0 if argv else 2
+    where, given = argv[0], {"out": "", "seconds": "1", "film": "false"}
+    for text in argv[1:]:
+        key, equals, value = text.partition("=")
+        if not equals or key not in given:
+            raise UserError(f"'{text}': expected out=FOLDER, seconds=NUMBER or film=true")
+        given[key] = value
+    try:
+        seconds = float(given["seconds"])
+    except ValueError:
+        seconds = 0.0
+    if not 0.2 <= seconds <= 20:
+        raise UserError(f"seconds={given['seconds']}: must be a number from 0.2 to 20, of each joint's move")
+    hand = load_hand(where)
+    out = Path(given["out"] or hand.folder).expanduser()
+    from dexsim.console import folders
+
+    folders.make(out, "out=")
+    table = moves(hand)
+    wrong = []
+    print(
+        f"{'joint':<22}{'finger':<10}{'what it does':<21}{'range rad':>15}{'tip goes':>10}{'closing':>10}"
+        "  links that touch"
+    )
+    for k, m in enumerate(table):
+        low, high = hand.limits[k]
+        finger = hand.fingers[m.finger].name if m.finger >= 0 else "-"
+        closing = f"{1e3 * m.closer:+.0f} mm" if m.role.startswith("bends") else ""
+        touch = f"{m.touches[0]}, {m.touches[1]} at {m.touches[2]:.2f}" if m.touches else ""
+        print(
+            f"{m.joint:<22}{finger:<10}{m.role:<21}{f'{low:.2f} to {high:.2f}':>15}{1e3 * m.travel:>7.0f} mm"
+            f"{closing:>10}  {touch}"
+        )
+        if m.role.startswith("bends") and m.closer < -0.002:
+            wrong.append(m.joint)
+        if m.finger >= 0 and m.travel < 0.001:
+            print(f"check: {m.joint} does not move its fingertip: is tip.body right?")
+    for joint in wrong:
+        print(
+            f"check: {joint} takes its fingertip away from those it presses against as it closes: turn its sign in"
+            " closes, or take it out of flexion"
+        )
+    _show(hand, out, seconds, given["film"] == "true")
+    return 1 if wrong else 0
+
+
+def _show(hand: Hand, out: Path, seconds: float, film: bool) -> None:
+    """The film and the sheet of pictures."""
+    from dexsim.view import video
+
+    model = hand.spec().compile()
+    start = picture.qpos(hand, model, hand.pose("open"))
+    data = picture.posed(model, start)
+    middle, radius = picture.bounds(model, data)
+    camera: dict[str, Any] = {
+        "lookat": [float(x) for x in middle],
+        "distance": 2.6 * radius,
+        "azimuth": 140.0,
+        "elevation": -25.0,
+    }
+    note = folder.corrections.written(hand.folder) if out.resolve() == hand.folder.resolve() else None
+    made = []
+    try:
+        _sheet(hand, model, start, camera, out / "check.png")
+        made.append("check.png")
+        if film:
+            rows, text = [], []
+            count = max(8, int(seconds * RATE))
+            for j, name in enumerate(hand.joints):
+                at = int(model.joint(name).qposadr[0])
+                low, high = hand.limits[j]
+                s = np.linspace(0, 1, count)
+                way = np.interp(s, [0, 0.2, 0.7, 1], [start[at], low, high, start[at]])
+                for angle in way:
+                    q = start.copy()
+                    q[at] = angle
+                    rows.append(q)
+                    text.append(f"{name}: {angle:+.2f} rad")
+            limit = int(60 * RATE)
+            if len(rows) > limit:  # a video holds a minute
+                keep = np.linspace(0, len(rows) - 1, limit).astype(int)
+                rows, text = [rows[k] for k in keep], [text[k] for k in keep]
+            clip = video.Clip(model, np.array(rows), hand.name, None, None, text)
+            video.render(
+                [clip], out / "check.mp4", 1.0 / RATE, size=(480, 368), camera=camera | {"distance": 2.1 * radius}
+            )
+            made.append("check.mp4")
+    except video.NoRenderer as error:
+        print(f"no pictures: {error}")
+    if note is not None:  # ours to overwrite the next time
+        for name in made:
+            note["files"][name] = folder.sha(out / name)
+        (out / folder.corrections.NOTE).write_text(json.dumps(note, indent=1), encoding="utf-8")
+    for name in made:
+        print(out / name)
+
+
+def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[str, Any], path: Path) -> None:
+    """One row a joint: at its low end, open, at its high end."""
+    from matplotlib.figure import Figure
+
+    from dexsim.view.stills import Shot, render
+
+    shots, titles = [], []
+    for j, name in enumerate(hand.joints):
+        at = int(model.joint(name).qposadr[0])
+        for angle in hand.limits[j]:
+            q = start.copy()
+            q[at] = angle
+            shots.append(Shot(0, q, camera["lookat"], camera["distance"], 140.0, -25.0, (300, 250)))
+            titles.append(f"{name} {angle:+.2f}")
+    images = render([model], shots)
+    columns = 6
+    rows = -(-len(shots) // columns)
+    figure = Figure(figsize=(2.6 * columns, 2.4 * rows), dpi=70, layout="constrained")
+    for k, (image, title) in enumerate(zip(images, titles, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, fontsize=8)
+    figure.savefig(path)

@@ -1,0 +1,360 @@
+"""A hand of a robot's file: what is found, guessed, checked, written; what a person corrects; what is refused."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from scipy.spatial import ConvexHull
+
+from dexsim.errors import UserError
+from dexsim.hand import load_hand
+from dexsim.import_hand import command, geometry, moves, shapes, taxels
+from dexsim.import_hand.importing import Settings, import_hand
+from tests import hands
+
+
+@pytest.fixture(scope="module")
+def claw(tmp_path_factory) -> Path:
+    """The made-up hand imported once; not to be changed."""
+    folder = tmp_path_factory.mktemp("claw")
+    import_hand(hands.write(folder / "robot"), folder / "hand", picture=False)
+    return folder / "hand"
+
+
+def test_what_the_tree_and_the_axes_say(claw):
+    hand = load_hand(claw)
+    assert [f.name for f in hand.fingers] == ["thumb", "index", "middle", "ring"]
+    assert [hand.joints[j] for j in hand.fingers[0].joints] == ["thumb_turn", "thumb_1", "thumb_2"]
+    assert [hand.joints[j] for j in hand.fingers[0].flexion] == ["thumb_1", "thumb_2"]
+    assert [hand.joints[j] for j in hand.fingers[2].flexion] == ["middle_1", "middle_2"]
+    assert all(c == 1 for f in hand.fingers for c in f.closes)
+    assert hand.opposing == (0,) and hand.handedness == "right" and hand.palm_body == "base"
+    np.testing.assert_allclose(hand.file.palm.forward, [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(hand.file.palm.normal, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(hand.fingers[1].normal, [0, 0, 1], atol=0.02)  # a finger's tip looks where it closes to
+    assert 0.02 < hand.fingers[1].position[0] < 0.045 and abs(hand.fingers[1].position[1]) < 1e-3
+    assert (hand.efforts == 0.6).all() and (hand.speeds == 7).all()  # the file's own <limit effort= velocity=>
+
+
+def test_mirrored_it_is_a_left_hand(tmp_path):
+    result = import_hand(hands.write(tmp_path / "robot", left=True), tmp_path / "hand", picture=False)
+    assert result.hand["handedness"] == "left"
+
+
+def _depth(model: mujoco.MjModel, q: np.ndarray) -> float:
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    return max((-c.dist for c in data.contact[: data.ncon]), default=0.0)
+
+
+def test_fingertips_approach_each_other_and_no_link_is_in_another(claw):
+    hand = load_hand(claw)
+    model = hand.spec().compile()
+    ids = [int(model.joint(j).qposadr[0]) for j in hand.joints]
+    gaps, facing = [], []
+    for name in ("open", "cupped"):
+        data = mujoco.MjData(model)
+        data.qpos[ids] = hand.pose(name)
+        mujoco.mj_kinematics(model, data)
+        at = np.array([data.body(f.body).xpos + data.body(f.body).xmat.reshape(3, 3) @ f.position for f in hand.fingers])
+        normals = np.array([data.body(f.body).xmat.reshape(3, 3) @ f.normal for f in hand.fingers])
+        gaps.append(np.linalg.norm(at[0] - at[1:].mean(0)))
+        way = at[1:].mean(0) - at[0]
+        facing.append(normals[0] @ way / np.linalg.norm(way))
+        assert _depth(model, data.qpos) < 0.002
+        if name == "cupped":
+            assert (at[:, 2] > 0.012).all()  # before the palm, which is 12 mm thick from its frame on
+    assert gaps[1] < 0.6 * gaps[0] and facing[1] > 0.5
+    assert hand.span == pytest.approx(gaps[0], abs=0.01)
+
+
+def test_shapes_are_capsules_and_cores_with_the_rubbers_margin(claw):
+    hand = load_hand(claw)
+    model = hand.spec().compile()
+    kinds = {"link": set(), "tip": set()}
+    for g in range(model.ngeom):
+        if model.geom_contype[g]:
+            kinds["tip" if model.geom(g).name.startswith("tip_") else "link"].add(int(model.geom_type[g]))
+    assert kinds == {"link": {int(mujoco.mjtGeom.mjGEOM_CAPSULE)} | kinds["link"] & {int(mujoco.mjtGeom.mjGEOM_SPHERE)},
+                     "tip": {int(mujoco.mjtGeom.mjGEOM_MESH)}}  # fmt: skip
+    for finger in hand.fingers:
+        g = model.geom(finger.geoms[0]).id
+        assert model.geom_margin[g] == pytest.approx(shapes.MARGIN)
+        core = geometry.geom_surface(model, g)[0]
+        assert len(core) <= shapes.CORNERS
+        skin = np.array([[float(x) for x in line.split()[1:]] for line in
+                         (claw / f"skin_{finger.name}.obj").read_text().splitlines() if line[0] == "v"])  # fmt: skip
+        planes = ConvexHull(skin).equations
+        inside = -(core @ planes[:, :3].T + planes[:, 3]).max(1)
+        assert (inside > shapes.MARGIN - 2e-5).all() and inside.min() < shapes.MARGIN + 3e-4
+
+
+def test_taxels_lie_on_the_palmar_side_and_cover_it(claw):
+    with open(claw / "taxels_middle.csv", newline="") as f:
+        rows = list(csv.DictReader(f))
+    point = np.array([[float(r[c]) for c in "xyz"] for r in rows])
+    normal = np.array([[float(r[c]) for c in ("nx", "ny", "nz")] for r in rows])
+    assert len(rows) == 48 and (point[:, 2] > 0).all() and (normal[:, 2] > taxels.STEEPEST - 0.1).all()
+    # the tip is a capsule of 7.5 mm along x: on its side, this far from its axis (its facets sag 0.37 mm)
+    straight = (point[:, 0] > 0.0135) & (point[:, 0] < 0.036)
+    assert np.linalg.norm(point[straight, 1:], axis=1) == pytest.approx(0.0075, abs=4e-4)
+    lattice = point.reshape(6, 8, 3)
+    assert (np.diff(lattice[:, :, 0], axis=1) > 0).all()  # rows run from the joint to the tip
+    spread = np.ptp(point, axis=0)
+    assert spread[0] > 0.008 and spread[1] > 0.008
+    area = sum(float(r["area"]) for r in rows)
+    assert area > 0.8 * spread[0] * spread[1]
+
+
+def test_a_second_run_changes_nothing(claw, tmp_path):
+    shutil.copytree(claw.parent, tmp_path / "all")
+    hand = tmp_path / "all" / "hand"
+    before = {p.relative_to(hand): p.read_bytes() for p in hand.rglob("*") if p.is_file() and p.name != ".import.json"}
+    result = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
+    after = {p.relative_to(hand): p.read_bytes() for p in hand.rglob("*") if p.is_file() and p.name != ".import.json"}
+    assert before == after and result.corrected == [] and result.kept == []
+
+
+def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
+    shutil.copytree(claw.parent, tmp_path / "all")
+    hand = tmp_path / "all" / "hand"
+    text = (hand / "hand.yaml").read_text()
+    content = yaml.safe_load(text)
+    effort = content["joints"][0]["effort"]
+    content["joints"][0]["effort"] = effort + 0.3
+    content["joints"] = [*content["joints"][3:], *content["joints"][:3]]  # another order on the wire
+    content["poses"]["cupped"]["thumb_turn"] = 1.9
+    content["palm"]["position"] = [0.01, 0.0, 0.012]
+    content["fingers"][1]["name"] = "pointer"
+    content["guessed"].remove("fingers.middle.tip.normal")  # confirmed as it is
+    (hand / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (hand / "servo.yaml").write_text((hand / "servo.yaml").read_text() + "# measured\n")
+    (hand / "notes.txt").write_text("mine")
+    result = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
+    now = yaml.safe_load((hand / "hand.yaml").read_text())
+    assert now["joints"][-3] == {"name": "thumb_turn", "effort": pytest.approx(effort + 0.3), "speed": 7}
+    assert now["palm"]["position"] == [0.01, 0.0, 0.012]
+    assert now["poses"]["cupped"]["thumb_turn"] == 1.9
+    assert [f["name"] for f in now["fingers"]] == ["thumb", "pointer", "middle", "ring"]
+    for place in ("palm.position", "fingers.middle.tip.normal"):
+        assert place not in now["guessed"]
+    assert "palm.normal" in now["guessed"] and "poses.cupped" in now["guessed"]
+    assert sorted(result.kept) == ["notes.txt", "servo.yaml"] and "palm.position" in result.corrected
+    assert (hand / "servo.yaml").read_text().endswith("# measured\n") and (hand / "notes.txt").read_text() == "mine"
+    again = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
+    assert yaml.safe_load((hand / "hand.yaml").read_text()) == now, again.lines
+    load_hand(hand)
+
+
+def _broken(tmp_path: Path, change) -> Path:
+    path = hands.write(tmp_path / "robot")
+    path.write_text(change(path.read_text()))
+    return path
+
+
+BAD = {
+    "missing mesh": (lambda t: t.replace("meshes/tip.stl", "meshes/gone.stl"), r"mesh meshes/gone\.stl: no such file"),
+    "missing package": (lambda t: t.replace("meshes/tip.stl", "package://none/tip.stl"), r"package://none/tip\.stl: no such file.*packages="),
+    "no inertia": (lambda t: t.replace(t[t.index("<inertial>", t.index("ring_far")): t.index("</inertial>", t.index("ring_far")) + 11], "", 1),
+                   r"link index_far without <inertial>.*density="),
+    "zero limits": (lambda t: t.replace('lower="-0.2" upper="1.7"', 'lower="0" upper="0"', 1), r"joint 'index_1' has .*limits.*low < high"),
+    "degrees": (lambda t: t.replace('upper="1.7"', 'upper="97"', 1), r"joint 'index_1'.*in degrees"),
+    "endless": (lambda t: t.replace('name="ring_1" type="revolute"', 'name="ring_1" type="continuous"'), r"joint 'ring_1' is continuous"),
+    "one name twice": (lambda t: t.replace("ring_far", "middle_far"), r"two links have the name 'middle_far'"),
+    "mimic": (lambda t: t.replace('effort="0.6" velocity="7"/></joint>', 'effort="0.6" velocity="7"/><mimic joint="thumb_1"/></joint>', 2).replace(
+        '<mimic joint="thumb_1"/>', '<mimic joint="index_1"/>', 2).replace('<mimic joint="index_1"/>', "", 1), r"move together.*index_2.*coupled=independent"),
+    "millimetres": (lambda t: _scaled(t), r"longest finger is .* m, allowed .*millimetres"),
+    "xacro": (lambda t: t.replace('<robot name="claw">', '<robot name="claw" xmlns:xacro="http://x/xacro"><xacro:macro name="a"/>'), r"run xacro"),
+    "entities": (lambda t: '<!DOCTYPE robot [<!ENTITY a "b">]>' + t, r"defines XML entities"),
+    "not XML": (lambda t: "solid tip\n", r"is not XML"),
+    "not a robot": (lambda t: "<html/>", r"root element is <html>"),
+    "one finger": (lambda t: "\n".join(line for line in t.splitlines() if not any(f in line for f in ("index", "middle", "thumb"))), r"1 finger"),
+}  # fmt: skip
+
+
+def _scaled(text: str) -> str:
+    """A hand drawn in millimetres, read as metres."""
+    import re
+
+    def times(match: re.Match[str]) -> str:
+        return f'{match[1]}="{" ".join(str(1000 * float(x)) for x in match[2].split())}"'
+
+    return re.sub(r'\b(xyz|size|radius)="([-0-9. e]+)"(?=/>)', times, text).replace('axis xyz="0.0 -1000.0 0.0"', 'axis xyz="0 -1 0"')
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_get_one_line_and_nothing_is_written(case, tmp_path):
+    change, said = BAD[case]
+    path = _broken(tmp_path, change)
+    with pytest.raises(UserError, match=said) as error:
+        import_hand(path, tmp_path / "hand", picture=False)
+    assert "\n" not in str(error.value) and (str(path) in str(error.value) or "mesh" in str(error.value))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["robot"]
+
+
+def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(tmp_path):
+    path = hands.write(tmp_path / "robot")
+    hands.tip(tmp_path / "robot" / "meshes" / "tip.stl", hole=True)
+    with pytest.raises(UserError, match=r"finger thumb: the mesh of its tip is not closed, \d+ edges.*holes=hull"):
+        import_hand(path, tmp_path / "hand", picture=False)
+    assert not (tmp_path / "hand").exists()
+    import_hand(path, tmp_path / "hand", Settings(holes="hull"), picture=False)
+    load_hand(tmp_path / "hand")
+
+
+def test_self_collision_at_the_open_pose_is_refused_and_the_old_folder_stays(claw, tmp_path):
+    shutil.copytree(claw.parent, tmp_path / "all")
+    hand = tmp_path / "all" / "hand"
+    content = yaml.safe_load((hand / "hand.yaml").read_text())
+    loaded, rng = load_hand(hand), np.random.default_rng(0)
+    model = loaded.spec().compile()
+    ids = [int(model.joint(j).qposadr[0]) for j in loaded.joints]
+    q = np.zeros(model.nq)
+    while _depth(model, q) < 0.004:
+        q[ids] = rng.uniform(*loaded.limits.T).round(3)
+    content["poses"]["open"] = dict(zip(loaded.joints, map(float, q[ids])))
+    (hand / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    before = {p: p.read_bytes() for p in hand.rglob("*") if p.is_file()}
+    with pytest.raises(UserError, match=r"self-collision at the open pose: '.*' and '.*' overlap by [\d.]+ mm"):
+        import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
+    assert before == {p: p.read_bytes() for p in hand.rglob("*") if p.is_file()}
+    assert sorted(p.name for p in hand.parent.iterdir()) == ["hand", "robot"]
+
+
+def test_a_folder_that_is_not_ours_is_not_touched(tmp_path):
+    path = hands.write(tmp_path / "robot")
+    (tmp_path / "hand").mkdir()
+    (tmp_path / "hand" / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match="not a folder that import-hand wrote"):
+        import_hand(path, tmp_path / "hand", picture=False)
+
+
+def test_coupled_joints_are_driven_alone_only_when_asked(tmp_path):
+    change, _ = BAD["mimic"]
+    path = _broken(tmp_path, change)
+    result = import_hand(path, tmp_path / "hand", Settings(coupled="independent"), picture=False)
+    assert any("taken apart" in line and "index_2" in line for line in result.lines)
+    assert "index_2" in load_hand(tmp_path / "hand").joints
+
+
+def test_a_package_path_is_found_beside_and_above_the_file(tmp_path):
+    robot = tmp_path / "claw"
+    path = hands.write(robot / "urdf", mesh="package://claw/meshes/tip.stl")
+    shutil.move(robot / "urdf" / "meshes", robot / "meshes")
+    import_hand(path, tmp_path / "hand", Settings(pads=None), picture=False)
+    assert not load_hand(tmp_path / "hand").touches
+    away = tmp_path / "elsewhere" / "claw.urdf"
+    away.parent.mkdir()
+    shutil.copy(path, away)
+    shutil.move(robot, tmp_path / "packages" / "claw")
+    with pytest.raises(UserError, match="packages="):
+        import_hand(away, tmp_path / "other", picture=False)
+    import_hand(away, tmp_path / "other", Settings(packages=[tmp_path / "packages"], pads=None), picture=False)
+
+
+def test_missing_inertia_from_a_density(tmp_path):
+    path = _broken(tmp_path, BAD["no inertia"][0])
+    import_hand(path, tmp_path / "hand", Settings(density=1000.0, pads=None), picture=False)
+    model = load_hand(tmp_path / "hand").spec().compile()
+    volume = trimesh.load(tmp_path / "robot" / "meshes" / "tip.stl").volume
+    assert model.body("index_far").mass[0] == pytest.approx(1000 * volume, rel=0.02)
+
+
+def test_absurd_figures_are_named(tmp_path):
+    path = hands.write(tmp_path / "robot")
+    text = path.read_text().replace('effort="0.6" velocity="7"', 'effort="600" velocity="7"', 1)
+    at = text.index('<mass value="', text.index("ring_far"))
+    text = text[:at] + '<mass value="20"/>' + text[text.index("/>", at) + 2 :]
+    path.write_text(text)
+    lines = "\n".join(import_hand(path, tmp_path / "hand", Settings(pads=None), picture=False).lines)
+    assert "joint 'index_1': effort 600 N m is unusual" in lines
+    assert "link 'ring_far': mass 20 kg: heavy for a finger; in grams?" in lines
+    assert "link 'ring_far': inertia" in lines and "too small" in lines
+
+
+def test_taxels_from_a_csv_and_those_inside_the_finger(claw, tmp_path):
+    path = hands.write(tmp_path / "robot")
+    normals = {f.name: np.array(f.normal) for f in load_hand(claw).fingers}
+    axis = {"thumb": np.array([0, -1.0, 0])}
+
+    def table(depth: float) -> Path:
+        lines = ["finger,x,y,z,nx,ny,nz"]
+        for finger, n in normals.items():
+            for s in (0.015, 0.02, 0.025):
+                p = s * axis.get(finger, np.array([1.0, 0, 0])) + (0.0075 - (depth if finger == "ring" else 0.0)) * n
+                lines.append(f"{finger}," + ",".join(f"{v:.6f}" for v in [*p, *n]))
+        out = tmp_path / "taxels.csv"
+        out.write_text("\n".join(lines) + "\n")
+        return out
+
+    import_hand(path, tmp_path / "hand", Settings(pads=table(0.0)), picture=False)
+    assert len((tmp_path / "hand" / "taxels_ring.csv").read_text().splitlines()) == 4
+    with pytest.raises(UserError, match=r"taxel 0 of finger ring lies 3\.\d mm inside the finger"):
+        import_hand(path, tmp_path / "other", Settings(pads=table(0.003)), picture=False)
+    (tmp_path / "taxels.csv").write_text("finger,x,y,z\nring,0,0,0\n")
+    with pytest.raises(UserError, match="no column nx, ny, nz"):
+        import_hand(path, tmp_path / "other", Settings(pads=tmp_path / "taxels.csv"), picture=False)
+    assert not (tmp_path / "other").exists()
+
+
+def test_rays_meet_the_nearest_face_and_holes_are_counted():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.01)
+    surface = np.asarray(ball.vertices), np.asarray(ball.faces)
+    origins = np.array([[0.0, 0.0, 0.05], [0.005, 0.0, 0.05], [0.02, 0.0, 0.05]])
+    distance, normal = geometry.first_hits(surface, origins, np.array([0.0, 0, -1]))
+    np.testing.assert_allclose(distance[:2], [0.04, 0.05 - np.sqrt(0.01**2 - 0.005**2)], atol=2e-5)
+    assert np.isinf(distance[2])
+    np.testing.assert_allclose(normal[1], [0.5, 0, np.sqrt(0.75)], atol=0.05)
+    assert geometry.open_edges(surface) == 0
+    assert geometry.open_edges((surface[0], surface[1][1:])) == 3
+
+
+def test_check_tells_a_joint_that_opens_where_it_should_close(claw, tmp_path, capsys):
+    shutil.copytree(claw, tmp_path / "hand")
+    assert all(m.closer > 0.002 for m in moves.moves(load_hand(tmp_path / "hand")) if m.role.startswith("bends"))
+    text = (tmp_path / "hand" / "hand.yaml").read_text()
+    content = yaml.safe_load(text)
+    content["fingers"][1]["closes"] = [-1, 1]
+    (tmp_path / "hand" / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    wrong = [m.joint for m in moves.moves(load_hand(tmp_path / "hand")) if m.role.startswith("bends") and m.closer < 0]
+    assert wrong == ["index_1"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["claw.urdf"], "out=FOLDER"),
+        (["out=x"], "one model file is needed, 0 given"),
+        (["a.urdf", "b.urdf", "out=x"], "2 given: a.urdf, b.urdf"),
+        (["a.urdf", "out=x", "pads=8"], "pads=8: must be ROWSxCOLUMNS"),
+        (["a.urdf", "out=x", "effort=-1"], "effort=-1: must be a number from 0.001"),
+        (["a.urdf", "out=x", "coupled=maybe"], "coupled=maybe: must be refuse or independent"),
+        (["a.urdf", "out=x", "colour=red"], "'colour=red': no such setting"),
+        (["a.urdf", "out=x"], "a.urdf does not exist"),
+    ],
+)
+def test_arguments(argv, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError) as error:
+        command.main(argv)
+    assert said in str(error.value) and not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_picture_shows_the_hand(claw, tmp_path):
+    """Every panel has a hand in it: not one colour, and open differs from cupped."""
+    from PIL import Image
+
+    from dexsim.import_hand import picture
+
+    picture.draw(load_hand(claw), tmp_path / "picture.png")
+    image = np.asarray(Image.open(tmp_path / "picture.png").convert("L"), float)
+    assert image.shape[1] > 1000 and image.std() > 20
