@@ -135,7 +135,7 @@ def import_hand(
         search = _search(own, m, found, motions, thumbs, palm)
     never, meet = poses.meetings(search)
     tell(f"shapes   {len(made.capsules)} capsules on links and palm, {len(made.cores)} tips of {shapes.CORNERS}"
-         f" corners at most; {1e3 * made.error[0]:.1f} mm off the links on average; {meet} pairs of links can meet")  # fmt: skip
+         f" corners at most; {1e3 * made.error[0]:.1f} mm off the links; {meet} pairs of links can meet")  # fmt: skip
 
     order = [str(j) for j in fixes.pick("joint order", [m.joint(j).name for j in found.joints])]
     closed, open_ = _poses(search, order, fixes, pick, out, where, tell)
