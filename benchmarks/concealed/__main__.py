@@ -142,7 +142,9 @@ def main(argv: list[str]) -> dict:
     root = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}"
     plan = generate.plan(s["mix"], s["seed"], s["one_joint"])
     jobs = [(entry, n, s["seed"], root, s["laws"]) for n, entry in enumerate(plan)]
-    # in the order of the plan, which is drawn: where the budget ends the run, what was done is a fair sample of all
+    # the hand's first: they take longest, and the run's end would cut them off. Else in the order of the plan, which is
+    # drawn: where the budget ends the run, what was done is a fair sample of each
+    jobs.sort(key=lambda job: -len(job[0]["kinds"]) - 1 if job[0]["shape"] == "hand" else 0)
     made, tick = [], Progress("made", len(jobs))
     with ProcessPoolExecutor(max(s["jobs"], 1), mp_context=get_context("spawn")) as pool:
         for m in pool.map(generate.once, jobs):
