@@ -91,8 +91,8 @@ def _eccentricity(L: Shown, n: dict) -> dict:
     """Amplitude of the one harmonic that comes nearest over the recorded angles."""
     q = L["position"]
     error = plant.encoded(q, 0.0, 0.0, n["eccentric"], n["eccentric_at"], n["second_harmonic"])
-    fit = np.linalg.lstsq(np.stack([np.sin(q), np.cos(q), np.ones_like(q)], 1), error, rcond=None)[0]
-    return {"eccentricity": float(np.hypot(*fit[:2]))}
+    fit = np.linalg.lstsq(np.stack([np.sin(q), np.cos(q)], 1), error, rcond=None)[0]
+    return {"eccentricity": float(np.hypot(*fit))}
 
 
 def _ecc_own(L: Shown, n: dict, o: dict) -> np.ndarray:
