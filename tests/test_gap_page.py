@@ -98,7 +98,8 @@ def test_notes_that_recordings_share_are_said_once():
 
 
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
-    from dexsim.gap.report.page import _findings
+    from dexsim.gap.report.page import render
+    from dexsim.gap.report.sections import Findings
     from dexsim.gap.report.sentence import sentence
     from dexsim.gap.result import Diagnosis, empty
 
@@ -111,11 +112,19 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     data["held_out"] |= {"before": 0.02, "after": 0.01}
     data["findings"] = [found("command_delay", 0.9, "delay"), found("lag", 0.3, "time_constant")]
     d = Diagnosis(data, "", [])
-    html = _findings(d)
+    html = render(Findings(d))
     missing, hints = html.split("<h2>Hints</h2>")
     assert "delay" in missing and "lag" not in missing.lower().replace("lagg", "") and "lag" in hints.lower()
     said = sentence(data, d, 0.001)
     assert "later than believed" in said and "more" not in said
     data["findings"] = data["findings"][1:]
     data["verdict"] = "unknown"
-    assert "What is missing" not in _findings(d) and "no effect of the catalogue explains" in sentence(data, d, 0.001)
+    assert "What is missing" not in render(Findings(d)) and "no effect of the catalogue explains" in sentence(data, d, 0.001)
+
+
+def test_what_recordings_say_is_text_and_no_markup():
+    from dexsim.gap.report.page import page
+    from dexsim.gap.result import Diagnosis, empty
+
+    text = page(Diagnosis(empty(), "a <b>sentence</b> & more", ["<script>alert(1)</script>"]))
+    assert "<script" not in text and "&lt;script&gt;" in text and "a &lt;b&gt;sentence&lt;/b&gt; &amp; more" in text
