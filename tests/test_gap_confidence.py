@@ -164,3 +164,22 @@ def test_what_is_neutral_is_not_believed_to_a_few_percent():
     assert not confidence.holds_nothing([scale], {"scale": (0.96, 0.98)}, case)
     assert confidence.holds_nothing([scale], {"scale": (0.96, 1.01)}, case)
     assert confidence.holds_nothing([limit], {"torque": (1.92, 1.96)}, case)
+
+
+def test_a_size_that_may_lie_beyond_what_is_looked_for_is_doubted():
+    """An interval that ends at the far bound is only as long as the search; one that ends at the bound beside nothing is not cut."""
+    p = Param("scale", ("position_scale",), "factor", 0.7, 1.3, 1.0)
+    case = SimpleNamespace(scales=SimpleNamespace(nominal={}))
+    assert confidence.beyond([p], {"scale": (0.7, 0.98)}, case) == "scale"
+    assert confidence.beyond([p], {"scale": (0.72, 0.98)}, case) == ""
+    one_sided = Param("delay", ("delay",), "add", 0.0, 0.1, 0.0)
+    assert confidence.beyond([one_sided], {"delay": (0.0, 0.01)}, case) == ""
+    assert confidence.beyond([one_sided], {"delay": (0.02, 0.1)}, case) == "delay"
+
+
+def test_a_sensor_of_the_wrong_sign_is_not_doubted_for_its_sign():
+    """That the effort's sign is not what it says is the effect itself; a fault of the position is not."""
+    for bad, signs, kept in (({"a"}, {"a"}, 0.95), ({"a"}, set(), DOUBTED)):
+        sensor = evidence(effect="current_sensor", joint="a", confidence=0.95)
+        confidence.of_the_whole([sensor], {}, bad, signs)
+        assert sensor.confidence == kept

@@ -9,7 +9,7 @@ import pytest
 from test_gap_least import Judged, judged
 
 from dexsim.gap import rules
-from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
 from dexsim.gap.judge.joint import JointAnswer, stretched
@@ -345,3 +345,20 @@ def test_a_pad_must_be_touched_for_a_while():
             patch.setattr("dexsim.gap.touch.diagnosis.PadSearch", lambda *_: "search")
             touch.model()
         assert (touch.pads[0].search == "search") is judged_, seconds
+
+
+def test_friction_at_one_load_is_a_set():
+    rng = np.random.default_rng(0)
+    for spread, alike in ((0.2, ["load_friction"]), (0.45, [])):
+        load = 0.5 + spread * 0.5 * np.clip(rng.normal(size=4000), -2, 2) / 0.88
+        case = SimpleNamespace(regimes={"speed": np.ones(4000), "_load": load}, scales=SimpleNamespace(speed=1.0),
+                               plant=SimpleNamespace(run_of=np.zeros(4000, int)))  # fmt: skip
+        assert inseparable("coulomb_friction", case, [0]) == alike, spread
+        assert inseparable("lag", case, [0]) == []
+
+
+def test_repeats_that_differ_by_what_was_found_are_no_floor():
+    floor = conclude.Noise(3.0, "repeats", {"a": 3.0, "b": 3.0})
+    for left, same in ((1.2, False), (2.0, True)):
+        assert (floor.at_most({"a": left}) is floor) is same, left
+    assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0

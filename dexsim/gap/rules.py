@@ -219,6 +219,19 @@ class JudgeRules:
         "by judgement",
         "test_a_rival_of_the_same_class_makes_a_set",
     )
+    one_load: float = _rule(
+        0.3,
+        "standard deviation over mean of the load on the gear while a joint slides: less is one load, under which friction that"
+        " grows with it is not told from friction that does not",
+        "between 0.12 (a case of another plant with one load) and 0.54 (the least of six with several)",
+        "test_friction_at_one_load_is_a_set",
+    )
+    overstated: float = _rule(
+        2.0,
+        "x what is left with what was found: a floor from repeats that is larger holds what differs between them, not noise",
+        "by judgement; a drive that warms up between two repeats gave 3.0",
+        "test_repeats_that_differ_by_what_was_found_are_no_floor",
+    )
     part: float = _rule(
         0.2,
         "share of the squared error on what was kept out that an effect removes at least that is more than a hint",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from dexsim.gap.effects.backlash import Backlash
 from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.effects.compliance import Compliance
-from dexsim.gap.effects.confusion import CLASSES
+from dexsim.gap.effects.confusion import BLIND, CLASSES
 from dexsim.gap.effects.contact_friction import ContactFriction
 from dexsim.gap.effects.contact_stiffness import ContactStiffness
 from dexsim.gap.effects.coulomb_friction import CoulombFriction
@@ -40,6 +41,9 @@ from dexsim.gap.effects.torque_ripple import TorqueRipple
 from dexsim.gap.effects.torque_speed_limit import TorqueSpeedLimit
 from dexsim.gap.effects.touch_effect import TouchEffect
 from dexsim.gap.effects.viscous_friction import ViscousFriction
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
 
 CATALOGUE: tuple[Effect, ...] = (
     CoulombFriction(),
@@ -100,6 +104,12 @@ def separating(effects: Sequence[str]) -> str:
 def confusable(a: str, b: str) -> bool:
     """Whether two effects of joints are of one class that some recordings cannot separate."""
     return bool({*EFFECTS[a].classes} & {*EFFECTS[b].classes}) if a in EFFECTS and b in EFFECTS else False
+
+
+def inseparable(effect: str, case: Case, runs: Sequence[int]) -> list[str]:
+    """Effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`confusion.BLIND`)."""
+    blind = [c for c in EFFECTS[effect].classes if c in BLIND and BLIND[c](case, runs)]
+    return [e for e in EFFECTS if e != effect and {*EFFECTS[e].classes} & {*blind}]
 
 
 def touch_confusable(a: str, b: str) -> bool:

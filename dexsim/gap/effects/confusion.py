@@ -3,6 +3,19 @@
 An effect names the classes that it belongs to; only members of one class may be reported as a set.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dexsim.gap.effects.effect import SLOW
+from dexsim.gap.rules import JUDGE
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
+
 CLASSES: dict[str, str] = {
     "friction or play": "small reversals about a pose while a load holds the joint to one side, then without it, "
     "and very slow ramps (both encoders logged if there are two)",
@@ -20,3 +33,15 @@ CLASSES: dict[str, str] = {
 }
 TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
 """Of touch: the first one's own experiment tells its members apart."""
+
+
+def at_one_load(case: Case, runs: Sequence[int]) -> bool:
+    """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and one that does not
+    are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its mean."""
+    slides = case.regimes["speed"] > SLOW * case.scales.speed
+    load = np.abs(case.regimes["_load"][slides & np.isin(case.plant.run_of, runs)])
+    return bool(len(load)) and float(load.std()) < JUDGE.one_load * float(load.mean())
+
+
+BLIND: dict[str, Callable[[Case, Sequence[int]], bool]] = {"friction and load": at_one_load}
+"""Of classes: whether recordings cannot separate their members, however one of them may fit a little better than the others."""

@@ -14,6 +14,7 @@ from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.locate import bins
+from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings
 from dexsim.gap.search import baseline
@@ -31,6 +32,16 @@ class Noise:
     how: str
     joints: dict[str, float]
 
+    def at_most(self, left: dict[str, float]) -> Noise:
+        """The floor, where repeats differ by what was found (a drive that warms up between them): then what is left with it [rad or m, by
+        joint] is far less than they differ by, and is the floor."""
+        lower = {j: x for j, x in left.items() if JUDGE.overstated * x < self.joints[j]}
+        if not lower:
+            return self
+        joints = self.joints | lower
+        floor = float(np.sqrt(np.mean(np.square(list(joints.values())))))
+        return Noise(min(floor, self.floor), f"{self.how}; of {', '.join(lower)} what is left, which is less", joints)
+
 
 def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Kept, noise: Noise, how: str, channel: list[dict[str, Any]],
              plains: Sequence[baseline.Baseline] = ()) -> None:
@@ -40,7 +51,6 @@ def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Ke
     plain model of each joint."""
     data, notes, m = d.data, d.notes, d.mechanism
     data["verdict"] = "none"
-    data["noise_floor"] = {"position_rad": float(noise.floor), "how": noise.how, "joints": {k: float(v) for k, v in noise.joints.items()}}
     findings: list[dict[str, Any]] = []
     for a in answers:
         joint = a.case.joint
@@ -56,6 +66,8 @@ def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Ke
             d.curves.append(curve)
     d.spots = bins.control([x for a in answers for x in a.spots])
     refuted = _take_back(d, answers, findings)
+    noise = noise.at_most({a.case.joint: rms(a.after) for a in answers if a.found and a.case.joint not in refuted})
+    data["noise_floor"] = {"position_rad": float(noise.floor), "how": noise.how, "joints": {k: float(v) for k, v in noise.joints.items()}}
     findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
     for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
         v = d.joints[joint]
@@ -179,7 +191,9 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
     for joint in {e.joint for e in mine}:
         confidence.together([e for e in mine if e.joint == joint])
     coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if EFFECTS[f["effect"]].couples}
-    confidence.of_the_whole(mine, coupled, {j for f in channel for j in f["where"]["joints"]})
+    signs = {j for f in channel if f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
+    others = {j for f in channel if not f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
+    confidence.of_the_whole(mine, coupled, signs | others, signs - others)
     for f, e in zip(findings, mine, strict=True):
         f["confidence"] = round(e.confidence, 3)
         d.notes += [f"{e.effect} on {e.joint} is not sure: {reason}" for reason in e.reasons]

@@ -7,7 +7,7 @@ three effects where a machine has one, a temperature that follows the clock. Eac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -91,6 +91,19 @@ def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
     return ""
 
 
+def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> str:
+    """Key of a size whose 90 % interval reaches, away from nothing, to the end of what is looked for: how large it is is not known; empty
+    where none does."""
+    for p in params:
+        if p.key in SHAPES:
+            continue
+        zero, room = neutral_of(p, case), 1e-3 * p.span
+        low, high = spread[p.key]
+        if (low <= p.low + room and zero > p.low + 0.25 * p.span) or (high >= p.high - room and zero < p.high - 0.25 * p.span):
+            return p.key
+    return ""
+
+
 def left_over(after: float, before: float, noise: float) -> float:
     """Share of a squared error `before` that stays, above `JUDGE.within` x the noise."""
     base = (JUDGE.within * noise) ** 2
@@ -171,9 +184,9 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
     return said
 
 
-def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str]) -> None:
+def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str], signs: Set[str] = frozenset()) -> None:
     """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that is not
-    what it says."""
+    what it says; signs: those of them of which only the effort's sign is not, which is what a wrong sensor looks like."""
     misread = [e.joint for e in all_ if EFFECTS[e.effect].misreads]
     for e in all_:
         elsewhere = [j for j in misread if j != e.joint]
@@ -182,5 +195,5 @@ def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str]) -
         pulls = [j for j, k in coupled.items() if k == e.joint]
         if pulls and not EFFECTS[e.effect].couples:
             _doubt(e, f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
-        if e.joint in bad:
+        if e.joint in bad and not (EFFECTS[e.effect].effort_only and e.joint in signs):
             _doubt(e, f"a signal of {e.joint} is not what it says")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import confusable, separating
+from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.locate import bins
@@ -97,9 +97,10 @@ class JointAnswer:
         q, effort = errors.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True)
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.effect.effort_only
-        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], error_without, effort_only)
+        of_effort = effort_only and self.effort_after is not None
+        was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if of_effort else (error_without, rms(self.after))
+        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], was, left, effort_only)
         gain = verdict.gain_interval((self.measured - q) ** 2, self.after, self.t)
-        was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if effort_only and self.effort_after is not None else (error_without, rms(self.after))
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * JUDGE.part:.0f} %")
         elif not effort_only and gain[0] < -JUDGE.slack:
@@ -109,10 +110,11 @@ class JointAnswer:
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.set_share][:2]
+        alike = inseparable(mm.id, case, sorted({*self.kept.train, *self.kept.test}))
+        same += [(e, 0.0) for e in alike if e not in dict(same)][: 2 - len(same)]
         signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
-        of_effort = effort_only and self.effort_after is not None
         finding = {
             "effect": mm.id,
             "confidence": evidence.confidence,  # what the other findings say of it comes last
@@ -155,13 +157,16 @@ class JointAnswer:
                 raw[key], spread[key] = float(x), (float(b[0]), float(b[1]))
         return raw, spread
 
-    def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, effort_only: bool) -> confidence.Evidence:
-        """How sure the name is, and every reason to doubt it."""
-        case, outcome, before, after = self.case, self.outcome, rms(self.before), rms(self.after)
+    def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, after: float, effort_only: bool) -> confidence.Evidence:
+        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out without and with it: of the
+        motion, or of the effort where the motion is unaffected (what is left of the motion then tells nothing of it)."""
+        case, outcome = self.case, self.outcome
+        # the one effect of the reading: nothing else explains the effort
+        before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (rms(self.before), case.sigma)
         earned = 1.0 if effort_only else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
         evidence = confidence.Evidence(
-            mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, case.sigma),
-            confidence.left_over(after, error_without, case.sigma), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
+            mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, noise),
+            confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
         nothing = confidence.holds_nothing(mm.variant.params, spread, case)
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
@@ -174,9 +179,11 @@ class JointAnswer:
         stopped = confidence.at_bound(mm.variant.params, raw, case)
         if stopped:
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
+        elif far := confidence.beyond(mm.variant.params, self._fitted(mm, self.bounds)[1], case):
+            evidence.reasons.append(f"its {far.replace('_', ' ')} may be larger than what is looked for")
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
         evidence.of_pose = mm.effect.of_pose(raw, case)
-        evidence.confidence = confidence.weigh(evidence, before, after, error_without, case.sigma)
+        evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
         if nothing or small:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         return evidence

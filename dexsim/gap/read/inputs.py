@@ -13,12 +13,14 @@ from scipy.interpolate import PchipInterpolator
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
+from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.read.runs import Run
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
 from dexsim.recording.schema import Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
+SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
 BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
 SHORTEST = 0.5  # s
 
@@ -231,8 +233,11 @@ def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list
             if f.kind == "stuck" and f.text.startswith("position"):  # dry friction may hold it: `channels.inspect` tells beside the others
                 continue
             key = (f.kind, f.topic, f.joint)
+            sensor = f.kind in SIGN and f.joint in joints
             entry = out.setdefault(key, {
-                "effect": "bad_channel", "confidence": 0.9, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
+                "effect": "bad_channel", "confidence": 0.9, "alternatives": [],
+                "indistinguishable": ["bad_channel", CurrentSensor.id] if sensor else [],
+                "separating_experiment": CurrentSensor.experiment if sensor else None,
                 "where": {"joints": [f.joint] if f.joint in joints else [], "taxels": [], "topics": [f.topic] if f.topic else []},
                 "regime": f"{f.kind}: {f.text}", "when": [], "parameters": {}, "held_out": None,
             })  # fmt: skip
