@@ -158,6 +158,20 @@ def test_held_out_copies_are_refused(rig, tmp_path):
         diagnose(Settings(paths[:2], tmp_path, [copy], str(model), str(servo)), say=lambda _: None)
 
 
+def test_two_recordings_of_a_dead_encoder_are_no_copies(rig, tmp_path):
+    """Both hold one reading for all their length: that is a fault of the signal, which is named, not one recording given twice."""
+    folder, paths, model, servo = rig
+    dead = []
+    for k in (0, 1):
+        r = read(paths[k], audit=False)
+        r.states.position.value[:] = 0.25
+        dead.append(tmp_path / f"dead_{k}.mcap")
+        write(dead[-1], r)
+    s = Settings([*paths[2:], dead[0]], tmp_path / "out", [paths[0], dead[1]], str(model), str(servo), next_recording=False, allowed={"command_delay"})
+    d = diagnose(s, say=lambda _: None)
+    assert "bad_channel" in [f["effect"] for f in d.data["findings"]]
+
+
 def test_a_model_that_does_not_compile_still_says_what_the_recordings_are(rig, tmp_path):
     folder, paths, model, servo = rig
     broken = tmp_path / "broken.xml"
