@@ -78,6 +78,7 @@ def export(
     from dexsim.learning import checkpoint as checkpoints
     from dexsim.learning.ppo import load_policy
     from dexsim.sim.quiet import quiet_warp
+    from dexsim.tasks.env import hand_of
 
     data = checkpoints.load(checkpoint)
     task = data["config"]["choices"]["task"]
@@ -90,7 +91,7 @@ def export(
             f"{checkpoint}: trained on task={task}, whose camera and arm the deployed loop does not read; "
             f"export a policy of task={' or task='.join(BUILDERS)}"
         )
-    measured = None if calibration is None else Calibration.load(calibration)
+    measured = None if calibration is None else Calibration.load(calibration, hand=hand_of(data["config"]))
     out = Path(out).expanduser()
     if out.is_dir():
         outputs.recover(out)  # what an export that was killed left
@@ -122,8 +123,10 @@ def export(
                               dynamic_axes={"observation": {0: "batch"}, "action": {0: "batch"}})  # fmt: skip
         rows = golden(env, policy, model, steps, seed)
         np.savez_compressed(part / bundle.GOLDEN, **rows)
-        measured = Calibration.default(env.effort.double().numpy()) if measured is None else measured
+        measured = Calibration.default(env.effort.double().numpy(), env.hand) if measured is None else measured
         m = manifest(env, data, measured, path, len(rows["observation"]))
+        if not env.hand.comes_along:
+            _copy_hand(env.hand, part / bundle.HAND)
         (part / bundle.MANIFEST).write_text(yaml.safe_dump(m, sort_keys=False, width=120), encoding="utf-8")
         (part / bundle.CONFIG).write_text(yaml.safe_dump(data["config"], sort_keys=False), encoding="utf-8")
     (out / outputs.WRITTEN).unlink(missing_ok=True)  # a bundle is never written twice
@@ -132,6 +135,32 @@ def export(
     print(f"policy   {checkpoints.provenance(data)}")
     print(f"bundle   {out}")
     return out
+
+
+MOST_HAND = 256 << 20
+"""Bytes of a hand's folder that a bundle carries."""
+
+
+def _copy_hand(hand: Any, out: Path) -> None:
+    """The hand's folder into the bundle, whole: the simulated hand needs it, and a robot its kinematics."""
+    import shutil
+
+    from dexsim.hand import load_hand
+
+    files = [p for p in hand.folder.rglob("*") if p.is_file()]
+    size = sum(p.stat().st_size for p in files)
+    if size > MOST_HAND:
+        raise UserError(
+            f"hand {hand.folder}: {size / 2**20:.0f} MiB in its folder, a bundle carries {MOST_HAND >> 20} MiB; put"
+            " hand.yaml, the model and its meshes into a folder of their own"
+        )
+    shutil.copytree(hand.folder, out)
+    try:
+        load_hand(out, hand.mirror, hand.scale)
+    except UserError as error:
+        raise UserError(
+            f"hand {hand.folder}: cannot be carried, what it names must lie in its folder ({error})"
+        ) from None
 
 
 def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str, Any]:
@@ -182,9 +211,10 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
 
 def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, rows: int) -> dict[str, Any]:
     """Everything that a robot must know, as plain data."""
-    from dexsim.assets import xhand
     from dexsim.deploy import bundle
+    from dexsim.tactile.layout import touch_shape
 
+    hand, (pads, taxels) = env.hand, touch_shape(env.hand)
     task, cfg = env.task, data["config"]
     own = _grasp(env) if task["name"] == "grasp" else _rotate(env)
     table, at = [], 0
@@ -197,15 +227,19 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
     action = {"mode": task["action"]["mode"], "scale": float(task["action"]["scale"]),
               "lead": float(task["action"]["lead"]),
               "clip": [-1.0, 1.0], "unit": "rad", "low": _floats(env.q_low), "high": _floats(env.q_high),
-              "speed_limit_rad_s": _floats(xhand.speeds()), "order": "joints"}  # fmt: skip
+              "speed_limit_rad_s": _floats(hand.speeds), "order": "joints"}  # fmt: skip
     return {
         "format": bundle.FORMAT, "version": bundle.VERSION, "task": task["name"],
         "policy": {"file": bundle.POLICY, "sha256": bundle.sha256(policy), "input": "observation", "output": "action",
                    "observation_size": at, "action_size": env.num_actions, "opset": OPSET, "dtype": "float32",
                    "normalization": "inside: feed the observation as the table below states it"},
         "observation": table,
-        "joints": list(xhand.JOINTS), "fingers": list(xhand.FINGERS),
-        "taxels": {"per_finger": xhand.TAXELS_PER_FINGER, "index": "column * 12 + row", "layout": "xhand_right"},
+        "hand": {"name": hand.name, "folder": None if hand.comes_along else bundle.HAND, "mirror": hand.mirror,
+                 "scale": hand.scale},
+        "joints": list(hand.joints), "fingers": list(hand.finger_names),
+        "taxels": {"per_finger": taxels, "pads": pads, "layout": hand.robot,
+                   "index": f"column * {hand.fingers[0].pad.rows} + row" if pads and hand.fingers[0].pad.rows else
+                   "order of the pad's file"},
         "action": action,
         "initial_pose": own.pop("initial_pose"),
         "rates": {"policy_period_s": env.dt, "policy_hz": round(1 / env.dt, 4), "read_hz": 100.0} | own.pop("rates"),
@@ -221,8 +255,6 @@ def manifest(env: Any, data: dict[str, Any], calibration: Any, policy: Path, row
 
 def _grasp(env: Any) -> dict[str, Any]:
     """The parts of a manifest that differ between tasks."""
-    from dexsim.deploy import observations
-
     scaling = {
         "tau/tau_max": "torque [N.m] / normalization.tau_max",
         "F/F_max": "force [N] / normalization.force_max_N",
@@ -230,7 +262,7 @@ def _grasp(env: Any) -> dict[str, Any]:
     named = {"force_command": "the commanded share of normalization.force_max_N"}
     rows = [
         (name, width, unit, source, named.get(name, scaling.get(unit, "none")))
-        for name, width, unit, source in observations.OBSERVATION
+        for name, width, unit, source in env.rows()
     ]
     return {
         "rows": rows, "initial_pose": _floats(env.pose0),
@@ -255,7 +287,7 @@ def _rotate(env: Any) -> dict[str, Any]:
     scaled = {"last_action": "(target - middle) / half of action.low..high" if targets else "none"}
     rows = [
         (name, width, unit, source, scaled.get(name, "none"))
-        for name, width, unit, source in observations_rotate.rows(task)
+        for name, width, unit, source in observations_rotate.rows(task, *env.sizes)
     ]
     imu = task["perception"] == "imu"
     middle = int((g.hand - g.hand.mean(0)).norm(dim=1).argmin())

@@ -137,7 +137,7 @@ def test_builder_places_every_signal():
     one = lambda k, *shape: torch.full((2, *shape), float(k))  # noqa: E731
     s = observations.Signals(one(1, 12), one(2, 12), one(3, 2), one(4), one(5), one(6, 5), one(7, 5, 3), one(8, 5, 3), one(9))
     out = observations.build(s, 2.0)
-    at = observations.slices()
+    at = observations.slices(observations.rows(12, 5, 5))
     assert out.shape == (2, 66)
     for name, want in (("joint_angle", 1), ("joint_torque", 2), ("contact_force", 3), ("contact_centre", 7),
                        ("fingertip_position", 8), ("force_command", 9)):  # fmt: skip

@@ -7,11 +7,11 @@ import torch
 
 from dexsim.cli import start
 from dexsim.paths import CONFIGS
-from dexsim.tasks.make_grasps import FINGER_OF
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
 
 MASS, FRICTION, EDGE = 0.05, 0.9, 0.0403  # kg, 1, m
+FINGER_OF = [0, 0, 0, 1, 1, 1, 2, 2, 3, 3, 4, 4]  # of each joint
 OPEN = (1.248, 0.371, 0.951, 0.0, 0.387, 0.87, 0.387, 0.87, 0.387, 0.87, 0.387, 0.87)  # rad, SDK order
 POSE = (0.0560, -0.0005, 0.0940, 0.9861, 0.0120, 0.1440, -0.0819)  # of the box between thumb and fingers, palm frame
 CLOSING = (1, 0, 0, 0, 1, 1, 1, 1, 1, 1, 0, 0)  # joints that move

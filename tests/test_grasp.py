@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,19 +11,17 @@ import torch
 from worlds import grasp_cfg, grasp_env
 
 from dexsim.assets import xhand
+from dexsim.deploy import observations
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.tasks import grasp_eval, make_env, terms
-from dexsim.tasks.grasp import ACTOR_SIZE, OBSERVATION, PRIVILEGED
+from dexsim.tasks.grasp import privileged
 
 N = 8
 QUIET = ("task.sensors.joint_noise=0", "task.sensors.torque_noise=0", "task.sensors.tip_noise=0", "task.sensors.vision_z_noise=0")
 NO_BIAS = ("randomize.sensors.vision_xy=0", "randomize.sensors.torque_bias=0")
-SLICES = {}
-_at = 0
-for _name, _width, *_ in OBSERVATION:
-    SLICES[_name] = slice(_at, _at + _width)
-    _at += _width
+SLICES = observations.slices(observations.rows(12, 5, 5))
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +47,12 @@ def act(env, value: float = 0.0) -> torch.Tensor:
 
 
 def test_sizes_and_layout(env):
-    rows = [(name, width) for name, width, *_ in OBSERVATION]
+    rows = [(name, width) for name, width, *_ in env.rows()]
     assert rows == [("joint_angle", 12), ("joint_torque", 12), ("object_position", 3), ("object_velocity", 3), ("contact_force", 5),
                     ("contact_centre", 15), ("fingertip_position", 15), ("force_command", 1)]
     obs = env.get_observations()
-    assert obs["actor"].shape == (N, 66) and ACTOR_SIZE == 66
-    assert obs["critic"].shape == (N, 66 + sum(w for _, w in PRIVILEGED)) == (N, 148)
+    assert obs["actor"].shape == (N, 66)
+    assert obs["critic"].shape == (N, 66 + sum(w for _, w in privileged(12, 5))) == (N, 148)
     groups = env.describe()["observations"]
     for group in ("actor", "critic"):
         assert sum(row[1] for row in groups[group]) == obs[group].shape[1]
@@ -280,10 +279,10 @@ def test_f_max_is_a_static_press_of_about_ten_newtons(env):
     from dexsim.tasks.press import fingertip_press
 
     assert 5.0 < env.f_max < 20.0
-    servo = grasp_cfg()["servo"]
-    full, half = fingertip_press(servo), fingertip_press(servo, drive=0.5)
+    servo, hand = grasp_cfg()["servo"], load_hand()
+    full, half = fingertip_press(hand, servo), fingertip_press(hand, servo, drive=0.5)
     assert half == pytest.approx(full / 2, rel=0.05)  # static: proportional to torque
-    assert fingertip_press(servo, stiffness=20000.0) == pytest.approx(full, rel=0.05)  # and hardly of the rubber
+    assert fingertip_press(hand, servo, stiffness=20000.0) == pytest.approx(full, rel=0.05)  # and hardly of the rubber
 
 
 # -- ends ------------------------------------------------------------------------------------------------------------------------
@@ -538,7 +537,8 @@ def test_play_prints_the_papers_columns_of_the_grasp():
     r = {"command": command, "mass": np.full(n, 0.05), "friction": np.full(n, 1.0), "load": np.full(n, 0.5), "pushed": np.zeros(n), "held": np.ones(n),
          "held90": np.ones(n), "held180": np.ones(n), "force": command[:, None] * [1.0, 2, 2, 2, 2], "alive": np.ones(n),
          "torque": np.tile(np.where(np.arange(n) % 2, 0.2, 0.4)[:, None], 12), "moved": np.zeros(n), "untouched": np.zeros(n)}  # fmt: skip
-    metrics = grasp_eval._metrics(r, r, 2.0)
+    stage = SimpleNamespace(f_max=2.0, hand=load_hand())
+    metrics = grasp_eval._metrics(r, r, stage)
     (title, header, rows), (_, _, intervals) = grasp_eval._papers_columns(metrics)
     assert "paper's columns" in title and header[0] == "contact forces N" and len(rows) == 1
     low, high = (float(x) for x in rows[0][0].split(" .. "))
@@ -546,7 +546,7 @@ def test_play_prints_the_papers_columns_of_the_grasp():
     assert rows[0][1:3] == ("0.2 .. 0.4", "1.000") and abs(float(rows[0][3])) < 0.05
     assert [i[0] for i in intervals] == ["hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation", "torque_command_correlation"]
     nothing = r | {"held": np.zeros(n)}
-    assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, 2.0))[0][2] == [("-", "-", "-", "-")]
+    assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, stage))[0][2] == [("-", "-", "-", "-")]
 
 
 def test_the_grasps_intervals_are_those_of_theory():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from dexsim.hand import load_hand
 from dexsim.tasks import grasp_eval
 from dexsim.tasks.grasp_eval import HOLD, PUSH_S, SETTLE, STAY_S, TURN_S
 from dexsim.tasks.randomize import Sampler
@@ -25,6 +26,8 @@ class Stage:
         self.rng = torch.Generator().manual_seed(0)
         self.sampler = Sampler({}, self.rng, N, "cpu")
         self.objects = SimpleNamespace(mass=MASS, friction=torch.ones(N), variant=torch.zeros(N, dtype=torch.long))
+        self.hand, self.unit = load_hand(), 1.0
+        self.opposing, self.others = torch.tensor([0]), torch.tensor([1, 2, 3, 4])
         self.fixed_command, self.outside_force, self.f_max = None, torch.zeros(N, 3), 8.0
         self.fields = {"opt.gravity": torch.zeros(N, 3)}
         self.engine = SimpleNamespace(field=self.fields.__getitem__)
@@ -103,9 +106,9 @@ def test_held_is_touched_by_the_thumb_and_a_finger():
 def test_what_must_be_held_is_what_the_commanded_forces_can_carry():
     """Four fingers of 10 N at command 0.5 are 20 N: with friction 0.8 they carry a load of 8 N, and not more."""
     r = {"command": np.full(4, 0.5), "friction": np.full(4, 0.8), "load": np.array([4.0, 7.9, 8.1, 20.0])}
-    assert grasp_eval.must_hold(r, 10.0).tolist() == [True, True, False, False]
+    assert grasp_eval.must_hold(r, 10.0, 4).tolist() == [True, True, False, False]
     r["mass"] = r["load"] / 9.81
-    assert grasp_eval.can_carry(r, 10.0).tolist() == [True, True, False, False]
+    assert grasp_eval.can_carry(r, 10.0, 4).tolist() == [True, True, False, False]
 
 
 def test_the_load_is_weight_and_push_together():

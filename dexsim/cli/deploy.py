@@ -66,8 +66,10 @@ def main(argv: Sequence[str]) -> int:
         raise UserError("say which policy: bundle=DIR (dexsim export writes one)")
     b = bundles.load(given["bundle"])
     base = b.manifest["normalization"]["tau_max"]
-    calibration = (Calibration.load(given["calibration"], base) if "calibration" in given
-                   else Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base))  # fmt: skip
+    if "calibration" in given:
+        calibration = Calibration.load(given["calibration"], base, b.hand)
+    else:
+        calibration = Calibration.from_dict(b.manifest["calibration"], f"{b.path}: calibration", base, b.hand)
     settings = LoopSettings(**changes)
     settings.check()
     if "command" in changes and b.manifest["task"] != "grasp":
@@ -172,6 +174,11 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
                                 shape=given.get("shape"),
                                 grip=b.manifest.get("grip"))  # fmt: skip
         return driver, place or driver
+    if kind == "xhand" and b.hand.name != "xhand":
+        raise UserError(
+            f"driver=xhand: the policy in {b.path} is for hand={b.hand.name}; run the Loop with a HandDriver of that"
+            " hand (dexsim/deploy/driver.py)"
+        )
     if kind == "xhand":
         from dexsim.deploy.vendor import VendorXHand
 
@@ -226,11 +233,11 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     folders.make(path.parent, "record=")
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
     meta = {
-        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": "xhand_right",
+        "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": b.hand.robot,
         "effort_is": "current_A", "effort_sign": sign,
         "tactile_unit": "count", "tactile_lsb": f"{calibration.lsb:g}",
         "tactile_axis_sign": ",".join(f"{int(s):+d}" for s in calibration.axis_sign),
-        "tactile_layout": "xhand_right", "gravity": "0 0 -9.81",
+        "tactile_layout": b.hand.robot, "gravity": "0 0 -9.81",
         "notes": f"deployed policy {b.manifest['policy']['sha256'][:12]}",
     }  # fmt: skip
     config = yaml.safe_dump({"deploy": dataclasses.asdict(settings), "bundle": b.manifest["versions"]}, sort_keys=False)

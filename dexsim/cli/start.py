@@ -154,7 +154,8 @@ def _from_checkpoint(
     data: dict[str, Any], config_dir: Path, request: settings.Request, fresh: dict[str, Any]
 ) -> DictConfig:
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
-    own = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
+    own: dict[str, Any] = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
+    own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0}
     cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
     if "sim" in cfg:
         cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)
@@ -185,6 +186,9 @@ def _preset(cfg: DictConfig, device: str) -> str:
 def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
     plain = settings.resolve(cfg)
     plain["device"] = device
+    hand = Path(str(plain["hand"])).expanduser()
+    if hand.exists() and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
+        plain["hand"] = str(hand.resolve())
     return plain
 
 
@@ -211,8 +215,12 @@ def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:
 def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
     """Put the content of the user's files into ``servo``, ``tactile`` and ``randomize``, so that overrides reach it and
     a checkpoint carries it."""
-    servo, tactile = _last(request, "servo_file"), _last(request, "tactile_file")
+    servo, tactile, hand = (_last(request, k) for k in ("servo_file", "tactile_file", "hand"))
     OmegaConf.set_struct(cfg, False)
+    if hand is not None and servo is None and "servo" not in request.choices:
+        from dexsim.hand import load_hand
+
+        servo = str(load_hand(hand).servo_path)
     if servo is not None:
         from dexsim.actuator.table import ServoTable
 

@@ -12,7 +12,7 @@ from dexsim.errors import UserError
 @dataclass(frozen=True)
 class ActionRule:
     """mode: relative (targets move by action * scale a control step, within `lead` of the measured angle) or absolute
-    (the action spans the range); scale, lead rad; low, high [12] rad."""
+    (the action spans the range); scale, lead rad; low, high [J] rad."""
 
     mode: str
     scale: float
@@ -21,7 +21,7 @@ class ActionRule:
     high: np.ndarray
 
     def target(self, action: np.ndarray, before: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Targets [12] rad from the action [12], the last targets and the measured angles q [12] rad."""
+        """Targets [J] rad from the action [J], the last targets and the measured angles q [J] rad."""
         a = np.clip(np.nan_to_num(np.asarray(action, np.float32)), -1.0, 1.0)
         if self.mode == "relative":
             target = before + a * np.float32(self.scale)

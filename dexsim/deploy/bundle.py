@@ -13,20 +13,24 @@ import numpy as np
 from dexsim import yaml_text
 from dexsim.deploy import manifests
 from dexsim.errors import UserError
+from dexsim.hand import Hand, load_hand
 
 FORMAT, VERSION = manifests.FORMAT, manifests.VERSION
 POLICY, MANIFEST, GOLDEN, CONFIG = "policy.onnx", "manifest.yaml", "golden.npz", "config.yaml"
+HAND = "hand"
+"""Folder of a bundle with the hand that it is for, where that does not come with dexsim."""
 MOST_BYTES = 256 << 20
 """Of a policy's network."""
 
 
 @dataclass
 class Bundle:
-    """path: the folder; manifest: its content; session: onnxruntime's."""
+    """path: the folder; manifest: its content; session: onnxruntime's; hand: whose."""
 
     path: Path
     manifest: dict[str, Any]
     session: Any
+    hand: Hand
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Actions [N, A] of observations [N, D], float32."""
@@ -35,8 +39,8 @@ class Bundle:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved training config. Raises UserError where there is none."""
-        return _mapping(self.path / CONFIG)
+        """The resolved training config, with the bundle's own hand. Raises UserError where there is none."""
+        return _mapping(self.path / CONFIG) | self.hand.identity
 
 
 def load(path: str | Path) -> Bundle:
@@ -46,8 +50,10 @@ def load(path: str | Path) -> Bundle:
     if not (path / MANIFEST).is_file():
         raise UserError(f"{path}: no {MANIFEST} there; dexsim export checkpoint=... out=DIR writes a bundle")
     manifest = _mapping(path / MANIFEST)
-    manifests.check(manifest, path / MANIFEST)
-    _same_table(manifest, path / MANIFEST)
+    which = manifests.hand_entry(manifest, path / MANIFEST)
+    hand = load_hand(which.name if which.folder is None else path / which.folder, which.mirror, which.scale)
+    manifests.check(manifest, path / MANIFEST, hand)
+    _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
     if not policy.is_file():
         raise UserError(f"{path}: {POLICY} is missing; export the bundle again")
@@ -56,7 +62,7 @@ def load(path: str | Path) -> Bundle:
     data = policy.read_bytes()
     if hashlib.sha256(data).hexdigest() != manifest["policy"]["sha256"]:
         raise UserError(f"{policy}: is not the file that {MANIFEST} names (sha256 differs): export the bundle again")
-    bundle = Bundle(path, manifest, session(data, policy))
+    bundle = Bundle(path, manifest, session(data, policy), hand)
     _try(bundle, policy)
     return bundle
 
@@ -68,11 +74,13 @@ def builder(task: str) -> Any:
     return {"grasp": observations, "rotate": observations_rotate}[task]
 
 
-def _same_table(m: dict[str, Any], file: Path) -> None:
+def _same_table(m: dict[str, Any], file: Path, hand: Hand) -> None:
     """The observation that the network was trained on is the one that is built here, row by row."""
     here = [(r["name"], r["stop"] - r["start"], r["unit"]) for r in m["observation"]]
     own = builder(m["task"])
-    ours = [tuple(row[:3]) for row in (own.rows(m["task_settings"]) if m["task"] == "rotate" else own.OBSERVATION)]
+    sizes = len(hand.joints), len(hand.fingers), len(hand.fingers) if hand.touches else 0
+    table = own.rows(m["task_settings"], *sizes) if m["task"] == "rotate" else own.rows(*sizes)
+    ours = [tuple(row[:3]) for row in table]
     if here != ours:
         bad = next(i for i in range(max(len(here), len(ours))) if here[i : i + 1] != ours[i : i + 1])
         raise UserError(

@@ -7,41 +7,45 @@ by a thread of the driver's own, which keeps the newest state for `read`.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from dexsim.assets import xhand
-
 PASSIVE, POSITION = 0, 3
 """The SDK's control modes that are used: 0 passive (relaxed; the hardware still damps), 3 position."""
-TAXELS = (len(xhand.FINGERS), xhand.TAXELS_PER_FINGER, 3)
 
 
 @dataclass
 class HandState:
-    """One reading, as the SDK gives it; joints in SDK order, fingers from the thumb.
+    """One reading, as the SDK gives it; J joints and P pads of up to T taxels in the order of the hand's hand.yaml: no
+    names pass between a driver and the loop.
 
     time: host clock [s] at which it arrived (the SDK has no hardware stamp); sequence: counts readings.
-    position [12] rad; current [12] mA, + opening, - closing; temperature [12] degC; error [12] codes (0 ok).
-    tactile [5, 120, 3] counts: fx, fy int8, fz uint8; taxel k = column * 12 + row. velocity [12] rad/s, None where the
-    firmware does not say.
+    position [J] rad; current [J] mA, + opening, - closing; temperature [J] degC; error [J] codes (0 ok), None for
+    either: not measured. tactile [P, T, 3] counts: fx, fy int8, fz uint8; taxels as in the pad's file; None: nothing is
+    felt. velocity [J] rad/s, None where the firmware does not say.
     """
 
     time: float
     sequence: int
     position: np.ndarray
     current: np.ndarray
-    temperature: np.ndarray = field(default_factory=lambda: np.zeros(12))
-    error: np.ndarray = field(default_factory=lambda: np.zeros(12, np.int64))
-    tactile: np.ndarray = field(default_factory=lambda: np.zeros(TAXELS, np.int16))
+    temperature: np.ndarray | None = None
+    error: np.ndarray | None = None
+    tactile: np.ndarray | None = None
     velocity: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        joints = np.shape(self.position)
+        self.temperature = np.zeros(joints) if self.temperature is None else self.temperature
+        self.error = np.zeros(joints, np.int64) if self.error is None else self.error
+        self.tactile = np.zeros((0, 0, 3), np.int16) if self.tactile is None else self.tactile
 
 
 @dataclass
 class HandCommand:
-    """Targets for every joint. position [12] rad; kp, ki, kd: the firmware's integer gains; tor_max [12] mA; mode."""
+    """Targets for every joint. position [J] rad; kp, ki, kd: the firmware's integer gains; tor_max [J] mA; mode."""
 
     position: np.ndarray
     tor_max: np.ndarray

@@ -1,44 +1,48 @@
-"""Where fingertips and pads are, from joint angles: MuJoCo's kinematics of the committed hand model."""
+"""Where fingertips and pads are, from joint angles: MuJoCo's kinematics of the hand's model."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
 
-from dexsim.assets import xhand
-from dexsim.tactile.layout import xhand_layout
+from dexsim.hand import Hand, load_hand
+from dexsim.hand.skin import tip_skins
+from dexsim.tactile.layout import hand_layout
 
 
 class HandKinematics:
     """Forward kinematics of one hand, palm frame, and the places of its taxels."""
 
-    def __init__(self) -> None:
-        spec = xhand.hand_spec()
+    def __init__(self, hand: Hand | None = None) -> None:
+        """hand: whose (the xHand)."""
+        hand = hand or load_hand("xhand")
+        spec = hand.spec()
         for geom in list(spec.geoms):  # poses of bodies only; masses are stated, not taken from geoms
             if not geom.contype and not geom.conaffinity:
                 spec.delete(geom)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         m = self.model
-        self._q = np.array([m.joint(j).qposadr[0] for j in xhand.JOINTS])
-        self._body = np.array([m.body(b).id for b in xhand.TIP_BODIES])
-        self._site = np.array([m.site(s).id for s in xhand.TIP_SITES])
-        layout = xhand_layout()
+        self._q = np.array([m.joint(j).qposadr[0] for j in hand.joints])
+        self._body = np.array([m.body(b).id for b in hand.tip_bodies])
+        self._offset = np.array([f.position for f in hand.fingers])
+        layout = hand_layout(hand)
         # taxels where the simulated ones are: on the surface that is pressed
-        self.taxels = layout.lifted([xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]).point.copy()
-        self.pad_centre = layout.centre()
+        self.taxels = np.zeros((0, 0, 3)) if layout is None else layout.lifted(tip_skins(hand)).point.copy()
+        self.pad_centre = np.zeros((0, 3)) if layout is None else layout.centre()
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Angles [12] rad -> (tips [5, 3] m, positions [5, 3] m and rotations [5, 3, 3] of the pads' bodies)."""
+        """Angles [J] rad -> (tips [F, 3] m, positions [F, 3] m and rotations [F, 3, 3] of the tips' bodies)."""
         d = self.data
         d.qpos[self._q] = q
         mujoco.mj_kinematics(self.model, d)
-        return d.site_xpos[self._site].copy(), d.xpos[self._body].copy(), d.xmat[self._body].reshape(5, 3, 3).copy()
+        position, turn = d.xpos[self._body].copy(), d.xmat[self._body].reshape(-1, 3, 3).copy()
+        return position + np.einsum("fij,fj->fi", turn, self._offset), position, turn
 
     def touch(
         self, normal: np.ndarray, position: np.ndarray, rotation: np.ndarray, weighted: bool = True
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal forces [5, 120] N and the pads' poses -> (force [5] N, centre [5, 3] m in the palm frame: the
+        """Normal forces [P, T] N and the tips' poses -> (force [P] N, centre [P, 3] m in the palm frame: the
         force-weighted mean of the taxels, or the mean of those that feel anything; the pad's centre where nothing is
         felt)."""
         force = normal.sum(1)
@@ -46,4 +50,5 @@ class HandKinematics:
         total = weight.sum(1)
         at = np.einsum("ft,ftk->fk", weight, self.taxels) / np.where(total > 0, total, 1.0)[:, None]
         at = np.where(total[:, None] > 0, at, self.pad_centre)
-        return force, np.einsum("fij,fj->fi", rotation, at) + position
+        pads = len(force)
+        return force, np.einsum("fij,fj->fi", rotation[:pads], at) + position[:pads]

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
@@ -29,6 +28,7 @@ from dexsim.deploy.safety import Guard
 from dexsim.deploy.timing import Timing
 from dexsim.deploy.vision import HeightSource
 from dexsim.errors import UserError
+from dexsim.tactile.layout import touch_shape
 
 HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
 SEEN = {ORIENTATION: 0.1, "place": 0.5}
@@ -60,7 +60,7 @@ class LoopSettings:
     late s: so does a turn that is later than this; overruns: so do as many turns in a row that end more than a reading
     period after they were due; hang s: so does a loop that does not turn at all (seen by a thread of its own). speed:
     targets' largest, over the joints' no-load speeds; margin rad kept free at the joint limits. tor_max mA: the
-    firmware's current limit, [12] or one;
+    firmware's current limit, [J] or one;
     kp: its gain.
     recover: after letting go, home again once readings have been good for recover_s; else the run ends.
     """
@@ -94,7 +94,7 @@ class LoopSettings:
             if value is None:
                 continue
             numbers = np.atleast_1d(np.asarray(value, float))
-            if not ((numbers >= low) & (numbers <= high)).all() or (name == "tor_max" and numbers.size not in (1, 12)):
+            if not ((numbers >= low) & (numbers <= high)).all() or (name != "tor_max" and numbers.size != 1):
                 raise UserError(f"{name}={value}: must lie in [{low:g}, {high:g}]{' ' * bool(unit)}{unit}")
 
 
@@ -148,7 +148,13 @@ class Loop:
                 " (dexsim/deploy/vision.py, imu.py)"
             )
         tor_max = 1e3 * calibration.current_max if settings.tor_max is None else settings.tor_max
-        self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (12,)), 1, 32767)
+        J = len(bundle.hand.joints)
+        if np.size(tor_max) not in (1, J):
+            raise UserError(f"tor_max={tor_max}: must be one number, or one for each of {J} joints")
+        if calibration.hand.joints != bundle.hand.joints:
+            raise UserError(f"calibration is of {calibration.hand.name}, bundle {bundle.path} of {bundle.hand.name}")
+        self.tor_max = np.clip(np.broadcast_to(np.asarray(tor_max, float), (J,)), 1, 32767)
+        self._taxels = touch_shape(bundle.hand)
         self.guard = Guard(
             self.rule.low + settings.margin,
             self.rule.high - settings.margin,
@@ -218,7 +224,7 @@ class Loop:
         limit = self.clock.now() + 2.0
         while True:
             state, now = self.driver.read(), self.clock.now()
-            wrong = "there is none" if state is None else implausible(state, now)
+            wrong = "there is none" if state is None else implausible(state, now, self.bundle.hand, self._taxels)
             if wrong is None and now - state.time > self.settings.stale:
                 wrong = f"it is {1e3 * (now - state.time):.0f} ms old"
             if wrong is None:
@@ -297,7 +303,7 @@ class Loop:
         if self._coded_since is not None and now - self._coded_since > s.stale:
             j = int(np.argmax(np.asarray(self.state.error) != 0))
             return (
-                f"{xhand.JOINTS[j]} reports error code {self.state.error[j]}"
+                f"{self.bundle.hand.joints[j]} reports error code {self.state.error[j]}"
                 f" for {1e3 * (now - self._coded_since):.0f} ms"
             )
         if self._nonsense_since is not None and now - self._nonsense_since > s.stale:
@@ -331,7 +337,7 @@ class Loop:
         if state is None or state.sequence == self._sequence:
             return False
         self._sequence = state.sequence
-        self._wrong = implausible(state, now)
+        self._wrong = implausible(state, now, self.bundle.hand, self._taxels)
         if self._wrong is not None:
             self.report.counts["bad_readings"] += 1
             return False
@@ -339,7 +345,8 @@ class Loop:
         if self.recorder is not None:
             r = self.recorder
             r.put("state", now, state.position, state.velocity, 1e-3 * np.asarray(state.current, float), state.time)
-            r.put("tactile", now, state.tactile)
+            if np.size(state.tactile):
+                r.put("tactile", now, state.tactile)
             if self.fresh_for % 100 == 1:
                 r.put("temperature", now, state.temperature)
             if np.any(state.error):
@@ -477,11 +484,11 @@ class Loop:
         if error.max() > self.settings.home_error:
             j = int(error.argmax())
             raise UserError(
-                f"homing: {xhand.JOINTS[j]} is {error[j]:.2f} rad from its home {self.home[j]:.2f} rad, allowed"
-                f" {self.settings.home_error:g}; free the hand, or check its zero and the current limit"
+                f"homing: {self.bundle.hand.joints[j]} is {error[j]:.2f} rad from its home {self.home[j]:.2f} rad,"
+                f" allowed {self.settings.home_error:g}; free the hand, or check its zero and the current limit"
             )
         rest = np.mean(self._rest, 0)
-        if rest.sum() > 0:
+        if rest.size and rest.sum() > 0:
             self.report.counts["taxels_zeroed"] = int((rest > 0.5).sum())
             self.calibration.bias = self.calibration.bias + np.where(rest > 0.5, rest - self.calibration.bias, 0.0)
 
@@ -517,7 +524,8 @@ class Loop:
                     self._lock.release()
             try:
                 self.driver.send(
-                    HandCommand(np.zeros(12) if self.target is None else self.target, np.zeros(12), kp=0, mode=PASSIVE)
+                    HandCommand(np.zeros_like(self.tor_max) if self.target is None else self.target,
+                                np.zeros_like(self.tor_max), kp=0, mode=PASSIVE)
                 )
                 self.clock.sleep_until(self.clock.now() + RELAX_EVERY)
             except BaseException:

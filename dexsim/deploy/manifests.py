@@ -7,13 +7,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 from dexsim.typed import Count, Positive, Real, convert
 
 FORMAT, VERSION = "dexsim-bundle", 1
 AGAIN = "export the bundle again"
-Joints = Annotated[list[Real], msgspec.Meta(min_length=12, max_length=12)]
+Joints = Annotated[list[Real], msgspec.Meta(min_length=1, max_length=256)]
+JointsAbove = Annotated[list[Positive], msgspec.Meta(min_length=1, max_length=256)]
 Several = Annotated[list[Real], msgspec.Meta(max_length=4096)]
 Any_ = dict[str, Any]
 
@@ -25,7 +26,7 @@ class Network(msgspec.Struct):
     input: str
     output: str
     observation_size: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
-    action_size: Literal[12]
+    action_size: Annotated[int, msgspec.Meta(ge=1, le=256)]
 
 
 class Row(msgspec.Struct):
@@ -45,7 +46,7 @@ class Action(msgspec.Struct):
     lead: Annotated[float, msgspec.Meta(gt=0, le=10)]
     low: Joints
     high: Joints
-    speed_limit_rad_s: Annotated[list[Positive], msgspec.Meta(min_length=12, max_length=12)]
+    speed_limit_rad_s: JointsAbove
 
 
 class Rates(msgspec.Struct):
@@ -57,7 +58,7 @@ class Rates(msgspec.Struct):
 class Normalization(msgspec.Struct):
     """N.m and N."""
 
-    tau_max: Annotated[list[Positive], msgspec.Meta(min_length=12, max_length=12)]
+    tau_max: JointsAbove
     force_max_N: Positive | None = None
 
 
@@ -109,6 +110,15 @@ class Grip(msgspec.Struct):
     object_edge_m: Annotated[float, msgspec.Meta(gt=0, le=1.0)]
 
 
+class HandEntry(msgspec.Struct):
+    """Which hand: one that comes with dexsim (`name`), or the bundle's own `folder`; mirrored, scaled."""
+
+    name: Annotated[str, msgspec.Meta(max_length=64)]
+    folder: Literal["hand"] | None = None
+    mirror: bool = False
+    scale: Annotated[float, msgspec.Meta(ge=0.2, le=5.0)] = 1.0
+
+
 class Manifest(msgspec.Struct):
     """What `dexsim.export.manifest` writes, as far as the loop and its check depend on it."""
 
@@ -127,13 +137,19 @@ class Manifest(msgspec.Struct):
     golden: Golden
     versions: Any_
     trained: Any_
+    hand: HandEntry | None = None
     task_settings: TaskSettings | None = None
     grip: Grip | None = None
 
 
-def check(raw: dict[str, Any], source: object) -> Manifest:
-    """The manifest as declared above. Raises UserError, one line: not a manifest, another version, a key missing or of
-    the wrong type, a value outside its range or beyond what the hand can do."""
+def hand_entry(raw: dict[str, Any], source: object) -> HandEntry:
+    """Which hand a manifest is of: bundles from before there was a choice are of the xHand."""
+    return convert(raw.get("hand") or {"name": "xhand"}, HandEntry, f"{source}: hand", AGAIN)
+
+
+def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
+    """The manifest as declared above, of this hand. Raises UserError, one line: not a manifest, another version, a key
+    missing or of the wrong type, a value outside its range or beyond what the hand can do."""
     if raw.get("format") != FORMAT:
         raise UserError(f"{source}: not the manifest of a policy bundle")
     if raw.get("version") != VERSION:
@@ -149,14 +165,14 @@ def check(raw: dict[str, Any], source: object) -> Manifest:
             )
     if m.task == "grasp" and m.normalization.force_max_N is None:
         raise UserError(f"{source}: lacks normalization.force_max_N, which task=grasp needs; {AGAIN}")
-    for key, ours in (("joints", xhand.JOINTS), ("fingers", xhand.FINGERS)):
+    for key, ours in (("joints", hand.joints), ("fingers", hand.finger_names)):
         if getattr(m, key) != list(ours):
             raise UserError(
                 f"{source}: {key} are {', '.join(getattr(m, key))[:120]}; this hand's are {', '.join(ours)}, in this"
                 " order"
             )
     _table(m, source)
-    _limits(m, source)
+    _limits(m, source, hand)
     return m
 
 
@@ -175,25 +191,33 @@ def _table(m: Manifest, source: object) -> None:
         )
 
 
-def _limits(m: Manifest, source: object) -> None:
-    """Ranges and speeds lie within the hand's own, poses within the ranges."""
-    low, high = xhand.joint_limits().T
+def _limits(m: Manifest, source: object, hand: Hand) -> None:
+    """One number a joint; ranges and speeds lie within the hand's own, poses within the ranges."""
+    low, high = hand.limits.T
+    J = len(hand.joints)
     slack = 1e-3
     checks = [
         ("action.low", m.action.low, low, high),
         ("action.high", m.action.high, low, high),
-        ("action.speed_limit_rad_s", m.action.speed_limit_rad_s, np.zeros(12), xhand.speeds()),
+        ("action.speed_limit_rad_s", m.action.speed_limit_rad_s, np.zeros(J), hand.speeds),
         ("initial_pose", m.initial_pose, low, high),
     ]
     if m.grip is not None:
         checks += [("grip.target", m.grip.target, low, high)]
+    sizes = [(key, len(values)) for key, values, *_ in checks]
+    sizes += [("normalization.tau_max", len(m.normalization.tau_max)), ("policy.action_size", m.policy.action_size)]
+    if m.grip is not None:
+        sizes += [("grip.hand", len(m.grip.hand))]
+    for key, count in sizes:
+        if count != J:
+            raise UserError(f"{source}: {key}: {count}, must be {J}, one a joint of {hand.name}; {AGAIN}")
     for key, values, least, most in checks:
-        for joint, value, a, b in zip(xhand.JOINTS, values, least, most, strict=True):
+        for joint, value, a, b in zip(hand.joints, values, least, most, strict=True):
             if not a - slack <= value <= b + slack:
                 raise UserError(
                     f"{source}: {key} of {joint} is {value:g}, the hand's range is {a:.4g} to {b:.4g}; {AGAIN}"
                 )
-    for joint, a, b in zip(xhand.JOINTS, m.action.low, m.action.high, strict=True):
+    for joint, a, b in zip(hand.joints, m.action.low, m.action.high, strict=True):
         if not a < b:
             raise UserError(
                 f"{source}: action.low of {joint} is {a:g}, action.high {b:g}; low must be below high; {AGAIN}"

@@ -37,7 +37,7 @@ class Measure:
 
     def __init__(self, calibration: Calibration, force_max: float, period: float):
         self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
-        self.hand = HandKinematics()
+        self.hand = HandKinematics(calibration.hand)
         self.reset()
 
     def reset(self) -> None:
@@ -49,7 +49,7 @@ class Measure:
     def observe(
         self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, 66] float32, touch forces [5] N). seen [3] m: the object, palm frame;
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame;
         command 0..1."""
         s = self.signals(state, seen, command)
         return self.observation(s), s.touch_force[0].numpy()
@@ -70,7 +70,7 @@ class Measure:
             _tensor(force), _tensor(centre), _tensor(tips), _tensor([command])[0])  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
-        """[1, 66] float32, by the builder that training used."""
+        """[1, D] float32, by the builder that training used."""
         return observations.build(signals, self.force_max).numpy()
 
 
@@ -84,15 +84,19 @@ class TurnMeasure:
     def __init__(self, calibration: Calibration, manifest: dict[str, Any], period: float):
         self.calibration, self.period, self.task = calibration, float(period), manifest["task_settings"]
         self.needs = ORIENTATION if self.task["perception"] == "imu" else None
-        self.hand = HandKinematics()
+        self.hand = HandKinematics(calibration.hand)
         goal = self.task["goal"]
         axis = torch.tensor([float(x) for x in goal["axis"]])
         self.axis = axis / axis.norm()
         self.turn = rotation.about(self.axis, torch.tensor(math.radians(float(goal["angle"]))))
         low, high = (np.array(manifest["action"][k], np.float32) for k in ("low", "high"))
         self._middle, self._half = torch.from_numpy((low + high) / 2), torch.from_numpy((high - low) / 2)
-        self.frame = sum(row[1] for row in observations_rotate.rows(self.task, frames=1))
+        self.frame = sum(row[1] for row in observations_rotate.rows(self.task, *self._sizes(), frames=1))
         self.reset()
+
+    def _sizes(self) -> tuple[int, int, int]:
+        hand = self.calibration.hand
+        return len(hand.joints), len(hand.fingers), len(self.calibration.gain)
 
     def reset(self) -> None:
         """A new episode: the next orientation gives the first goal."""
@@ -100,14 +104,14 @@ class TurnMeasure:
         self.goals = 0
         self._past: torch.Tensor | None = None
         self._last: tuple[float, np.ndarray] | None = None
-        self._speed = np.zeros(12)
+        self._speed = np.zeros(len(self.calibration.hand.joints))
 
     @torch.inference_mode()
     def observe(
         self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [5] N). seen [4]: the object's orientation w x y
-        z as its IMU says; target [12] rad: the last ones sent; action [12]: the last. The command is not used."""
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [4]: the object's orientation w x y
+        z as its IMU says; target [J] rad: the last ones sent; action [J]: the last. The command is not used."""
         s = self.signals(state, seen, target, action)
         out = observations_rotate.build(s, self.task)
         if self.task["perception"] == "proprioception":
@@ -154,7 +158,7 @@ class TurnMeasure:
             self.goal = observations_rotate.next_goal(q, self.axis, self.turn, self.task["goal"]["keep_tilt"])
 
     def _velocity(self, state: HandState) -> np.ndarray:
-        """[12] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
+        """[J] rad/s: the firmware's, or the difference of the last two readings that were acted on."""
         if state.velocity is not None and np.isfinite(state.velocity).all():
             return np.asarray(state.velocity, float)
         q = np.asarray(state.position, float)

@@ -10,35 +10,40 @@ from typing import NamedTuple
 
 import torch
 
-OBSERVATION = (  # table (a) of the paper: name, width, unit, what it is on hardware
-    ("joint_angle", 12, "rad", "measured"),
-    ("joint_torque", 12, "tau/tau_max", "motor current, as calibrated"),
-    ("object_position", 3, "m", "x, y held at their first value; z from vision: noisy, delayed"),
-    ("object_velocity", 3, "m/s", "finite difference of the measured z; x, y zero"),
-    ("contact_force", 5, "F/F_max", "sum of a pad's normal forces"),
-    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
-    ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
-    ("force_command", 1, "F/F_max", "0..1"),
-)
 FRAME = {
     "joint_angle": "joint", "joint_torque": "joint", "object_position": "palm", "object_velocity": "palm",
     "contact_force": "taxel, along the normal", "contact_centre": "palm", "fingertip_position": "palm",
     "force_command": "none",
 }  # fmt: skip
-"""Frame of each row of OBSERVATION. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
+"""Frame of each of `rows`. Palm: origin at the palm's centre, x along the fingers, z out of the palm."""
 ORDER = {
     "joint_angle": "joints", "joint_torque": "joints", "object_position": "x y z", "object_velocity": "x y z",
     "contact_force": "fingers", "contact_centre": "fingers, x y z each", "fingertip_position": "fingers, x y z each",
     "force_command": "one",
 }  # fmt: skip
-ACTOR_SIZE = sum(row[1] for row in OBSERVATION)
+
+
+def rows(joints: int, fingers: int, pads: int) -> list[tuple[str, int, str, str]]:
+    """(name, width, unit, what it is on hardware) of the observation, table (a) of the paper, for a hand of so many
+    joints, fingers and touch pads (without pads: without the rows of touch)."""
+    table = (
+        ("joint_angle", joints, "rad", "measured"),
+        ("joint_torque", joints, "tau/tau_max", "motor current, as calibrated"),
+        ("object_position", 3, "m", "x, y held at their first value; z from vision: noisy, delayed"),
+        ("object_velocity", 3, "m/s", "finite difference of the measured z; x, y zero"),
+        ("contact_force", pads, "F/F_max", "sum of a pad's normal forces"),
+        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
+        ("fingertip_position", 3 * fingers, "m", "palm frame, forward kinematics"),
+        ("force_command", 1, "F/F_max", "0..1"),
+    )
+    return [row for row in table if row[1]]
 
 
 class Signals(NamedTuple):
-    """What is measured, N hands at once. joint_position [N, 12] rad; joint_torque [N, 12] over tau_max, positive along
-    positive joint position; object_xy [N, 2], object_z [N] m, object_vz [N] m/s; touch_force [N, 5] N; touch_centre
-    [N, 5, 3] and fingertip [N, 5, 3] m, palm frame; command [N] 0..1. Joints in the SDK's order, fingers from the
-    thumb."""
+    """What is measured, N hands at once. joint_position [N, J] rad; joint_torque [N, J] over tau_max, positive along
+    positive joint position; object_xy [N, 2], object_z [N] m, object_vz [N] m/s; touch_force [N, P] N, touch_centre
+    [N, P, 3] (P pads, 0 without touch) and fingertip [N, F, 3] m, palm frame; command [N] 0..1. Joints and fingers in
+    the hand's order."""
 
     joint_position: torch.Tensor
     joint_torque: torch.Tensor
@@ -52,8 +57,7 @@ class Signals(NamedTuple):
 
 
 def build(s: Signals, force_max: float) -> torch.Tensor:
-    """The actor's observation [N, 66], rows of `OBSERVATION`. force_max: F_max [N] of a fingertip at command 1."""
-    n = s.joint_position.shape[0]
+    """The actor's observation [N, D], rows of `rows`. force_max: F_max [N] of a fingertip at command 1."""
     zero2 = torch.zeros_like(s.object_xy)
     return torch.cat([
         s.joint_position,
@@ -61,8 +65,8 @@ def build(s: Signals, force_max: float) -> torch.Tensor:
         s.object_xy, s.object_z[:, None],
         zero2, s.object_vz[:, None],
         s.touch_force / force_max,
-        s.touch_centre.reshape(n, 15),
-        s.fingertip.reshape(n, 15),
+        s.touch_centre.flatten(1),
+        s.fingertip.flatten(1),
         s.command[:, None],
     ], 1)  # fmt: skip
 
@@ -72,10 +76,10 @@ def height_speed(z: torch.Tensor, before: torch.Tensor, period: float) -> torch.
     return (z - before) / period
 
 
-def slices() -> dict[str, slice]:
-    """Where each row of `OBSERVATION` lies."""
+def slices(table: list[tuple[str, int, str, str]]) -> dict[str, slice]:
+    """Where each of `rows` lies."""
     out, at = {}, 0
-    for name, width, *_ in OBSERVATION:
+    for name, width, *_ in table:
         out[name] = slice(at, at + width)
         at += width
     return out

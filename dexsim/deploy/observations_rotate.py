@@ -15,21 +15,30 @@ from dexsim import rotation
 
 ORIENTATION = {"6d": 6, "quaternion": 4, "none": 0}
 
-ACTOR = (  # table (b): name, width, unit, what it is on hardware
-    ("joint_angle", 12, "rad", "measured"),
-    ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
-    ("last_action", 12, "1", "targets last sent, over each joint's range in [-1, 1]"),
-    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
-    ("contact_force", 5, "N", "sum of a pad's normal forces"),
-    ("fingertip_position", 15, "m", "palm frame, forward kinematics"),
-)
-PROPRIOCEPTION = (  # no object pose; `history` of these, newest first
-    ("joint_angle", 12, "rad", "measured"),
-    ("joint_velocity", 12, "rad/s", "measured"),
-    ("last_action", 12, "1", "targets last sent, over each joint's range in [-1, 1]"),
-    ("contact_centre", 15, "m", "force-weighted mean of taxel positions, palm frame"),
-    ("contact_force", 5, "N", "sum of a pad's normal forces"),
-)
+
+def actor(joints: int, fingers: int, pads: int) -> tuple[tuple[str, int, str, str], ...]:
+    """Table (b), (name, width, unit, what it is on hardware), for a hand of so many joints, fingers and touch pads."""
+    return (
+        ("joint_angle", joints, "rad", "measured"),
+        ("relative_orientation", 6, "1", "6D of R_object^T R_goal, both in the palm frame; object from its IMU"),
+        ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
+        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
+        ("contact_force", pads, "N", "sum of a pad's normal forces"),
+        ("fingertip_position", 3 * fingers, "m", "palm frame, forward kinematics"),
+    )
+
+
+def proprioception(joints: int, pads: int) -> tuple[tuple[str, int, str, str], ...]:
+    """The same without an object's pose; `history` of these, newest first."""
+    return (
+        ("joint_angle", joints, "rad", "measured"),
+        ("joint_velocity", joints, "rad/s", "measured"),
+        ("last_action", joints, "1", "targets last sent, over each joint's range in [-1, 1]"),
+        ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
+        ("contact_force", pads, "N", "sum of a pad's normal forces"),
+    )
+
+
 FRAME = {
     "joint_angle": "joint", "joint_velocity": "joint", "relative_orientation": "object", "last_action": "joint",
     "contact_centre": "palm", "contact_force": "taxel, along the normal", "fingertip_position": "palm",
@@ -44,10 +53,11 @@ ORDER = {
 
 
 class Signals(NamedTuple):
-    """What is measured, N hands at once. joint_position [N, 12] rad; joint_velocity [N, 12] rad/s (used without an IMU
-    only); orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, 12], see
-    `sent`; touch_force [N, 5] N; touch_centre, fingertip [N, 5, 3] m, palm frame; past [N, H, F]: the last H frames,
-    newest first (perception=proprioception, else empty); fresh [N] bool: an episode begins."""
+    """What is measured, N hands at once. joint_position [N, J] rad; joint_velocity [N, J] rad/s (used without an IMU
+    only); orientation [N, 4]: the object's as its IMU says, goal [N, 4] in the same frame, w x y z; sent [N, J], see
+    `sent`; touch_force [N, P] N, touch_centre [N, P, 3], fingertip [N, F, 3] m, palm frame (P = 0 without touch); past
+    [N, H, D]: the last H frames, newest first (perception=proprioception, else empty); fresh [N] bool: an episode
+    begins."""
 
     joint_position: torch.Tensor
     joint_velocity: torch.Tensor
@@ -61,13 +71,16 @@ class Signals(NamedTuple):
     fresh: torch.Tensor
 
 
-def rows(task: Mapping[str, Any], frames: int | None = None) -> list[tuple[str, int, str, str]]:
-    """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`. frames: of how
-    many control steps a row of the history is taken (default: `history`)."""
+def rows(
+    task: Mapping[str, Any], joints: int, fingers: int, pads: int, frames: int | None = None
+) -> list[tuple[str, int, str, str]]:
+    """(name, width, unit, what) of the actor's observation under a task's `observe` and `perception`, for a hand of so
+    many joints, fingers and touch pads. frames: of how many control steps a row of the history is taken (default:
+    `history`)."""
     o = task["observe"]
-    proprioception = task["perception"] == "proprioception"
+    blind = task["perception"] == "proprioception"
     out = []
-    for name, width, unit, text in PROPRIOCEPTION if proprioception else ACTOR:
+    for name, width, unit, text in proprioception(joints, pads) if blind else actor(joints, fingers, pads):
         if name == "relative_orientation":
             width = ORIENTATION[o["orientation"]]
             text = text if width != 4 else "quaternion, sign as it comes"
@@ -76,7 +89,7 @@ def rows(task: Mapping[str, Any], frames: int | None = None) -> list[tuple[str, 
         elif name == "contact_centre" and not o.get("force_weighted", True):
             text = "mean position of the touched taxels, palm frame"
         if width and o.get(name, True) is not False:
-            count = (frames or task["history"]) if proprioception else 1
+            count = (frames or task["history"]) if blind else 1
             out.append((name, width * count, unit, text))
     return out
 
@@ -84,17 +97,18 @@ def rows(task: Mapping[str, Any], frames: int | None = None) -> list[tuple[str, 
 def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
     """The actor's observation [N, D], rows of `rows(task)`. With perception=proprioception the newest frame is put
     before `past`, whose oldest is left out; a fresh episode's history is its first frame."""
-    n = s.joint_position.shape[0]
+    n, joints = s.joint_position.shape
     parts = {
         "joint_angle": s.joint_position, "joint_velocity": s.joint_velocity, "last_action": s.sent,
-        "contact_centre": s.touch_centre.reshape(n, 15), "contact_force": s.touch_force,
-        "fingertip_position": s.fingertip.reshape(n, 15),
+        "contact_centre": s.touch_centre.flatten(1), "contact_force": s.touch_force,
+        "fingertip_position": s.fingertip.flatten(1),
     }  # fmt: skip
-    proprioception = task["perception"] == "proprioception"
-    if not proprioception:
+    blind = task["perception"] == "proprioception"
+    if not blind:
         parts["relative_orientation"] = relative(s.orientation, s.goal, task["observe"]["orientation"])
-    frame = torch.cat([parts[row[0]] for row in rows(task, frames=1)], 1)
-    if not proprioception:
+    sizes = joints, parts["fingertip_position"].shape[1] // 3, s.touch_force.shape[1]
+    frame = torch.cat([parts[row[0]] for row in rows(task, *sizes, frames=1)], 1)
+    if not blind:
         return frame
     moved = torch.cat([frame[:, None], s.past[:, :-1]], 1)
     return torch.where(s.fresh[:, None, None], frame[:, None].expand_as(moved), moved).reshape(n, -1)
@@ -103,10 +117,10 @@ def build(s: Signals, task: Mapping[str, Any]) -> torch.Tensor:
 def sent(
     action: torch.Tensor, target: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, what: str
 ) -> torch.Tensor:
-    """What was last sent to the drives [N, 12]. target: the targets over each joint's range (middle, half [12] rad) in
+    """What was last sent to the drives [N, J]. target: the targets over each joint's range (middle, half [J] rad) in
     [-1, 1], in absolute mode the action itself; in relative mode a step alone would not tell how hard a finger is told
     to press.
-    step: the action [N, 12]."""
+    step: the action [N, J]."""
     return action if what == "step" else (target - middle) / half
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.assets import xhand
-from dexsim.deploy.driver import TAXELS, HandState
+from dexsim.deploy.driver import HandState
+from dexsim.hand import Hand
 
 AHEAD = 0.05
 """s that a stamp may lie ahead of the loop's clock: a driver's thread stamps while a turn is under way."""
@@ -26,45 +26,44 @@ class _Bounds:
     high: Any
 
 
-_LOW, _HIGH = xhand.joint_limits().T
 _JOINT = (
-    _Bounds("position", "rad", _LOW - BEYOND, _HIGH + BEYOND),
     _Bounds("current", "mA", -32768.0, 32767.0),
     _Bounds("temperature", "degC", -60.0, 250.0),
 )
 _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded or cut
 
 
-def implausible(state: HandState, now: float) -> str | None:
+def implausible(state: HandState, now: float, hand: Hand, taxels: tuple[int, int]) -> str | None:
     """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead,
     an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged
-    here."""
+    here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`)."""
+    J, (low, high) = len(hand.joints), hand.limits.T
     if (wrong := bad_stamp(state.time, now)) is not None:
         return wrong
-    for b in _JOINT:
+    for b in (_Bounds("position", "rad", low - BEYOND, high + BEYOND), *_JOINT):
         x = _array(getattr(state, b.name))
-        if x is None or x.shape != (12,):
-            return f"{b.name} is not 12 numbers"
+        if x is None or x.shape != (J,):
+            return f"{b.name} is not {J} numbers"
         bad = ~((x >= b.low) & (x <= b.high))  # NaN too
         if bad.any():
             j = int(np.argmax(bad))
-            return f"{b.name} of {xhand.JOINTS[j]} is {x[j]:.4g} {b.unit}"
+            return f"{b.name} of {hand.joints[j]} is {x[j]:.4g} {b.unit}"
     error = _array(state.error)
-    if error is None or error.shape != (12,):
-        return "error is not 12 codes"
+    if error is None or error.shape != (J,):
+        return f"error is not {J} codes"
     touch = _array(state.tactile)
-    if touch is None or touch.shape != TAXELS:
-        return f"tactile is not {' x '.join(map(str, TAXELS))} numbers"
-    top = float(np.abs(touch).max())
+    if touch is None or (touch.size and touch.shape != (*taxels, 3)):
+        return f"tactile is not {' x '.join(map(str, (*taxels, 3)))} numbers"
+    top = float(np.abs(touch).max(initial=0.0))
     if not top <= _TOUCH:
         return f"a taxel reads {top:.4g} counts"
     if state.velocity is not None:
         speed = _array(state.velocity)
-        if speed is None or speed.shape != (12,):
-            return "velocity is not 12 numbers"
+        if speed is None or speed.shape != (J,):
+            return f"velocity is not {J} numbers"
         if (np.abs(speed) > FASTEST).any():  # NaN: not said, as of older firmware
             j = int(np.nanargmax(np.abs(speed)))
-            return f"velocity of {xhand.JOINTS[j]} is {speed[j]:.4g} rad/s"
+            return f"velocity of {hand.joints[j]} is {speed[j]:.4g} rad/s"
     return None
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
 from dexsim.deploy.driver import Clock, HandCommand, HandState
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 from dexsim.recording.schema import Recording, Series
 
 EPS = 1e-6  # s, of rounding in stored times
@@ -25,13 +25,14 @@ class ReplayHand:
     name = "replay"
 
     def __init__(self, recording: Recording, calibration: Calibration, clock: Clock):
-        missing = [j for j in xhand.JOINTS if j not in recording.joints]
+        hand: Hand = calibration.hand
+        missing = [j for j in hand.joints if j not in recording.joints]
         if missing:
-            raise UserError(f"recording {recording.path}: lacks {', '.join(missing)}: not of an xHand")
+            raise UserError(f"recording {recording.path}: lacks {', '.join(missing)}: not of {hand.name}")
         self.recording, self.calibration, self.clock = recording, calibration, clock
         self.sent: list[tuple[float, np.ndarray]] = []
         self.relaxed = False
-        self._order = [recording.joints.index(j) for j in xhand.JOINTS]
+        self._order = [recording.joints.index(j) for j in hand.joints]
         effort = recording.signed_effort()
         self._current = None
         if effort is not None:
@@ -55,7 +56,7 @@ class ReplayHand:
         i = int(np.searchsorted(q.t, now + EPS, side="right")) - 1
         if i < 0:
             return None
-        current, tactile = np.zeros(12), np.zeros((5, xhand.TAXELS_PER_FINGER, 3))
+        current, tactile = np.zeros(len(self._order)), np.zeros((*self.calibration.gain.shape, 3))
         if self._current is not None:
             live = self.recording.effort_is != "torque_Nm"
             k = int(np.searchsorted(self._current[0], now + (EPS if live else -EPS), side="right")) - 1

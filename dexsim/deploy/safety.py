@@ -14,7 +14,7 @@ from dexsim.errors import UserError
 class Guard:
     """Applied to targets after the policy, joint by joint.
 
-    low, high [12] rad; speed [12] rad/s, of targets; current [12] mA; current_sign [12]: of the current that drives
+    low, high [J] rad; speed [J] rad/s, of targets; current [J] mA; current_sign [J]: of the current that drives
     toward positive position. counts: how often each limit changed a target (joint-steps). Over its current for
     `sustained` s, or over `temperature` degC, a joint makes `must_relax` say why.
     """
@@ -41,7 +41,7 @@ class Guard:
     def apply(
         self, target: np.ndarray, before: np.ndarray, q: np.ndarray, current: np.ndarray, period: float
     ) -> np.ndarray:
-        """Safe targets [12] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and
+        """Safe targets [J] rad: finite and within the limits, whatever comes in. before: the last ones sent; q rad and
         current mA: measured; period s since the last."""
         t = np.asarray(target, float).copy()
         middle = 0.5 * (self.low + self.high)

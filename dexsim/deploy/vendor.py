@@ -22,10 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.deploy.driver import PASSIVE, TAXELS, Clock, HandCommand, HandState
+from dexsim.deploy.driver import PASSIVE, Clock, HandCommand, HandState
 from dexsim.errors import UserError
 
 BAUD = 3_000_000
+JOINTS, TAXELS = 12, (5, 120, 3)
+"""Of the only hand that this package drives."""
 CLOSE = 1.0  # s that the bus has to carry the command to relax
 
 
@@ -125,7 +127,7 @@ class VendorXHand:
         with self._lock:
             command = self._command
         if command is not None:
-            for i in range(12):
+            for i in range(JOINTS):
                 f = self._wire.finger_command[i]
                 f.id, f.kp, f.ki, f.kd = i, int(command.kp), int(command.ki), int(command.kd)
                 f.position, f.tor_max, f.mode = float(command.position[i]), int(command.tor_max[i]), int(command.mode)
@@ -144,7 +146,7 @@ class VendorXHand:
 
 def convert(raw: Any, now: float, sequence: int) -> HandState:
     """The SDK's state struct as ours; nothing scaled."""
-    joints = [raw.finger_state[i] for i in range(12)]
+    joints = [raw.finger_state[i] for i in range(JOINTS)]
     tactile = np.zeros(TAXELS, np.int16)
     for f in range(TAXELS[0]):
         force = raw.sensor_data[f].raw_force

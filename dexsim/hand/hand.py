@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,8 @@ class Hand:
     """A hand, checked against its model. Joints [J] in the order on the wire, fingers [F] in the file's.
 
     limits [J, 2] rad, efforts [J] N m, speeds [J] rad/s; opposing and others: indices of the fingers that press against
-    the others, and of those; palm_body; span m and force N (or None) as in the file; mirror, scale: what was derived.
+    the others, and of those; palm_body; span m and force (N, or how it is told) as in the file; mirror, scale: what was
+    derived.
     """
 
     folder: Path
@@ -52,12 +54,17 @@ class Hand:
     opposing: tuple[int, ...]
     others: tuple[int, ...]
     span: float
-    force: float | None
+    force: float | str | None
     _spec: mujoco.MjSpec = field(repr=False)
 
     def spec(self) -> mujoco.MjSpec:
         """A fresh model of the hand alone: world frame = palm frame, no actuators, sensors or lights."""
         return self._spec.copy()
+
+    @cached_property
+    def compiled(self) -> mujoco.MjModel:
+        """The compiled model of the hand alone, shared: not to be changed."""
+        return self._spec.copy().compile()
 
     @property
     def name(self) -> str:
@@ -119,7 +126,16 @@ class Hand:
     @property
     def identity(self) -> dict[str, object]:
         """What `load_hand` needs to make it again."""
-        return {"hand": str(self.folder), "hand_mirror": self.mirror, "hand_scale": self.scale}
+        return {
+            "hand": self.name if self.comes_along else str(self.folder),
+            "hand_mirror": self.mirror,
+            "hand_scale": self.scale,
+        }
+
+    @property
+    def comes_along(self) -> bool:
+        """Whether it is one of those in dexsim itself."""
+        return self.folder == Path(__file__).parents[1] / "assets" / self.name
 
     def pose(self, which: str) -> np.ndarray:
         """Joint angles [J] rad of the pose "open" or "cupped"."""

@@ -103,7 +103,7 @@ def _load(path: Path, stamp: int, mirror: bool, scale: float) -> Hand:
         opposing=opposing,
         others=tuple(k for k in range(len(names)) if k not in opposing),
         span=file.span * scale,
-        force=file.force,
+        force=float(file.force) if isinstance(file.force, (int, float)) else file.force,
         _spec=spec,
     )
 

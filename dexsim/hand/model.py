@@ -114,6 +114,9 @@ def _joints(spec: mujoco.MjSpec, file: HandFile, where: str) -> None:
             f"{where}: joints: lacks '{missing[0]}' of the model ({len(missing)} in all); name every hinge and slide,"
             " or fix it in the model"
         )
+    for entry in file.joints:
+        if entry.armature is not None:
+            spec.joint(entry.name).armature = entry.armature
     m = spec.copy().compile()
     for k in range(m.njnt):
         if not m.dof_M0[m.jnt_dofadr[k]] > 0:

@@ -24,11 +24,13 @@ Metre = Annotated[float, msgspec.Meta(gt=0.01, le=10.0)]
 
 
 class JointEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A driven joint. effort: N m (N of a slide), speed: rad/s (m/s), the largest of each; its range is the model's."""
+    """A driven joint. effort: N m (N of a slide), speed: rad/s (m/s), the largest of each; its range is the model's.
+    armature: kg m2 (kg) of the rotor seen at the joint, instead of the model's, which often has none."""
 
     name: Text
     effort: Positive
     speed: Positive
+    armature: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None
 
 
 class Palm(msgspec.Struct, forbid_unknown_fields=True):
@@ -81,10 +83,21 @@ class Poses(msgspec.Struct, forbid_unknown_fields=True):
     cupped: dict[str, Real]
 
 
+class PlacesEntry(msgspec.Struct, forbid_unknown_fields=True):
+    """Points [m], palm frame; each is told from the cupped pose where it is left out. catch: on the palm, an object is
+    let fall over it; middle: of what the hand can reach; beside: its y is where an object lies in the reach of all
+    fingers."""
+
+    catch: Vector | None = None
+    middle: Vector | None = None
+    beside: Vector | None = None
+
+
 class HandFile(msgspec.Struct, forbid_unknown_fields=True):
-    """The file. Paths are relative to its folder. force: N that a fingertip can press with, None: from the servo's
-    torque limits and the levers; span: m, width of what the hand can grasp; guessed: places of this file that a program
-    guessed; source: free."""
+    """The file. Paths are relative to its folder. force: N that a fingertip can press with; None: from the servo's
+    torque limits and the levers, press: from a simulated press (pads with a lattice); span: m, width of what the
+    hand can grasp; held_cubes: poses that rotation begins with (dexsim stable-grasps), None: searched for; guessed:
+    places of this file that a program guessed; source: free."""
 
     format: Literal["dexsim-hand"]
     version: Literal[1]
@@ -98,7 +111,9 @@ class HandFile(msgspec.Struct, forbid_unknown_fields=True):
     opposing: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=31)]
     poses: Poses
     span: Metre
-    force: Positive | None = None
+    force: Positive | Literal["press"] | None = None
+    places: PlacesEntry | None = None
+    held_cubes: Text | None = None
     guessed: list[str] = []
     source: dict[str, Any] = {}
 
@@ -114,10 +129,15 @@ def read(path: Path) -> HandFile:
 def to_yaml(file: HandFile) -> str:
     """The file's text, fields in their order; what is at its default and optional is left out."""
     data = msgspec.to_builtins(file)
+    for joint in data["joints"]:
+        if joint["armature"] is None:
+            del joint["armature"]
     for finger in data["fingers"]:
-        for name in ("closes", "pad"):
-            if finger[name] is None and name == "closes":
-                del finger[name]
+        if finger["closes"] is None:
+            del finger["closes"]
+    for name in ("places", "held_cubes"):
+        if data[name] is None:
+            del data[name]
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=116, default_flow_style=False)
 
 

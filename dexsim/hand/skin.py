@@ -53,7 +53,7 @@ def obj_vertices(path: Path) -> np.ndarray:
 
 def geom_points(hand: Hand, geoms: tuple[str, ...]) -> np.ndarray:
     """Points [V, 3] m of the surfaces of collision geoms, in the frame of their body."""
-    model = hand.spec().compile()
+    model = hand.compiled
     ball = _sphere()
     out = []
     for name in geoms:

@@ -14,7 +14,10 @@ from dexsim.errors import UserError
 from dexsim.sim import mujoco_kernels as kernels
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 
-_SLOTS = 12  # contacts of one pair that are summed; more are counted, and fail in `check_overflow`
+_SLOTS, _MANY_SLOTS = 12, 64
+"""Contacts of one pair that are summed; more are counted, and fail in `check_overflow`. The many where a model has more
+than _FEW_GEOMS that collide, links of several boxes, say: each slot costs time, whether it is used or not."""
+_FEW_GEOMS = 48
 _LOST = 1 << 6  # bit of `Engine.t.overflow`
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 
@@ -23,6 +26,7 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
     """Compile `spec` with one contact sensor a pair (C MuJoCo's batch does not hand out its contact list)."""
     kinds = {"geom": mujoco.mjtObj.mjOBJ_GEOM, "body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY}
     spec = spec.copy()
+    slots = _SLOTS if sum(bool(g.contype or g.conaffinity) for g in spec.geoms) <= _FEW_GEOMS else _MANY_SLOTS
     field = mujoco.mjtConDataField
     data = sum(1 << int(f) for f in (field.mjCONDATA_FOUND, field.mjCONDATA_FORCE, field.mjCONDATA_NORMAL, field.mjCONDATA_TANGENT))
     for p in pairs:
@@ -33,7 +37,7 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
                 raise UserError(f"contact pair: no {kind} named '{name}' in the model")
         spec.add_sensor(
             name=f"pair_{p.name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds[p.first[0]], objname=p.first[1],
-            reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, _SLOTS])
+            reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, slots])
     return spec.compile()
 
 
@@ -71,7 +75,9 @@ class MujocoEngine(Engine):
         self._overflow, self._most = wp.zeros(N, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
         self.t.overflow = wp.to_torch(self._overflow)
         if P:
-            first = [model.sensor_adr[model.sensor(f"pair_{p.name}").id] for p in self.pairs]
+            sensors = [model.sensor(f"pair_{p.name}").id for p in self.pairs]
+            first = [model.sensor_adr[s] for s in sensors]
+            self._slots = int(model.sensor_intprm[sensors[0], 2])
             self._contact_args = [wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False), wp.array(first, dtype=int, device="cpu")]
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
@@ -133,7 +139,7 @@ class MujocoEngine(Engine):
 
     def check_overflow(self) -> None:
         if bool((self.t.overflow & _LOST).any()):
-            raise UserError(f"contact overflow: a contact pair had {self._most.numpy()[0]} contacts, sim.engine=mujoco sums {_SLOTS}; "
+            raise UserError(f"contact overflow: a contact pair had {self._most.numpy()[0]} contacts, sim.engine=mujoco sums {self._slots}; "
                             f"use sim.engine=warp, or pairs of fewer geoms")
         self.t.overflow.zero_()
 
@@ -145,7 +151,7 @@ class MujocoEngine(Engine):
     def _contacts(self) -> None:
         if not self.pairs:
             return
-        args = [*self._contact_args, _SLOTS, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
+        args = [*self._contact_args, self._slots, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
         wp.launch(kernels.read_contacts, dim=(self.n, len(self.pairs)), inputs=args, device="cpu")
         sound = self.t.flags.numpy() == 0
         self._peak[0] = max(self._peak[0], self._ncon.reshape(-1).max(initial=0, where=sound))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 
 
 @dataclass(frozen=True)
@@ -216,20 +217,51 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     }
 
 
+def hand_layout(hand: Hand) -> TaxelLayout | None:
+    """The taxels of a hand's pads, pad f on finger f; None where it has none. Mirrored and scaled as the hand is: a
+    mirrored pad keeps its y axis, its x axis turns round, so that taxel frames stay right-handed. Raises UserError."""
+    if not hand.touches:
+        return None
+    pads, rows = [], set()
+    for finger in hand.fingers:
+        own = finger.pad
+        pad = load_layout(hand.folder / own.taxels, finger.body, finger.name, own.kind)
+        if own.rows and len(pad["point"]) % own.rows:
+            raise UserError(
+                f"hand {hand.folder}: fingers.{finger.name}.pad.rows={own.rows}: its {len(pad['point'])} taxels are no"
+                " multiple of it; 0 where they form no lattice"
+            )
+        rows.add(own.rows)
+        if hand.mirror:
+            flip = np.array([1.0, -1.0, 1.0])
+            pad["point"], pad["normal"] = pad["point"] * flip, pad["normal"] * flip
+            pad["tx"] = None if pad["tx"] is None else -pad["tx"] * flip
+        if hand.scale != 1.0:
+            pad["point"] = pad["point"] * hand.scale
+            pad["area"] = None if pad["area"] is None else pad["area"] * hand.scale**2
+        pads.append(pad)
+    return replace(TaxelLayout.build(pads), rows=rows.pop() if len(rows) == 1 else 0)
+
+
+def touch_shape(hand: Hand) -> tuple[int, int]:
+    """Pads, and taxels of the largest: (0, 0) for a hand without touch."""
+    layout = hand_layout(hand)
+    return (0, 0) if layout is None else (layout.pads, layout.taxels)
+
+
+def tip_layout(hand: Hand) -> TaxelLayout:
+    """One point a fingertip, its end, as if it were a pad: for what a reward must know of a hand without touch."""
+    return TaxelLayout.build([
+        {"name": f.name, "body": f.body, "kind": "finger", "point": [f.position], "normal": [f.normal]}
+        for f in hand.fingers
+    ])  # fmt: skip
+
+
 def xhand_layout() -> TaxelLayout:
     """The xHand's 5 x 120 taxels (`dexsim/assets/xhand/taxels_*.csv`)."""
-    from dexsim.assets import xhand
+    from dexsim.hand import load_hand
 
-    folder = Path(xhand.__file__).parent
-    pads = []
-    for finger, body in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True):
-        kind = "thumb" if finger == "thumb" else "finger"
-        pad = load_layout(folder / f"taxels_{kind}.csv", body, finger, kind)
-        if len(pad["point"]) != xhand.TAXELS_PER_FINGER:
-            want = xhand.TAXELS_PER_FINGER
-            raise UserError(f"taxel file {folder}/taxels_{kind}.csv: {len(pad['point'])} taxels, must be {want}")
-        pads.append(pad)
-    return replace(TaxelLayout.build(pads), rows=xhand.ROWS)
+    return hand_layout(load_hand("xhand"))
 
 
 def tip_points(model: object, geoms: Sequence[str]) -> list[np.ndarray]:

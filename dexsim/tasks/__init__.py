@@ -7,11 +7,13 @@ import difflib
 from dexsim.errors import UserError
 
 
-def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
+def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps=None):
     """The environment of `cfg["task"]["name"]`: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
 
-    cfg: the resolved configuration as a plain dict. engine: "auto", "warp" or "mujoco". Raises UserError for an
-    unknown task and for every impossible value that the task finds.
+    cfg: the resolved configuration as a plain dict. engine: "auto", "warp" or "mujoco". grasps: held poses that
+    rotation begins with (`tasks.stable_grasps.GraspSet`); by default those of `task.initial.poses` or of the hand,
+    searched for first where it has none. Raises UserError for an unknown task and for every impossible value that the
+    task finds.
     """
     from dexsim.tasks.grasp import GraspEnv
     from dexsim.tasks.rotate import RotateEnv
@@ -27,4 +29,10 @@ def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "au
         raise UserError(
             f"task.name='{name}': must be one of {', '.join(tasks)}" + (f"; did you mean {near[0]}?" if near else "")
         )
+    if name == "rotate":
+        if grasps is None and cfg["task"]["initial"]["poses"] is None and mode == "palm":
+            from dexsim.tasks.make_grasps import ensure
+
+            ensure(cfg)
+        return tasks[name](cfg, n_worlds, device, seed, engine, grasps)
     return tasks[name](cfg, n_worlds, device, seed, engine)

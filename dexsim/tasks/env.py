@@ -20,14 +20,16 @@ from tensordict import TensorDict
 
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
+from dexsim.hand import Hand, load_hand
+from dexsim.hand.places import places
+from dexsim.hand.skin import tip_skins
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.engine import FLAG_NAN
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
 from dexsim.tasks import worlds
@@ -38,39 +40,49 @@ from dexsim.tasks.reality import Reality, present
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
-FINGER_ROOTS = (
-    "right_hand_thumb_bend_link",
-    "right_hand_index_bend_link",
-    "right_hand_mid_link1",
-    "right_hand_ring_link1",
-    "right_hand_pinky_link1",
-)
-PAIRS = (
-    *(ContactPair(f"tip_{f}", ("geom", f"tip_{f}"), ("body", OBJECT)) for f in xhand.FINGERS),
-    *(
-        ContactPair(f"finger_{f}", ("subtree", root), ("body", OBJECT))
-        for f, root in zip(xhand.FINGERS, FINGER_ROOTS, strict=True)
-    ),
-    ContactPair("palm", ("body", "right_hand_link"), ("body", OBJECT)),
-    *(
-        ContactPair(f"self_{f}", ("body", b), ("subtree", "right_hand_link"))
-        for f, b in zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)
-    ),
-)
-"""Contact pairs of the hand scenes: fingertip on object (0-4), whole finger on object (5-9), palm on object (10),
-distal link on the hand itself (11-15)."""
+UNIT_SPAN = 0.1
+"""m, `span` of the hand that the lengths in task settings are for; they are multiplied by span / UNIT_SPAN."""
+UNIT_PALM = 0.025
+"""m, height of that hand's palm over the origin of its palm frame."""
+
+
+def contact_pairs(hand: Hand, root: str) -> tuple[ContactPair, ...]:
+    """Contact pairs of the hand scenes, F fingers: fingertip on object (0 .. F-1), whole finger on object (F .. 2F-1),
+    palm on object (2F), distal link on the hand itself (2F+1 .. 3F). A fingertip of several geoms counts as its whole
+    distal link. root: the hand's root body."""
+    obj = ("body", OBJECT)
+    return (
+        *(
+            ContactPair(f"tip_{f.name}", ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body), obj)
+            for f in hand.fingers
+        ),
+        *(ContactPair(f"finger_{f.name}", ("subtree", f.root), obj) for f in hand.fingers),
+        ContactPair("palm", ("body", hand.palm_body), obj),
+        *(ContactPair(f"self_{f.name}", ("body", f.body), ("subtree", root)) for f in hand.fingers),
+    )
+
+
+def hand_of(cfg: dict) -> Hand:
+    """The hand of a resolved config; the xHand for checkpoints from before there was a choice. Raises UserError."""
+    return load_hand(cfg.get("hand") or "xhand", cfg.get("hand_mirror", False), cfg.get("hand_scale", 1.0))
 
 
 class HandEnv(VecEnv):
-    """N xHands with one object each. A task subclasses it; see `tasks/grasp.py`.
+    """N hands with one object each. A task subclasses it; see `tasks/grasp.py`.
 
-    Shapes: actions [N, 12] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
-    dones [N]. Positions are in the palm frame, which is the world frame (the hand is fixed; gravity turns).
+    Shapes: actions [N, J] in [-1, 1]; observations a TensorDict of "actor" [N, A] and "critic" [N, C]; rewards and
+    dones [N]. J joints, F fingers, P touch pads (F, or 0 without touch) in the hand's order. Positions are in the palm
+    frame, which is the world frame (the hand is fixed; gravity turns). `unit`: the hand's span over UNIT_SPAN;
+    `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """
 
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
         self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
-        self.num_envs, self.device, self.num_actions = n_worlds, device, len(xhand.JOINTS)
+        self.hand = hand_of(cfg)
+        self.unit, self.places = self.hand.span / UNIT_SPAN, places(self.hand)
+        self.rise = float(self.places.catch[2]) - self.unit * UNIT_PALM
+        self.num_envs, self.device, self.num_actions = n_worlds, device, len(self.hand.joints)
+        self.fingers, self.pads = len(self.hand.fingers), len(self.hand.fingers) if self.hand.touches else 0
         self.decimation, self.dt = _periods(sim, self.task)
         if self.task["action"]["mode"] not in ("relative", "absolute"):
             raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
@@ -80,7 +92,7 @@ class HandEnv(VecEnv):
         self.shape_names = [
             _known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])
         ]
-        spec = hand(cfg.get("model_file"))  # a checkpoint from before has none
+        spec = model_of(self.hand, cfg.get("model_file"))  # a checkpoint from before has none
         contact = self.task["contact"]
         d = contact["impedance"]
         if not 0.5 <= d < 1.0:
@@ -88,23 +100,25 @@ class HandEnv(VecEnv):
         firm = contact.get("hand_impedance")  # links and palm; null, and in checkpoints from before: MuJoCo's default
         if firm is not None and not 0.5 <= firm < 1.0:
             raise UserError(f"task.contact.hand_impedance={firm}: must be null or lie in [0.5, 1)")
-        scene = hand_object_scene(
-            spec, [shapes[s] for s in self.shape_names], self.task["objects"]["baked_scales"], sim["timestep"]
-        )
+        root = spec.worldbody.bodies[0].name
+        scales = [x * self.unit for x in self.task["objects"]["baked_scales"]]
+        scene = hand_object_scene(spec, [shapes[s] for s in self.shape_names], scales, sim["timestep"])
+        tips, joints = set(self.hand.tip_geoms), set(self.hand.joints)
         for geom in spec.geoms:
-            if geom.name in xhand.TIP_GEOMS:
+            if geom.name in tips:
                 geom.solimp = [d, d, 1e-3, 0.5, 2.0]
             elif firm is not None:  # the object's too: MuJoCo takes the mean of two that touch
                 geom.solimp = [firm, firm, 1e-3, 0.5, 2.0]
         for joint in spec.joints:
-            if joint.name in xhand.JOINTS:
+            if joint.name in joints:
                 # stiffer dry friction than MuJoCo's default, in which a stuck joint creeps; stiffer yet, and Newton
                 # needs many more iterations (measured: 99th percentile 9 at 0.9999, 5 here)
                 joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
         _solver_options(spec, sim, engine_of(engine, device))
         self.rng = torch.Generator(device=device)
         self.rng.manual_seed(seed)
-        self.reality = Reality(cfg["reality"], self.rng) if present(cfg) else None  # another world to be judged in
+        # another world to be judged in
+        self.reality = Reality(cfg["reality"], self.rng, self.hand) if present(cfg) else None
         if self.reality is not None:
             self.reality.change_model(spec)
         self._drawn = None
@@ -118,7 +132,7 @@ class HandEnv(VecEnv):
             device,
             engine,
             fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
-            pairs=PAIRS,
+            pairs=contact_pairs(self.hand, root),
             deterministic=sim["deterministic"],
             nconmax=sim["nconmax"],
             njmax=sim["njmax"],
@@ -128,12 +142,12 @@ class HandEnv(VecEnv):
         self.scene = scene
         self.servo = Servo(
             self.engine,
-            xhand.JOINTS,
+            self.hand.joints,
             ServoTable.from_dict(cfg["servo"]),
             control_period=self.dt,
             varied=list(cfg["randomize"].get("servo", {})),
         )
-        self.objects = Objects(self.engine, scene, list(xhand.TIP_GEOMS), d)
+        self.objects = Objects(self.engine, scene, list(self.hand.tip_geoms), d)
         if self.reality is not None:
             self.objects.friction_factor = self.reality.friction_factor(
                 self.engine.mjm, self.objects.hand_geoms.tolist()
@@ -141,12 +155,12 @@ class HandEnv(VecEnv):
         touch_shapes = ShapeSet([v.shape for v in scene.variants], device)
         self.touch = Tactile(
             self.engine,
-            xhand_layout(),
+            hand_layout(self.hand) or tip_layout(self.hand),
             touch_shapes,
             OBJECT,
             cfg["tactile"],
-            pairs=[f"tip_{f}" for f in xhand.FINGERS],
-            tips=[xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS],
+            pairs=[f"tip_{f}" for f in self.hand.finger_names],
+            tips=tip_skins(self.hand) if self.hand.touches else None,
         )
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
@@ -286,7 +300,7 @@ class HandEnv(VecEnv):
         graph.replay()
 
     def act(self, actions: torch.Tensor) -> None:
-        """Turn actions [N, 12] into targets. `relative`: the target moves by action * scale a step, held within the
+        """Turn actions [N, J] into targets. `relative`: the target moves by action * scale a step, held within the
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
         the joint's range."""
         a = torch.nan_to_num(actions.to(torch.float32)).clamp(-1.0, 1.0)
@@ -338,7 +352,7 @@ class HandEnv(VecEnv):
         object_velocity: torch.Tensor,
         target: torch.Tensor | None = None,
     ) -> None:
-        """Where mask holds: hand at rest at hand_q [N, 12], sent to target [N, 12] (hand_q without one); object at pose
+        """Where mask holds: hand at rest at hand_q [N, J], sent to target [N, J] (hand_q without one); object at pose
         [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own)."""
         e, target = self.engine, hand_q if target is None else target
         qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
@@ -385,37 +399,40 @@ class HandEnv(VecEnv):
         if self.reality is not None:
             self.reality.read(self)
         normal = clean(t.pair_normal)
-        self.tip_force.copy_(normal[:, 0:5])
-        self.finger_force.copy_(normal[:, 5:10])
-        self.palm_force.copy_(normal[:, 10])
-        self.self_force.copy_(normal[:, 11:16])
+        F = self.fingers
+        self.tip_force.copy_(normal[:, 0:F])
+        self.finger_force.copy_(normal[:, F : 2 * F])
+        self.palm_force.copy_(normal[:, 2 * F])
+        self.self_force.copy_(normal[:, 2 * F + 1 :])
         pos = t.xpos[:, self.tip_body]
         rot = t.xmat[:, self.tip_body]
         tip = pos + (rot @ self.tip_offset[None, :, :, None])[..., 0]
-        self.tips.copy_(clean(tip.reshape(self.num_envs, 15)).reshape(self.num_envs, 5, 3))
+        self.tips.copy_(clean(tip.reshape(self.num_envs, 3 * F)).reshape(self.num_envs, F, 3))
 
     def _index(self) -> None:
-        e, dev = self.engine, self.device
+        e, dev, hand = self.engine, self.device, self.hand
         mjm = e.mjm
 
         def long(x):
             return torch.as_tensor(x, dtype=torch.long, device=dev)
 
-        self.joint_q, self.joint_v = long(e.qpos_index(xhand.JOINTS)), long(e.dof_index(xhand.JOINTS))
+        self.joint_q, self.joint_v = long(e.qpos_index(hand.joints)), long(e.dof_index(hand.joints))
         j = e.joint("object_free")
         self.object_q = long(range(mjm.jnt_qposadr[j], mjm.jnt_qposadr[j] + 7))
         self.object_v = long(range(mjm.jnt_dofadr[j], mjm.jnt_dofadr[j] + 6))
-        limits = torch.as_tensor(xhand.joint_limits(), dtype=torch.float32, device=dev)
+        limits = torch.as_tensor(hand.limits, dtype=torch.float32, device=dev)
         self.q_low, self.q_high = limits[:, 0], limits[:, 1]
         self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
-        self.effort = torch.as_tensor(xhand.efforts(), dtype=torch.float32, device=dev)
-        self.tip_body = long([e.body(b) for b in xhand.TIP_BODIES])
+        self.effort = torch.as_tensor(hand.efforts, dtype=torch.float32, device=dev)
+        self.tip_body = long([e.body(b) for b in hand.tip_bodies])
         self.pad_centre = torch.as_tensor(self.touch.layout.centre(), dtype=torch.float32, device=dev)
-        sites = [mjm.site(f"tip_{f}").id for f in xhand.FINGERS]
-        self.tip_offset = torch.as_tensor(mjm.site_pos[sites], dtype=torch.float32, device=dev)
+        self.tip_offset = torch.tensor([f.position for f in hand.fingers], dtype=torch.float32, device=dev)
+        # fingers that press against the others, and those; the joints whose torque closes each finger
+        self.opposing, self.others = long(hand.opposing), long(hand.others)
+        self.roots = long([f.flexion[0] for f in hand.fingers])
 
     def _buffers(self) -> None:
-        n, dev, J = self.num_envs, self.device, self.num_actions
+        n, dev, J, F = self.num_envs, self.device, self.num_actions, self.fingers
 
         def zeros(*shape, dtype=torch.float32):
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
@@ -424,8 +441,8 @@ class HandEnv(VecEnv):
         self.action, self.last_action, self.target = zeros(J), zeros(J), zeros(J)
         self.q, self.qd, self.torque = zeros(J), zeros(J), zeros(J)
         self.object_pose, self.object_velocity = zeros(7), zeros(6)
-        self.tip_force, self.finger_force, self.self_force, self.palm_force = zeros(5), zeros(5), zeros(5), zeros()
-        self.tips = zeros(5, 3)
+        self.tip_force, self.finger_force, self.self_force, self.palm_force = zeros(F), zeros(F), zeros(F), zeros()
+        self.tips = zeros(F, 3)
         self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.reward = zeros()
         self._blind = zeros(dtype=torch.bool)  # worlds of which an observation was not finite
@@ -523,7 +540,7 @@ class HandEnv(VecEnv):
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        return tuple(xhand.JOINTS)
+        return self.hand.joints
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
         """What a control step leaves to the next, live; a task adds its own. Whole numbers with their lowest and
@@ -570,13 +587,13 @@ def _periods(sim: dict, task: dict) -> tuple[int, float]:
     return k, control
 
 
-def hand(path: str | None) -> mujoco.MjSpec:
-    """The xHand, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
+def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
+    """The hand's model, or a file's version of it (a diagnosis writes one where inertia or mass was fitted).
 
     Raises UserError for a file that does not compile, or lacks a joint, fingertip body or fingertip geom of the
     hand."""
     if path is None:
-        return xhand.hand_spec()
+        return hand.spec()
     if not Path(path).expanduser().is_file():
         raise UserError(f"model_file={path}: no such file")
     try:
@@ -585,10 +602,11 @@ def hand(path: str | None) -> mujoco.MjSpec:
     except (ValueError, RuntimeError) as error:
         raise UserError(f"model_file={path}: {' '.join(str(error).split())}") from None
     has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
-    missing = [n for n in (*xhand.JOINTS, *xhand.TIP_BODIES, *xhand.TIP_GEOMS) if n not in has]
+    missing = [n for n in (*hand.joints, *hand.tip_bodies, *hand.tip_geoms) if n not in has]
     if missing:
         raise UserError(
-            f"model_file={path}: is not the xHand: it lacks {', '.join(missing[:4])}; tasks are for this hand"
+            f"model_file={path}: is not a model of hand={hand.name}: it lacks {', '.join(missing[:4])}; give the"
+            " model.xml that a diagnosis of this hand wrote"
         )
     return spec
 

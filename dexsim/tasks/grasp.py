@@ -12,35 +12,31 @@ import numpy as np
 import torch
 
 from dexsim import rotation
-from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.deploy import observations
-from dexsim.deploy.observations import ACTOR_SIZE, OBSERVATION
 from dexsim.errors import UserError
+from dexsim.hand.places import approach
 from dexsim.tactile.clearance import Clearance
 from dexsim.tasks import terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
 from dexsim.tasks.servos import ServoRandomizer
 
-FINGER_ROOT = [xhand.FLEXION_ROOT[f] for f in xhand.FINGERS]
-"""Joint whose torque closes each finger: thumb 1, index 4, middle 6, ring 8, little 10 (SDK order)."""
-INNER, OUTER = [4, 6, 8, 10], [5, 7, 9, 11]
-"""First and second flexion joints of the four fingers (SDK order)."""
-
 CENTRE_LENGTH = 0.03
 """Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward
-`centre`."""
+`centre`, of a hand of UNIT_SPAN."""
 
-assert ACTOR_SIZE == 66
 
-PRIVILEGED = (
-    ("joint_velocity", 12), ("object_quaternion", 4), ("object_velocity_full", 6), ("object_size", 3),
-    ("object_kind", 4),
-    ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_stiffness", 1), ("contact_damping", 1),
-    ("push", 3),
-    ("finger_force", 5), ("palm_force", 1), ("kp", 12), ("torque_limit", 12), ("target_error", 12), ("command_time", 1),
-)  # fmt: skip
+def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
+    """(name, width) of what the critic sees beyond the actor's rows, with task.critic=privileged."""
+    return (
+        ("joint_velocity", joints), ("object_quaternion", 4), ("object_velocity_full", 6), ("object_size", 3),
+        ("object_kind", 4),
+        ("object_mass", 1), ("object_com", 3), ("object_friction", 1), ("contact_stiffness", 1), ("contact_damping", 1),
+        ("push", 3),
+        ("finger_force", fingers), ("palm_force", 1), ("kp", joints), ("torque_limit", joints),
+        ("target_error", joints), ("command_time", 1),
+    )  # fmt: skip
 
 
 class GraspEnv(HandEnv):
@@ -54,9 +50,15 @@ class GraspEnv(HandEnv):
             drive *= (low + high) / 2
         # another world does not tell its drives
         believed = self.cfg.get("belief") or {"servo": self.cfg["servo"], "drive": drive}
-        self.f_max = fingertip_press(believed["servo"], stiffness=t["contact"]["stiffness"], drive=believed["drive"])
+        self.f_max = fingertip_press(
+            self.hand, believed["servo"], stiffness=t["contact"]["stiffness"], drive=believed["drive"]
+        )
         # index tensors on the device: a Python list would be copied there at every use
-        self.roots, self.inner, self.outer = (torch.tensor(x, device=dev) for x in (FINGER_ROOT, INNER, OUTER))
+        pressed = [self.hand.fingers[k] for k in self.hand.others]
+        self.inner = torch.tensor([f.flexion[0] for f in pressed], device=dev)
+        self.outer = torch.tensor([f.flexion[1] for f in pressed if len(f.flexion) > 1], dtype=torch.long, device=dev)
+        closing = torch.as_tensor(self.hand.closing, dtype=torch.float32, device=dev)
+        self.root_closes, self.inner_closes = closing[self.roots], closing[self.inner]
         self.tau_max = self.effort[self.roots]
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
         train, held = t["objects"]["train"], t["objects"]["held_out"]
@@ -100,13 +102,17 @@ class GraspEnv(HandEnv):
         if t["critic"] not in ("paper", "privileged"):
             raise UserError(f"task.critic={t['critic']}: must be paper or privileged")
         self.gravity0 = torch.tensor([0.0, 0.0, -9.81], device=dev)
-        self.centre0 = torch.tensor(t["initial"]["object_xy"], device=dev)
-        self.reach = torch.tensor([0.05, 0.0, 0.0], device=dev)  # the middle of the grasp
+        where, xy, beside = self.places, t["initial"]["object_xy"], t["reward"]["centre_y"]
+        self.centre0 = torch.tensor(where.catch[:2].tolist() if xy is None else xy, device=dev)
+        self.reach = torch.tensor(where.middle.tolist(), device=dev)  # the middle of the grasp
+        self.beside = float(where.beside[1]) if beside is None else beside
         self.across = torch.tensor([0.0, 1.0, 0.0], device=dev)
         h = 0.5**0.5  # rotations that bring the body's x, y or z axis to palm y
         to_y = torch.tensor([[h, 0.0, 0.0, h], [1.0, 0.0, 0.0, 0.0], [h, -h, 0.0, 0.0]], device=dev)
         self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.scene.variants], device=dev)]
-        self.pose0 = torch.tensor([t["initial"]["pose"][j] for j in xhand.JOINTS], device=dev)
+        pose = t["initial"]["pose"]
+        angles = self.hand.pose("open").tolist() if pose is None else [pose[j] for j in self.hand.joints]
+        self.pose0 = torch.tensor(angles, device=dev)
 
         def zeros(*shape, dtype=torch.float32):
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
@@ -116,7 +122,7 @@ class GraspEnv(HandEnv):
         self.first_xy, self.z_seen, self.vz_seen = zeros(2), zeros(), zeros()
         lag = max(1, int(round(t["sensors"]["vision_delay"][1] / self.dt)) + 1)
         self.z_history, self.z_delay = zeros(lag + 1), zeros(dtype=torch.long)
-        self.torque_bias = zeros(12)
+        self.torque_bias = zeros(self.num_actions)
         self.outside_force = zeros(3)  # N on the object's body frame, on top of the random pushes (evaluation)
         self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
         self.pushes = True
@@ -136,7 +142,7 @@ class GraspEnv(HandEnv):
     def begin_episodes(self, mask: torch.Tensor) -> None:
         s, t = self.sampler, self.task
         pick = torch.searchsorted(self._cumulative, s.uniform()).clamp(max=len(self._cumulative) - 1)
-        scale = s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
+        scale = self.unit * s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
         self.objects.write(
             mask,
             self._rows[pick],
@@ -154,11 +160,11 @@ class GraspEnv(HandEnv):
         gravity = self.engine.field("opt.gravity")
         gravity.copy_(torch.where(mask[:, None], self.gravity0.to(gravity.dtype), gravity))
 
-        hand = self.pose0 + s.draw("initial.joint", 12)
+        hand = self.pose0 + s.draw("initial.joint", self.num_actions)
         hand = torch.maximum(torch.minimum(hand, self.q_high), self.q_low)
         # the drop: the lowest point of the object starts `drop` above the palm
-        xy = self.centre0 + s.draw("initial.object_xy", 2)
-        z = self.objects.radius + s.draw("initial.drop")
+        xy = self.centre0 + self.unit * s.draw("initial.object_xy", 2)
+        z = self.objects.radius + self.unit * s.draw("initial.drop") + self.rise
         pose = torch.cat([xy, z[:, None], self._orientation()], 1)
         velocity = torch.cat(
             [s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1
@@ -170,7 +176,8 @@ class GraspEnv(HandEnv):
         delay = (low + (high - low + 1) * s.uniform()).long().clamp(low, high)
         self.z_delay.copy_(torch.where(mask, delay, self.z_delay))
         self.z_seen.copy_(torch.where(mask, z, self.z_seen))
-        self.torque_bias.copy_(torch.where(mask[:, None], s.draw("sensors.torque_bias", 12), self.torque_bias))
+        bias = s.draw("sensors.torque_bias", self.num_actions)
+        self.torque_bias.copy_(torch.where(mask[:, None], bias, self.torque_bias))
         self._new_command(mask)
         self._new_push(mask)
 
@@ -223,16 +230,18 @@ class GraspEnv(HandEnv):
         """Dropped: the object's centre is below the palm or far from it."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
-        away = (p - self.reach).norm(dim=1) > limit["distance"]
+        away = (p - self.reach).norm(dim=1) > self.unit * limit["distance"]
         # while a world's gravity is turned, "below" means away from the palm
-        return {"dropped": away | (p[:, 2] < limit["below"])}
+        return {"dropped": away | (p[:, 2] < self.unit * limit["below"] + self.rise)}
 
     # -- rewards
     # ---------------------------------------------------------------------------------------------------------------
     def rewards(self) -> dict[str, torch.Tensor]:
         w, r = self.task["rewards"], self.task["reward"]
         force, contact = self.tip_force, self.tip_force > r["contact_threshold"]
-        torque = self.torque[:, self.roots]
+        torque = self.torque[:, self.roots] * self.root_closes
+        opposed, pressed = contact[:, self.opposing].any(1), contact[:, self.others]
+        aside = force[:, self.others] / self.f_max - self.command[:, None]
         out = {
             # R_force and R_torque: sum over fingers of R_i * contact_i (paper, eqs. for R_force, R_torque)
             "force": w["force"]
@@ -243,32 +252,32 @@ class GraspEnv(HandEnv):
             * terms.tracking(
                 torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact
             ),
-            # R_diff: variance of the four fingers' first joints
-            "diff": w["diff"] * self.q[:, self.inner].var(dim=1, unbiased=False),
+            # R_diff: variance of the first joints of the fingers beside the opposing one
+            "diff": w["diff"] * (self.q[:, self.inner] * self.inner_closes).var(dim=1, unbiased=False),
             # R_outter: distance of the second joints from their mid-range, not squared
             "outer": w["outer"] * (self.q[:, self.outer] - self.q_mid[self.outer]).norm(dim=1),
             "termination": w["termination"] * self._ended(),
             "action": w["action"] * (self.action - self.last_action).square().sum(1),  # R_action
             "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
             # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
-            "grip": w["grip"] * contact[:, 0] * contact[:, 1:].float().mean(1),
-            "force_near": w["force_near"]
-            * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs()).clamp(min=0).mean(1),
+            "grip": w["grip"] * opposed * pressed.float().mean(1),
+            "force_near": w["force_near"] * (1 - aside.abs()).clamp(min=0).mean(1),
             # a finger that does not touch has nothing else that says which way the object lies
-            "reach": w["reach"] * torch.exp(-self.clearance.distance[:, 1:].clamp(min=0) / r["reach_length"]).mean(1),
+            "reach": w["reach"]
+            * torch.exp(
+                -self.clearance.distance[:, self.others].clamp(min=0) / (self.unit * r["reach_length"])
+            ).mean(1),
             "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
             "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
         }
         if "worst" in w:  # checkpoints from before have neither of the two
             # the mean hides one finger that presses on nothing
-            out["worst"] = w["worst"] * (1 - (force[:, 1:] / self.f_max - self.command[:, None]).abs().amax(1)).clamp(
-                min=0
-            )
+            out["worst"] = w["worst"] * (1 - aside.abs().amax(1)).clamp(min=0)
             # an object that lies to one side is out of the reach of the outer fingers
-            out["centre"] = w["centre"] * ((self.object_pose[:, 1] - r["centre_y"]).abs() / CENTRE_LENGTH).clamp(
-                max=2.0
-            )
-        self._measure(contact)
+            out["centre"] = w["centre"] * (
+                (self.object_pose[:, 1] - self.beside).abs() / (self.unit * CENTRE_LENGTH)
+            ).clamp(max=2.0)
+        self._measure(opposed, pressed)
         return out
 
     def _ended(self) -> torch.Tensor:
@@ -277,8 +286,7 @@ class GraspEnv(HandEnv):
     # -- observations
     # ----------------------------------------------------------------------------------------------------------
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
-        s, sense = self.sampler, self.task["sensors"]
-        n = self.num_envs
+        s, sense, J = self.sampler, self.task["sensors"], self.num_actions
         z = self.object_pose[:, 2]
         if advance:
             self.z_history.copy_(torch.cat([z[:, None], self.z_history[:, :-1]], 1))
@@ -290,21 +298,22 @@ class GraspEnv(HandEnv):
         torque_max = self.effort
         actor = observations.build(
             observations.Signals(
-                joint_position=self.q + sense["joint_noise"] * s.normal(12),
-                joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(12),
+                joint_position=self.q + sense["joint_noise"] * s.normal(J),
+                joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(J),
                 object_xy=self.first_xy,
                 object_z=self.z_seen,
                 object_vz=vz,
-                touch_force=self.touch.force,
-                touch_centre=self.touch.centre,
-                fingertip=self.tips + sense["tip_noise"] * s.normal(15).reshape(n, 5, 3),
+                touch_force=self.touch.force[:, : self.pads],
+                touch_centre=self.touch.centre[:, : self.pads],
+                fingertip=self.tips + sense["tip_noise"] * s.normal(3 * self.fingers).reshape(self.tips.shape),
                 command=self.command,
             ),
             self.f_max,
         )  # the deployed loop builds its own with the same function
         critic = [
             self.q, self.torque / torque_max, self.object_pose[:, :3], self.object_velocity[:, :3],
-            self.touch.force_clean / self.f_max, self.touch.centre_clean.reshape(n, 15), self.tips.reshape(n, 15),
+            self.touch.force_clean[:, : self.pads] / self.f_max, self.touch.centre_clean[:, : self.pads].flatten(1),
+            self.tips.flatten(1),
             self.command[:, None],
         ]  # fmt: skip
         if self.task["critic"] == "privileged":
@@ -314,6 +323,10 @@ class GraspEnv(HandEnv):
             "actor": torch.where(ok, actor, torch.zeros_like(actor)),
             "critic": torch.nan_to_num(torch.cat(critic, 1)),
         }
+
+    def rows(self) -> list[tuple[str, int, str, str]]:
+        """(name, width, unit, what it is on hardware) of the actor's observation."""
+        return observations.rows(self.num_actions, self.fingers, self.pads)
 
     def _privileged(self) -> list[torch.Tensor]:
         o = self.objects
@@ -330,7 +343,7 @@ class GraspEnv(HandEnv):
 
     # -- what the log shows
     # ------------------------------------------------------------------------------------------------------
-    def _measure(self, contact: torch.Tensor) -> None:
+    def _measure(self, opposed: torch.Tensor, pressed: torch.Tensor) -> None:
         late = self.episode_length_buf * self.dt > 2.0
         count = late.sum().clamp(min=1)
 
@@ -338,9 +351,11 @@ class GraspEnv(HandEnv):
             return (x * late).sum() / count
 
         self._metrics = {
-            "task/held": mean((contact[:, 0] & contact[:, 1:].any(1)).float()),
-            "task/force_error": mean((self.tip_force[:, 1:] - self.command[:, None] * self.f_max).abs().mean(1)),
-            "task/fingers_touching": mean(contact[:, 1:].float().sum(1)),
+            "task/held": mean((opposed & pressed.any(1)).float()),
+            "task/force_error": mean(
+                (self.tip_force[:, self.others] - self.command[:, None] * self.f_max).abs().mean(1)
+            ),
+            "task/fingers_touching": mean(pressed.float().sum(1)),
             "task/force_other": mean(self.self_force.sum(1)),
         }
 
@@ -363,27 +378,28 @@ class GraspEnv(HandEnv):
             "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers",
             "reach": "ours: pads near the object",
             "worst": "ours: force_near of the finger that is furthest off",
-            "centre": f"ours: object beside the fingers' middle, over {CENTRE_LENGTH} m",
+            "centre": f"ours: object beside the fingers' middle, over {self.unit * CENTRE_LENGTH:.3g} m",
             "self": "ours: tips pressing on the hand",
         }
-        groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in OBSERVATION]}
-        critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in OBSERVATION]
+        table = self.rows()
+        groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in table]}
+        critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in table]
         if self.task["critic"] == "privileged":
-            critic += [(name, width, "privileged") for name, width in PRIVILEGED]
+            critic += [(name, width, "privileged") for name, width in privileged(self.num_actions, self.fingers)]
         groups["critic"] = critic
         act = self.task["action"]
         return {
             "observations": groups,
             "action": [
                 (j, float(lo), float(hi), f"rad ({act['mode']})")
-                for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)
+                for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
             ],
             "rewards": [(k, w, notes[k]) for k, w in r.items()],
             "terminations": [
                 (
                     "dropped",
-                    f"centre below {self.task['termination']['below']} m or {self.task['termination']['distance']} m"
-                    " away",
+                    f"centre below {self.unit * self.task['termination']['below'] + self.rise:.3g} m or"
+                    f" {self.unit * self.task['termination']['distance']:.3g} m away",
                 ),
                 ("nan", "state not finite"),
                 ("time_out", f"{self.max_episode_length} steps"),
@@ -393,7 +409,9 @@ class GraspEnv(HandEnv):
                 for name, (lo, hi, log) in self.sampler.ranges.items()
             ],
             "notes": [
-                f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[1].item():.2f} N.m (command 1)"
+                f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[self.others[0]].item():.2f} N.m"
+                " (command 1)",
+                *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
             ],
             "headline": ["task/held", "task/force_error"],
         }
@@ -410,12 +428,17 @@ class GraspEnv(HandEnv):
         of its maximum. A floor for what is learned, and a check that the physics can hold anything at all."""
         if self.task["action"]["mode"] != "relative":
             raise UserError(f"policy=scripted: moves by task.action.mode=relative, not {self.task['action']['mode']}")
-        start = dict(
-            zip((row[0] for row in OBSERVATION), np.cumsum([0, *(row[1] for row in OBSERVATION)]), strict=False)
-        )
+        start = {name: part.start for name, part in observations.slices(self.rows()).items()}
         torque, vz, command = start["joint_torque"], start["object_velocity"] + 2, start["force_command"]
-        closing = torch.zeros(self.num_actions, device=self.device)
-        closing[INNER + OUTER], closing[:3] = rate, torch.tensor([rate, 0.8 * rate, 0.8 * rate], device=self.device)
+        way, closing = approach(self.hand), np.zeros(self.num_actions)
+        for k in self.hand.others:
+            turned = list(self.hand.fingers[k].flexion[:2])
+            closing[turned] = rate * way[turned]
+        for k in self.hand.opposing:
+            finger = self.hand.fingers[k]
+            for j in finger.joints:
+                closing[j] = (0.8 if j in finger.flexion else 1.0) * rate * way[j]
+        closing = torch.as_tensor(closing, dtype=torch.float32, device=self.device)
         age = torch.zeros(self.num_envs, device=self.device)
 
         def policy(obs) -> torch.Tensor:

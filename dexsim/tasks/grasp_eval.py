@@ -1,10 +1,10 @@
 """Evaluation of the grasp task: does the hand hold, under pushes and upside down, and does it press as commanded?
 
 One episode (seconds): the object is dropped at 0; at `SETTLE` its place in the palm frame is noted; for `HOLD` seconds
-it must stay within `RADIUS` of that place, touched at every control step by the thumb and a finger. In every second
-episode a push of twice the object's weight acts for half a second within the hold, in a random direction. Then the hand
-is turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame, slowly enough
-that the turn itself adds nothing.
+it must stay within `RADIUS` of that place, touched at every control step by an opposing finger and another. In every
+second episode a push of twice the object's weight acts for half a second within the hold, in a random direction. Then
+the hand is turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame,
+slowly enough that the turn itself adds nothing.
 
 The command is constant in an episode, uniform in [0, 1] over episodes.
 """
@@ -16,12 +16,11 @@ import torch
 
 from dexsim import intervals
 
-SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m
+SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
 TURN_S, STAY_S = 0.75, 1.0
 BINS = 10
 RESAMPLES = 1000  # of the bootstrap
-FINGERS = ("index", "mid", "ring", "pinky")
 _END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
 
 
@@ -29,7 +28,7 @@ _END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
 def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     """Play `episodes` episodes, `env.num_envs` at a time, half as many again on shapes that were never trained on.
 
-    policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
+    policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
     """
     was, env.graphs = env.graphs, False  # commands, pushes and objects are not those that a recording holds
     env.rng.manual_seed(seed)
@@ -37,11 +36,11 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     trained = _play_all(env, policy, episodes, env.train_rows, progress, "trained shapes")
     held_out = _play_all(env, policy, max(episodes // 2, 1), env.held_rows, progress, "kept-out shapes")
     env.graphs = was
-    metrics = _metrics(trained, held_out, env.f_max)
+    metrics = _metrics(trained, held_out, env)
     metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
 
     def force_command(ax):
-        _force_plot(ax, trained)
+        _force_plot(ax, trained, env)
 
     def hold_by_command(ax):
         _hold_plot(ax, trained)
@@ -92,7 +91,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
     place = torch.zeros(n, 3, device=dev)
     moved, untouched = torch.zeros_like(alive), torch.zeros_like(alive)  # what went wrong within the hold
-    force, torque, samples = torch.zeros(n, 5, device=dev), torch.zeros(n, 12, device=dev), torch.zeros(n, device=dev)
+    force, torque, samples = torch.zeros_like(env.tip_force), torch.zeros_like(env.torque), torch.zeros(n, device=dev)
     shown = list(range(min(4, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]  # before an episode ends and its object is replaced
     qpos, shown_force = [], []
@@ -111,8 +110,9 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
             place.copy_(p)
             held = alive.clone()
         if t > SETTLE:
-            touched = (env.finger_force[:, 0] > 0) & (env.finger_force[:, 1:] > 0).any(1)
-            near = (p - place).norm(dim=1) <= RADIUS
+            felt = env.finger_force > 0
+            touched = felt[:, env.opposing].any(1) & felt[:, env.others].any(1)
+            near = (p - place).norm(dim=1) <= env.unit * RADIUS
             good = alive & touched & near
             if t <= SETTLE + HOLD:
                 held &= good
@@ -149,7 +149,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         force_shown, given = np.stack(shown_force, 1), command[shown].cpu().numpy()
         names = [env.scene.variants[int(v)].shape.name for v in out["shape"][shown]]
         out["frames"] = {
-            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": ("thumb", *FINGERS),
+            "model": models, "qpos": list(np.stack(qpos, 1)), "dt": dt, "names": env.hand.finger_names,
             "full": 1.2 * env.f_max,
             "label": [f"{name}, {1000 * m:.0f} g, friction"
                       f" {mu:.1f}" for name, m,
@@ -173,15 +173,15 @@ def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
     return v * c + torch.linalg.cross(axis, v) * s + axis * (axis * v).sum(1, keepdim=True) * (1 - c)
 
 
-def must_hold(r: dict, f_max: float) -> np.ndarray:
+def must_hold(r: dict, f_max: float, fingers: int) -> np.ndarray:
     """Episodes [E] whose commanded forces can carry the load: sum_i F_cmd F_max >= 2 |m (g + a_push)| / mu, summed over
-    the four fingers, a_push in its drawn direction (zero in episodes without a push)."""
-    return 4 * r["command"] * f_max >= 2 * r["load"] / r["friction"]
+    the fingers beside the opposing one, a_push in its drawn direction (zero in episodes without a push)."""
+    return fingers * r["command"] * f_max >= 2 * r["load"] / r["friction"]
 
 
-def can_carry(r: dict, f_max: float) -> np.ndarray:
+def can_carry(r: dict, f_max: float, fingers: int) -> np.ndarray:
     """Episodes [E] whose commanded forces can carry the object's weight alone: sum_i F_cmd F_max >= 2 m g / mu."""
-    return 4 * r["command"] * f_max >= 2 * r["mass"] * 9.81 / r["friction"]
+    return fingers * r["command"] * f_max >= 2 * r["mass"] * 9.81 / r["friction"]
 
 
 def _rate(ok: np.ndarray, among: np.ndarray) -> float | None:
@@ -192,12 +192,14 @@ def _corr(a: np.ndarray, b: np.ndarray) -> float | None:
     return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 1e-9 and b.std() > 1e-9 else None
 
 
-def _metrics(r: dict, k: dict, f_max: float) -> dict:
-    able, able_k = must_hold(r, f_max), must_hold(k, f_max)
+def _metrics(r: dict, k: dict, env) -> dict:
+    f_max, others = env.f_max, list(env.hand.others)
+    n = len(others)
+    able, able_k = must_hold(r, f_max, n), must_hold(k, f_max, n)
     pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
-    carried = can_carry(r, f_max)
+    carried = can_carry(r, f_max, n)
     held = r["held"].astype(bool)
-    total = r["force"][:, 1:].sum(1)
+    total, torque = _of(r["force"], others).sum(1), _flexing(r, env)
     out = {
         "episodes": int(len(held)), "episodes_kept_out": int(len(k["held"])),
         "hold_rate": _rate(r["held"], ~pushed & firm),
@@ -212,21 +214,21 @@ def _metrics(r: dict, k: dict, f_max: float) -> dict:
         "share_moved": float(r["moved"].mean()), "share_untouched": float(r["untouched"].mean()),
         "share_dropped": float(1 - r["alive"].mean()),
     }  # fmt: skip
-    for i, name in enumerate(("thumb", *FINGERS)):
+    for i, name in enumerate(env.hand.finger_names):
         out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])
     if held.sum() > 2:
-        slope, offset = np.polyfit(r["command"][held] * 4 * f_max, total[held], 1)
+        slope, offset = np.polyfit(r["command"][held] * n * f_max, total[held], 1)
         out["force_slope"], out["force_offset_N"] = float(slope), float(offset)
-        out["force_error_N"] = float(np.abs(r["force"][held, 1:] - r["command"][held, None] * f_max).mean())
+        out["force_error_N"] = float(np.abs(_of(r["force"][held], others) - r["command"][held, None] * f_max).mean())
         out["contact_force_range_N"] = [float(x) for x in np.percentile(r["force"][held].sum(1), [5, 95])]
         out["joint_torque_range_Nm"] = [
-            float(x) for x in np.percentile(r["torque"][held][:, [4, 6, 8, 10]].mean(1), [5, 95])
+            float(x) for x in np.percentile(torque[held].mean(1), [5, 95])
         ]
-        out["torque_command_correlation"] = _corr(r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1))
-        out["by_command"] = _by_command(r, held)
+        out["torque_command_correlation"] = _corr(r["command"][held], torque[held].sum(1))
+        out["by_command"] = _by_command(r, held, torque)
         out["force_command_correlation_interval"] = _corr_interval(r["command"][held], total[held])
         out["torque_command_correlation_interval"] = _corr_interval(
-            r["command"][held], r["torque"][held][:, [4, 6, 8, 10]].sum(1)
+            r["command"][held], torque[held].sum(1)
         )
     for name, part, among in (
         ("hold_rate", r, ~pushed & firm),
@@ -263,11 +265,22 @@ def _by_object(r: dict, env) -> dict[str, float | None]:
     return {str(name): _rate(r["held"], among & (names == name)) for name in np.unique(names)}
 
 
-def _by_command(r: dict, held: np.ndarray) -> dict:
+def _of(x: np.ndarray, columns: list[int]) -> np.ndarray:
+    """Columns of x, row by row in memory, so that sums do not depend on how they were picked."""
+    return np.ascontiguousarray(x[:, columns])
+
+
+def _flexing(r: dict, env) -> np.ndarray:
+    """Torque [E, K] N.m, closing, of the first flexion joint of each finger beside the opposing ones."""
+    joints = [env.hand.fingers[k].flexion[0] for k in env.hand.others]
+    return r["torque"][:, joints] * env.hand.closing[joints].astype(np.float32)
+
+
+def _by_command(r: dict, held: np.ndarray, torque: np.ndarray) -> dict:
     """Held episodes in tenths of the command: its mean, the contact force of all fingers [N] (mean, 5 and 95
-    percentile) and the torque of the four flexion joints [N.m], their mean; empty tenths left out."""
+    percentile) and the torque [E, K] of the flexion joints [N.m], their mean; empty tenths left out."""
     bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
-    total, torque = r["force"].sum(1), r["torque"][:, [4, 6, 8, 10]].mean(1)
+    total, torque = r["force"].sum(1), torque.mean(1)
     rows: dict = {"command": [], "force_N": [], "force_range_N": [], "torque_Nm": []}
     for b in range(BINS):
         m = held & (bins == b)
@@ -311,7 +324,8 @@ def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
 
 
 def _tables(r: dict, k: dict, env) -> list:
-    f_max = env.f_max
+    f_max, others = env.f_max, list(env.hand.others)
+    n, names_of = len(others), [env.hand.finger_names[i] for i in others]
     rows = []
     bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
     pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
@@ -320,15 +334,15 @@ def _tables(r: dict, k: dict, env) -> list:
         if not m.any():
             continue
         h = m & held
-        force = r["force"][h, 1:].sum(1).mean() if h.any() else float("nan")
-        error = np.abs(r["force"][h, 1:] - r["command"][h, None] * f_max).mean() if h.any() else float("nan")
+        force = r["force"][h][:, others].sum(1).mean() if h.any() else float("nan")
+        error = np.abs(r["force"][h][:, others] - r["command"][h, None] * f_max).mean() if h.any() else float("nan")
         rows.append(
             (
                 f"{b / BINS:.1f}-{(b + 1) / BINS:.1f}",
                 int(m.sum()),
                 _pct(held, m & ~pushed),
                 _pct(held, m & pushed),
-                f"{4 * f_max * (b + 0.5) / BINS:.1f}",
+                f"{n * f_max * (b + 0.5) / BINS:.1f}",
                 f"{force:.1f}",
                 f"{error:.2f}",
             )
@@ -336,13 +350,13 @@ def _tables(r: dict, k: dict, env) -> list:
     tables = [
         (
             "Hold and force by command",
-            ("F_cmd", "episodes", "held %", "held pushed %", "asked N (4 fingers)", "got N", "error N/finger"),
+            ("F_cmd", "episodes", "held %", "held pushed %", f"asked N ({n} fingers)", "got N", "error N/finger"),
             rows,
         )
     ]
     mass_edges, mu_edges = [0.03, 0.065, 0.14, 0.31], [0.4, 0.67, 0.93, 1.21]
     grid = []
-    able = must_hold(r, f_max)
+    able = must_hold(r, f_max, n)
     for a, b in zip(mass_edges[:-1], mass_edges[1:], strict=True):
         line = [f"{1000 * a:.0f}-{1000 * min(b, 0.3):.0f} g"]
         for c, d in zip(mu_edges[:-1], mu_edges[1:], strict=True):
@@ -359,13 +373,13 @@ def _tables(r: dict, k: dict, env) -> list:
     )
     by_shape = []
     for part, label in ((r, ""), (k, " (kept out)")):
-        able = must_hold(part, f_max)
+        able = must_hold(part, f_max, n)
         names = np.array([env.scene.variants[int(v)].shape.name for v in part["shape"]])
         for name in dict.fromkeys(names.tolist()):
             m = names == name
             p = part["pushed"].astype(bool)
             h = m & part["held"].astype(bool)
-            missing = [f"{100 * (part['force'][h, i + 1] < 0.1).mean():.0f}" if h.any() else "-" for i in range(4)]
+            missing = [f"{100 * (part['force'][h, i] < 0.1).mean():.0f}" if h.any() else "-" for i in others]
             by_shape.append(
                 (
                     name + label,
@@ -378,7 +392,7 @@ def _tables(r: dict, k: dict, env) -> list:
     tables.append(
         (
             "Held % by object, and % of held episodes in which a finger does not touch",
-            ("object", "episodes", "held %", "held pushed %", *FINGERS),
+            ("object", "episodes", "held %", "held pushed %", *names_of),
             by_shape,
         )
     )
@@ -389,11 +403,11 @@ def _pct(ok: np.ndarray, among: np.ndarray) -> str:
     return f"{100 * ok[among].mean():.1f}" if among.any() else "-"
 
 
-def _force_plot(ax, r: dict) -> None:
+def _force_plot(ax, r: dict, env) -> None:
     held = r["held"].astype(bool)
     c = r["command"][held]
-    for i, name in enumerate(FINGERS):
-        ax.scatter(c, r["force"][held, i + 1], s=4, alpha=0.4, label=name)
+    for i in env.hand.others:
+        ax.scatter(c, r["force"][held, i], s=4, alpha=0.4, label=env.hand.finger_names[i])
     ax.set_xlabel("force command")
     ax.set_ylabel("contact force of a finger [N]")
     ax.set_title("Measured force over command, held episodes")

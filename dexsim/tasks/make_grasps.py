@@ -7,53 +7,65 @@ and must lie still for `HOLD` seconds. The saved set is checked again by tests/t
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 from dexsim import rotation
-from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.hand.places import approach
+from dexsim.tasks.env import UNIT_SPAN, hand_of
 from dexsim.tasks.rotate import RotateEnv
-from dexsim.tasks.stable_grasps import GraspSet
+from dexsim.tasks.stable_grasps import GraspSet, held_file
 
 SETTLE, HOLD = 2.0, 2.0  # s
 DRIFT, TURN = 0.004, 0.10  # m, rad: how far a held cube may creep in HOLD seconds
 TILT = 0.26  # rad, largest tilt of a start
 TIPS = 2  # fingertips that touch a start, at least
-MIDDLE, AROUND = (0.05, 0.002), 0.03  # m: the cube's centre lies within AROUND of MIDDLE
-
-# Joint angles [rad], SDK order: where the fingers are while the cube falls onto the palm, and between which angles they
-# close (ours). The fingers curl around the face away from the wrist, the thumb lies at the side of the index finger.
-OPEN = (0.3, 0.3, 0.2, 0.0, 0.2, 0.3, 0.2, 0.3, 0.2, 0.3, 0.2, 0.3)
-CLOSED = (
-    (0.2, 1.0), (0.7, 1.5), (0.2, 1.4),
-    (-0.15, 0.15), (0.0, 0.5), (1.6, 1.9),
-    (0.0, 0.5), (1.6, 1.9), (0.0, 0.5), (1.6, 1.9), (0.0, 0.5), (1.6, 1.9),
-)  # fmt: skip
-FINGER_OF = [k for k, f in enumerate(xhand.FINGERS) for _ in xhand.JOINTS_OF_FINGER[f]]  # of each joint
-BASE = [4, 6, 8, 10]  # first flexion joints of the four fingers
-SPREAD = 0.15  # rad, by which the four fingers differ from a common bend
-CENTRE_X, CENTRE_Y = (0.035, 0.06), (-0.012, 0.018)  # m, where the cube is let go
+SIZES = (0.045, 0.06)  # m, edges of cubes for a hand of UNIT_SPAN
+AROUND = 0.03  # m: the cube's centre lies within it of the place where it fell
+# How the fingers close: to the hand's cupped pose, give or take (rad, ours), the fingers beside the opposing one alike.
+# On the xHand they curl around the face away from the wrist, the thumb lies at the side of the index finger.
+OPPOSING, SIDEWAYS, ALIKE = 0.45, 0.15, 0.25
+SPREAD = 0.15  # rad, by which those fingers differ from a common bend
+CENTRE_X, CENTRE_Y = 0.0125, 0.015  # m, either side of the hand's `catch`, where the cube is let go
 CLEARANCE = 0.01  # m, of its lowest point over the palm
 LAND, CLOSE, SPEED, LEAD = 0.4, 2.0, 1.5, 0.08  # s, s, rad/s, rad: the fingers close until their tips touch
 TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses on
 
 
-def candidates(n: int, sizes: tuple[float, float], rng: torch.Generator) -> GraspSet:
-    """n open hands, each with a cube above its palm and the joint angles (`target`) that it will close to."""
-    u = torch.rand(n, 12, generator=rng)
-    low, high = torch.tensor(CLOSED).unbind(1)
-    target = low + (high - low) * u
-    for joints in (BASE, [5, 7, 9, 11]):
-        target[:, joints] = target[:, joints[:1]] + SPREAD * (2 * u[:, joints] - 1)
+def candidates(env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator) -> GraspSet:
+    """n open hands, each with a cube (edges of sizes [m]) above its palm and the joint angles (`target`) that it will
+    close to."""
+    hand: Hand = env.hand
+    J, sign = len(hand.joints), torch.as_tensor(hand.closing, dtype=torch.float32)
+    u, common = 2 * torch.rand(n, J, generator=rng) - 1, 2 * torch.rand(n, 8, generator=rng) - 1
+    target = torch.as_tensor(hand.pose("cupped"), dtype=torch.float32).repeat(n, 1)
+    opened = torch.as_tensor(hand.pose("open"), dtype=torch.float32).repeat(n, 1)
+    for k, finger in enumerate(hand.fingers):
+        for j in finger.joints:
+            if k in hand.opposing:
+                target[:, j] += OPPOSING * u[:, j]
+            elif j in finger.flexion:
+                together = common[:, min(finger.flexion.index(j), 7)]
+                target[:, j] += sign[j] * (ALIKE * together + SPREAD * u[:, j])
+            else:
+                target[:, j] += SIDEWAYS * u[:, j]
+    limits = torch.as_tensor(hand.limits, dtype=torch.float32)
+    target = torch.maximum(torch.minimum(target, limits[:, 1]), limits[:, 0])
     edge = sizes[0] + (sizes[1] - sizes[0]) * torch.rand(n, generator=rng)
-    xy = torch.stack([lo + (hi - lo) * torch.rand(n, generator=rng) for lo, hi in (CENTRE_X, CENTRE_Y)], 1)
+    aside = torch.tensor([CENTRE_X, CENTRE_Y]) * (2 * torch.rand(n, 2, generator=rng) - 1)
+    catch = torch.as_tensor(env.places.catch, dtype=torch.float32)
     yaw = 2 * torch.pi * torch.rand(n, generator=rng)
     zero = torch.zeros(n)
     quat = torch.stack([(yaw / 2).cos(), zero, zero, (yaw / 2).sin()], 1)
-    hand = torch.tensor(OPEN).repeat(n, 1)
-    hand[:, BASE] = target[:, BASE]  # the fingers' first links stay: the cube may lie on them
-    pose = torch.cat([xy, (0.025 + CLEARANCE + edge / 2)[:, None], quat], 1)
-    return GraspSet(edge, hand, target, pose)
+    base = [hand.fingers[k].flexion[0] for k in hand.others]
+    opened[:, base] = target[:, base]  # the fingers' first links stay: the cube may lie on them
+    pose = torch.cat([
+        catch[:2] + env.unit * aside, (catch[2] + env.unit * CLEARANCE + edge / 2)[:, None], quat
+    ], 1)  # fmt: skip
+    return GraspSet(edge, opened, target, pose)
 
 
 def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
@@ -68,7 +80,9 @@ def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     still = (v.norm(dim=1) < 0.01) & (w.norm(dim=1) < 0.1) & (env.qd.abs().amax(1) < 0.2)
     flat = rotation.tilt(end.pose[:, 3:], env.axis) < TILT
     touched = (env.tip_force > 0.02).sum(1) >= TIPS
-    inside = (end.pose[:, 2] > 0.03) & (end.pose[:, :2] - torch.tensor(MIDDLE)).norm(dim=1).lt(AROUND)
+    catch = torch.as_tensor(env.places.catch, dtype=torch.float32)
+    near = (end.pose[:, :2] - catch[:2]).norm(dim=1) < env.unit * AROUND
+    inside = near & (end.pose[:, 2] > catch[2] + 0.005 * env.unit)
     return end, still & flat & touched & inside & ~env.nan
 
 
@@ -78,7 +92,7 @@ def holds(env, start: GraspSet) -> torch.Tensor:
     ok = torch.ones(len(start), dtype=torch.bool)
     for _ in range(int(round(HOLD / env.dt))):
         _play(env, env.dt)
-        ok &= (env.object_pose[:, :3] - start.pose[:, :3]).norm(dim=1) < DRIFT
+        ok &= (env.object_pose[:, :3] - start.pose[:, :3]).norm(dim=1) < env.unit * DRIFT
         ok &= rotation.error(env.object_pose[:, 3:], start.pose[:, 3:]) < TURN
     return ok & ((env.tip_force > 0.02).sum(1) >= 1) & ~env.nan
 
@@ -90,16 +104,19 @@ def _begin(env, start: GraspSet) -> None:
 
 
 def _play(env, seconds: float, towards: torch.Tensor | None = None) -> None:
-    """Physics and servo alone: no episode ends. With `towards` [N, 12] every finger moves there at SPEED, at most LEAD
+    """Physics and servo alone: no episode ends. With `towards` [N, J] every finger moves there at SPEED, at most LEAD
     ahead of its joints, until its tip touches the cube; without, the targets stay."""
-    touched = torch.zeros(env.num_envs, 5, dtype=torch.bool)
+    touched = torch.zeros(env.num_envs, env.fingers + 1, dtype=torch.bool)
+    finger = torch.tensor([k if k >= 0 else env.fingers for k in env.hand.finger_of_joint])  # the last: of none
+    press = PRESS * torch.as_tensor(approach(env.hand), dtype=torch.float32)
     for _ in range(int(round(seconds / env.dt))):
         if towards is not None:
             target = env.target + (towards - env.target).clamp(-SPEED * env.dt, SPEED * env.dt)
             target = torch.maximum(torch.minimum(target, env.q + LEAD), env.q - LEAD)
-            first = (env.tip_force > TOUCH) & ~touched
-            target = torch.where(touched[:, FINGER_OF], env.target, target)
-            target = torch.where(first[:, FINGER_OF], env.q + PRESS, target)
+            first = torch.zeros_like(touched)
+            first[:, :-1] = (env.tip_force > TOUCH) & ~touched[:, :-1]
+            target = torch.where(touched[:, finger], env.target, target)
+            target = torch.where(first[:, finger], env.q + press, target)
             touched |= first
             env.target.copy_(torch.maximum(torch.minimum(target, env.q_high), env.q_low))
         env.servo.send(env.target)
@@ -107,15 +124,43 @@ def _play(env, seconds: float, towards: torch.Tensor | None = None) -> None:
         env.read_state()
 
 
+def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:
+    """Something for the worlds to begin with: open hands, cubes well above them."""
+    hand = hand_of(cfg)
+    opened = torch.as_tensor(hand.pose("open"), dtype=torch.float32).repeat(n, 1)
+    pose = torch.tensor([0.0, 0.0, 3 * hand.span, 1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    return GraspSet(torch.full((n,), float(sizes[1])), opened, opened.clone(), pose)
+
+
+def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report=print) -> None:
+    """The held poses of a config's hand are there: else they are searched for and kept in the hand's folder. Raises
+    UserError."""
+    hand = hand_of(cfg)
+    file = held_file(hand)
+    if file.is_file() or hand.file.held_cubes is not None:
+        return
+    if not os.access(file.parent, os.W_OK):
+        raise UserError(
+            f"hand={hand.name}: has no held poses for task=rotate to begin with, and {file.parent} cannot be written;"
+            f" make them with dexsim stable-grasps hand={hand.folder} out=FILE and give task.initial.poses=FILE"
+        )
+    report(f"no held poses of hand={hand.name} yet: looking for {count}, to be kept in {file} ...")
+    plain = cfg | {"hand_mirror": False, "hand_scale": 1.0, "reality": {"name": "none"}}
+    one = hand.span / hand.scale / UNIT_SPAN
+    poses = generate(plain, count, worlds, seed, (one * SIZES[0], one * SIZES[1]), report)
+    new = file.with_name(f".{file.stem}.new.npz")
+    poses.save(new)
+    new.replace(file)
+
+
 def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report=print) -> GraspSet:
-    """At least `count` held poses, made on the CPU by C MuJoCo."""
+    """At least `count` held poses, made on the CPU by C MuJoCo. sizes: edges of the cubes [m]. Raises UserError."""
     rng = torch.Generator().manual_seed(seed)
-    first = candidates(worlds, sizes, rng)
-    env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=first)
+    env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=_waiting(cfg, worlds, sizes))
     found: list[GraspSet] = []
     total = tried = 0
     while total < count:
-        rest, fit = settle(env, candidates(worlds, sizes, rng) if tried else first)
+        rest, fit = settle(env, candidates(env, worlds, sizes, rng))
         tried += worlds
         for _ in range(2):  # two draws of mass, friction and drives
             fit &= holds(env, rest)
@@ -123,5 +168,8 @@ def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, 
         total += int(fit.sum())
         report(f"{total} held of {tried} tried")
         if tried >= 4096 and total < tried / 2000:
-            raise UserError(f"only {total} of {tried} candidates held: sizes={list(sizes)} do not fit this hand")
+            raise UserError(
+                f"hand={env.hand.name}: only {total} of {tried} cubes of {list(sizes)} m were held: look at"
+                " poses.cupped, opposing and places.catch of its hand.yaml, or give sizes=[low,high] that fit the hand"
+            )
     return GraspSet.join(found)[torch.arange(count)]

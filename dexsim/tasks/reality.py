@@ -23,9 +23,8 @@ import numpy as np
 import torch
 import yaml
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.paths import CONFIGS
+from dexsim.hand import Hand, load_hand
 from dexsim.tasks.servos import RELATIVE
 
 CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
@@ -83,8 +82,14 @@ class Reality:
     step `substeps`, `late` and `read`. Runs on the CPU.
     """
 
-    def __init__(self, cfg: dict[str, Any], rng: torch.Generator):
-        self.cfg, self.rng = cfg, rng
+    def __init__(self, cfg: dict[str, Any], rng: torch.Generator, hand: Hand):
+        self.cfg, self.rng, self.hand = cfg, rng, hand
+        given = len(cfg["contact"]["friction_by_finger"])
+        if given != len(hand.fingers):
+            raise UserError(
+                f"reality={cfg['name']}: its friction_by_finger is of {given} fingers, hand={hand.name} has"
+                f" {len(hand.fingers)}; draw one for this hand: python -m dexsim.tasks.reality"
+            )
         self.last: torch.Tensor | None = None
         for key, known in (("cone", CONES), ("solver", SOLVERS)):
             if cfg["solver"][key] not in known:
@@ -96,7 +101,7 @@ class Reality:
         o.cone, o.solver = CONES[self.cfg["solver"]["cone"]], SOLVERS[self.cfg["solver"]["solver"]]
         o.tolerance = self.cfg["solver"]["tolerance"]
         for geom in spec.geoms:
-            if geom.name in xhand.TIP_GEOMS:
+            if geom.name in self.hand.tip_geoms:
                 geom.solimp = c["tip_solimp"]
                 geom.condim = 6
                 geom.friction = [geom.friction[0], c["torsional"], c["rolling"]]
@@ -105,9 +110,9 @@ class Reality:
 
     def friction_factor(self, model: mujoco.MjModel, geoms: list[int]) -> torch.Tensor:
         """Friction of each hand geom over the world's, [G]: by finger, 1 elsewhere."""
-        by = dict(zip(xhand.FINGERS, self.cfg["contact"]["friction_by_finger"], strict=True))
-        names = [model.geom(g).name for g in geoms]
-        return torch.tensor([by.get(n.removeprefix("tip_"), 1.0) if n.startswith("tip_") else 1.0 for n in names])
+        shares = self.cfg["contact"]["friction_by_finger"]
+        by = {g: x for f, x in zip(self.hand.fingers, shares, strict=True) for g in f.geoms}
+        return torch.tensor([by.get(model.geom(g).name, 1.0) for g in geoms])
 
     def substeps(self, nominal: int) -> int:
         """Physics steps of this control period: nominal, give or take `timing.jitter` of it, the same on average."""
@@ -132,15 +137,17 @@ class Reality:
         env.torque.copy_(torch.round(env.torque * s["torque_scale"] / s["torque_step"]) * s["torque_step"])
 
 
-def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
-    """The numbers of another world, all from one seed. servo: the nominal table (dexsim/configs/servo/xhand.yaml)."""
+def draw(seed: int, servo: dict[str, Any], hand: Hand | None = None) -> dict[str, Any]:
+    """The numbers of another world, all from one seed. servo: the nominal table (the hand's servo file);
+    hand: whose (the xHand)."""
+    hand = hand or load_hand("xhand")
     rng = np.random.default_rng(seed)
 
     def u(low: float, high: float, digits: int = 4) -> float:
         return float(f"{rng.uniform(low, high):.{digits}g}")
 
     joints = {}
-    for joint in xhand.JOINTS:
+    for joint in hand.joints:
         base = servo["joints"]["*"] | servo["joints"].get(joint, {})
         dry = base["coulomb_friction"] * rng.uniform(1.0, 2.2)
         joints[joint] = {
@@ -167,7 +174,7 @@ def draw(seed: int, servo: dict[str, Any]) -> dict[str, Any]:
             "tip_solimp": [u(0.85, 0.92), u(0.975, 0.99), u(0.0008, 0.002), 0.5, 2.0],
             "hand_solref": [u(0.008, 0.015), u(0.8, 1.2)],
             "torsional": u(0.002, 0.006), "rolling": u(5e-5, 3e-4),
-            "friction_by_finger": [u(0.8, 1.15) for _ in xhand.FINGERS],
+            "friction_by_finger": [u(0.8, 1.15) for _ in hand.fingers],
         },
         "servo": {"drive": "torque", "joints": joints, "current_per_torque": "unknown", "loop_encoder": "joint",
                   "position_encoder": "joint"},
@@ -212,19 +219,20 @@ def text(world: dict[str, Any]) -> str:
 
 def main(argv: list[str]) -> int:
     """`seed=N out=PATH`: draw a world and write its file."""
-    own: dict[str, Any] = {"seed": 20261121, "out": None}
+    own: dict[str, Any] = {"seed": 20261121, "out": None, "hand": "xhand"}
     for item in argv:
         key, eq, value = item.partition("=")
         if not eq or key not in own:
-            raise UserError(f"{item!r}: the settings are seed=N and out=PATH")
+            raise UserError(f"{item!r}: the settings are seed=N, out=PATH and hand=NAME or PATH")
         own[key] = yaml.safe_load(value) if key == "seed" else value
     if not isinstance(own["seed"], int) or own["seed"] < 0:
         raise UserError(f"seed={own['seed']}: must be a whole number from 0 up")
     if own["out"] is None:
         raise UserError("out=PATH: say where to write the world, e.g. out=dexsim/configs/reality/bench.yaml")
-    servo = yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+    hand = load_hand(own["hand"])
+    servo = yaml.safe_load(hand.servo_path.read_text(encoding="utf-8"))
     out = Path(own["out"]).expanduser()
-    world = draw(own["seed"], servo)
+    world = draw(own["seed"], servo, hand)
     world["name"] = out.stem
     out.write_text(text(world), encoding="utf-8")
     print(f"world    {out}")

@@ -15,32 +15,35 @@ import math
 import torch
 
 from dexsim import rotation
-from dexsim.assets import xhand
 from dexsim.deploy import observations_rotate as observations
-from dexsim.deploy.observations_rotate import ACTOR, ORIENTATION
+from dexsim.deploy.observations_rotate import ORIENTATION
 from dexsim.errors import UserError
-from dexsim.tactile.layout import xhand_layout
+from dexsim.hand.skin import tip_skins
+from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
-from dexsim.tasks.stable_grasps import GraspSet
+from dexsim.tasks.stable_grasps import GraspSet, held_poses
 
-CRITIC = (  # beyond the actor's rows, which the critic gets clean and whole
-    ("object_orientation", 6, "1", "6D, palm frame"),
-    ("fingertip_velocity", 30, "m/s, rad/s", "linear and angular of each"),
-    ("fingertip_rotation", 30, "1", "6D of each"),
-    ("joint_velocity", 12, "rad/s", ""),
-    ("object_velocity", 3, "m/s", ""),
-    ("object_spin", 3, "rad/s", ""),
-)
-ACTOR_SIZE = sum(row[1] for row in ACTOR)
-CRITIC_SIZE = ACTOR_SIZE + sum(row[1] for row in CRITIC)
-assert (ACTOR_SIZE, CRITIC_SIZE) == (65, 149)
 
-PRIVILEGED = (  # with task.critic=privileged, ours
-    ("drift", 3), ("object_size", 1), ("object_mass", 1), ("object_com", 3), ("object_friction", 1),
-    ("contact_damping", 1),
-    ("finger_force", 5), ("palm_force", 1), ("torque", 12), ("target_error", 12),
-)  # fmt: skip
+def critic(joints: int, fingers: int) -> tuple[tuple[str, int, str, str], ...]:
+    """(name, width, unit, what) of what the critic sees beyond the actor's rows, which it gets clean and whole."""
+    return (
+        ("object_orientation", 6, "1", "6D, palm frame"),
+        ("fingertip_velocity", 6 * fingers, "m/s, rad/s", "linear and angular of each"),
+        ("fingertip_rotation", 6 * fingers, "1", "6D of each"),
+        ("joint_velocity", joints, "rad/s", ""),
+        ("object_velocity", 3, "m/s", ""),
+        ("object_spin", 3, "rad/s", ""),
+    )
+
+
+def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
+    """(name, width) of what else it sees with task.critic=privileged, ours."""
+    return (
+        ("drift", 3), ("object_size", 1), ("object_mass", 1), ("object_com", 3), ("object_friction", 1),
+        ("contact_damping", 1),
+        ("finger_force", fingers), ("palm_force", 1), ("torque", joints), ("target_error", joints),
+    )  # fmt: skip
 
 
 class RotateEnv(HandEnv):
@@ -64,12 +67,12 @@ class RotateEnv(HandEnv):
         super().__init__(cfg, n_worlds, device, seed, engine)
 
     def setup(self) -> None:
-        t, n, dev = self.task, self.num_envs, self.device
+        t, n, dev, F = self.task, self.num_envs, self.device, self.fingers
         self._check()
         self.servo_random = ServoRandomizer(self.servo, self.sampler)
-        edges = self.sampler.range("object.size")[:2]
+        edges = [self.unit * x for x in self.sampler.range("object.size")[:2]]
         if self.grasps is None:
-            self.grasps = GraspSet.load(t["initial"]["poses"]).within(*edges).to(dev)
+            self.grasps = held_poses(self.hand, t["initial"]["poses"]).within(*edges).to(dev)
         self.box = [v.shape.name for v in self.scene.variants].index("box")
         self.box_row = torch.full((n,), self.box, device=dev)
         self.box_half = self.objects.primitive_size(self.box_row[:1], torch.ones(1, 3, device=dev))
@@ -90,24 +93,29 @@ class RotateEnv(HandEnv):
         self.last_done = zeros(dtype=torch.long)  # successes of each world's last ended episode
         self.reached, self.dropped, self.tipped, self.nan_end = (zeros(dtype=torch.bool) for _ in range(4))
         self.d_rot, self.d_pos = zeros(), zeros()
-        self.tip_rot, self.tip_last, self.tip_rot_last = zeros(5, 3, 3), zeros(5, 3), zeros(5, 3, 3)
-        self.tip_velocity = zeros(5, 6)
+        self.tip_rot, self.tip_last, self.tip_rot_last = zeros(F, 3, 3), zeros(F, 3), zeros(F, 3, 3)
+        self.tip_velocity = zeros(F, 6)
         lag = max(1, math.ceil(self.sampler.range("imu.delay")[1] / self.dt) + 1)
         self.imu_past, self.imu_delay = zeros(lag + 1, 4), zeros(dtype=torch.long)
         self.imu_past[..., 0] = 1.0
         self.heading, self.heading_rate, self.goal_heading, self.imu_tilt = zeros(), zeros(), zeros(), zeros(3)
         self.seen = zeros(4)
         self.seen[:, 0] = 1.0
-        self.joint_bias = zeros(12)
+        self.joint_bias = zeros(self.num_actions)
         observe = t["observe"]
-        frame = sum(row[1] for row in observations.rows(t, frames=1))
+        frame = sum(row[1] for row in observations.rows(t, *self.sizes, frames=1))
         self.past = zeros(t["history"], frame) if t["perception"] == "proprioception" else None
         self.taxel_point = None
         if not observe["force_weighted"]:
-            layout = xhand_layout()
-            felt = layout.lifted([xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]) if self.touch.cfg.lift else layout
-            self.taxel_point = torch.as_tensor(felt.point, dtype=torch.float32, device=dev)  # [5, T, 3], link frame
+            layout = hand_layout(self.hand) or tip_layout(self.hand)
+            felt = layout.lifted(tip_skins(self.hand)) if self.touch.cfg.lift and self.pads else layout
+            self.taxel_point = torch.as_tensor(felt.point, dtype=torch.float32, device=dev)  # [F, T, 3], link frame
             self.pad_centre = torch.as_tensor(layout.centre(), dtype=torch.float32, device=dev)
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Joints, fingers and touch pads."""
+        return self.num_actions, self.fingers, self.pads
 
     def _check(self) -> None:
         t = self.task
@@ -195,7 +203,7 @@ class RotateEnv(HandEnv):
         gravity = self.engine.field("opt.gravity")
         gravity.copy_(torch.where(m1, self.gravity.to(gravity.dtype), gravity))
         pose = g.pose[pick]
-        hand, target = g.hand[pick], g.target[pick] + s.draw("initial.target", 12)
+        hand, target = g.hand[pick], g.target[pick] + s.draw("initial.target", self.num_actions)
         target = torch.maximum(torch.minimum(target, self.q_high), self.q_low)
         self.place(mask, hand, pose, torch.zeros_like(self.object_velocity), target)
 
@@ -206,7 +214,7 @@ class RotateEnv(HandEnv):
         self.heading_rate.copy_(torch.where(mask, s.draw("imu.heading_rate"), self.heading_rate))
         self.imu_tilt.copy_(torch.where(m1, s.draw("imu.tilt", 3), self.imu_tilt))
         self.imu_tilt[:, 2] = 0.0  # heading has its own drift
-        self.joint_bias.copy_(torch.where(m1, s.draw("sensors.joint_bias", 12), self.joint_bias))
+        self.joint_bias.copy_(torch.where(m1, s.draw("sensors.joint_bias", self.num_actions), self.joint_bias))
         delay = (s.draw("imu.delay") / self.dt).round().long()
         self.imu_delay.copy_(torch.where(mask, delay, self.imu_delay))
 
@@ -238,7 +246,8 @@ class RotateEnv(HandEnv):
         `tilt` away from the axis."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
-        self.dropped.copy_(((p - self.home).norm(dim=1) > limit["distance"]) | (p[:, 2] < limit["below"]))
+        away = (p - self.home).norm(dim=1) > self.unit * limit["distance"]
+        self.dropped.copy_(away | (p[:, 2] < self.unit * limit["below"] + self.rise))
         self.tipped.copy_(self._tilt_from_goal() > limit["tilt"])
         self.nan_end.copy_(self.nan)
         return {"dropped": self.dropped, "tipped": self.tipped}
@@ -262,9 +271,12 @@ class RotateEnv(HandEnv):
         self.d_pos.copy_((self.object_pose[:, :3] - self.home).norm(dim=1))
         # goal: 1 / (|d_rot| + eps) * 1 / (1 + exp(alpha (d_goal - delta_dist))), table "Reward for in-hand object
         # rotation"
-        close = 1 / (self.d_rot.abs() + r["epsilon"]) * torch.sigmoid(-r["alpha"] * (self.d_pos - r["delta_dist"]))
+        close = 1 / (self.d_rot.abs() + r["epsilon"]) * torch.sigmoid(
+            -r["alpha"] * (self.d_pos / self.unit - r["delta_dist"])
+        )
         lost = self.dropped | self.tipped  # `terminated` comes first
-        self.reached.copy_((self.d_rot < r["delta_rot"]) & (self.d_pos < r["delta_pos"]) & ~self.nan & ~lost)
+        there = (self.d_rot < r["delta_rot"]) & (self.d_pos < self.unit * r["delta_pos"])
+        self.reached.copy_(there & ~self.nan & ~lost)
         out = {
             "goal": w["goal"] * close,
             "action": w["action"] * (self.action - self.last_action).square().sum(1),
@@ -306,21 +318,22 @@ class RotateEnv(HandEnv):
             self._feel_motion(fresh)
             if t["perception"] != "proprioception":
                 self._read_imu(fresh)
-        angle = self.q + self.joint_bias + sense["joint_noise"] * s.normal(12)
+        angle = self.q + self.joint_bias + sense["joint_noise"] * s.normal(self.num_actions)
+        P, F = self.pads, self.fingers
         force, centre = self._felt()
-        tips, sent = self.tips.reshape(n, 15), self._last_action()
+        tips, sent = self.tips.flatten(1), self._last_action()
         imu = t["perception"] != "proprioception"
         past = tips[:, None, :0] if imu else self.past
         actor = observations.build(
             observations.Signals(
                 joint_position=angle,
-                joint_velocity=self.qd if imu else self.qd + sense["velocity_noise"] * s.normal(12),
+                joint_velocity=self.qd if imu else self.qd + sense["velocity_noise"] * s.normal(self.num_actions),
                 orientation=self.seen,
                 goal=self._goal_seen(),
                 sent=sent,
                 touch_force=force,
                 touch_centre=centre,
-                fingertip=tips + sense["tip_noise"] * s.normal(15) if imu else tips,
+                fingertip=tips + sense["tip_noise"] * s.normal(3 * F) if imu else tips,
                 past=past,
                 fresh=fresh,
             ),
@@ -332,8 +345,8 @@ class RotateEnv(HandEnv):
         q = self.object_pose[:, 3:]
         critic = [
             self.q, rotation.six(rotation.multiply(rotation.conjugate(q), self.goal)), sent,
-            self.touch.centre_clean.reshape(n, 15), self.touch.force_clean, tips,
-            rotation.six(q), self.tip_velocity.reshape(n, 30), rotation.six_of_matrix(self.tip_rot).reshape(n, 30),
+            self.touch.centre_clean[:, :P].flatten(1), self.touch.force_clean[:, :P], tips,
+            rotation.six(q), self.tip_velocity.flatten(1), rotation.six_of_matrix(self.tip_rot).reshape(n, 6 * F),
             self.qd,
             self.object_velocity[:, :3], self._spin(),
         ]  # fmt: skip
@@ -354,7 +367,7 @@ class RotateEnv(HandEnv):
         return {"actor": actor, "critic": torch.nan_to_num(torch.cat(critic, 1))}
 
     def _last_action(self) -> torch.Tensor:
-        """What was last sent to the drives [N, 12]; see `observations_rotate.sent`."""
+        """What was last sent to the drives [N, J]; see `observations_rotate.sent`."""
         return observations.sent(
             self.action, self.target, self.q_mid, self.q_half, self.task["observe"].get("last_action", "step")
         )
@@ -402,18 +415,18 @@ class RotateEnv(HandEnv):
         return observations.relative(self.seen, self._goal_seen(), self.task["observe"]["orientation"])
 
     def _felt(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Contact force [N, 5] N and centre [N, 15] m as the actor has them."""
-        centre = self.touch.centre.reshape(self.num_envs, 15) if self.taxel_point is None else self._plain_centre()
-        return self.touch.force, centre
+        """Contact force [N, P] N and centre [N, 3 P] m as the actor has them."""
+        centre = self.touch.centre.flatten(1) if self.taxel_point is None else self._plain_centre()
+        return self.touch.force[:, : self.pads], centre[:, : 3 * self.pads]
 
     def _plain_centre(self) -> torch.Tensor:
-        """Contact centres [N, 15] without force weighting: the mean position of the taxels that feel anything."""
+        """Contact centres [N, 3 F] without force weighting: the mean position of the taxels that feel anything."""
         on = (self.touch.raw > 0).float()
         count = on.sum(-1, keepdim=True)
         mean = torch.einsum("nft,ftc->nfc", on, self.taxel_point) / count.clamp(min=1)
         local = torch.where(count > 0, mean, self.pad_centre)
         pos, rot = self.engine.t.xpos[:, self.tip_body].float(), self.engine.t.xmat[:, self.tip_body].float()
-        return (pos + (rot @ local[..., None])[..., 0]).reshape(self.num_envs, 15)
+        return (pos + (rot @ local[..., None])[..., 0]).flatten(1)
 
     # -- what the log shows
     # ------------------------------------------------------------------------------------------------------
@@ -444,21 +457,24 @@ class RotateEnv(HandEnv):
             "torque": "ours: motor torque",
             "other": "ours: touched by palm or links",
         }
-        critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in ACTOR] + [row[:3] for row in CRITIC]
+        whole = [row for row in observations.actor(*self.sizes) if row[1]]
+        seen = [(name, width, f"{unit}; clean") for name, width, unit, _ in whole]
+        seen += [row[:3] for row in critic(*self.sizes[:2])]
         if t["critic"] == "privileged":
-            critic += [(name, width, "privileged") for name, width in PRIVILEGED]
+            seen += [(name, width, "privileged") for name, width in privileged(*self.sizes[:2])]
         limit, r = t["termination"], t["reward"]
-        actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in observations.rows(t)]
+        actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in observations.rows(t, *self.sizes)]
         edge = 1000 * self.grasps.edge
         return {
-            "observations": {"actor": actor, "critic": critic},
+            "observations": {"actor": actor, "critic": seen},
             "action": [
                 (j, float(lo), float(hi), f"rad ({t['action']['mode']})")
-                for j, lo, hi in zip(xhand.JOINTS, self.q_low.tolist(), self.q_high.tolist(), strict=True)
+                for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
             ],
             "rewards": [(k, w, notes[k]) for k, w in t["rewards"].items() if w],
             "terminations": [
-                ("dropped", f"centre {limit['distance']} m from its start or below {limit['below']} m"),
+                ("dropped", f"centre {self.unit * limit['distance']:.3g} m from its start or below"
+                 f" {self.unit * limit['below'] + self.rise:.3g} m"),
                 ("tipped", f"{limit['tilt']} rad away from lying on its face"),
                 ("nan", "state not finite"),
                 ("time_out", f"{self.max_episode_length} steps"),
@@ -469,7 +485,9 @@ class RotateEnv(HandEnv):
             ],
             "notes": [
                 f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
-                f"reached: rotation error below {r['delta_rot']} rad and drift below {r['delta_pos']} m",
+                f"reached: rotation error below {r['delta_rot']} rad and drift below"
+                f" {self.unit * r['delta_pos']:.3g} m",
+                *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
             ],
         }
 

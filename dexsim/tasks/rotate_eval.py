@@ -33,7 +33,7 @@ HEADER = (
 def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     """Play `episodes` trials, `env.num_envs` at a time.
 
-    policy: TensorDict of observations -> actions [N, 12]. Returns {"metrics", "tables", "frames", "plots"}.
+    policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
     """
     env.end_curriculum()
     env.rng.manual_seed(seed)
@@ -141,7 +141,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     if shown:
         stop = [max(1, min(len(qpos), int(end_step[w]) - 1)) for w in shown]  # the end's own frame is the next trial's
         out["frames"] = {
-            "model": models, "dt": dt, "names": ("thumb", "index", "mid", "ring", "pinky"), "full": 5.0,
+            "model": models, "dt": dt, "names": env.hand.finger_names, "full": 5.0,
             "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
             "label": [f"{edge[w]:.0f} mm, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
                       for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
@@ -156,8 +156,8 @@ def row_of(env) -> tuple[str, ...]:
     o = env.task["observe"]
     none = env.task["perception"] == "proprioception"
     return (
-        *("yes" if o[k] else "-" for k in ("contact_centre", "contact_force")),
-        "yes" if o["contact_centre"] and o["force_weighted"] else "-",
+        *("yes" if o[k] and env.pads else "-" for k in ("contact_centre", "contact_force")),
+        "yes" if o["contact_centre"] and o["force_weighted"] and env.pads else "-",
         {"6d": "6D", "quaternion": "Quaternion", "none": "-"}["none" if none else o["orientation"]],
     )
 

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from dexsim import rotation
-from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.tactile.layout import xhand_layout
+from dexsim.hand.skin import tip_skins
+from dexsim.tactile.layout import hand_layout
 from dexsim.tasks.patches import Patches
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import FINGERTIPS, GraspSet
@@ -54,8 +54,13 @@ class FingertipEnv(RotateEnv):
     def setup(self) -> None:
         t, n, dev = self.task, self.num_envs, self.device
         if self.grasps is None and t["initial"]["poses"] is None:
-            edges = self.sampler.range("object.size")[:2]
-            self.grasps = GraspSet.load(FINGERTIPS).within(*edges).to(dev)
+            edges, hand = [self.unit * x for x in self.sampler.range("object.size")[:2]], self.hand
+            if hand.name != "xhand":
+                raise UserError(
+                    f"hand={hand.name}: has no cubes held by fingertips for this task to begin with; give"
+                    " task.initial.poses=FILE"
+                )
+            self.grasps = GraspSet.load(FINGERTIPS).derived(hand.mirror, hand.scale).within(*edges).to(dev)
         self._check_fingertips()
         super().setup()
 
@@ -66,9 +71,11 @@ class FingertipEnv(RotateEnv):
         if t["observe"]["taxels"] is not None:
             if self.taxel_point is not None:
                 raise UserError("task.observe.taxels: needs task.observe.force_weighted=true")
-            layout = xhand_layout()
+            layout = hand_layout(self.hand)
+            if layout is None:
+                raise UserError(f"task.observe.taxels: hand={self.hand.name} has no touch pads; use null")
             if self.touch.cfg.lift:
-                layout = layout.lifted([xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS])
+                layout = layout.lifted(tip_skins(self.hand))
             self.patches = Patches(layout, t["observe"]["taxels"], dev)
         self.gravity = self.gravity.expand(n, 3).clone()
         self.palm = zeros(dtype=torch.long)
@@ -259,7 +266,7 @@ class FingertipEnv(RotateEnv):
             return super()._felt()
         force, local = self.patches.read(self.touch.raw)
         pos, rot = self.engine.t.xpos[:, self.tip_body].float(), self.engine.t.xmat[:, self.tip_body].float()
-        return force, (pos + (rot @ local[..., None])[..., 0]).reshape(self.num_envs, 15)
+        return force, (pos + (rot @ local[..., None])[..., 0]).flatten(1)
 
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
         out = super().observe(advance)

@@ -1,4 +1,4 @@
-"""A simulated xHand behind the SDK's fields: units, signs, rounding, rates and latency of the real one, physics of
+"""A simulated hand behind the SDK's fields: units, signs, rounding, rates and latency of the real one, physics of
 training.
 
 `SimulatedHand` is the hand on its bench, in simulated time. `SimulatedXHand` is the driver: with a real clock the hand
@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.calibration.file import Calibration
-from dexsim.deploy.driver import PASSIVE, POSITION, TAXELS, Clock, HandCommand, HandState
+from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandState
 from dexsim.errors import UserError
+from dexsim.tactile.layout import touch_shape
+from dexsim.tasks.env import hand_of
 
 POSITION_LSB = 2 * np.pi / 4096
 """rad a count of the hand's 12-bit encoders."""
@@ -70,18 +71,19 @@ class SimulatedHand:
             cfg["task"]["objects"]["held_out"] = [s for s in cfg["task"]["objects"]["held_out"] if s != shape] or [
                 "box"
             ]
+        grasps = None
         if grip is not None:
-            cfg["task"]["initial"]["poses"] = None  # the file need not be here: the bundle says which pose
-        self.env = make_env(cfg, 1, "cpu", seed, "mujoco")
+            from dexsim.tasks.stable_grasps import GraspSet
+
+            rows = (grip["object_edge_m"], grip["hand"], grip["target"], grip["object_pose"])
+            grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows))
+        self.env = make_env(cfg, 1, "cpu", seed, "mujoco", grasps)
+        self.taxels = touch_shape(self.env.hand)
         self.calibration, self.noise = calibration, float(config["task"]["sensors"].get("vision_z_noise", 0.0))
         self.rng = np.random.default_rng(seed)
         env, self._torch = self.env, torch
         self.imu = None
         if grip is not None:
-            from dexsim.tasks.stable_grasps import GraspSet
-
-            rows = (grip["object_edge_m"], grip["hand"], grip["target"], grip["object_pose"])
-            env.grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows))
             env.reset_all()
             self.imu = SimulatedImu(config, env, self.rng)
         self.time, self.sequence, self.held = 0.0, 0, True
@@ -100,7 +102,7 @@ class SimulatedHand:
     def lie_flat(self) -> None:
         """The hand open and free, as it is before anybody drives it; the object waits over it."""
         env, torch = self.env, self._torch
-        q = torch.as_tensor(np.clip(np.full(12, 0.05), *xhand.joint_limits().T))[None]
+        q = torch.as_tensor(np.clip(np.full(env.num_actions, 0.05), *env.hand.limits.T))[None]
         env.engine.t.qpos[:, env.joint_q] = q.to(env.engine.t.qpos.dtype)
         env.engine.t.qvel.zero_()
         env.servo.reset(None, q)
@@ -192,15 +194,17 @@ class SimulatedHand:
         current = np.clip(
             np.round(1e3 * self.calibration.current(env.torque[0].double().numpy())), -32768, 32767
         ).astype(np.int16)
-        tactile = np.zeros(TAXELS, np.int16)
-        if env.touch.raw3 is not None:
+        tactile = np.zeros((*self.taxels, 3), np.int16)
+        if not tactile.size:
+            pass
+        elif env.touch.raw3 is not None:
             counts = env.touch.raw3[0].double().numpy() / (self.calibration.lsb * self.calibration.axis_sign)
             tactile[:] = np.clip(np.round(counts), [-128, -128, 0], [127, 127, 255])
         else:
             tactile[..., 2] = np.clip(np.round(env.touch.raw[0].double().numpy() / self.calibration.lsb), 0, 255)
         speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
-        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(12, 30.0),
-                         np.zeros(12, np.int64), tactile,
+        return HandState(now, self.sequence, position.astype(np.float32), current, np.full(len(position), 30.0),
+                         np.zeros(len(position), np.int64), tactile,
                          np.clip(speed, -32.768, 32.767))  # fmt: skip
 
 
@@ -337,29 +341,30 @@ def choose_gl() -> str:
 
 # -- the driver
 # -----------------------------------------------------------------------------------------------------------------
-# time, sequence, position, current, temperature, error, speed; place, its time; orientation, its time
-_STATE = 2 + 12 * 5 + 4 + 5
-_PLACE, _TURNED = slice(62, 66), slice(66, 71)
-_COMMAND = 2 + 12 * 2 + 2  # number, mode, position, tor_max, kp, what is done with the object
+_PLACE, _TURNED = slice(-9, -5), slice(-5, None)
+"""The end of a state: place, its time; orientation, its time. Before it: time, sequence; position, current,
+temperature, error, speed of every joint."""
 _PRESENT, _RELEASE = 1.0, 2.0
 
 
-def _shared(context: Any) -> tuple:
-    """Two slots of state (the newest by its count) and two of commands: one writer each, no locks."""
-    touch = int(np.prod(TAXELS))
-    return (context.RawArray(ctypes.c_double, 2 * _STATE), context.RawArray(ctypes.c_int16, 2 * touch),
+def _shared(context: Any, joints: int, taxels: tuple[int, int]) -> tuple:
+    """Two slots of state (the newest by its count) and two of commands: one writer each, no locks. A command: number,
+    mode, position, tor_max, kp, what is done with the object."""
+    touch = 3 * int(np.prod(taxels))
+    state, command = 2 + 5 * joints + 9, 2 + 2 * joints + 2
+    return (context.RawArray(ctypes.c_double, 2 * state), context.RawArray(ctypes.c_int16, 2 * max(touch, 1)),
             context.RawValue(ctypes.c_int64, -1),
-            context.RawArray(ctypes.c_double, 2 * _COMMAND), context.RawValue(ctypes.c_int64, -1),
+            context.RawArray(ctypes.c_double, 2 * command), context.RawValue(ctypes.c_int64, -1),
             context.RawValue(ctypes.c_int, 0))  # fmt: skip
 
 
 class SimulatedXHand:
-    """The driver of a simulated xHand (see the module). clock: a `VirtualClock` keeps it in this process, in step.
+    """The driver of a simulated hand (see the module). clock: a `VirtualClock` keeps it in this process, in step.
 
     latency [s]: from a state's measurement until `read` gives it, on top of the bus period.
     """
 
-    name = "simulated xHand"
+    name = "simulated hand"
 
     def __init__(
         self,
@@ -374,6 +379,8 @@ class SimulatedXHand:
     ):
         self.clock, self.latency = clock or Clock(), latency
         self._args = (config, calibration, seed, camera, shape, grip)
+        hand = hand_of(config)
+        self.joints, self.taxels = len(hand.joints), touch_shape(hand)
         self._process = None
         self.hand: SimulatedHand | None = None
         self._queue: list[tuple[float, Any]] = []
@@ -394,7 +401,7 @@ class SimulatedXHand:
         if self._args[3]:
             choose_gl()
         context = multiprocessing.get_context("spawn")
-        shared = _shared(context)
+        shared = _shared(context, self.joints, self.taxels)
         self._views = _views(shared)
         self._number, self._object = 0, 0.0
         process = context.Process(target=_live, args=(self._args, shared, self.latency, os.getpid()), daemon=True)
@@ -420,10 +427,10 @@ class SimulatedXHand:
             row, touch = v["state"][k % 2].copy(), v["touch"][k % 2].copy()
             if v["newest"].value - k < 2:
                 break  # else the slot was written over while it was copied
-        part = row[2:62].reshape(5, 12)
+        part = row[2:-9].reshape(5, self.joints)
         return HandState(row[0], int(row[1]), part[0].astype(np.float32), part[1].astype(np.int16), part[2],
                          part[3].astype(np.int64),
-                         touch.reshape(TAXELS), part[4])  # fmt: skip
+                         touch[: 3 * int(np.prod(self.taxels))].reshape(*self.taxels, 3), part[4])  # fmt: skip
 
     def place(self, now: float) -> tuple[np.ndarray, float] | None:
         """HeightSource: the object as the simulated camera last saw it."""
@@ -449,10 +456,10 @@ class SimulatedXHand:
 
     def relax(self) -> None:
         if self.hand is not None:
-            self._commands = [HandCommand(self.hand.target, np.zeros(12), mode=PASSIVE)]
+            self._commands = [HandCommand(self.hand.target, np.zeros(self.joints), mode=PASSIVE)]
             self.hand.relax()
         elif self._process is not None:
-            self._post(PASSIVE, np.zeros(12), np.zeros(12), 0)
+            self._post(PASSIVE, np.zeros(self.joints), np.zeros(self.joints), 0)
 
     def present(self) -> None:
         """The object is held out."""
@@ -480,15 +487,8 @@ class SimulatedXHand:
     def _post(self, mode: int, position: np.ndarray, tor_max: np.ndarray, kp: float) -> None:
         v = self._views
         self._number += 1
-        row = v["command"][self._number % 2]
-        row[0], row[1], row[2:14], row[14:26], row[26], row[27] = (
-            self._number,
-            mode,
-            position,
-            tor_max,
-            kp,
-            self._object,
-        )
+        row, end = v["command"][self._number % 2], 2 + self.joints
+        row[:2], row[2:end], row[end:-2], row[-2:] = (self._number, mode), position, tor_max, (kp, self._object)
         v["sent"].value = self._number
 
     def _step(self) -> HandState | None:
@@ -541,10 +541,11 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
         if number > taken:
             row = v["command"][number % 2].copy()
             taken = number
-            hand.command(HandCommand(row[2:14], row[14:26], kp=int(row[26]), mode=int(row[1])))
-            if row[27] == _PRESENT:
+            end = 2 + hand.env.num_actions
+            hand.command(HandCommand(row[2:end], row[end:-2], kp=int(row[-2]), mode=int(row[1])))
+            if row[-1] == _PRESENT:
                 hand.present()
-            elif row[27] == _RELEASE:
+            elif row[-1] == _RELEASE:
                 hand.release()
         now = time.monotonic()
         if now - zero - hand.time > 0.25:  # too slow a machine: simulated time stands still rather than jump
@@ -557,10 +558,10 @@ def _live(args: tuple, raw: tuple, latency: float, parent: int) -> None:
         count += 1
         slot = v["state"][count % 2]
         slot[0], slot[1] = state.time, state.sequence
-        slot[2:62] = np.concatenate([state.position, state.current, state.temperature, state.error, state.velocity])
+        slot[2:-9] = np.concatenate([state.position, state.current, state.temperature, state.error, state.velocity])
         for part, seen in ((_PLACE, hand.place()), (_TURNED, hand.orientation())):
             slot[part] = np.append(seen[0], seen[1] + zero) if seen is not None else np.nan
-        v["touch"][count % 2] = state.tactile.reshape(-1)
+        v["touch"][count % 2, : state.tactile.size] = state.tactile.reshape(-1)
         v["newest"].value = count
         due = max(due + BUS_PERIOD, time.monotonic() - BUS_PERIOD)
         wait = due - time.monotonic()

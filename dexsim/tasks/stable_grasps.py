@@ -13,15 +13,17 @@ import numpy as np
 import torch
 
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 
-DEFAULT = Path(__file__).parents[1] / "assets" / "grasps" / "cube.npz"
-FINGERTIPS = DEFAULT.with_name("fingertips.npz")
+FOUND = "held_cubes.npz"
+"""File of a hand's folder in which a search keeps what it found."""
+FINGERTIPS = Path(__file__).parents[1] / "assets" / "grasps" / "fingertips.npz"
 """Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
 
 
 @dataclass
 class GraspSet:
-    """K held poses. edge [K] m; hand [K, 12] rad, the joint angles; target [K, 12] rad, what the servos are sent; pose
+    """K held poses. edge [K] m; hand [K, J] rad, the joint angles; target [K, J] rad, what the servos are sent; pose
     [K, 7], the cube (x y z m, quaternion w x y z), palm frame. Tensors, float32."""
 
     edge: torch.Tensor
@@ -30,9 +32,9 @@ class GraspSet:
     pose: torch.Tensor
 
     @classmethod
-    def load(cls, path: str | Path | None) -> GraspSet:
-        """Read a file that this module wrote; None: the one that comes with dexsim. Raises UserError."""
-        path = DEFAULT if path is None else Path(path).expanduser()
+    def load(cls, path: str | Path) -> GraspSet:
+        """Read a file that this module wrote. Raises UserError."""
+        path = Path(path).expanduser()
         try:
             with np.load(path) as data:
                 return cls(**{f.name: torch.as_tensor(data[f.name], dtype=torch.float32) for f in fields(cls)})
@@ -53,6 +55,14 @@ class GraspSet:
                             f"{self.edge.min():.3f} to {self.edge.max():.3f} m")
         return self[keep]
 
+    def derived(self, mirror: bool, scale: float) -> GraspSet:
+        """The same poses of the hand's mirror image (palm y -> -y), or of one with all lengths times scale."""
+        if not mirror and scale == 1.0:
+            return self
+        flip = torch.tensor([1, -1, 1, 1, -1, 1, -1.0]) if mirror else torch.ones(7)
+        size = torch.tensor([scale] * 3 + [1.0] * 4)
+        return GraspSet(self.edge * scale, self.hand.clone(), self.target.clone(), self.pose * flip * size)
+
     def to(self, device: str) -> GraspSet:
         """The same on a device."""
         return GraspSet(*(v.to(device) for v in vars(self).values()))
@@ -67,6 +77,23 @@ class GraspSet:
     def join(parts: list[GraspSet]) -> GraspSet:
         """All poses of several sets."""
         return GraspSet(*(torch.cat([vars(p)[f.name] for p in parts]) for f in fields(GraspSet)))
+
+
+def held_file(hand: Hand) -> Path:
+    """Where a hand's held poses are, or would be kept."""
+    return hand.folder / (hand.file.held_cubes or FOUND)
+
+
+def held_poses(hand: Hand, path: str | Path | None = None) -> GraspSet:
+    """Held poses of a file, or of the hand's own (mirrored and scaled as the hand is). Raises UserError: no file, or
+    one of a hand with other joints."""
+    found = GraspSet.load(held_file(hand) if path is None else path)
+    if found.hand.shape[1] != len(hand.joints):
+        raise UserError(
+            f"held poses {path or held_file(hand)}: of a hand with {found.hand.shape[1]} joints, {hand.name} has"
+            f" {len(hand.joints)}; make them with dexsim stable-grasps hand={hand.folder} out=PATH"
+        )
+    return found.derived(hand.mirror, hand.scale) if path is None else found
 
 
 if __name__ == "__main__":  # python -m dexsim.tasks.stable_grasps out=poses.npz
