@@ -24,7 +24,8 @@ settings (key=default):
   count=2000                  poses wanted
   worlds=256                  hands tried at once, on the CPU
   seed=0                      of everything random
-  sizes=[0.045,0.06]          edges of the cubes [m]: the smallest and the largest, within [0.02, 0.1];
+  sizes=[0.045,0.06]          edges of the cubes [m]: the smallest and the largest, within [0.01, 0.3], times the
+                              span of the hand over 0.1 m;
                               [0.04,0.065] with hold=fingertips
   any setting of task=rotate, or task=rotate_fingertips  (dexsim train --help)
 """
@@ -57,8 +58,8 @@ def main(argv: list[str]) -> int:
         raise UserError(f"hold={own['hold']}: must be {' or '.join(TASK)}")
     task, usual = TASK[own["hold"]]
     sizes = usual if own["sizes"] is None else own["sizes"]
-    if not (isinstance(sizes, list) and len(sizes) == 2 and 0.02 <= sizes[0] <= sizes[1] <= 0.1):
-        raise UserError(f"sizes={sizes}: must be [low, high] edges within [0.02, 0.1] m")
+    if not (isinstance(sizes, list) and len(sizes) == 2 and 0.01 <= sizes[0] <= sizes[1] <= 0.3):
+        raise UserError(f"sizes={sizes}: must be [low, high] edges within [0.01, 0.3] m")
     for key in ("count", "worlds"):
         if not (isinstance(own[key], int) and own[key] >= 1):
             raise UserError(f"{key}={own[key]}: must be a whole number from 1 up")
@@ -71,10 +72,13 @@ def main(argv: list[str]) -> int:
 
     from dexsim.sim.quiet import quiet_warp
     from dexsim.tasks import make_fingertip_grasps, make_grasps
+    from dexsim.tasks.env import UNIT_SPAN, hand_of
 
     generate = (make_grasps if own["hold"] == "palm" else make_fingertip_grasps).generate
     torch.set_num_threads(1)
     quiet_warp("cpu")
+    if own["sizes"] is None:  # as large for this hand as the usual ones for a hand of UNIT_SPAN
+        sizes = [hand_of(begun.cfg).span / UNIT_SPAN * x for x in sizes]
     grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))
     grasps.save(out)
     print(f"{len(grasps)} held poses, cubes of {1000 * grasps.edge.min():.0f}-{1000 * grasps.edge.max():.0f} mm: {out}")
