@@ -186,7 +186,7 @@ class FakeHand:
             self.q = self.q + (self.target - self.q) * (1 - np.exp(-(now - self.last) / 0.03))
         self.last = now
         self.sequence += 1
-        return HandState(now, self.sequence, self.q.astype(np.float32), self.current)
+        return HandState(now, self.sequence, self.q.astype(np.float32), self.current, tactile=np.zeros((5, 120, 3), np.int16))
 
     def send(self, command):
         self.sent.append((self.clock.now(), command.position.copy(), command.tor_max.copy(), command.mode))
