@@ -10,6 +10,7 @@ import pytest
 from benchmarks import tools
 from benchmarks.touch_matters import analysis, rows
 from benchmarks.touch_matters.__main__ import chosen, common
+from benchmarks.touch_matters.judge import metrics_of
 from dexsim.errors import UserError
 
 
@@ -97,3 +98,11 @@ def test_a_row_that_is_not_is_named():
     assert [r.key for r in chosen("full,no_pose")] == ["full", "no_pose"]
     with pytest.raises(UserError, match="nonsense"):
         chosen("full,nonsense")
+
+
+def test_each_seeds_metrics_are_of_its_own_trials():
+    trials = [[3, 10.0, "dropped", "up", 0.05, 0.1, 0.8, 1.0], [5, 20.0, "capped", "up", 0.05, 0.1, 0.8, 0.0]]
+    m = metrics_of(trials, 20.0, 50)
+    assert m["consecutive_successes"]["average"] == 4 and m["capped"] == 1 and m["seconds_to_fall"] == 15
+    assert m["ends"] == {"dropped": 1, "leaned": 0, "nan": 0, "capped": 1}
+    assert m["touched_by_others"] == pytest.approx(1 / 30)

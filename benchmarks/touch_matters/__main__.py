@@ -1,18 +1,19 @@
 """Train every row of sensors with paired seeds on the task by fingertips, and judge each policy in three worlds.
 
     python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..] [seeds=1,2,3,4,5]
-        [gpus=0,1,..] [each=1] [iterations=300] [seconds=S] [episodes=512] [bench_episodes=64] [cap=60] [save=25]
-        [judged=training,wide,bench] [any other setting of train.py]
+        [gpus=0,1,..] [each=1] [iterations=300] [seconds=S] [episodes=512] [bench_episodes=32] [cap=120] [save=25]
+        [judged=training,wide,bench|none] [at=ITERATION] [any other setting of train.py]
     python -m benchmarks.touch_matters.analysis out=out/touch_matters
 
 `each` trainings share a GPU. `seconds` after the start trainings are ended, saved and judged; all rows are judged at
-the last iteration (a multiple of `save`) that every one has reached. The same command again goes on where it stopped.
-Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's table and
-figure.
+the last iteration (a multiple of `save`) that every one has reached, or `at`. The same command again goes on where it
+stopped. Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's
+table and figure.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import queue
@@ -29,11 +30,12 @@ import torch
 from benchmarks import tools
 from benchmarks.reproduce.jobs import done
 from benchmarks.touch_matters import rows
+from benchmarks.touch_matters.judge import checkpoints
 from dexsim.errors import UserError
 
 OWN = {"out": "out/touch_matters", "rows": "paper", "seeds": "1,2,3,4,5", "gpus": "null", "each": "1",
-       "iterations": "300", "seconds": "null", "episodes": "512", "bench_episodes": "64", "cap": "60", "save": "25",
-       "judged": "training,wide,bench", "states": "false"}  # fmt: skip
+       "iterations": "300", "seconds": "null", "episodes": "512", "bench_episodes": "32", "cap": "120", "save": "25",
+       "judged": "training,wide,bench", "states": "false", "at": "null"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,43 +84,35 @@ def train(job: Job, gpu: str | None, iterations: int, until: float, save: int, e
                 child.wait()
 
 
-def checkpoints(folder: Path) -> dict[int, Path]:
-    """Iteration -> checkpoint, of those kept while a row was trained."""
-    found = {}
-    for path in folder.glob("train_*/model_*.pt"):
-        found[int(path.stem.removeprefix("model_"))] = path
-    return found
-
-
 def common(jobs: Sequence[Job]) -> int | None:
     """The last iteration of which every training kept a checkpoint; None where there is none."""
     kept = [set(checkpoints(j.folder)) for j in jobs]
     return max(set.intersection(*kept), default=None) if kept else None
 
 
-def judge(job: Job, worlds: Sequence[str], at: int, gpu: str | None, own: dict[str, str], threads: int,
-          extra: Sequence[str]) -> None:  # fmt: skip
-    """Judge the policy of iteration `at` where it has not been."""
-    import json
+def judge(out: Path, row: rows.Row, seeds: Sequence[int], world: str, at: int, gpu: str | None, own: dict[str, str],
+          threads: int) -> None:  # fmt: skip
+    """Judge the policies of iteration `at` of a row's seeds in a world, those that have not been."""
 
-    def judged(world: str) -> bool:
-        path = job.folder / f"{world}.json"
+    def judged(seed: int) -> bool:
+        path = out / row.key / f"seed{seed}" / f"{world}.json"
         return path.exists() and json.loads(path.read_text())["iteration"] == at
 
-    worlds = [w for w in worlds if not judged(w)]
-    if not worlds:
+    seeds = [s for s in seeds if not judged(s)]
+    if not seeds:
         return
-    cpu = all(w in rows.ON_CPU for w in worlds)
-    command = [sys.executable, "-m", "benchmarks.touch_matters.judge", f"checkpoint={checkpoints(job.folder)[at]}",
-               f"row={job.row.key}", f"seed={job.seed}", f"out={job.folder}", f"worlds={','.join(worlds)}",
-               f"episodes={own['bench_episodes' if cpu else 'episodes']}", f"cap={own['cap']}", f"threads={threads}",
-               f"states={own['states']}", *extra]  # fmt: skip
+    cpu = world in rows.ON_CPU
+    command = [sys.executable, "-m", "benchmarks.touch_matters.judge", f"out={out}", f"row={row.key}",
+               f"seeds={','.join(map(str, seeds))}", f"worlds={world}", f"at={at}", f"cap={own['cap']}",
+               f"episodes={own['bench_episodes' if cpu else 'episodes']}", f"threads={threads}",
+               f"states={own['states']}"]  # fmt: skip
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     env |= {"CUDA_VISIBLE_DEVICES": ""} if cpu else {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}
-    with open(job.folder / f"judge_{worlds[0]}.log", "w") as log:
+    name = f"{world}_{'_'.join(map(str, seeds))}"
+    with open(out / row.key / f"judge_{name}.log", "w") as log:
         status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=env, cwd=tools.ROOT).returncode
     if status:
-        print(f"{job.row.key} seed {job.seed}: judging in {', '.join(worlds)} FAILED, see {log.name}", flush=True)
+        print(f"{row.key} in {world}: judging FAILED, see {log.name}", flush=True)
 
 
 def lanes(work: Sequence[Callable[[str | None], None]], where: Sequence[str | None]) -> list[threading.Thread]:
@@ -171,19 +165,28 @@ def main(argv: list[str]) -> None:
 
     for t in lanes([training(j) for j in jobs], [g for _ in range(each) for g in gpus]):
         t.join()
-    at = common(jobs)
-    if at is None:
-        raise UserError(f"out={out}: not every training has reached iteration {save}; see its train.log")
+    if own["judged"] == "none":
+        return
+    at = common(jobs) if own["at"] == "null" else tools.numbers(own["at"], "at")[0]
+    if at is None or not all(at in checkpoints(j.folder) for j in jobs):
+        raise UserError(f"out={out}: not every training kept iteration {at or save}; see its train.log")
     say(f"judging all at iteration {at}")
     asked = own["judged"].split(",")
-    on_gpu, on_cpu = [w for w in asked if w not in rows.ON_CPU], [w for w in asked if w in rows.ON_CPU]
+    if not set(asked) <= set(rows.WORLDS):
+        raise UserError(f"judged={own['judged']}: must be none, or of {', '.join(rows.WORLDS)}")
     cores = len(os.sched_getaffinity(0))
     spare = max(1, cores - 2 * len(gpus))
     threads = max(1, min(4, spare // max(len(jobs), 1)))
-    judges = [lambda gpu, j=j: judge(j, on_gpu, at, gpu, own, threads, []) for j in jobs]
-    benches = [lambda _, j=j: judge(j, on_cpu, at, None, own, threads, []) for j in jobs] if on_cpu else []
-    running = lanes(judges, gpus if None in gpus else [g for _ in range(3) for g in gpus])
-    running += lanes(benches, [None] * max(1, spare // threads))
+    on_gpu = [  # all seeds of a row at once: an evaluation takes as long for many worlds as for few
+        lambda gpu, r=r, w=w: judge(out, r, [j.seed for j in jobs if j.row == r], w, at, gpu, own, threads)
+        for w in asked if w not in rows.ON_CPU for r in every
+    ]  # fmt: skip
+    on_cpu = [
+        lambda _, j=j, w=w: judge(out, j.row, [j.seed], w, at, None, own, threads)
+        for w in asked if w in rows.ON_CPU for j in jobs
+    ]  # fmt: skip
+    running = lanes(on_gpu, gpus if None in gpus else [g for _ in range(2) for g in gpus])
+    running += lanes(on_cpu, [None] * max(1, spare // threads))
     for t in running:
         t.join()
     say("done: python -m benchmarks.touch_matters.analysis out=" + str(out))

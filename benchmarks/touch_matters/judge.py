@@ -1,6 +1,9 @@
-"""Judge one policy in one or more worlds: python -m benchmarks.touch_matters.judge checkpoint=PATH row=R seed=S
-out=FOLDER worlds=training,wide [episodes=512] [cap=60] [threads=1] [states=true]. Writes FOLDER/<world>.json, and with
-`states` FOLDER/<world>_states.npz (joints and cube of a few trials, for a film)."""
+"""Judge the policies of a row in one or more worlds, all its seeds at once: python -m benchmarks.touch_matters.judge
+out=FOLDER row=R seeds=1,2,.. at=ITERATION worlds=training,wide [episodes=512] [cap=120] [threads=1] [states=true].
+
+Writes FOLDER/R/seed<k>/<world>.json, and with `states` FOLDER/R/<world>_states.npz (joints and cube of a few trials of
+the first seed, for a film). Every policy plays `episodes` worlds of its own.
+"""
 
 from __future__ import annotations
 
@@ -9,66 +12,95 @@ import os
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from benchmarks import tools
 from benchmarks.touch_matters import rows
 from dexsim.cli import build
 from dexsim.cli import start as start_up
+from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import load_policy
 from dexsim.paths import CONFIGS
+from dexsim.tasks.rotate_eval import summary
 
-OWN = {"checkpoint": "", "row": "", "seed": "0", "out": "", "worlds": "training", "episodes": "512", "cap": "60",
+OWN = {"out": "", "row": "", "seeds": "1", "at": "0", "worlds": "training", "episodes": "512", "cap": "120",
        "threads": "1", "states": "false"}  # fmt: skip
 TRIALS_SEED = 1000
 
 
-def judge(own: dict[str, str], world: str, extra: list[str]) -> dict:
-    """Metrics of the policy in a world, and what it was."""
-    cpu = world in rows.ON_CPU
-    begun = start_up.for_play(
-        [
-            f"checkpoint={own['checkpoint']}", f"episodes={own['episodes']}", f"seed={TRIALS_SEED}", "video=false",
-            f"task.evaluation.cap_s={own['cap']}", *rows.WORLDS[world],
-            *(["device=cpu", f"sim.threads={own['threads']}"] if cpu else []), *extra,
-        ],
-        CONFIGS,
-    )  # fmt: skip
-    env = build.build_env(begun.cfg, None, {"world": world})
-    checkpoint.check_layout(begun.data, checkpoint.layout_of(env), own["checkpoint"])
-    policy = load_policy(begun.data, env, own["checkpoint"])
-    found = env.evaluate(policy, int(own["episodes"]), TRIALS_SEED)
-    if own["states"] == "true":
-        frames = found["frames"]
-        np.savez_compressed(
-            Path(own["out"]) / f"{world}_states.npz",
-            **{f"qpos_{i}": q.astype(np.float32) for i, q in enumerate(frames["qpos"])},
-            **{f"force_{i}": o["force"].astype(np.float32) for i, o in enumerate(frames["overlay"])},
-            half=np.array([m.geom_size[m.geom("object_box").id] for m in frames["model"]]),
-            label=np.array(frames["label"]), dt=frames["dt"], names=np.array(frames["names"]),
-        )  # fmt: skip
-    build.close(env)
-    return {
-        "row": own["row"],
-        "seed": int(own["seed"]),
-        "world": world,
-        "steps": int(begun.data["steps"]),
-        "iteration": int(begun.data["iteration"]),
-        "metrics": found["metrics"],
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Iteration -> checkpoint, of those kept while a row was trained from a seed in `folder`."""
+    return {int(p.stem.removeprefix("model_")): p for p in folder.glob("train_*/model_*.pt")}
+
+
+def metrics_of(trials: list, cap: float, resamples: int) -> dict:
+    """Metrics of one policy from its trials (`FingertipEnv.of_trials`)."""
+    successes, time, end = (np.array([t[k] for t in trials]) for k in range(3))
+    other = np.array([t[7] for t in trials])
+    return summary(successes, time, end == "capped", cap, resamples, TRIALS_SEED) | {
+        "ends": {e: int((end == e).sum()) for e in ("dropped", "leaned", "nan", "capped")},
+        "touched_by_others": float(other.sum() / max(time.sum(), 1e-9)),
+        "trials": trials,
     }
 
 
-def main(argv: list[str]) -> None:
-    own, extra = tools.split(argv, OWN)
-    Path(own["out"]).mkdir(parents=True, exist_ok=True)
-    for world in own["worlds"].split(","):
-        data = judge(own, world, extra)
-        target = Path(own["out"]) / f"{world}.json"
+def judge(own: dict[str, str], world: str) -> None:
+    """Play all seeds of a row in a world."""
+    seeds, each = tools.numbers(own["seeds"], "seeds"), int(own["episodes"])
+    folder = Path(own["out"]) / own["row"]
+    paths = [checkpoints(folder / f"seed{s}")[int(own["at"])] for s in seeds]
+    total = each * len(seeds)
+    argv = [
+        f"checkpoint={paths[0]}", f"episodes={total}", f"worlds={total}", f"seed={TRIALS_SEED}", "video=false",
+        f"task.evaluation.cap_s={own['cap']}", *rows.WORLDS[world],
+    ]  # fmt: skip
+    begun = start_up.for_play(
+        [*argv, *(["device=cpu", f"sim.threads={own['threads']}"] if world in rows.ON_CPU else [])], CONFIGS
+    )
+    env = build.build_env(begun.cfg, None, {"world": world})
+    loaded = [checkpoint.load(str(p)) for p in paths]
+    for data, path in zip(loaded, paths, strict=True):
+        checkpoint.check_layout(data, checkpoint.layout_of(env), str(path))
+    policies = [load_policy(data, env, str(path)) for data, path in zip(loaded, paths, strict=True)]
+
+    def act(obs):
+        return torch.cat([p(obs[i * each : (i + 1) * each]) for i, p in enumerate(policies)])
+
+    found = env.evaluate(act, total, TRIALS_SEED)
+    trials, evaluation = found["metrics"]["trials"], begun.cfg["task"]["evaluation"]
+    for i, (seed, data) in enumerate(zip(seeds, loaded, strict=True)):
+        metrics = metrics_of(trials[i * each : (i + 1) * each], evaluation["cap_s"], evaluation["resamples"])
+        target = folder / f"seed{seed}" / f"{world}.json"
         part = target.with_suffix(".part")
-        part.write_text(json.dumps(data))
+        part.write_text(json.dumps({
+            "row": own["row"], "seed": seed, "world": world, "steps": int(data["steps"]),
+            "iteration": int(data["iteration"]), "metrics": metrics,
+        }))  # fmt: skip
         os.replace(part, target)
-        average = data["metrics"]["consecutive_successes"]["average"]
-        print(f"{own['row']} {own['seed']} {world}: {average:.2f}", flush=True)
+        print(f"{own['row']} {seed} {world}: {metrics['consecutive_successes']['average']:.2f}", flush=True)
+    if own["states"] == "true":
+        keep_states(found["frames"], folder / f"{world}_states.npz")
+    build.close(env)
+
+
+def keep_states(frames: dict, path: Path) -> None:
+    """A file of the trials that an evaluation filmed; see `benchmarks.touch_matters.film`."""
+    np.savez_compressed(
+        path,
+        **{f"qpos_{i}": q.astype(np.float32) for i, q in enumerate(frames["qpos"])},
+        **{f"force_{i}": o["force"].astype(np.float32) for i, o in enumerate(frames["overlay"])},
+        half=np.array([m.geom_size[m.geom("object_box").id] for m in frames["model"]]),
+        label=np.array(frames["label"]), dt=frames["dt"], names=np.array(frames["names"]),
+    )  # fmt: skip
+
+
+def main(argv: list[str]) -> None:
+    own, rest = tools.split(argv, OWN)
+    if rest:
+        raise UserError(f"{rest[0]!r}: the settings are {', '.join(OWN)}")
+    for world in own["worlds"].split(","):
+        judge(own, world)
 
 
 if __name__ == "__main__":

@@ -314,11 +314,14 @@ class FingertipEnv(RotateEnv):
 
     def of_trials(self, r: dict) -> dict:
         """Share of the time in which anything but fingertips touched; and every trial: its successes, seconds, end,
-        palm, edge m, mass kg, friction."""
-        shares = r["other_steps"].sum() * self.dt / max(r["time"].sum(), 1e-9)
+        palm, edge m, mass kg, friction, seconds in which anything but fingertips touched."""
+        other = r["other_steps"] * self.dt
         rows = zip(
             r["successes"].tolist(), np.round(r["time"], 3).tolist(), r["end"].tolist(), r["palm"].tolist(),
             np.round(r["edge"], 4).tolist(), np.round(r["mass"], 4).tolist(), np.round(r["friction"], 3).tolist(),
-            strict=True,
+            np.round(other, 3).tolist(), strict=True,
         )  # fmt: skip
-        return {"touched_by_others": float(shares), "trials": [[*a[:3], PALMS[a[3]], *a[4:]] for a in rows]}
+        return {
+            "touched_by_others": float(other.sum() / max(r["time"].sum(), 1e-9)),
+            "trials": [[*a[:3], PALMS[a[3]], *a[4:]] for a in rows],
+        }
