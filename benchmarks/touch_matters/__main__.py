@@ -185,7 +185,7 @@ def main(argv: list[str]) -> None:
         lambda _, j=j, w=w: judge(out, j.row, [j.seed], w, at, None, own, threads)
         for w in asked if w in rows.ON_CPU for j in jobs
     ]  # fmt: skip
-    running = lanes(on_gpu, gpus if None in gpus else [g for _ in range(2) for g in gpus])
+    running = lanes(on_gpu, gpus if None in gpus else [g for _ in range(3) for g in gpus])
     running += lanes(on_cpu, [None] * max(1, spare // threads))
     for t in running:
         t.join()
