@@ -1,19 +1,18 @@
-"""sim.collision=hand beside sim.collision=mujoco, in one process on one device: start, physics, full step, profile,
-play.
+"""dexsim's own kernels (sim.collision=hand, sim.solver=hand) beside MuJoCo-Warp's (both mujoco), in one process on one
+device: start, physics, full step, profile, play.
 
     python -m benchmarks.collision [out=out/collision.json] [worlds=8192] [steps=40] [rounds=3] [episodes=512]
-    [limit_s=330]
-                                   [parts=measure,variants,play,exact] [any setting of train.py]
+                                   [limit_s=330] [parts=measure,solve,variants,play,exact] [any setting of train.py]
 
-The grasp of benchmarks.step is made once, with `hand`, and handed to the other setting, so that both step the same
-worlds.
+The grasp of benchmarks.step is made once, with dexsim's kernels, and handed to the other settings (`narrow`: dexsim's
+contacts, MuJoCo-Warp's solver; `mujoco`: MuJoCo-Warp's of both), so that all step the same worlds.
   start     seconds until the first control steps are done, and the modules compiled until then (with an empty kernel
-  cache: a
-            cold start); what the other setting compiles in addition is listed beside it
-  measure   for both settings: times as benchmarks.step, stages as benchmarks.trace, microseconds of each kernel of one
-  physics
-            step launched one by one, Newton iterations, contacts, pairs tested and overlapping
-  variants  bare physics under other launch sizes and solver options, one at a time, with `hand`
+            cache: a cold start); what each other setting compiles in addition is listed beside it
+  measure   for each: times as benchmarks.step, stages as benchmarks.trace, microseconds of each kernel of one physics
+            step launched one by one and of the recorded parts of the environment's step, Newton iterations, contacts,
+            pairs tested and overlapping
+  variants  bare physics with dexsim's kernels under other launch sizes and solver options, one at a time
+  solve     accelerations and forces of both solvers from the same constraints
   play      metrics of checkpoints/grasp.pt and rotate.pt under both
   exact     contacts of random poses against C MuJoCo (benchmarks.narrow_phase) on this device
 What no longer fits into `limit_s` is left out and named. The file is written after every part.
@@ -29,15 +28,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 import warp as wp
+from mujoco_warp._src import solver
 from warp._src import context
 
 from benchmarks import narrow_phase, tools, trace
 from benchmarks import step as step_benchmark
-from benchmarks.physics import edited
 from benchmarks.tape import Tape
 from dexsim.cli import start as start_up
 from dexsim.learning.ppo import load_policy
@@ -45,8 +43,22 @@ from dexsim.paths import CONFIGS
 from dexsim.sim import warp_engine
 from dexsim.tasks import make_env
 
-SETTINGS = ("hand", "mujoco")
-PARTS = ("measure", "variants", "play", "exact")
+SETTINGS = {
+    "hand": {"collision": "hand", "solver": "hand"},
+    "narrow": {"collision": "hand", "solver": "mujoco"},
+    "mujoco": {"collision": "mujoco", "solver": "mujoco"},
+}
+"""Whose kernels: dexsim's; dexsim's for contacts only; MuJoCo-Warp's."""
+PARTS = ("measure", "solve", "variants", "play", "exact")
+SOLVERS: list[dict[str, Any]] = [
+    *({"rows": rows} for rows in (32, 48, 96, 160)),
+    *({"worlds_per_block": worlds} for worlds in (2, 4)),
+    *({"registers": registers} for registers in (64, 80, 96)),
+    {"fast_math": True},
+    {"fast_math": True, "registers": 80},
+    {"fast_math": True, "rows": 48, "registers": 80},
+]
+"""Launch choices of dexsim's solver that `variants` times, each from the defaults."""
 
 
 @contextmanager
@@ -67,6 +79,10 @@ def compiled() -> Iterator[list[tuple[str, float]]]:
         yield built
     finally:
         context.Module._compile = compile_module
+
+
+def _percentiles(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return x.median(), x.quantile(0.99), x.max()
 
 
 class Run:
@@ -120,7 +136,7 @@ class Run:
     def make(self, setting: str) -> dict:
         """Build the environment and do three control steps."""
         begin = time.perf_counter()
-        cfg = {**self.cfg, "sim": {**self.cfg["sim"], "collision": setting}}
+        cfg = {**self.cfg, "sim": {**self.cfg["sim"], **SETTINGS[setting]}}
         with compiled() as built:
             try:
                 env = make_env(cfg, cfg["worlds"], self.device, 0, "warp")
@@ -154,7 +170,53 @@ class Run:
         return {"bare_ms": bare, "servo_ms": driven, "touch_ms": touched, "full_ms": full, "overhead": full / bare - 1,
                 "env_steps_per_s": 1e3 * env.num_envs / full,
                 "physics_steps_per_s": 1e3 * env.num_envs * env.decimation / bare,
-                "rounds_ms": {k: [round(1e3 * x, 3) for x in t] for k, t in times.items()}}  # fmt: skip
+                "rounds_ms": {k: [round(1e3 * x, 3) for x in t] for k, t in times.items()},
+                "recorded_us": self.recorded(env)}  # fmt: skip
+
+    def recorded(self, env: Any) -> dict[str, float]:
+        """Microseconds of each recorded part of the environment's step outside physics."""
+        out = {}
+        for name, graph in env._recorded.items():
+            out[name] = round(1e6 * tools.seconds(self.device, graph.replay, 50), 1)
+        out["observations"] = round(1e6 * tools.seconds(self.device, env.get_observations, 50), 1)
+        return out
+
+    def solve(self) -> dict:
+        """dexsim's solver against MuJoCo-Warp's on the same constraints: the grasp's, warm started as in a step and
+        from spoilt starts. Differences of accelerations [rad/s^2 or m/s^2] and of forces [N]; and whether two runs are
+        equal."""
+        env = self.back("hand")
+        e = env.engine
+        m, d, ours = e.m, e.d, e.newton
+        for _ in range(3):
+            e.step(env.decimation, env.servo.before_each)
+        with wp.ScopedDevice(self.device):
+            e.physics_step()
+        warm, kept = wp.to_torch(d.qacc_warmstart), wp.to_torch(d.qacc_warmstart).clone()
+        rows = torch.arange(d.njmax, device=self.device) < wp.to_torch(d.nefc)[:, None]
+        generator = torch.Generator(device=self.device).manual_seed(0)
+        out: dict[str, Any] = {}
+        for spoilt in (0.0, 10.0, 100.0):
+            warm.copy_(kept + spoilt * torch.randn(kept.shape, generator=generator, device=self.device))
+            found = {}
+            for name, call in (("mujoco", lambda: solver.solve(m, d)), ("hand", ours.launch), ("again", ours.launch)):
+                with wp.ScopedDevice(self.device):
+                    call()
+                found[name] = [wp.to_torch(x).clone() for x in (d.qacc, d.efc.force, d.solver_niter, d.efc.state)]
+            (a, fa, na, sa), (b, fb, nb, sb) = found["mujoco"], found["hand"]
+            off, force = (a - b).abs().amax(1), torch.where(rows, (fa - fb).abs(), 0).amax(1)
+            out[f"spoilt {spoilt:g}"] = {
+                "acceleration_median_99_worst": [float(x) for x in _percentiles(off)],
+                "acceleration_largest": float(a.abs().max()),
+                "force_median_99_worst": [float(x) for x in _percentiles(force)],
+                "force_largest": float(fa[rows].abs().max()),
+                "same_iterations": float((na == nb).float().mean()),
+                "iterations": [float(na.float().mean()), float(nb.float().mean())],
+                "same_states": float(((sa == sb) | ~rows).all(1).float().mean()),
+                "bitwise_equal_again": bool((found["again"][0] == b).all()),
+            }  # fmt: skip
+        warm.copy_(kept)
+        return out
 
     def stages(self, setting: str) -> dict:
         env = self.back(setting)
@@ -217,51 +279,41 @@ class Run:
 
     def variants(self) -> dict:
         env = self.envs["hand"]
-        m, narrow = env.engine.m, env.engine.narrow
-        dims = m.block_dim
+        m, narrow, newton = env.engine.m, env.engine.narrow, env.engine.newton
         out = {"as it is": self.bare(env)}
-        trials = [(narrow, "block_dim", x) for x in (32, 64, 256)] if narrow is not None else []
-        trials += [
-            (dims, name, x)
-            for name, values in (
-                ("update_gradient_JTDAJ_dense", (32, 64, 256)),
-                ("update_gradient_cholesky", (32, 128)),
-                ("linesearch_iterative", (64,)),
-                ("contact_jac_tiled", (64,)),
-            )
-            for x in values
-        ]
-        trials += [(m.opt, "iterations", x) for x in (4, 6)] + [(m.opt, "ls_iterations", 10)]
-        for owner, name, value in trials:
+        trials = [(narrow, {"block_dim": x}) for x in (32, 64, 256)] if narrow is not None else []
+        trials += [(newton, changes) for changes in SOLVERS] if newton is not None else []
+        trials += [(m.opt, {"iterations": 4}), (m.opt, {"ls_iterations": 10})]
+        if newton is not None:
+            self.compile_solvers(newton)
+        for owner, changes in trials:
+            name = ", ".join(f"{k}={v}" for k, v in changes.items())
             if time.perf_counter() - self.begin > self.limit:
-                self.out["left_out"].append(f"variants: {name}={value}")
+                self.out["left_out"].append(f"variants: {name}")
                 continue
-            kept = getattr(owner, name)
-            setattr(owner, name, value)
+            kept = {k: getattr(owner, k) for k in changes}
+            for k, v in changes.items():
+                setattr(owner, k, v)
             try:
-                out[f"{name}={value}"] = self.bare(env)
+                out[name] = self.bare(env)
             except Exception as error:
-                out[f"{name}={value}"] = f"{type(error).__name__}: {error}"
-            setattr(owner, name, kept)
+                out[name] = f"{type(error).__name__}: {error}"
+            for k, v in kept.items():
+                setattr(owner, k, v)
         return out
 
-    def sparse(self) -> dict:
-        """Bare physics with a sparse Jacobian, whose solver adds all of a Newton iteration's Hessian in one kernel."""
+    def compile_solvers(self, newton: Any) -> None:
+        """Compile all variants of the solver at once."""
+        def launch_all() -> None:
+            for changes in SOLVERS:
+                kept = {k: getattr(newton, k) for k in changes}
+                for k, v in changes.items():
+                    setattr(newton, k, v)
+                newton.launch()
+                for k, v in kept.items():
+                    setattr(newton, k, v)
 
-        def edit(spec: mujoco.MjSpec) -> None:
-            spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-
-        with edited(edit), compiled() as built:
-            env = make_env(
-                {**self.cfg, "sim": {**self.cfg["sim"], "collision": "hand"}},
-                self.cfg["worlds"],
-                self.device,
-                0,
-                "warp",
-            )
-            out = {"bare_ms": self.bare(env)}
-        self.envs["sparse"] = env
-        return out | {"compile_s": sum(s for _, s in built), "kernels": self.kernels("sparse")}
+        warp_engine.compile_together(launch_all, self.device)
 
     def play(self, task: str, setting: str) -> dict:
         worlds = min(self.episodes, 2048)
@@ -274,7 +326,7 @@ class Run:
             *(["task.evaluation.cap_s=30"] if task == "rotate" else []),
         ]
         begun = start_up.for_play(argv, CONFIGS)
-        cfg = {**begun.cfg, "sim": {**begun.cfg["sim"], "collision": setting}}
+        cfg = {**begun.cfg, "sim": {**begun.cfg["sim"], **SETTINGS[setting]}}
         env = make_env(cfg, cfg["worlds"], self.device, cfg["seed"], "warp")
         policy = load_policy(begun.data, env, str(begun.source), begun.typed)
         with torch.no_grad():
@@ -291,14 +343,18 @@ def main(argv: list[str]) -> dict:
         run.part("measure hand", lambda: run.measure("hand"))
         run.part("stages hand", lambda: run.stages("hand"))
         run.part("kernels hand", lambda: run.kernels("hand"))
-    run.part("start mujoco", lambda: run.make("mujoco"))
-    if "measure" in run.parts:
-        run.part("measure mujoco", lambda: run.measure("mujoco"))
-        run.part("stages mujoco", lambda: run.stages("mujoco"))
-        run.part("kernels mujoco", lambda: run.kernels("mujoco"))
+    if "variants" in run.parts:
+        run.part("variants", run.variants, 10)
+    for setting in ("narrow", "mujoco") if "measure" in run.parts else ():
+        run.part(f"start {setting}", lambda setting=setting: run.make(setting))
+        run.part(f"measure {setting}", lambda setting=setting: run.measure(setting))
+        run.part(f"stages {setting}", lambda setting=setting: run.stages(setting))
+        run.part(f"kernels {setting}", lambda setting=setting: run.kernels(setting))
+    if "solve" in run.parts:
+        run.part("solve", run.solve)
     if "play" in run.parts:
         for task in ("grasp", "rotate"):
-            for setting in SETTINGS:
+            for setting in ("hand", "mujoco"):
                 run.part(f"play {task} {setting}", lambda task=task, setting=setting: run.play(task, setting), 15)
     if "exact" in run.parts:
         for kind in narrow_phase.KINDS:
@@ -307,11 +363,8 @@ def main(argv: list[str]) -> dict:
                 lambda kind=kind: narrow_phase.kind_of_pair(kind, run.poses, run.device, min(run.poses, 8192)),
                 8,
             )
-    if "variants" in run.parts:
-        run.part("variants", run.variants, 10)
-        run.part("sparse", run.sparse, 30)
-    if {f"measure {s}" for s in SETTINGS} <= set(run.out):
-        hand, theirs = (run.out[f"measure {s}"] for s in SETTINGS)
+    if {"measure hand", "measure mujoco"} <= set(run.out):
+        hand, theirs = (run.out[f"measure {s}"] for s in ("hand", "mujoco"))
         if "error" not in hand | theirs:
             run.out["physics_speedup"] = theirs["bare_ms"] / hand["bare_ms"]
             run.out["full_speedup"] = theirs["full_ms"] / hand["full_ms"]

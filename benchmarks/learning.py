@@ -1,7 +1,7 @@
 """Environment steps a second with PPO included, where the time goes, and the distance to bare physics with PPO.
 
     python -m benchmarks.learning [worlds=4096,8192,16384,32768] [iterations=6] [policy=checkpoints/grasp.pt]
-                                  [settle=120] [variants=false] [any other setting of train.py]
+                                  [settle=120] [variants=not_recorded,float32] [any other setting of train.py]
 
 For each number of worlds, in one run:
   full   the environment and rsl-rl's PPO as train.py runs them, with the actor of a trained policy, so that the worlds
@@ -9,8 +9,8 @@ For each number of worlds, in one run:
   bare   the same PPO on a stand-in that returns the same observations, rewards and ends, and in whose step only physics
          happens: the physics steps of the last rollout, from the same states, driven by the recorded torques.
 Seconds an iteration are medians, from device clocks: physics, rest of the environment's step, inference (actor, critic,
-storage, statistics), update. ratio: steps a second of full over bare. variants=true times other settings of learning as
-well: float32 products instead of TF32, bfloat16 autocast, torch.compile.
+storage, statistics), update. ratio: steps a second of full over bare. variants times other settings of learning as
+well: not_recorded (rsl-rl's own update), float32 products instead of TF32, bfloat16 autocast, compiled (torch.compile).
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ import torch
 from benchmarks import tools
 from benchmarks.tape import Tape
 from dexsim.cli import machine
+from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.runner import Runner
 from dexsim.tasks import make_env
 
 VARIANTS: dict[str, dict[str, Any]] = {
+    "not_recorded": {"graphed": False},
     "float32": {"tf32": False},
     "bfloat16": {"use_mixed_precision": True},
     "compiled": {"compile": "default"},
@@ -112,7 +114,7 @@ class Clock:
 def _timed(runner: Runner, env: Any, iterations: int) -> dict[str, float]:
     """Medians over iterations: seconds of an iteration, of env.step, of the update; the rest is inference."""
     clock = Clock(str(env.device))
-    step, update = env.step, runner.alg.update
+    step, update = env.step, runner._updater.update
 
     def around(name, call):
         def run(*args):
@@ -123,7 +125,7 @@ def _timed(runner: Runner, env: Any, iterations: int) -> dict[str, float]:
 
         return run
 
-    env.step, runner.alg.update = around("step", step), around("update", update)
+    env.step, runner._updater.update = around("step", step), around("update", update)
     rows: list[dict[str, float]] = []
     last = [0.0]
 
@@ -138,7 +140,7 @@ def _timed(runner: Runner, env: Any, iterations: int) -> dict[str, float]:
     try:
         runner.learn(runner.iteration + iterations + 1, on_iteration)
     finally:
-        env.step, runner.alg.update = step, update
+        env.step, runner._updater.update = step, update
     rows = rows[1:]  # the first one compiles, allocates and records
     return {k: statistics.median(r[k] for r in rows) for k in rows[0]}
 
@@ -154,6 +156,8 @@ def _settings(cfg: dict, changes: dict[str, Any]) -> dict:
     if "compile" in changes:
         agent["torch_compile_mode"] = changes["compile"]
     cfg = {**cfg, "tf32": changes.get("tf32", cfg["tf32"])}
+    if "graphed" in changes:
+        cfg["graphed_update"] = changes["graphed"]
     if "use_mixed_precision" in changes:
         agent["algorithm"]["use_mixed_precision"] = True
     return {**cfg, "agent": agent}
@@ -202,12 +206,15 @@ def main(argv: list[str]) -> dict:
             "iterations": "6" if cuda else "3",
             "policy": str(tools.ROOT / "checkpoints" / "grasp.pt"),
             "settle": "120" if cuda else "40",
-            "variants": "false",
+            "variants": "",
         },
     )
     cfg = tools.config(rest)
     data = checkpoint.load(own["policy"], cfg["device"])
-    variants = VARIANTS if own["variants"] == "true" else {}
+    names = list(VARIANTS) if own["variants"] == "all" else [v for v in own["variants"].split(",") if v]
+    if unknown := [v for v in names if v not in VARIANTS]:
+        raise UserError(f"variants={unknown[0]}: must be of {', '.join(VARIANTS)}, or all")
+    variants = {v: VARIANTS[v] for v in names}
     iterations, settle = tools.numbers(own["iterations"], "iterations")[0], tools.numbers(own["settle"], "settle")[0]
     out: dict = {"benchmark": "learning", **tools.about(cfg["device"]), "rows": []}
     for worlds in tools.numbers(own["worlds"], "worlds"):

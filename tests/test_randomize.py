@@ -125,3 +125,46 @@ def test_a_given_seed_gives_the_same_numbers():
     a, b, c = (sampler({"x": [0.0, 1.0]}, seed=s).draw("x", 2) for s in (1, 1, 2))
     assert torch.equal(a, b) and not torch.equal(a, c)
     assert np.isfinite(a.numpy()).all()
+
+
+def test_drawn_together_is_what_is_drawn_one_by_one():
+    """The same ranges, shapes and narrowing; the first time under a name, the very same numbers."""
+    cfg = {"a": {"u": [1.0, 3.0], "log": {"log": [0.01, 1.0]}, "fixed": 2.5}}
+
+    def ask(s: Sampler) -> list[torch.Tensor]:
+        return [s.draw("a.u"), s.uniform(2), s.draw("a.log", 3), s.normal(2, 2), s.draw("a.fixed"), s.draw("a.u", 2, 3), s.uniform()]
+
+    s, alone = sampler(cfg), sampler(cfg)
+    with s.together("episode"):
+        for a, b in zip(ask(s), ask(alone), strict=True):
+            assert torch.equal(a, b)
+    s.width.fill_(0.5)
+    alone.width.fill_(0.5)
+    with s.together("episode"):
+        got = ask(s)
+    for a, b in zip(got, ask(alone), strict=True):
+        assert a.shape == b.shape and a.dtype == b.dtype
+        tolerance = 6 * float(b.double().std()) / a.numel() ** 0.5 + 1e-6
+        assert abs(float(a.double().mean() - b.double().mean())) < tolerance
+        assert abs(float(a.double().std() - b.double().std())) < tolerance
+        assert float(a.min()) == pytest.approx(float(b.min()), abs=6 * tolerance + 0.5 * (a.dim() == 3 and a.shape[1:] == (2, 2)))
+    assert 1.5 <= float(got[0].min()) and float(got[0].max()) <= 2.5, "a curriculum narrows it"
+    assert float(got[1].min()) < 0.01 and float(got[1].max()) > 0.99, "and leaves what has no range alone"
+    columns = torch.cat([x.reshape(N, -1) for x in got if float(x.std()) > 0], 1)
+    c = torch.corrcoef(columns.T) - torch.eye(columns.shape[1])
+    assert float(c.abs().max()) < 6 / N**0.5
+    with s.together("episode"):
+        again = ask(s)
+    assert not torch.equal(again[0], got[0])
+
+
+def test_something_else_than_planned_is_drawn_too():
+    s = sampler({"x": [1.0, 2.0], "y": [5.0, 6.0]})
+    with s.together("episode"):
+        s.draw("x"), s.draw("y")
+    with s.together("episode"):
+        y, x, z = s.draw("y"), s.draw("x", 4), s.draw("y")
+    assert x.shape == (N, 4) and 1 <= float(x.min()) and float(x.max()) <= 2
+    assert all(v.shape == (N,) and 5 <= float(v.min()) and float(v.max()) <= 6 for v in (y, z))
+    assert not torch.equal(y, z)
+    assert s.draw("x").shape == (N,), "and outside"

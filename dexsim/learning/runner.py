@@ -21,6 +21,7 @@ from dexsim.tasks import worlds
 import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
 from rsl_rl.runners import OnPolicyRunner  # isort: skip
 from rsl_rl.utils import check_nan  # isort: skip
+from dexsim.learning import graphed  # isort: skip
 
 from dexsim.errors import UserError
 
@@ -61,6 +62,9 @@ class Runner(OnPolicyRunner):
         with agent_errors():
             super().__init__(env, agent_config(cfg, device, typed), log_dir=None, device=device)
         self.iteration, self.steps = 0, 0
+        # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
+        record = device.startswith("cuda") and cfg.get("graphed_update", True) and not graphed.unsupported(self.alg)
+        self._updater = graphed.GraphedUpdate(self.alg) if record else self.alg
         self._meter = Meter(env.num_envs, device)
         self._layout = checkpoint.layout_of(env)
         self._fresh = True
@@ -208,7 +212,7 @@ class Runner(OnPolicyRunner):
     def _update(self) -> dict[str, float]:
         """One PPO update. Raises UserError when it left something not finite, before that is saved."""
         try:
-            losses = self.alg.update()
+            losses = self._updater.update()
         except RuntimeError:
             if self._finite():
                 raise

@@ -55,24 +55,28 @@ def make_engine(
     njmax: int = 160,
     threads: int = 0,
     collision: str = "auto",
+    solver: str = "auto",
 ) -> Engine:
     """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a CPU).
 
     fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
     (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all. collision (MuJoCo-Warp only): who finds the contacts of
     convex hulls: "hand" (`dexsim.sim.collision`), "mujoco" (MuJoCo-Warp itself), "auto" (hand, where it serves the model).
+    solver (MuJoCo-Warp only): who finds the contact forces: "hand" (`dexsim.sim.solver`), "mujoco", "auto", likewise.
     """
     no_log_file()
     engine = engine_of(engine, device)
     if collision not in ("auto", "hand", "mujoco"):
         raise UserError(f"sim.collision='{collision}': must be auto, hand or mujoco")
+    if solver not in ("auto", "hand", "mujoco"):
+        raise UserError(f"sim.solver='{solver}': must be auto, hand or mujoco")
     device = "cuda:0" if device == "cuda" else device  # torch.cuda.set_device wants a number
     if engine == "mujoco" and device != "cpu":
         raise UserError(f"sim.engine=mujoco runs on the CPU only, not on device={device}; use sim.engine=warp or device=cpu")
     if engine == "warp":
         from dexsim.sim.warp_engine import WarpEngine
 
-        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax, collision)
+        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax, collision, solver)
     from dexsim.sim.mujoco_engine import MujocoEngine, compile_with_sensors
 
     return MujocoEngine(compile_with_sensors(spec, pairs), worlds, fields, pairs, threads)

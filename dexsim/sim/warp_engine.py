@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 
 import mujoco
 import mujoco_warp as mjw
@@ -14,7 +14,8 @@ import warp as wp
 
 from dexsim.errors import UserError
 from dexsim.sim import contact
-from dexsim.sim.collision import NarrowPhase, unsupported
+from dexsim.sim import collision as narrow_phase
+from dexsim.sim import solver as newton
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 from dexsim.sim.warmup import compile_together
 
@@ -34,6 +35,7 @@ class WarpEngine(Engine):
     """N worlds on MuJoCo-Warp, float32, CPU or CUDA. See `Engine` for the interface.
 
     narrow: who finds the contacts of convex hulls, None = MuJoCo-Warp itself.
+    newton: who finds the contact forces, None = MuJoCo-Warp itself.
     """
 
     kind = "warp"
@@ -50,13 +52,17 @@ class WarpEngine(Engine):
         nconmax: int,
         njmax: int,
         collision: str,
+        solver: str = "auto",
     ):
         super().__init__(model, worlds, device, fields, pairs)
         self.real = wp.float32
-        why_not = unsupported(model)
+        why_not = narrow_phase.unsupported(model)
         if collision == "hand" and why_not:
             raise UserError(f"sim.collision=hand: {why_not}; use sim.collision=mujoco")
         self.nconmax, self.njmax = nconmax, -(-njmax // 16) * 16  # the solver's tiles want multiples of 16
+        no_solver = newton.unsupported(model, device, self.njmax)
+        if solver == "hand" and no_solver:
+            raise UserError(f"sim.solver=hand: {no_solver}; use sim.solver=mujoco")
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         if device.startswith("cuda"):
@@ -76,9 +82,10 @@ class WarpEngine(Engine):
             if "opt.gravity" in fields:
                 self.m.opt.gravity = wp.array(np.tile(model.opt.gravity, (worlds, 1)), dtype=wp.vec3)
             self.d = mjw.put_data(model, mujoco.MjData(model), nworld=worlds, nconmax=nconmax, njmax=self.njmax)
-            self.narrow = NarrowPhase(model, self.m, self.d) if collision != "mujoco" and not why_not else None
+            self.narrow = narrow_phase.NarrowPhase(model, self.m, self.d) if collision != "mujoco" and not why_not else None
             if self.narrow is not None and not self.narrow.number:
                 self.narrow = None
+            self.newton = newton.NewtonSolver(self.m, self.d) if solver != "mujoco" and not no_solver else None
             P = len(self.pairs)
             w = self.wp
             w.time, w.qpos, w.qvel, w.qfrc_applied = self.d.time, self.d.qpos, self.d.qvel, self.d.qfrc_applied
@@ -128,7 +135,10 @@ class WarpEngine(Engine):
 
     def physics_step(self) -> None:
         """One bare physics step, launched and not recorded."""
-        with self.narrow.in_place() if self.narrow is not None else nullcontext():
+        with ExitStack() as stack:
+            for ours in (self.narrow, self.newton):
+                if ours is not None:
+                    stack.enter_context(ours.in_place())
             mjw.step(self.m, self.d)
 
     def _one_step(self) -> None:

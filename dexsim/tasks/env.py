@@ -138,6 +138,7 @@ class HandEnv(VecEnv):
             njmax=sim["njmax"],
             threads=sim["threads"],
             collision=sim.get("collision", "auto"),
+            solver=sim.get("solver", "auto"),
         )
         self.scene = scene
         self.servo = Servo(
@@ -326,7 +327,11 @@ class HandEnv(VecEnv):
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
-        self.begin_episodes(mask)
+        if self.graphs and self.device.startswith("cuda"):  # (evaluation draws as ever, whatever the device)
+            with self.sampler.together("episodes"):
+                self.begin_episodes(mask)
+        else:
+            self.begin_episodes(mask)
         self.engine.refresh()
         self._clear_touch(mask)
         self.episode_length_buf.masked_fill_(mask, 0)

@@ -12,11 +12,49 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import warp as wp
 
 from dexsim.errors import UserError
 
 KEEP = 10
 """Files a run writes at most; `nan_count` goes on counting."""
+
+
+_NONE = 2**31 - 1
+_THREADS = 64  # that copy one field
+
+
+@wp.kernel(enable_backward=False)
+def _first(nan: wp.array(dtype=wp.bool), first: wp.array(dtype=int)):
+    """The lowest world that is not finite."""
+    w = wp.tid()
+    if nan[w]:
+        wp.atomic_min(first, 0, w)
+
+
+@wp.func_native("((unsigned*)to)[k] = ((const unsigned*)(source + stride * (unsigned long long)world))[k];")
+def _copy_word(to: wp.uint64, source: wp.uint64, stride: wp.uint64, world: int, k: int):
+    """4 bytes of a world's row. Fields differ in type and shape; what is kept of them is bytes."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def _keep(first: wp.array(dtype=int), taken: wp.array(dtype=wp.bool), fields: wp.array2d(dtype=wp.uint64)):
+    """Copies that world's row of every field (address, bytes between worlds, address to copy to, words of a world)."""
+    f, lane = wp.tid()
+    if first[0] == wp.static(_NONE) or taken[0]:
+        return
+    words = int(fields[f, 3])
+    for k in range(lane, words, wp.static(_THREADS)):
+        _copy_word(fields[f, 2], fields[f, 0], fields[f, 1], first[0], k)
+
+
+@wp.kernel(enable_backward=False)
+def _take(first: wp.array(dtype=int), taken: wp.array(dtype=wp.bool), world: wp.array(dtype=wp.int64)):
+    if first[0] != wp.static(_NONE) and not taken[0]:
+        world[0] = wp.int64(first[0])
+        taken[0] = True
+    first[0] = wp.static(_NONE)
 
 
 class NanDump:
@@ -46,7 +84,9 @@ class NanDump:
         self._rows = rows
         self._kept = {k: torch.zeros(v.shape[1:], dtype=v.dtype, device=dev) for k, v in rows.items()}
         self._world = torch.zeros(1, dtype=torch.long, device=dev)
-        self._taken = torch.zeros((), dtype=torch.bool, device=dev)
+        self._taken = torch.zeros(1, dtype=torch.bool, device=dev)
+        self._first = torch.full((1,), _NONE, dtype=torch.int32, device=dev)
+        self._fields = torch.tensor([_row(rows[k], kept) for k, kept in self._kept.items()], dtype=torch.int64).to(dev)
 
     def before(self) -> None:
         """Targets are sent and forces set; physics is next."""
@@ -55,12 +95,12 @@ class NanDump:
 
     def after(self, nan: torch.Tensor) -> None:
         """nan [N]: worlds that are not finite. Keeps one of them, unless one is kept that is not written yet."""
-        take = nan.any() & ~self._taken
-        world = nan.to(torch.uint8).argmax(0, keepdim=True)
-        self._world.copy_(torch.where(take, world, self._world))
-        for k, kept in self._kept.items():
-            kept.copy_(torch.where(take, self._rows[k].index_select(0, world)[0], kept))
-        self._taken |= take
+        device = str(nan.device)
+        first, taken = wp.from_torch(self._first), wp.from_torch(self._taken)
+        fields = wp.from_torch(self._fields, dtype=wp.uint64)
+        wp.launch(_first, dim=len(nan), inputs=[wp.from_torch(nan)], outputs=[first], device=device)
+        wp.launch(_keep, dim=(len(self._fields), _THREADS), inputs=[first, taken, fields], device=device)
+        wp.launch(_take, dim=1, inputs=[first, taken], outputs=[wp.from_torch(self._world)], device=device)
 
     def write(self, folder: Path) -> Path | None:
         """Write what is kept to folder/nan_<k>.npz; returns the path, None if there is nothing to write (or enough)."""
@@ -84,6 +124,14 @@ class NanDump:
             path = None
         self._taken.zero_()
         return path
+
+
+def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
+    """What `_keep` has to know of a field [N, ...]."""
+    if not source[0].is_contiguous() or source.element_size() % 4:
+        raise ValueError(f"NanDump: a world's row of {tuple(source.shape)} {source.dtype} is not words in one piece")
+    size = source.element_size()
+    return [source.data_ptr(), source.stride(0) * size, kept.data_ptr(), kept.numel() * size // 4]
 
 
 def load(path: Path) -> dict[str, np.ndarray]:

@@ -3,10 +3,60 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
 from dexsim.errors import UserError
+
+Request = tuple[str, tuple[int, ...]]
+"""What is drawn (a range's name, or UNIFORM or NORMAL) and its shape by world."""
+UNIFORM, NORMAL = "[0, 1)", "N(0, 1)"
+
+
+class Plan:
+    """Draws a list of requests at once: one call of the generator for all uniform numbers, one for all normal ones."""
+
+    def __init__(self, sampler: Sampler, requests: list[Request]):
+        self.requests, self._sampler = requests, sampler
+        size = {i: max(1, math.prod(shape)) for i, (_, shape) in enumerate(requests)}
+        log = {i: sampler.ranges[name][2] for i, (name, _) in enumerate(requests) if name in sampler.ranges}
+        groups = [  # rows of one matrix each, in this order
+            [i for i, (name, _) in enumerate(requests) if name == UNIFORM],
+            [i for i in log if not log[i]],
+            [i for i in log if log[i]],
+            [i for i, (name, _) in enumerate(requests) if name == NORMAL],
+        ]
+        self._rows = [[(i, size[i]) for i in group] for group in groups]
+        self._count = [sum(n for _, n in rows) for rows in self._rows]
+
+        def column(group: int, value) -> torch.Tensor:
+            numbers = [value(*sampler.ranges[requests[i][0]][:2]) for i, n in self._rows[group] for _ in range(n)]
+            return torch.tensor(numbers, dtype=torch.float32, device=sampler.device)[:, None]
+
+        self._low, self._span = column(1, lambda low, high: low), column(1, lambda low, high: high - low)
+        self._least, self._ratio = column(2, lambda low, high: low), column(2, lambda low, high: high / low)
+
+    def draw(self) -> list[torch.Tensor]:
+        """[N, *shape] of each request, in order."""
+        s, (plain, linear, log, normal) = self._sampler, self._count
+        u = torch.rand(plain + linear + log, s.n, generator=s.rng, device=s.device)
+        share = 0.5 + s.width * (u[plain:] - 0.5)
+        drawn = (
+            u[:plain],
+            torch.addcmul(self._low, share[:linear], self._span),
+            self._least * self._ratio ** share[linear:],
+            torch.randn(normal, s.n, generator=s.rng, device=s.device),
+        )
+        out: dict[int, torch.Tensor] = {}
+        for rows, values in zip(self._rows, drawn, strict=True):
+            at = 0
+            for i, n in rows:
+                out[i] = values[at : at + n].view(*self.requests[i][1], s.n).movedim(-1, 0)
+                at += n
+        return [out[i] for i in range(len(self.requests))]
 
 
 class Sampler:
@@ -22,6 +72,42 @@ class Sampler:
         # share of each range, about its middle, that `draw` uses: a curriculum widens it
         self.width = torch.ones((), device=device)
         self._read("randomize", cfg)
+        self._plans: dict[str, Plan] = {}
+        self._noted: list[Request] | None = None
+        self._ahead: deque[tuple[Request, torch.Tensor]] = deque()
+
+    @contextmanager
+    def together(self, name: str) -> Iterator[None]:
+        """Within this, what is drawn is drawn by a dozen kernels, and not by six for each range.
+
+        The first time under a `name` notes what is asked for, in which order. From then on all of that is drawn at the
+        beginning and handed out, as long as it is asked for in the same order; after something else, one by one again.
+        The numbers are others than without, of the same ranges.
+        """
+        plan = self._plans.get(name)
+        noted: list[Request] = []
+        if plan is None:
+            self._noted = noted
+        else:
+            self._ahead.extend(zip(plan.requests, plan.draw(), strict=True))
+        try:
+            yield
+        finally:
+            self._noted = None
+            self._ahead.clear()
+        if plan is None:
+            self._plans[name] = Plan(self, noted)
+
+    def _given(self, name: str, shape: tuple[int, ...]) -> torch.Tensor | None:
+        """What was drawn ahead for this request, if it is the next."""
+        if self._noted is not None:
+            self._noted.append((name, shape))
+        if self._ahead:
+            request, value = self._ahead.popleft()
+            if request == (name, shape):
+                return value
+            self._ahead.clear()
+        return None
 
     def _read(self, path: str, node) -> None:
         for key, value in node.items():
@@ -60,17 +146,23 @@ class Sampler:
     def draw(self, name: str, *shape: int) -> torch.Tensor:
         """[N, *shape] samples of the range `name`, float32."""
         low, high, log = self.range(name)
-        u = 0.5 + self.width * (self.uniform(*shape) - 0.5)
+        if (given := self._given(name, shape)) is not None:
+            return given
+        u = 0.5 + self.width * (torch.rand(self.n, *shape, generator=self.rng, device=self.device) - 0.5)
         if log:
             return low * (high / low) ** u
         return low + (high - low) * u
 
     def uniform(self, *shape: int) -> torch.Tensor:
         """[N, *shape] uniform in [0, 1)."""
+        if (given := self._given(UNIFORM, shape)) is not None:
+            return given
         return torch.rand(self.n, *shape, generator=self.rng, device=self.device)
 
     def normal(self, *shape: int) -> torch.Tensor:
         """[N, *shape] standard normal."""
+        if (given := self._given(NORMAL, shape)) is not None:
+            return given
         return torch.randn(self.n, *shape, generator=self.rng, device=self.device)
 
     def direction(self) -> torch.Tensor:

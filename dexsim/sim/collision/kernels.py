@@ -16,6 +16,10 @@ from dexsim.sim.collision.gjk import OVERLAP, distance, touching
 from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, Core, corner, corners, radius_of, support
 
 
+# Each product and sum rounded by itself, as on a CPU. Fused, a cross product of parallel edges is no longer zero but what one of
+# its two products lost by rounding: a direction out of nothing, by which flat simplices were taken to enclose the origin.
+_ROUNDED = {"fuse_fp": False}
+
 
 @wp.struct
 class Materials:
@@ -182,7 +186,7 @@ def add(pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3,
     write(mat, out, pairs.room, geoms, pairs.id[k], world, t.margin, t.gap, dist - t.radius, pos, b_mat * normal)
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
 def apart(
     pairs: Pairs,
     mat: Materials,
@@ -223,7 +227,7 @@ def apart(
         add(pairs, mat, out, k, t, q, s.v, -s.v / d, d)
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
 def overlapping(
     pairs: Pairs,
     mat: Materials,
