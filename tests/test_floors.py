@@ -26,7 +26,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "deploy",
         "tasks gap",  # neither knows of the other
         "learning",
-        "cli excite export import_hand",
+        "cli excite export import_hand import_object",
         "api",
     )
 )

@@ -39,6 +39,7 @@ COMMANDS: dict[str, Command] = {
     "audit": Command("dexsim.recording.command:main", "say what is in a recording and what is wrong with it"),
     "convert": Command("dexsim.recording.convert:main", "write a log (CSV, NPZ, a bag) as a recording"),
     "import-hand": Command("dexsim.import_hand.command:main", "make a hand of a robot's URDF or MJCF file"),
+    "import-object": Command("dexsim.import_object:main", "make an object to grasp of a mesh file"),
     "export": Command("dexsim.export:main", "write a policy as one folder that a robot can run"),
     "deploy": Command("dexsim.cli.deploy:main", "run an exported policy on a hand, real or simulated"),
     "stable-grasps": Command("dexsim.cli.stable_grasps:main", "make the held poses that rotation episodes start from"),

@@ -13,7 +13,8 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from dexsim.cli import checks, settings
+from dexsim.assets.objects.own import PARTS
+from dexsim.cli import checks, objects, settings
 from dexsim.cli import help as help_page
 from dexsim.errors import UserError
 from dexsim.learning import weights_and_biases
@@ -154,8 +155,8 @@ def _from_checkpoint(
     data: dict[str, Any], config_dir: Path, request: settings.Request, fresh: dict[str, Any]
 ) -> DictConfig:
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
-    own: dict[str, Any] = dict.fromkeys(("model_file", "tactile_file"))  # a checkpoint from before has none
-    own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0}
+    own: dict[str, Any] = dict.fromkeys(("model_file", "tactile_file", "objects", "kept_out"))  # new since
+    own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0, "object_scale": 1.0, "object_hulls": PARTS}
     cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
     if "sim" in cfg:
         cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)
@@ -189,6 +190,7 @@ def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
     hand = Path(str(plain["hand"])).expanduser()
     if hand.exists() and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
         plain["hand"] = str(hand.resolve())
+    objects.apply(plain)
     return plain
 
 

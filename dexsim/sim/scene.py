@@ -1,7 +1,7 @@
 """A hand with one free object whose shape, size, mass and centre of mass differ by world.
 
 One compiled model serves every shape: the object body carries geom slots (a box, a sphere, a capsule, and three convex
-hulls), of which a world uses those that its shape needs; the others are parked a kilometre away (they turn with the
+hulls or as many as the shapes need), of which a world uses those that its shape needs; the others are parked a kilometre away (they turn with the
 object, so such a scene must not have planes, which have no end). Per world only
 `geom_*` and `body_*` fields differ, so that topology, kernels and graphs are shared. Measured against one model a
 shape group, this needs one graph and one compile (see docs/results/speed.md).
@@ -16,8 +16,6 @@ import mujoco
 import numpy as np
 
 from dexsim.assets.objects import Shape
-from dexsim.errors import UserError
-
 OBJECT = "object"
 HULL_SLOTS = 3
 SLOTS = ("object_box", "object_sphere", "object_capsule", *(f"object_hull{i}" for i in range(HULL_SLOTS)))
@@ -47,13 +45,15 @@ class Variant:
 class Scene:
     """The spec, and the table from which a world's object is set.
 
-    variants: list of V variants. Per variant and slot (S = 6): dataid [V, S] int, pos [V, S, 3], quat [V, S, 4],
+    variants: list of V variants; slots: names of the object's S geoms, `SLOTS` and one more for each hull beyond three
+    that a shape has. Per variant and slot: dataid [V, S] int, pos [V, S, 3], quat [V, S, 4],
     size [V, S, 3], rbound [V, S], aabb [V, S, 6]; unit inertia about the centre of mass per kg at scale 1 [V, 3, 3]
     (zero for primitives: from their size).
     """
 
     spec: mujoco.MjSpec
     variants: list[Variant]
+    slots: tuple[str, ...]
     dataid: np.ndarray
     pos: np.ndarray
     quat: np.ndarray
@@ -69,8 +69,7 @@ def _mesh_name(shape: Shape, scale: float, part: int) -> str:
 def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequence[float], timestep: float) -> Scene:
     """Add the object to `hand` (changed in place) and build the table of its variants.
 
-    scales: the sizes at which hulls are baked (a mesh cannot be scaled by world). Raises UserError for a shape with
-    more hulls than slots.
+    scales: the sizes at which hulls are baked (a mesh cannot be scaled by world); a shape of true size gets 1 alone.
     """
     variants: list[Variant] = []
     spec = hand
@@ -79,9 +78,7 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
         if shape.kind in _PRIMITIVE_SLOT:
             variants.append(Variant(shape, 1.0))
             continue
-        if len(shape.hulls) > HULL_SLOTS:
-            raise UserError(f"object '{shape.name}' has {len(shape.hulls)} hulls, at most {HULL_SLOTS} are supported: merge some")
-        for scale in scales:
+        for scale in (1.0,) if shape.true_size else scales:
             variants.append(Variant(shape, float(scale)))
             for k, vertices in enumerate(shape.hulls):
                 spec.add_mesh(name=_mesh_name(shape, scale, k), uservert=(np.asarray(vertices) * scale).ravel())
@@ -103,13 +100,15 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
         placeholder = "placeholder"
     else:
         placeholder = _mesh_name(hulls[0].shape, hulls[0].scale, 0)
-    for k in range(HULL_SLOTS):
-        body.add_geom(name=SLOTS[3 + k], type=g.mjGEOM_MESH, meshname=placeholder, **common)
-    return Scene(spec, variants, *_variant_table(spec, variants))
+    most = max([HULL_SLOTS, *(len(v.shape.hulls) for v in hulls)])
+    slots = (*SLOTS[:3], *(f"object_hull{i}" for i in range(most)))
+    for slot in slots[3:]:
+        body.add_geom(name=slot, type=g.mjGEOM_MESH, meshname=placeholder, **common)
+    return Scene(spec, variants, slots, *_variant_table(spec, variants, slots))
 
 
-def _variant_table(spec: mujoco.MjSpec, variants: list[Variant]) -> tuple[np.ndarray, ...]:
-    V, S = len(variants), len(SLOTS)
+def _variant_table(spec: mujoco.MjSpec, variants: list[Variant], slots: tuple[str, ...]) -> tuple[np.ndarray, ...]:
+    V, S = len(variants), len(slots)
     probe = spec.copy()
     probe_body = probe.worldbody.add_body(name="probe")
     for v in variants:

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
-from dexsim.assets.objects import library
+from dexsim.assets.objects.own import named
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.places import places
@@ -88,10 +88,8 @@ class HandEnv(VecEnv):
             raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
         self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
-        shapes = library()
-        self.shape_names = [
-            _known_shape(s, shapes) for s in (*self.task["objects"]["train"], *self.task["objects"]["held_out"])
-        ]
+        shapes = named(self.task["objects"])
+        self.shape_names = list(shapes)
         spec = model_of(self.hand, cfg.get("model_file"))  # a checkpoint from before has none
         contact = self.task["contact"]
         d = contact["impedance"]
@@ -126,6 +124,7 @@ class HandEnv(VecEnv):
         for geom in list(spec.geoms):
             if not geom.contype and not geom.conaffinity:
                 spec.delete(geom)
+        more = len(scene.slots) - len(SLOTS)  # parts of hollow objects: each may touch
         self.engine = make_engine(
             spec,
             n_worlds,
@@ -134,8 +133,8 @@ class HandEnv(VecEnv):
             fields=(*OBJECT_FIELDS, "dof_damping", "dof_frictionloss", "dof_armature"),
             pairs=contact_pairs(self.hand, root),
             deterministic=sim["deterministic"],
-            nconmax=sim["nconmax"],
-            njmax=sim["njmax"],
+            nconmax=sim["nconmax"] + 2 * more,
+            njmax=sim["njmax"] + 8 * more,
             threads=sim["threads"],
             collision=sim.get("collision", "auto"),
             solver=sim.get("solver", "auto"),
@@ -492,7 +491,7 @@ class HandEnv(VecEnv):
         if self._drawn is None:
             self._drawn = self.drawn_spec.compile()
         model = copy.copy(self._drawn)
-        for slot in SLOTS:
+        for slot in self.scene.slots:
             g = self._drawn.geom(slot).id
             e = self.engine.geom(slot)
             for name in ("geom_pos", "geom_quat", "geom_size", "geom_dataid"):
@@ -615,11 +614,6 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
         )
     return spec
 
-
-def _known_shape(name: str, shapes: dict) -> str:
-    if name not in shapes:
-        raise UserError(f"task.objects: no shape '{name}'; shapes: {', '.join(shapes)}")
-    return name
 
 
 def _solver_options(spec: mujoco.MjSpec, sim: dict, engine: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dexsim.sim import Engine
-from dexsim.sim.scene import OBJECT, SLOTS, Scene
+from dexsim.sim.scene import OBJECT, Scene
 
 
 class Objects:
@@ -26,7 +26,7 @@ class Objects:
         self.engine, self.scene, self.impedance = engine, scene, impedance
         dev, n = engine.device, engine.n
         self.body = engine.body(OBJECT)
-        self.slots = torch.tensor([engine.geom(s) for s in SLOTS], device=dev)
+        self.slots = torch.tensor([engine.geom(s) for s in scene.slots], device=dev)
         self.tips = torch.tensor([engine.geom(g) for g in tip_geoms], device=dev)
         self.tip_bodies = torch.as_tensor(engine.mjm.geom_bodyid[self.tips.cpu().numpy()], device=dev).long()
         hand = [
@@ -124,7 +124,7 @@ class Objects:
         self._write_contact()
 
     def _write_geoms(self, mask, variant, kind, prim, half, bound) -> None:
-        S = len(SLOTS)
+        S = len(self.scene.slots)
         size, rbound, aabb = self._size[variant].clone(), self._rbound[variant].clone(), self._aabb[variant].clone()
         # the primitive slot in use
         own = (torch.arange(S, device=kind.device)[None] == kind[:, None]) & (kind < 3)[:, None]

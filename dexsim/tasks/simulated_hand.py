@@ -262,7 +262,6 @@ class SimulatedCamera:
     def __init__(self, env: Any):
         import mujoco
 
-        from dexsim.sim.scene import SLOTS
         from dexsim.view.video import INSTALL
 
         self._mujoco, self._env = mujoco, env
@@ -270,7 +269,7 @@ class SimulatedCamera:
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self.WIDTH, self.HEIGHT
         self._model.vis.global_.fovy = self.FOVY
         self._data = mujoco.MjData(self._model)
-        self._geoms = [self._model.geom(s).id for s in SLOTS]
+        self._geoms = [self._model.geom(s).id for s in env.scene.slots]
         try:
             self._renderer = mujoco.Renderer(self._model, self.HEIGHT, self.WIDTH)
         except Exception as error:  # whatever a driver raises

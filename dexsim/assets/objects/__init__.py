@@ -64,11 +64,12 @@ def names(held_out: bool | None = None) -> list[str]:
     return [name for name, shape in _library().items() if held_out is None or shape.held_out == held_out]
 
 
-def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0) -> Shape:
-    """A `Shape` of kind "grid" from a user's mesh file, or from a list of at most three files of its convex parts.
+def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts: int = 1) -> Shape:
+    """A `Shape` of kind "grid" from a user's mesh file (a hollow one split into at most `parts` convex ones), or from a
+    list of at most three files of its convex parts.
 
     See `dexsim.assets.objects.mesh.load_mesh`, which this calls.
     """
     from dexsim.assets.objects.mesh import load_mesh as load
 
-    return load(path, scale)
+    return load(path, scale, parts)

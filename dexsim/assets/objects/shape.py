@@ -51,13 +51,14 @@ class Shape:
     name: str
     kind: str
     held_out: bool  # kept for evaluation, never trained on
-    hulls: list[np.ndarray]  # of [V, 3] m, V <= 32, at most three, each the corners of a convex polyhedron
+    hulls: list[np.ndarray]  # of [V, 3] m, V <= 32, each the corners of a convex polyhedron
     grid: Grid | None
     volume: float  # m^3
     inertia_unit: np.ndarray  # [3, 3] m^2: inertia about the centre of mass per kg
     extents: np.ndarray  # [3] m, size of the bounding box
     size: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] m, primitives only
     grid_error: tuple[float, float] = (0.0, 0.0)  # m, mean and largest |grid - exact| within 2 mm of the surface
+    true_size: bool = False  # of a user's own: scenes take it at scale 1, not at the task's sizes
     notes: tuple[str, ...] = ()  # what was approximated, for a person to read
     # A point x of the file that the shape came from is (x * file_scale - file_centre) @ file_axes in the shape frame.
     file_centre: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] m
