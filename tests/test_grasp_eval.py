@@ -33,6 +33,7 @@ class Stage:
         self.engine = SimpleNamespace(field=self.fields.__getitem__)
         self.away, self.object_pose = away, torch.zeros(N, 7)
         self.finger_force = self.tip_force = touched.float()
+        self.palm_force = touched.float().sum(1)  # as much as the fingertips
         self.torque, self.gravity, self.force = torch.zeros(N, 12), [], []
 
     def reset_all(self):
@@ -118,3 +119,20 @@ def test_the_load_is_weight_and_push_together():
     np.testing.assert_allclose(out["load"][1::2], weight[1::2], rtol=1e-5)
     ratio = out["load"][::2] / weight[::2]
     assert (ratio >= 1 - 1e-5).all() and (ratio <= 3 + 1e-5).all() and (abs(ratio - 1) > 1e-3).all()
+
+
+def test_episodes_are_sorted_by_what_fingertips_carry():
+    r = {
+        "tips": np.array([0.1, 0.1, 0.5, 0.5, 1.0, 0.95]), "pushed": np.array([1, 0, 1, 0, 0, 0]),
+        "command": np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.05]), "held": np.array([1, 1, 0, 1, 0, 0]),
+        "held180": np.array([1, 0, 0, 1, 0, 0]),
+    }  # fmt: skip
+    rows = grasp_eval.by_share(r)
+    assert rows["from"] == [0.0, 0.4, 0.8] and rows["episodes"] == [2, 2, 1]  # too weak a command does not count
+    assert rows["held"] == [1.0, 1.0, 0.0] and rows["held_pushed"] == [1.0, 0.0, None]
+    assert rows["held_turned_180"] == [0.5, 0.5, 0.0]
+
+
+def test_what_fingertips_carry_is_measured_against_links_and_palm():
+    _, out = play()
+    assert np.allclose(out["tips"], 0.5)

@@ -20,6 +20,8 @@ SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
 TURN_S, STAY_S = 0.75, 1.0
 BINS = 10
+SHARE_S = 0.5  # s before the hold, over which it is measured what carries the object
+SHARES = 5
 RESAMPLES = 1000  # of the bootstrap
 _END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
 
@@ -38,6 +40,7 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     env.graphs = was
     metrics = _metrics(trained, held_out, env)
     metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
+    metrics["by_fingertip_share"] = by_share(trained)
 
     def force_command(ax):
         _force_plot(ax, trained, env)
@@ -90,6 +93,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
     place = torch.zeros(n, 3, device=dev)
+    by_tips, by_all = torch.zeros(n, device=dev), torch.zeros(n, device=dev)  # forces that press on the object
     moved, untouched = torch.zeros_like(alive), torch.zeros_like(alive)  # what went wrong within the hold
     force, torque, samples = torch.zeros_like(env.tip_force), torch.zeros_like(env.torque), torch.zeros(n, device=dev)
     shown = list(range(min(4, n))) if keep_frames else []
@@ -109,6 +113,9 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         if k == int(round(SETTLE / dt)):
             place.copy_(p)
             held = alive.clone()
+        if SETTLE - SHARE_S < t <= SETTLE:
+            by_tips += env.tip_force.sum(1)
+            by_all += env.finger_force.sum(1) + env.palm_force
         if t > SETTLE:
             felt = env.finger_force > 0
             touched = felt[:, env.opposing].any(1) & felt[:, env.others].any(1)
@@ -141,7 +148,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held,
         "held90": held90,
         "held180": held180, "load": load, "force": force / samples[:, None], "torque": torque / samples[:, None],
-        "alive": alive, "moved": moved, "untouched": untouched,
+        "alive": alive, "moved": moved, "untouched": untouched, "tips": by_tips / by_all.clamp(min=1e-6),
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
     out["frames"] = None
@@ -263,6 +270,25 @@ def _by_object(r: dict, env) -> dict[str, float | None]:
     names = np.array([env.scene.variants[int(v)].shape.name for v in r["shape"]])
     among = ~r["pushed"].astype(bool) & (r["command"] >= 0.1)
     return {str(name): _rate(r["held"], among & (names == name)) for name in np.unique(names)}
+
+
+def by_share(r: dict) -> dict:
+    """Episodes by the share of the normal contact force on the object that fingertips have just before the hold (the
+    rest is links' and palm's), in fifths: their number, shares held of those without and with a push, and of all those
+    still held with the hand turned by 180 degrees. Commands below 0.1 do not count; empty fifths are left out."""
+    bins = np.minimum((np.asarray(r["tips"]) * SHARES).astype(int), SHARES - 1)
+    pushed, firm = r["pushed"].astype(bool), r["command"] >= 0.1
+    rows: dict = {"from": [], "to": [], "episodes": [], "held": [], "held_pushed": [], "held_turned_180": []}
+    for b in range(SHARES):
+        among = firm & (bins == b)
+        if among.any():
+            rows["from"].append(b / SHARES)
+            rows["to"].append((b + 1) / SHARES)
+            rows["episodes"].append(int(among.sum()))
+            rows["held"].append(_rate(r["held"], among & ~pushed))
+            rows["held_pushed"].append(_rate(r["held"], among & pushed))
+            rows["held_turned_180"].append(_rate(r["held180"], among))
+    return rows
 
 
 def _of(x: np.ndarray, columns: list[int]) -> np.ndarray:
