@@ -1,7 +1,8 @@
-"""A small hand made on the spot, as URDF: a palm, three fingers, a thumb; primitives, and meshes for the tips."""
+"""A small hand made on the spot, as URDF: a palm, three fingers, a thumb; `python -m tests.hands FOLDER` writes it."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -82,3 +83,7 @@ def write(folder: Path, left: bool = False, mesh: str = "meshes/tip.stl") -> Pat
     path = folder / "claw.urdf"
     path.write_text(urdf(mesh, left))
     return path
+
+
+if __name__ == "__main__":
+    print(write(Path(sys.argv[1] if len(sys.argv) > 1 else "claw")))
