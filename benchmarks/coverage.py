@@ -268,11 +268,13 @@ def main(argv: list[str]) -> int:
         return "-" if v is None else f"{100 * v:.1f} %"
 
     print(
-        f"{'finger':8}{'F within (95 %)':>24}{'mu within (95 %)':>24}{'mu, own halves':>16}{'region visited':>16}{'samples':>18}   (training | {label})"
+        f"{'finger':8}{'F within (95 %)':>24}{'mu within (95 %)':>24}{'mu, own halves':>16}"
+        f"{'region visited':>16}{'samples':>18}   (training | {label})"
     )
     for finger, e in found.items():
         print(
-            f"{finger:8}{say(e, 'force'):>24}{say(e, 'centre'):>24}{share(e.get('centre_training_halves')):>16}{share(e['region_visited']):>16}"
+            f"{finger:8}{say(e, 'force'):>24}{say(e, 'centre'):>24}"
+            f"{share(e.get('centre_training_halves')):>16}{share(e['region_visited']):>16}"
             f"{e['samples_training']:>10}|{e['samples_other']}"
         )
     result = {"benchmark": "coverage", "other": label, "fingers": found, "plot": str(out / "coverage.png")}

@@ -166,24 +166,32 @@ def rig(rng: np.random.Generator, needs: str) -> dict:
     return b
 
 
+NO_CONTACT = 'contype="0" conaffinity="0"'
+
+
 def model_xml(b: dict, true: dict | None = None) -> str:
     """The pendulum(s) as MJCF; a second one hangs beside the first and shares nothing with it but the supply. true: by
     joint what differs from `b`, and a payload [kg] at the believed centre."""
 
     def load(kg: float) -> str:
         return (
-            f"""<geom type="sphere" size="0.001" pos="0 0 {-b["length"]:.6g}" mass="{kg:.6g}" contype="0" conaffinity="0"/>"""
+            f"""<geom type="sphere" size="0.001" pos="0 0 {-b["length"]:.6g}" mass="{kg:.6g}" {NO_CONTACT}/>"""
             if kg
             else ""
         )
 
     rows = [(k, j, {**b, **(true or {}).get(j, {})}) for k, j in enumerate(b["joints"])]
-    bodies = "".join(f"""
+    bodies = "".join(
+        f"""
     <body name="link_{j}" pos="0 {0.3 * k:g} 0">
       <joint name="{j}" type="hinge" axis="0 1 0" armature="{x["rotor"]:.6g}" range="-3 3" {STICKS}/>
-      <geom name="bob_{j}" type="sphere" size="0.012" pos="0 0 {-x["length"]:.6g}" mass="{x["mass"]:.6g}" contype="0" conaffinity="0"/>{load(x.get("payload", 0.0))}
-    </body>""" for k, j, x in rows)  # fmt: skip
-    return f"""<mujoco model="rig"><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/><worldbody>{bodies}
+      <geom name="bob_{j}" type="sphere" size="0.012" pos="0 0 {-x["length"]:.6g}" mass="{x["mass"]:.6g}"
+        {NO_CONTACT}/>{load(x.get("payload", 0.0))}
+    </body>"""
+        for k, j, x in rows
+    )
+    return f"""<mujoco model="rig"><compiler angle="radian"/>
+<option timestep="0.001" integrator="implicitfast"/><worldbody>{bodies}
 </worldbody></mujoco>
 """
 

@@ -2,13 +2,13 @@
 
     python -m benchmarks.soak [minutes=60] [out=FOLDER] [any other setting of train.py]
 
-The run is train.py's own (PPO, log, checkpoints), 32 worlds and one thread unless told otherwise. After each iteration it
-notes resident memory, its anonymous part (heap: a leak shows there, pages of files come and go), open files, threads, wall time and
-the process's CPU time; CPU time is the measure of an iteration on a machine that does other work as well. It is split: the PPO
-update is the same work in every iteration; collecting is not, because a better policy touches more (the number of touching
-fingers is noted beside it). Written: soak.csv, soak.json, soak.png. The first sixth is left out (start-up, caches, random policy).
-A slope is the least-squares line through the means of 30 blocks of the rest, its 95 % interval by Student's t: blocks, because
-neighbouring iterations are alike. Linux only (/proc).
+The run is train.py's own (PPO, log, checkpoints), 32 worlds and one thread unless told otherwise. After each iteration
+it notes resident memory, its anonymous part (heap: a leak shows there, pages of files come and go), open files,
+threads, wall time and the process's CPU time; CPU time is the measure of an iteration on a machine that does other work
+as well. It is split: the PPO update is the same work in every iteration; collecting is not, because a better policy
+touches more (the number of touching fingers is noted beside it). Written: soak.csv, soak.json, soak.png. The first
+sixth is left out (start-up, caches, random policy). A slope is the least-squares line through the means of 30 blocks of
+the rest, its 95 % interval by Student's t: blocks, because neighbouring iterations are alike. Linux only (/proc).
 """
 
 from __future__ import annotations
@@ -38,9 +38,14 @@ from dexsim.paths import CONFIGS
 COLUMNS = ("iteration", "wall_s", "cpu_s", "update_cpu_s", "rss_mib", "heap_mib", "files", "threads", "touching")
 BLOCKS = 30
 WARM_UP = 1 / 6  # of the run, left out of the slopes
-PANELS = (("heap_mib", "anonymous resident memory (MiB)"), ("files", "open files"), ("touching", "touching fingers a world"),
-          ("update_ms", "CPU time of a PPO update (ms)"), ("collect_ms", "CPU time of collecting (ms)"),
-          ("wall_ms", "wall time of an iteration (ms)"))
+PANELS = (
+    ("heap_mib", "anonymous resident memory (MiB)"),
+    ("files", "open files"),
+    ("touching", "touching fingers a world"),
+    ("update_ms", "CPU time of a PPO update (ms)"),
+    ("collect_ms", "CPU time of collecting (ms)"),
+    ("wall_ms", "wall time of an iteration (ms)"),
+)
 
 
 class TimedRunner(Runner):
@@ -71,15 +76,23 @@ def slope(hours: np.ndarray, values: np.ndarray, blocks: int = BLOCKS) -> dict[s
     y = np.array([values[p].mean() for p in parts])
     fit = stats.linregress(x, y)
     half = float(stats.t.ppf(0.975, len(x) - 2) * fit.stderr) if np.ptp(y) else 0.0
-    return {"mean": float(values.mean()), "per_hour": float(fit.slope), "low": float(fit.slope - half), "high": float(fit.slope + half)}
+    return {
+        "mean": float(values.mean()),
+        "per_hour": float(fit.slope),
+        "low": float(fit.slope - half),
+        "high": float(fit.slope + half),
+    }
 
 
 def summary(rows: np.ndarray) -> dict[str, dict[str, float]]:
-    """Slopes of what was sampled (rows [n, len(COLUMNS)]), the warm-up left out. Raises UserError for too short a run."""
+    """Slopes of what was sampled (rows [n, len(COLUMNS)]), the warm-up left out. Raises UserError for too short a
+    run."""
     columns = per_iteration(rows)
     kept = columns["hours"] >= WARM_UP * columns["hours"][-1]
     if kept.sum() < 2 * BLOCKS:
-        raise UserError(f"minutes: only {int(kept.sum())} iterations after the warm-up, {2 * BLOCKS} are needed; run it longer")
+        raise UserError(
+            f"minutes: only {int(kept.sum())} iterations after the warm-up, {2 * BLOCKS} are needed; run it longer"
+        )
     return {name: slope(columns["hours"][kept], values[kept]) for name, values in columns.items() if name != "hours"}
 
 
@@ -87,8 +100,13 @@ def per_iteration(rows: np.ndarray) -> dict[str, np.ndarray]:
     """Columns by name from the second sample on; times as milliseconds of one iteration."""
     table = dict(zip(COLUMNS, rows.T, strict=True))
     cpu, update, wall = (1e3 * np.diff(table[name]) for name in ("cpu_s", "update_cpu_s", "wall_s"))
-    return {"hours": table["wall_s"][1:] / 3600, "cpu_ms": cpu, "update_ms": update, "collect_ms": cpu - update, "wall_ms": wall} | {
-        name: table[name][1:] for name in ("rss_mib", "heap_mib", "files", "threads", "touching")}
+    return {
+        "hours": table["wall_s"][1:] / 3600,
+        "cpu_ms": cpu,
+        "update_ms": update,
+        "collect_ms": cpu - update,
+        "wall_ms": wall,
+    } | {name: table[name][1:] for name in ("rss_mib", "heap_mib", "files", "threads", "touching")}
 
 
 def draw(rows: np.ndarray, found: dict[str, dict[str, float]], path: Path) -> Path:
@@ -148,12 +166,20 @@ def main(argv: list[str]) -> int:
             writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in rows[-1]])
             file.flush()
             if runner.iteration % 200 == 0:
-                print(f"  {rows[-1][1] / 60:.1f} of {minutes:g} minutes, iteration {runner.iteration}, {rows[-1][5]:.1f} MiB,"
-                      f" {rows[-1][6]} files", flush=True)
+                print(
+                    f"  {rows[-1][1] / 60:.1f} of {minutes:g} minutes, iteration {runner.iteration}, "
+                    f"{rows[-1][5]:.1f} MiB,"
+                    f" {rows[-1][6]} files",
+                    flush=True,
+                )
 
         runner.learn(cfg["iterations"], each, lambda: stop.asked() or time.perf_counter() - began > 60 * minutes)
     log.finish()
-    return report(np.array(rows), out, {"worlds": cfg["worlds"], "engine": env.engine.kind, "minutes": minutes, "versions": machine.versions()})
+    return report(
+        np.array(rows),
+        out,
+        {"worlds": cfg["worlds"], "engine": env.engine.kind, "minutes": minutes, "versions": machine.versions()},
+    )
 
 
 def report(rows: np.ndarray, out: Path, about: dict) -> int:
@@ -162,7 +188,10 @@ def report(rows: np.ndarray, out: Path, about: dict) -> int:
     result = {"benchmark": "soak", **about, "iterations": int(rows[-1, 0]), "slopes": found}
     (out / "soak.json").write_text(json.dumps(result, indent=1))
     for name, f in found.items():
-        print(f"  {name:8s} mean {f['mean']:.5g}   {f['per_hour']:+.3g} an hour (95 %: {f['low']:+.3g} to {f['high']:+.3g})")
+        print(
+            f"  {name:8s} mean {f['mean']:.5g}   {f['per_hour']:+.3g} an hour (95 %: {f['low']:+.3g} to "
+            f"{f['high']:+.3g})"
+        )
     print(f"  figure   {draw(rows, found, out / 'soak.png')}")
     print(json.dumps(result))
     return 0

@@ -25,7 +25,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def command(main: Callable[[list[str]], object], about: str | None = None) -> None:
-    """Run `main` on the command line's arguments (or print `about` for --help) and end the process as every command of dexsim ends (`dexsim.console.ending`)."""
+    """Run `main` on the command line's arguments (or print `about` for --help) and end the process as every command of
+    dexsim ends (`dexsim.console.ending`)."""
 
     def run(argv: list[str]) -> int:
         main(argv)
@@ -67,7 +68,11 @@ def config(argv: Sequence[str]) -> dict[str, Any]:
 def about(device: str) -> dict[str, Any]:
     """Hardware and versions, for the JSON line."""
     cuda = device.startswith("cuda")
-    name = torch.cuda.get_device_name(device) if cuda else f"{platform.machine()} CPU, {len(os.sched_getaffinity(0))} cores"
+    name = (
+        torch.cuda.get_device_name(device)
+        if cuda
+        else f"{platform.machine()} CPU, {len(os.sched_getaffinity(0))} cores"
+    )
     return {"device": name, "versions": machine.versions()}
 
 
@@ -117,8 +122,8 @@ class Snapshot:
         self.everyone = torch.ones(e.n, dtype=torch.bool, device=e.device)
 
     def restore(self, env: Any, fields: bool = False) -> None:
-        """Put an environment of the same worlds there. The clock begins at 0, and the targets hold since ever. fields: also
-        what varies by world (for another environment than the one it was taken from)."""
+        """Put an environment of the same worlds there. The clock begins at 0, and the targets hold since ever. fields:
+        also what varies by world (for another environment than the one it was taken from)."""
         if fields:
             for name, value in self.fields.items():
                 env.engine.field(name).copy_(value)

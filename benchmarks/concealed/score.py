@@ -155,9 +155,10 @@ def one(truth: dict, d: dict) -> dict:
 
     group = truth["group"]
     inside = group in ("effect", "pair") or (group in ("hand", "touch") and effects)
-    out["wrong_sure"] = any(f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f,
-                                                                                                             e) for e in effects)
-                            for f in confident)  # fmt: skip
+    out["wrong_sure"] = any(
+        f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
+        for f in confident
+    )
     if inside:
         if len(effects) == 1:
             e = effects[0]

@@ -255,8 +255,18 @@ def pinch(given: dict[str, str]) -> None:
     out = Path(given["out"])
     out.parent.mkdir(parents=True, exist_ok=True)
     states = States(Series(t, np.round(-depth[:, None] / 1e-5) * 1e-5, STATES, t.copy()))
-    write(out, Recording(out, meta, ("distance",), Series(np.zeros(0), np.zeros((0, 1)), COMMANDS, np.zeros(0)), states, tactile=Series(t, felt, TACTILE),
-                         start_ns=1_000_000_000))  # fmt: skip
+    write(
+        out,
+        Recording(
+            out,
+            meta,
+            ("distance",),
+            Series(np.zeros(0), np.zeros((0, 1)), COMMANDS, np.zeros(0)),
+            states,
+            tactile=Series(t, felt, TACTILE),
+            start_ns=1_000_000_000,
+        ),
+    )
 
 
 def make(folders: list[Path], felt: list[int], lsb: float) -> dict:
@@ -338,7 +348,10 @@ def summed(given: dict[str, str]) -> None:
         felt.append(int((sum((r.tactile.value[:, pad, :, 2] > 2).sum(0) for r in counts) > 3).sum()))
         lsb = counts[0].tactile_lsb
     content = make([r / "found" for r in roots], felt, lsb)
-    head = f"# From presses on {len(roots)} fingertips ({sum(felt)} taxels felt them), diagnosed one by one: python -m benchmarks.loop.presses sum\n"
+    head = (
+        f"# From presses on {len(roots)} fingertips ({sum(felt)} taxels felt them), diagnosed one by one: python -m "
+        "benchmarks.loop.presses sum\n"
+    )
     Path(given["out"]).write_text(
         head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130), encoding="utf-8"
     )

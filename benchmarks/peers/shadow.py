@@ -23,7 +23,8 @@ from dexsim.tasks import make_env
 worlds, seconds = int(sys.argv[1]), float(sys.argv[2])
 torch.set_num_threads(1)
 build.quiet_warp("cpu")
-cfg = start.for_train(["task=grasp", "device=cpu", f"worlds={worlds}", "sim.threads=1", "task.objects.train=[box]"], CONFIGS).cfg
+settings = ["task=grasp", "device=cpu", f"worlds={worlds}", "sim.threads=1", "task.objects.train=[box]"]
+cfg = start.for_train(settings, CONFIGS).cfg
 env = make_env(cfg, worlds, "cpu", 0, "auto")
 random = lambda: 2 * torch.rand(worlds, 12) - 1
 for _ in range(20):
@@ -33,8 +34,9 @@ while time.process_time() - begin < seconds:
     env.step(random())
     steps += worlds
 spent = time.process_time() - begin
-print(json.dumps({"peer": f"dexsim, {worlds} worlds", "steps_per_cpu_s": steps / spent, "physics_per_step": env.decimation, "timestep": env.engine.dt,
-                  "control_s": env.dt, "dofs": int(env.engine.mjm.nv), "sensors": 600, "observation": int(env.obs["actor"].shape[1])}))
+print(json.dumps({"peer": f"dexsim, {worlds} worlds", "steps_per_cpu_s": steps / spent,
+                  "physics_per_step": env.decimation, "timestep": env.engine.dt, "control_s": env.dt,
+                  "dofs": int(env.engine.mjm.nv), "sensors": 600, "observation": int(env.obs["actor"].shape[1])}))
 """
 
 

@@ -1,4 +1,5 @@
-"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage|panda|ergocub data=PATH [out=DIR] [jobs=1]. One JSON line at the end."""
+"""Diagnose real recordings: python -m benchmarks.real bam|emps|sage|panda|ergocub data=PATH [out=DIR] [jobs=1]. One
+JSON line at the end."""
 
 from __future__ import annotations
 
@@ -17,34 +18,50 @@ from dexsim import intervals
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
 
-USAGE = """usage: python -m benchmarks.real bam|emps|sage|panda|ergocub [data=PATH] [out=out/real/NAME] [jobs=1] [fit=20] [figure=FILE.png]
+USAGE = """\
+usage: python -m benchmarks.real bam|emps|sage|panda|ergocub [data=PATH] [out=out/real/NAME] [jobs=1] [fit=20]
+                                 [figure=FILE.png]
 
-data: where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml; the Panda's trajectory; the
-ergoCub fingers' runs), or the folder of all of them with one folder each; without it ../shared/realdata is looked for. Where the data is
-absent a line says so and nothing is run. jobs: of BAM's four gains left out in turn, SAGE's six joints or ergoCub's fingers, how many at a
-time, each in a process of its own; fit: of SAGE's twenty motions, how many to fit. Each part's result is written to out/ as it is done; the
-whole to out/NAME.json.
+data: where you put the downloaded recordings (BAM's raw/*.json; EMPS' *.mat; SAGE's motions as npz with so101.xml;
+the Panda's trajectory; the ergoCub fingers' runs), or the folder of all of them with one folder each; without it
+../shared/realdata is looked for. Where the data is absent a line says so and nothing is run. jobs: of BAM's four
+gains left out in turn, SAGE's six joints or ergoCub's fingers, how many at a time, each in a process of its own; fit:
+of SAGE's twenty motions, how many to fit. Each part's result is written to out/ as it is done; the whole to
+out/NAME.json.
 """
 FOLDERS = {"bam": "bam_xl330", "emps": "emps", "sage": "sage_so101", "panda": "panda", "ergocub": "ergocub_fingers"}
 
 
 def bam(data: Path, out: Path, jobs: int) -> dict:
-    """Leave one gain out: each of the 16 recordings run free in closed loop, with everything chosen on the other three gains."""
+    """Leave one gain out: each of the 16 recordings run free in closed loop, with everything chosen on the other three
+    gains."""
     from benchmarks.real.convert_bam import convert
 
     gains = sorted(set(convert(data, out / "recordings").gains.values()))
     folds = []
     for done in _parts(fold, [(data, out, g) for g in gains], jobs):
         folds.append(done)
-        print(f"gain {done['gain']} left out: {done['verdict']}, {', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
-              f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+        print(
+            f"gain {done['gain']} left out: {done['verdict']}, "
+            f"{', '.join(_named(f) for f in done['findings']) or 'nothing'}; position MAE "
+            f"{1e3 * np.mean([e[1] for e in done['recordings'].values()]):.1f} mrad ({done['seconds']:.0f} s)",
+            flush=True,
+        )
     folds.sort(key=lambda f: f["gain"])
     errors = {k: v for f in folds for k, v in f["recordings"].items()}
     x = np.array(list(errors.values()))
     low, high = intervals.bootstrap((x[:, 1],), np.mean, 0, 2000)
-    return {"benchmark": "bam", "mae_mrad": float(1e3 * x[:, 1].mean()), "mae_low_mrad": float(1e3 * low), "mae_high_mrad": float(1e3 * high),
-            "mae_before_mrad": float(1e3 * x[:, 0].mean()), "to_beat_mrad": 52.3, "coulomb_viscous_mrad": 64.1,
-            "by_recording_mrad": {k: [round(1e3 * a, 1), round(1e3 * b, 1)] for k, (a, b) in sorted(errors.items())}, "folds": folds}  # fmt: skip
+    return {
+        "benchmark": "bam",
+        "mae_mrad": float(1e3 * x[:, 1].mean()),
+        "mae_low_mrad": float(1e3 * low),
+        "mae_high_mrad": float(1e3 * high),
+        "mae_before_mrad": float(1e3 * x[:, 0].mean()),
+        "to_beat_mrad": 52.3,
+        "coulomb_viscous_mrad": 64.1,
+        "by_recording_mrad": {k: [round(1e3 * a, 1), round(1e3 * b, 1)] for k, (a, b) in sorted(errors.items())},
+        "folds": folds,
+    }
 
 
 def _parts(work: Callable, given: Sequence[tuple], jobs: int):
@@ -66,10 +83,22 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
 
     made = convert(data, out / "recordings")
     start = time.perf_counter()
-    d = diagnose(Settings([made.estimation], out, [made.pulses], str(made.model), str(made.servo), next_recording=False), say=lambda _: None)
+    d = diagnose(
+        Settings([made.estimation], out, [made.pulses], str(made.model), str(made.servo), next_recording=False),
+        say=lambda _: None,
+    )
     save(d, out)
-    result = {"benchmark": "emps", "verdict": d.data["verdict"], "findings": [brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"],
-              "reference": REFERENCE, "held_out": d.data["held_out"], "joints": d.joints, "notes": d.notes, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    result = {
+        "benchmark": "emps",
+        "verdict": d.data["verdict"],
+        "findings": [brief(f) for f in d.data["findings"]],
+        "nuisance": d.data["nuisance"],
+        "reference": REFERENCE,
+        "held_out": d.data["held_out"],
+        "joints": d.joints,
+        "notes": d.notes,
+        "seconds": round(time.perf_counter() - start, 1),
+    }
     found = _emps_parameters(d)
     result["found"] = found
     result["off_percent"] = {k: round(100 * (found[k] / REFERENCE[k] - 1), 2) for k in REFERENCE}
@@ -89,24 +118,51 @@ def emps(data: Path, out: Path, jobs: int) -> dict:
         elif n.text != SQUARE and n.speed:
             more |= {"peak": n.value, "v_s": n.speed}
     result["inverse"] = {
-        "value": by, "low": {k: tool.low[n] for k, n in names.items()}, "high": {k: tool.high[n] for k, n in names.items()},
-        "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 3) for k in by}, "extra": tool.extra[:3], "residual": tool.residual, "with_named": more,
-        "named": [{"text": n.text, "effect": n.effect, "value": n.value, "low": n.low, "high": n.high, "share": n.share, "before_N": n.before, "after_N": n.after}
-                  for n in tool.named],
-    }  # fmt: skip
-    result["open_loop_mm"] = {name: {label: round(1e3 * force.open_loop(*x, **p), 3) for label, p in
-                                     (("reference", REFERENCE), ("found", found), ("inverse", by), ("named", more))} for name, x in given.items()}  # fmt: skip
+        "value": by,
+        "low": {k: tool.low[n] for k, n in names.items()},
+        "high": {k: tool.high[n] for k, n in names.items()},
+        "off_percent": {k: round(100 * (by[k] / REFERENCE[k] - 1), 3) for k in by},
+        "extra": tool.extra[:3],
+        "residual": tool.residual,
+        "with_named": more,
+        "named": [
+            {
+                "text": n.text,
+                "effect": n.effect,
+                "value": n.value,
+                "low": n.low,
+                "high": n.high,
+                "share": n.share,
+                "before_N": n.before,
+                "after_N": n.after,
+            }
+            for n in tool.named
+        ],
+    }
+    result["open_loop_mm"] = {
+        name: {
+            label: round(1e3 * force.open_loop(*x, **p), 3)
+            for label, p in (("reference", REFERENCE), ("found", found), ("inverse", by), ("named", more))
+        }
+        for name, x in given.items()
+    }
     return result
 
 
 def _emps_parameters(d) -> dict[str, float]:
-    """Mass, viscous and dry friction, offset of the fitted drive as servo.yaml and the nuisances have them, in the literature's terms."""
+    """Mass, viscous and dry friction, offset of the fitted drive as servo.yaml and the nuisances have them, in the
+    literature's terms."""
     from dexsim.actuator.columns import INDEX
 
     row = d.servo.nominal(("carriage",))[0]
     get = lambda n: float(row[INDEX[n]])  # noqa: E731
     mass = 95.0 * float(d.data["nuisance"].get("inertia_factor@carriage", 1.0))
-    return {"mass": mass, "viscous": get("viscous_friction"), "coulomb": get("coulomb_friction"), "offset": 0.5 * get("friction_asymmetry") * get("coulomb_friction")}
+    return {
+        "mass": mass,
+        "viscous": get("viscous_friction"),
+        "coulomb": get("coulomb_friction"),
+        "offset": 0.5 * get("friction_asymmetry") * get("coulomb_friction"),
+    }
 
 
 def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
@@ -120,21 +176,33 @@ def sage(data: Path, out: Path, jobs: int, fit: int = 0) -> dict:
     rows = {}
     for done in _parts(joint, [(made, out, j) for j in sorted(JOINTS, key=HARD.index)], jobs):
         rows[done["joint"]] = done
-        print(f"{done['joint']:<12} {done['before_mrad']:>7} -> {done['after_mrad']:>6} mrad  {', '.join(_named(f) for f in done['findings']) or '-'} "
-              f"({done['seconds']:.0f} s)", flush=True)  # fmt: skip
-    return {"benchmark": "sage", "fitted_motions": len(made.recordings), "commands_logged_late": made.late, "joints": {j: rows[j] for j in JOINTS},
-            "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+        print(
+            f"{done['joint']:<12} {done['before_mrad']:>7} -> {done['after_mrad']:>6} mrad  "
+            f"{', '.join(_named(f) for f in done['findings']) or '-'} "
+            f"({done['seconds']:.0f} s)",
+            flush=True,
+        )
+    return {
+        "benchmark": "sage",
+        "fitted_motions": len(made.recordings),
+        "commands_logged_late": made.late,
+        "joints": {j: rows[j] for j in JOINTS},
+        "seconds": round(time.perf_counter() - start, 1),
+    }
 
 
 def panda(data: Path, out: Path, jobs: int) -> dict:
-    """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is kept out."""
+    """Dry friction of seven joints under gravity, from their torque sensors; the last quarter of the one trajectory is
+    kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.gap.read.keep_out import KEEP_OUT
 
     made = convert(data, out / "recordings")
     wall, cpu = time.perf_counter(), time.process_time()
-    d = diagnose(Settings([made.recording], out, None, str(made.model), str(made.servo), next_recording=False), say=print)
+    d = diagnose(
+        Settings([made.recording], out, None, str(made.model), str(made.servo), next_recording=False), say=print
+    )
     save(d, out)
     cpu = time.process_time() - cpu
     rows, plainly = {}, plain(data, 1 - KEEP_OUT)
@@ -142,10 +210,22 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
         v = d.servo.value(j, "coulomb_friction")
         x = plainly[j]
         rows[j] = {"handed_on": None if v.unknown else v.value, "low": v.low, "high": v.high, "plain": x,
-                   "inside": bool(not v.unknown and x["low"] <= v.value <= x["high"]), "sigma": d.joints.get(j)}  # fmt: skip
-    return {"benchmark": "panda", "inside": sum(r["inside"] for r in rows.values()), "of": len(JOINTS), "joints": rows, "stages": d.stages,
-            "verdict": d.data["verdict"], "findings": [brief(f) for f in d.data["findings"]], "sentence": d.sentence, "held_out": d.data["held_out"], "notes": d.notes,
-            "cpu_seconds": round(cpu, 1), "seconds": round(time.perf_counter() - wall, 1), "shares": d.shares}  # fmt: skip
+                   "inside": bool(not v.unknown and x["low"] <= v.value <= x["high"]), "sigma": d.joints.get(j)}
+    return {
+        "benchmark": "panda",
+        "inside": sum(r["inside"] for r in rows.values()),
+        "of": len(JOINTS),
+        "joints": rows,
+        "stages": d.stages,
+        "verdict": d.data["verdict"],
+        "findings": [brief(f) for f in d.data["findings"]],
+        "sentence": d.sentence,
+        "held_out": d.data["held_out"],
+        "notes": d.notes,
+        "cpu_seconds": round(cpu, 1),
+        "seconds": round(time.perf_counter() - wall, 1),
+        "shares": d.shares,
+    }
 
 
 def ergocub(data: Path, out: Path, jobs: int) -> dict:
@@ -160,11 +240,16 @@ def ergocub(data: Path, out: Path, jobs: int) -> dict:
     for done in _parts(finger, work, jobs):
         rows[done["name"]] = done
         print(f"{done['name']:<16} {done['verdict']:<16} plain {done['plain_mrad']} -> {done['after_mrad']} mrad  "
-              f"{', '.join(_named(f) for f in done['findings']) or '-'} ({done['seconds']:.0f} s)", flush=True)  # fmt: skip
+              f"{', '.join(_named(f) for f in done['findings']) or '-'} ({done['seconds']:.0f} s)", flush=True)
     rows = {x[2]: rows[x[2]] for x in work}
     first = {which: {r: rows[r]["first_name"] for r in runs} for which, runs in FINGERS.items()}
-    return {"benchmark": "ergocub", "first_name_by_run": first, "dead_encoder_named": any(f["effect"] == "bad_channel" for f in rows["thumb1"]["findings"]),
-            "runs": rows, "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    return {
+        "benchmark": "ergocub",
+        "first_name_by_run": first,
+        "dead_encoder_named": any(f["effect"] == "bad_channel" for f in rows["thumb1"]["findings"]),
+        "runs": rows,
+        "seconds": round(time.perf_counter() - start, 1),
+    }
 
 
 HARD = ("Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Rotation", "Jaw")  # the longest to search first
@@ -180,7 +265,10 @@ def figure(result: dict, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     if result["benchmark"] == "bam":
-        rows = [(f"gain {f['gain']}", *(1e3 * np.mean([e[i] for e in f["recordings"].values()]) for i in (0, 1))) for f in result["folds"]]
+        rows = [
+            (f"gain {f['gain']}", *(1e3 * np.mean([e[i] for e in f["recordings"].values()]) for i in (0, 1)))
+            for f in result["folds"]
+        ]
         label = "position MAE, left-out gain (mrad)"
     elif result["benchmark"] == "sage":
         rows = [(j, v["before_mrad"], v["after_mrad"]) for j, v in result["joints"].items()]
@@ -191,7 +279,13 @@ def figure(result: dict, path: Path) -> None:
         label = "force left on the pulses, not fitted (N, rms)"
     fig, ax = plt.subplots(figsize=(7.2, 0.42 * len(rows) + 1.5), layout="constrained")
     y, pair = np.arange(len(rows)), 0.2 if result["benchmark"] != "emps" else 0.0
-    ax.barh(y - pair, [r[1] for r in rows], 0.38, color="#a0aec0", label="as believed, refitted within its ranges" if pair else "published structure")
+    ax.barh(
+        y - pair,
+        [r[1] for r in rows],
+        0.38,
+        color="#a0aec0",
+        label="as believed, refitted within its ranges" if pair else "published structure",
+    )
     ax.barh(y + pair, [r[2] for r in rows], 0.38, color="#2f855a", label="with what was found")
     ax.set_yticks(y, [r[0] for r in rows])
     ax.invert_yaxis()
@@ -203,13 +297,17 @@ def figure(result: dict, path: Path) -> None:
 
 
 def folder(name: str, given: str | None) -> Path | None:
-    """The folder of a data set; None where none was given and none lies beside the project. UserError where the given one is not there."""
+    """The folder of a data set; None where none was given and none lies beside the project. UserError where the given
+    one is not there."""
     root = Path(given).expanduser() if given else Path("../shared/realdata")
     inner = root / FOLDERS[name]
     if inner.is_dir():
         return inner
     if given and not root.is_dir():
-        raise UserError(f"data={given} is not a folder; download the recordings first (benchmarks/real/convert_{name}.py says where from)")
+        raise UserError(
+            f"data={given} is not a folder; download the recordings first (benchmarks/real/convert_{name}.py says "
+            "where from)"
+        )
     return root if given else None
 
 
@@ -217,15 +315,28 @@ def main(argv: list[str]) -> int:
     """Runs one benchmark; returns the exit status."""
     plain = [a for a in argv if "=" not in a]
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if not plain or len(plain) > 2 or plain[0] not in JOBS or set(given) - {"data", "out", "jobs", "figure", "fit"} or not given.get("jobs", "1").isdigit():
+    if (
+        not plain
+        or len(plain) > 2
+        or plain[0] not in JOBS
+        or set(given) - {"data", "out", "jobs", "figure", "fit"}
+        or not given.get("jobs", "1").isdigit()
+    ):
         print(USAGE, end="")
         return 0 if plain[:1] in (["-h"], ["--help"]) else 2
     if "figure" in given and plain[0] not in FIGURES:
         raise UserError(f"figure= is drawn for {', '.join(FIGURES)}, not for {plain[0]}")
     data = folder(plain[0], plain[1] if len(plain) == 2 else given.get("data"))
     if data is None:
-        print(json.dumps({"benchmark": plain[0], "skipped": f"../shared/realdata/{FOLDERS[plain[0]]} is absent; data=PATH names the recordings "
-                          f"(benchmarks/real/convert_{plain[0]}.py says where from)"}))  # fmt: skip
+        print(
+            json.dumps(
+                {
+                    "benchmark": plain[0],
+                    "skipped": f"../shared/realdata/{FOLDERS[plain[0]]} is absent; data=PATH names the recordings "
+                    f"(benchmarks/real/convert_{plain[0]}.py says where from)",
+                }
+            )
+        )
         return 0
     from dexsim.sim.quiet import quiet_warp
 

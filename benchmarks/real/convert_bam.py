@@ -1,4 +1,5 @@
-"""BAM's XL330 pendulum (github.com/Rhoban/bam, Apache-2.0): one small servo, a 0.49 kg mass at 0.1 m, four gains times four motions."""
+"""BAM's XL330 pendulum (github.com/Rhoban/bam, Apache-2.0): one small servo, a 0.49 kg mass at 0.1 m, four gains times
+four motions."""
 
 from __future__ import annotations
 
@@ -23,16 +24,22 @@ MODEL = """<mujoco model="bam_pendulum">
   </worldbody>
 </mujoco>
 """
-# From the datasheet at 5 V (0.52 N.m, 104 rpm), carried to 7.4 V; this servo is not one that was measured, and the datasheet
+# From the datasheet at 5 V (0.52 N.m, 104 rpm), carried to 7.4 V; this servo is not one that was measured, and the
+# datasheet
 # does not cover 7.4 V. Nothing is known of its friction.
 SERVO = {
     "drive": "voltage",
-    "joints": {"*": {
-        "kp": 0.29, "torque_limit": {"value": 0.77, "low": 0.35, "high": 1.5}, "no_load_speed": {"value": 16.1, "low": 8.0, "high": 60.0},
-        "coulomb_friction": "unknown", "viscous_friction": "unknown",
-    }},
+    "joints": {
+        "*": {
+            "kp": 0.29,
+            "torque_limit": {"value": 0.77, "low": 0.35, "high": 1.5},
+            "no_load_speed": {"value": 16.1, "low": 8.0, "high": 60.0},
+            "coulomb_friction": "unknown",
+            "viscous_friction": "unknown",
+        }
+    },
     "supply_voltage": 7.4,
-}  # fmt: skip
+}
 DUTY_PER_RAD = (4096 / (2 * np.pi)) / (256 * 885)  # the firmware's law: duty = kp_register * error * this
 
 
@@ -51,7 +58,9 @@ def convert(data: Path, out: Path) -> Bam:
     folder = data / "raw" if (data / "raw").is_dir() else data
     files = sorted(folder.glob("*.json"))
     if not files:
-        raise UserError(f"{data}: no BAM recordings (*.json); give the folder that holds bam/data.bak/raw of github.com/Rhoban/bam")
+        raise UserError(
+            f"{data}: no BAM recordings (*.json); give the folder that holds bam/data.bak/raw of github.com/Rhoban/bam"
+        )
     out.mkdir(parents=True, exist_ok=True)
     model, servo = out / "rig.xml", dump(out / "rig.yaml", SERVO)
     model.write_text(MODEL, encoding="utf-8")
@@ -66,11 +75,24 @@ def convert(data: Path, out: Path) -> Bam:
         pick = lambda x, keep=keep: x[keep][:, None]  # noqa: E731
         name = f"{path.stem}.mcap"
         kp = raw["kp"] * DUTY_PER_RAD
-        made.append(save(
-            out / name, ("joint",), t[keep], pick(column("goal_position")), t[keep], pick(column("position")), v=pick(column("speed")),
-            duty=pick(duty), temperature=pick(column("temp")), enabled=pick(column("torque_enable")), supply=column("input_volts")[keep],
-            robot="bam_xl330", gravity="0 0 -9.81", servo=yaml.safe_dump({"joints": {"joint": {"kp": float(kp)}}}),
-            notes=f"{raw['trajectory']}, gain register {raw['kp']}",
-        ))  # fmt: skip
+        made.append(
+            save(
+                out / name,
+                ("joint",),
+                t[keep],
+                pick(column("goal_position")),
+                t[keep],
+                pick(column("position")),
+                v=pick(column("speed")),
+                duty=pick(duty),
+                temperature=pick(column("temp")),
+                enabled=pick(column("torque_enable")),
+                supply=column("input_volts")[keep],
+                robot="bam_xl330",
+                gravity="0 0 -9.81",
+                servo=yaml.safe_dump({"joints": {"joint": {"kp": float(kp)}}}),
+                notes=f"{raw['trajectory']}, gain register {raw['kp']}",
+            )
+        )
         gains[name] = int(raw["kp"])
     return Bam(made, gains, model, servo)

@@ -1,4 +1,5 @@
-"""EMPS, a linear drive at 1 kHz (Janot, Gautier, Brunot 2019, nonlinearbenchmark.org): closed loop, force from the drive's voltage."""
+"""EMPS, a linear drive at 1 kHz (Janot, Gautier, Brunot 2019, nonlinearbenchmark.org): closed loop, force from the
+drive's voltage."""
 
 from __future__ import annotations
 
@@ -45,16 +46,38 @@ def convert(data: Path, out: Path, mass: float = 95.0) -> Emps:
     model = out / "emps.xml"
     model.write_text(MODEL.format(mass=mass), encoding="utf-8")
     # the law is volts = KV * (KP * error - speed); as a duty of 10 V, of which the drive makes FORCE_PER_VOLT * 10 N
-    servo = dump(out / "emps.yaml", {
-        "drive": "voltage", "loop_rate": 1000,
-        "joints": {"*": {"kp": KP * KV / VOLTS, "kd": KV / VOLTS, "torque_limit": FORCE_PER_VOLT * VOLTS, "coulomb_friction": "unknown",
-                         "viscous_friction": "unknown"}},
-    })  # fmt: skip
+    servo = dump(
+        out / "emps.yaml",
+        {
+            "drive": "voltage",
+            "loop_rate": 1000,
+            "joints": {
+                "*": {
+                    "kp": KP * KV / VOLTS,
+                    "kd": KV / VOLTS,
+                    "torque_limit": FORCE_PER_VOLT * VOLTS,
+                    "coulomb_friction": "unknown",
+                    "viscous_friction": "unknown",
+                }
+            },
+        },
+    )
     paths = []
     for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
         raw = loadmat(data / f"{name}.mat")
         get = lambda key, raw=raw: np.asarray(raw[key], float).reshape(-1)  # noqa: E731
         t, q, target, force = get("t"), get("qm"), get("qg"), float(raw["gtau"].squeeze()) * get("vir")
-        paths.append(save(out / f"{name.lower()}.mcap", ("carriage",), t, target[:, None], t, q[:, None], effort=force[:, None],
-                          robot="emps", gravity="0 0 0"))  # fmt: skip
+        paths.append(
+            save(
+                out / f"{name.lower()}.mcap",
+                ("carriage",),
+                t,
+                target[:, None],
+                t,
+                q[:, None],
+                effort=force[:, None],
+                robot="emps",
+                gravity="0 0 0",
+            )
+        )
     return Emps(paths[0], paths[1], model, servo)

@@ -1,13 +1,14 @@
-"""Fingers of the ergoCub humanoid hand, driven open loop (github.com/icub-tech-iit/ergocub-software, BSD-3-Clause): one tendon-driven joint a run.
+"""Fingers of the ergoCub humanoid hand, driven open loop (github.com/icub-tech-iit/ergocub-software, BSD-3-Clause): one
+tendon-driven joint a run.
 
-Each run as an npz: t [s], pwm_set and pwm_read [% of full duty], theta_deg [deg, 0 is a stop]. Only ratios of torque, inertia and friction show in a
-motion without a load cell: inertias are in units of an assumed one (`INERTIA`), torques with it. The host turned the duty round where the finger
-passed a threshold, which a free run of the whole would not know: each run is cut into clips of whole cycles of `CLIP` s and more, each of them
-free from its first sample.
+Each run as an npz: t [s], pwm_set and pwm_read [% of full duty], theta_deg [deg, 0 is a stop]. Only ratios of torque,
+inertia and friction show in a motion without a load cell: inertias are in units of an assumed one (`INERTIA`), torques
+with it. The host turned the duty round where the finger passed a threshold, which a free run of the whole would not
+know: each run is cut into clips of whole cycles of `CLIP` s and more, each of them free from its first sample.
 
-Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third, beginning with the
-third; of each run alone every fourth clip, beginning with the fourth. (First it was the last quarter of the clips; of the first run that was
-tried, middle1, that was one clip at a duty that no other clip has.)
+Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third,
+beginning with the third; of each run alone every fourth clip, beginning with the fourth. (First it was the last quarter
+of the clips; of the first run that was tried, middle1, that was one clip at a duty that no other clip has.)
 """
 
 from __future__ import annotations
@@ -20,7 +21,11 @@ import numpy as np
 from benchmarks.real.common import dump, save
 from dexsim.errors import UserError
 
-FINGERS = {"middle": ("middle", "middle1", "middle3", "middle4", "middle5", "middle6", "output"), "ring_little": ("rinky", "rinky1", "rinky3"), "thumb": ("thumb1",)}
+FINGERS = {
+    "middle": ("middle", "middle1", "middle3", "middle4", "middle5", "middle6", "output"),
+    "ring_little": ("rinky", "rinky1", "rinky3"),
+    "thumb": ("thumb1",),
+}
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
 CLIP = 2.0  # s
 KEPT = 4  # every so many of a run's clips is kept out
@@ -33,19 +38,27 @@ MODEL = f"""<mujoco model="ergocub_finger">
   <worldbody>
     <body name="finger">
       <joint name="joint" type="hinge" axis="0 1 0" range="0 1.6" armature="{0.9 * INERTIA}"/>
-      <geom name="link" type="sphere" size="0.005" pos="0 0 0.05" mass="{0.1 * INERTIA / 0.05**2}" contype="0" conaffinity="0"/>
+      <geom name="link" type="sphere" size="0.005" pos="0 0 0.05" mass="{0.1 * INERTIA / 0.05**2}"
+        contype="0" conaffinity="0"/>
     </body>
   </worldbody>
 </mujoco>
 """
-# Nothing is known of the drive but that duty makes torque less back-EMF; Coulomb and viscous friction are fitted with everything.
+# Nothing is known of the drive but that duty makes torque less back-EMF; Coulomb and viscous friction are fitted with
+# everything.
 SERVO = {
     "drive": "voltage",
-    "joints": {"*": {
-        "kp": float(PER_DUTY), "kd": 0.0, "torque_limit": {"value": 0.05, "low": 0.005, "high": 0.5}, "no_load_speed": {"value": 6.0, "low": 1.5, "high": 60.0},
-        "coulomb_friction": "unknown", "viscous_friction": "unknown",
-    }},
-}  # fmt: skip
+    "joints": {
+        "*": {
+            "kp": float(PER_DUTY),
+            "kd": 0.0,
+            "torque_limit": {"value": 0.05, "low": 0.005, "high": 0.5},
+            "no_load_speed": {"value": 6.0, "low": 1.5, "high": 60.0},
+            "coulomb_friction": "unknown",
+            "viscous_friction": "unknown",
+        }
+    },
+}
 
 
 @dataclass
@@ -63,12 +76,14 @@ def held_out(finger: str) -> tuple[str, ...]:
 
 
 def convert(data: Path, out: Path) -> Ergocub:
-    """Converts all runs. The duty that was set is a command (as a target far off, through a gain that makes a duty of it); what was read back
-    is the duty topic."""
+    """Converts all runs. The duty that was set is a command (as a target far off, through a gain that makes a duty of
+    it); what was read back is the duty topic."""
     names = [n for runs in FINGERS.values() for n in runs]
     absent = [n for n in names if not (data / f"{n}.npz").is_file()]
     if absent:
-        raise UserError(f"{data}: no {', '.join(f'{n}.npz' for n in absent)}; give the folder of the fingers' runs as npz")
+        raise UserError(
+            f"{data}: no {', '.join(f'{n}.npz' for n in absent)}; give the folder of the fingers' runs as npz"
+        )
     out.mkdir(parents=True, exist_ok=True)
     model, servo = out / "finger.xml", dump(out / "finger.yaml", SERVO)
     model.write_text(MODEL, encoding="utf-8")
@@ -82,13 +97,25 @@ def convert(data: Path, out: Path) -> Ergocub:
             on = slice(a, b)
             changed = a + np.flatnonzero(np.r_[True, np.diff(set_[on]) != 0])
             keep = slice(a, b, EVERY)
-            made[name].append(save(out / f"{name}_{k:02d}.mcap", ("joint",), t[changed], (set_ / PER_DUTY)[changed, None], t[keep], q[keep, None],
-                                   duty=read[keep, None] if np.ptp(read) > 0 else None, robot="ergocub_finger", gravity="0 0 0"))  # fmt: skip
+            made[name].append(
+                save(
+                    out / f"{name}_{k:02d}.mcap",
+                    ("joint",),
+                    t[changed],
+                    (set_ / PER_DUTY)[changed, None],
+                    t[keep],
+                    q[keep, None],
+                    duty=read[keep, None] if np.ptp(read) > 0 else None,
+                    robot="ergocub_finger",
+                    gravity="0 0 0",
+                )
+            )
     return Ergocub(made, model, servo)
 
 
 def _clips(t: np.ndarray, duty: np.ndarray, q: np.ndarray) -> list[tuple[int, int]]:
-    """Samples at which clips begin and end: where the duty turns positive; all in one where the encoder says nothing."""
+    """Samples at which clips begin and end: where the duty turns positive; all in one where the encoder says
+    nothing."""
     turns = np.flatnonzero((duty[1:] > 0) & (duty[:-1] <= 0)) + 1
     if np.ptp(q) == 0 or len(turns) < 2:
         return [(0, len(t))]
@@ -101,7 +128,8 @@ def _clips(t: np.ndarray, duty: np.ndarray, q: np.ndarray) -> list[tuple[int, in
 
 
 def repeat_noise(data: Path, name: str) -> float:
-    """What strokes at one duty differ by from one to the next, each from where it began [rad, rms over root 2]; NaN where none repeats."""
+    """What strokes at one duty differ by from one to the next, each from where it began [rad, rms over root 2]; NaN
+    where none repeats."""
     raw = np.load(data / f"{name}.npz")
     t, duty, q = raw["t"], raw["pwm_set"], np.radians(raw["theta_deg"])
     edges = np.r_[0, np.flatnonzero(np.diff(duty) != 0) + 1, len(t)]

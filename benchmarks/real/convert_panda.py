@@ -1,7 +1,9 @@
-"""A Franka Emika Panda on an exciting trajectory (Gaz, Cognetti, Oliva, Robuffo Giordano, De Luca, RA-L 2019): seven joint torque sensors at 1 kHz.
+"""A Franka Emika Panda on an exciting trajectory (Gaz, Cognetti, Oliva, Robuffo Giordano, De Luca, RA-L 2019): seven
+joint torque sensors at 1 kHz.
 
-From github.com/marcocognetti/FrankaEmikaPandaDynModel, matlab/data/Exciting_Traj/Trajectory_1, as one npz (t, q, tau, t_target, q_target) beside
-panda.xml (links with the inertial parameters that its authors identified) and panda.yaml (a loose belief of the drives).
+From github.com/marcocognetti/FrankaEmikaPandaDynModel, matlab/data/Exciting_Traj/Trajectory_1, as one npz (t, q, tau,
+t_target, q_target) beside panda.xml (links with the inertial parameters that its authors identified) and panda.yaml (a
+loose belief of the drives).
 """
 
 from __future__ import annotations
@@ -40,14 +42,24 @@ def convert(data: Path, out: Path) -> Panda:
     raw = np.load(data / FILE)
     for name in ("panda.xml", "panda.yaml"):
         shutil.copyfile(data / name, out / name)
-    path = save(out / "panda.mcap", JOINTS, raw["t_target"], raw["q_target"], raw["t"], raw["q"], effort=raw["tau"], robot="panda", gravity="0 0 -9.81")
+    path = save(
+        out / "panda.mcap",
+        JOINTS,
+        raw["t_target"],
+        raw["q_target"],
+        raw["t"],
+        raw["q"],
+        effort=raw["tau"],
+        robot="panda",
+        gravity="0 0 -9.81",
+    )
     return Panda(path, out / "panda.xml", out / "panda.yaml")
 
 
 def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:
-    """What a plain least squares makes of the first `share` of the trajectory, by joint: Coulomb, viscous friction and offset on the torque less
-    the rigid body (central derivatives by a local polynomial), with 90 % of a block bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m).
-    Shares no code with the tool."""
+    """What a plain least squares makes of the first `share` of the trajectory, by joint: Coulomb, viscous friction and
+    offset on the torque less the rigid body (central derivatives by a local polynomial), with 90 % of a block
+    bootstrap; N.m, N.m.s/rad, and what is left (rms, N.m). Shares no code with the tool."""
     raw = np.load(data / FILE)
     model = mujoco.MjModel.from_xml_path(str(data / "panda.xml"))
     state = mujoco.MjData(model)
@@ -74,5 +86,13 @@ def plain(data: Path, share: float = 1.0) -> dict[str, dict[str, float]]:
         draws = np.stack([np.linalg.solve(grams[p].sum(0), sides[p].sum(0)) for p in pick])
         x = np.linalg.lstsq(X, u, rcond=None)[0]
         low, high = np.quantile(draws, [0.05, 0.95], axis=0)
-        out[joint] = {"coulomb": x[0], "low": low[0], "high": high[0], "viscous": x[1], "offset": x[2], "left": float(np.std(u - X @ x)), "rigid_left": float(np.std(u))}
+        out[joint] = {
+            "coulomb": x[0],
+            "low": low[0],
+            "high": high[0],
+            "viscous": x[1],
+            "offset": x[2],
+            "left": float(np.std(u - X @ x)),
+            "rigid_left": float(np.std(u)),
+        }
     return out

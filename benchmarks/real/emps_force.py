@@ -1,4 +1,5 @@
-"""EMPS as its authors judge it: the recorded force drives a mass with friction, without feedback; and least squares on the force."""
+"""EMPS as its authors judge it: the recorded force drives a mass with friction, without feedback; and least squares on
+the force."""
 
 from __future__ import annotations
 
@@ -19,8 +20,19 @@ def load(data: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return get("t"), get("qm"), float(raw["gtau"].squeeze()) * get("vir")
 
 
-def open_loop(t: np.ndarray, q: np.ndarray, force: np.ndarray, mass: float, viscous: float, coulomb: float, offset: float = 0.0,
-              peak: float = 0.0, v_s: float = 1.0, by_direction: float = 0.0, late: float = 0.0) -> float:
+def open_loop(
+    t: np.ndarray,
+    q: np.ndarray,
+    force: np.ndarray,
+    mass: float,
+    viscous: float,
+    coulomb: float,
+    offset: float = 0.0,
+    peak: float = 0.0,
+    v_s: float = 1.0,
+    by_direction: float = 0.0,
+    late: float = 0.0,
+) -> float:
     """RMSE [m] of the position that the recorded force alone gives, acting `late` s late:
     M a = F - Fv v - by_direction |v| - (Fc + peak exp(-(v/v_s)^2)) sign(v) - offset."""
     dt = float(np.median(np.diff(t))) / SUBSTEPS

@@ -21,13 +21,26 @@ def fold(job: tuple[Path, Path, int]) -> dict:
     rest = [p for p in made.recordings if p not in held]
     start = time.perf_counter()
     name = f"gain_{gain}"
-    d = diagnose(Settings(rest, out / name, held, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
+    d = diagnose(
+        Settings(rest, out / name, held, str(made.model), str(made.servo), next_recording=False), say=_log(out, name)
+    )
     save(d, out / name)
-    return _keep(out, name, {
-        "gain": gain, "verdict": d.data["verdict"], "floor_rad": d.data["noise_floor"]["position_rad"], "findings": [brief(f) for f in d.data["findings"]],
-        "nuisance": d.data["nuisance"], "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()}, "notes": d.notes,
-        "stages": d.stages, "depends_on": d.data["unexplained"]["depends_on"], "seconds": round(time.perf_counter() - start, 1),
-    })  # fmt: skip
+    return _keep(
+        out,
+        name,
+        {
+            "gain": gain,
+            "verdict": d.data["verdict"],
+            "floor_rad": d.data["noise_floor"]["position_rad"],
+            "findings": [brief(f) for f in d.data["findings"]],
+            "nuisance": d.data["nuisance"],
+            "recordings": {name: [before, after] for (_, name), (before, after) in d.mae.items()},
+            "notes": d.notes,
+            "stages": d.stages,
+            "depends_on": d.data["unexplained"]["depends_on"],
+            "seconds": round(time.perf_counter() - start, 1),
+        },
+    )
 
 
 def joint(job: tuple[Any, Path, str]) -> dict:
@@ -38,22 +51,44 @@ def joint(job: tuple[Any, Path, str]) -> dict:
     made, out, name = job
     quiet_warp("cpu")
     start = time.perf_counter()
-    d = diagnose(Settings(made.recordings, out / name, made.held_out, str(made.model), str(made.servo), next_recording=False, joints={name}),
-                 say=_log(out, name))  # fmt: skip
+    d = diagnose(
+        Settings(
+            made.recordings,
+            out / name,
+            made.held_out,
+            str(made.model),
+            str(made.servo),
+            next_recording=False,
+            joints={name},
+        ),
+        say=_log(out, name),
+    )
     save(d, out / name)
     v = d.joints[name]
-    return _keep(out, name, {
-        "joint": name, "verdict": d.data["verdict"], "before_mrad": round(1e3 * v["before"], 2), "after_mrad": round(1e3 * v["after"], 2),
-        "as_fitted_mrad": round(1e3 * v.get("as_fitted", v["after"]), 2),  # whatever the motions kept out say of it
-        "findings": [brief(f) for f in d.data["findings"]], "nuisance": d.data["nuisance"], "held_out": d.data["held_out"],
-        "recordings": {r: [before, after] for (_, r), (before, after) in d.mae.items()}, "notes": d.notes,
-        "scanned": [x for o in d.outcomes for x in o.scanned[:8]], "depends_on": d.data["unexplained"]["depends_on"],
-        "seconds": round(time.perf_counter() - start, 1),
-    })  # fmt: skip
+    return _keep(
+        out,
+        name,
+        {
+            "joint": name,
+            "verdict": d.data["verdict"],
+            "before_mrad": round(1e3 * v["before"], 2),
+            "after_mrad": round(1e3 * v["after"], 2),
+            "as_fitted_mrad": round(1e3 * v.get("as_fitted", v["after"]), 2),  # whatever the motions kept out say of it
+            "findings": [brief(f) for f in d.data["findings"]],
+            "nuisance": d.data["nuisance"],
+            "held_out": d.data["held_out"],
+            "recordings": {r: [before, after] for (_, r), (before, after) in d.mae.items()},
+            "notes": d.notes,
+            "scanned": [x for o in d.outcomes for x in o.scanned[:8]],
+            "depends_on": d.data["unexplained"]["depends_on"],
+            "seconds": round(time.perf_counter() - start, 1),
+        },
+    )
 
 
 def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -> dict:
-    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: on every fourth clip of the first)."""
+    """Runs of one ergoCub finger: fitted on the first names, judged on the second (none: on every fourth clip of the
+    first)."""
     from benchmarks.real.convert_ergocub import KEPT, convert, repeat_noise
     from dexsim.gap.diagnosis import Settings, diagnose, save
     from dexsim.sim.quiet import quiet_warp
@@ -66,19 +101,40 @@ def finger(job: tuple[Path, Path, str, str, tuple[str, ...], tuple[str, ...]]) -
     if not held:
         judged = clips[KEPT - 1 :: KEPT]
         clips = [p for p in clips if p not in judged]
-    d = diagnose(Settings(clips, out / name, judged or None, str(made.model), str(made.servo), next_recording=False), say=_log(out, name))
+    d = diagnose(
+        Settings(clips, out / name, judged or None, str(made.model), str(made.servo), next_recording=False),
+        say=_log(out, name),
+    )
     save(d, out / name)
     v, plain = d.joints.get("joint", {}), d.data["baseline"]
     named = [f for f in d.data["findings"] if f["effect"] != "bad_channel"]
-    return _keep(out, name, {
-        "name": name, "finger": which, "fitted": fitted, "held_out": held, "verdict": d.data["verdict"], "sentence": d.sentence,
-        "clips": [len(clips), len(judged)], "first_name": named[0]["effect"] if named else None, "findings": [brief(f) for f in d.data["findings"]],
-        "before_mrad": _milli(v.get("before")), "after_mrad": _milli(v.get("after")), "plain_mrad": _milli(plain.get("error")),
-        "plain": plain.get("joints", {}).get("joint", {}).get("parameters"), "less_than_plain": round(1 - v["after"] / plain["error"], 3) if v and plain else None,
-        "repeat_noise_mrad": {n: _milli(repeat_noise(data, n)) for n in (*fitted, *held)}, "floor_mrad": _milli(d.data["noise_floor"]["position_rad"]),
-        "nuisance": d.data["nuisance"], "stages": d.stages, "depends_on": d.data["unexplained"]["depends_on"], "notes": d.notes,
-        "seconds": round(time.perf_counter() - start, 1),
-    })  # fmt: skip
+    return _keep(
+        out,
+        name,
+        {
+            "name": name,
+            "finger": which,
+            "fitted": fitted,
+            "held_out": held,
+            "verdict": d.data["verdict"],
+            "sentence": d.sentence,
+            "clips": [len(clips), len(judged)],
+            "first_name": named[0]["effect"] if named else None,
+            "findings": [brief(f) for f in d.data["findings"]],
+            "before_mrad": _milli(v.get("before")),
+            "after_mrad": _milli(v.get("after")),
+            "plain_mrad": _milli(plain.get("error")),
+            "plain": plain.get("joints", {}).get("joint", {}).get("parameters"),
+            "less_than_plain": round(1 - v["after"] / plain["error"], 3) if v and plain else None,
+            "repeat_noise_mrad": {n: _milli(repeat_noise(data, n)) for n in (*fitted, *held)},
+            "floor_mrad": _milli(d.data["noise_floor"]["position_rad"]),
+            "nuisance": d.data["nuisance"],
+            "stages": d.stages,
+            "depends_on": d.data["unexplained"]["depends_on"],
+            "notes": d.notes,
+            "seconds": round(time.perf_counter() - start, 1),
+        },
+    )
 
 
 def _milli(x: float | None) -> float | None:
@@ -106,5 +162,16 @@ def _keep(out: Path, name: str, result: dict) -> dict:
 
 def brief(f: dict) -> dict:
     """A finding without its stretches of time."""
-    return {k: f.get(k) for k in ("effect", "confidence", "indistinguishable", "alternatives", "regime", "parameters", "held_out", "separating_experiment")} | {
-        "joints": f["where"]["joints"]}  # fmt: skip
+    return {
+        k: f.get(k)
+        for k in (
+            "effect",
+            "confidence",
+            "indistinguishable",
+            "alternatives",
+            "regime",
+            "parameters",
+            "held_out",
+            "separating_experiment",
+        )
+    } | {"joints": f["where"]["joints"]}

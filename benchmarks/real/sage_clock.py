@@ -1,10 +1,10 @@
 """Which of SAGE's motions log their commands a period late: python -m benchmarks.real.sage_clock DATA_DIR
 
 A servo's current follows its position error and its speed (the law of its firmware and motor, whatever the load):
-|current| = |a error - b speed + c| + d, one a, b, c, d a joint. The error that explains the current best is the one with the command
-that was in force: the logged one, or that of a period later, where the log writes each command down after the servo has had it. What
-most motions have counts as right (a delay that all share is for the fit).
-The current has lost its sign and is used for nothing else; no model of the motion takes part. One JSON line.
+|current| = |a error - b speed + c| + d, one a, b, c, d a joint. The error that explains the current best is the one
+with the command that was in force: the logged one, or that of a period later, where the log writes each command down
+after the servo has had it. What most motions have counts as right (a delay that all share is for the fit). The current
+has lost its sign and is used for nothing else; no model of the motion takes part. One JSON line.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class _Joint:
 
 
 def late(data: Path) -> dict[str, float]:
-    """By motion: the difference of log-likelihoods in favour of commands logged a period late; above `SURE` they are."""
+    """By motion: the difference of log-likelihoods in favour of commands logged a period late; above `SURE` they
+    are."""
     files = sorted(data.glob("*.npz"))
     if not files:
         raise UserError(f"{data}: no motions (*.npz); see benchmarks/real/convert_sage.py for where from")
@@ -59,9 +60,16 @@ def late(data: Path) -> dict[str, float]:
     for _ in range(ROUNDS):
         out = dict.fromkeys(motions, 0.0)
         for j in range(6):
-            error, speed, current = (np.concatenate(x) for x in zip(*((m[j].error[choice[n]], m[j].speed, m[j].current) for n, m in motions.items()), strict=True))
+            error, speed, current = (
+                np.concatenate(x)
+                for x in zip(
+                    *((m[j].error[choice[n]], m[j].speed, m[j].current) for n, m in motions.items()), strict=True
+                )
+            )
             misfit = lambda p, e, v, i: np.abs(p[0] * e - p[1] * v + p[2]) + p[3] - i  # noqa: E731
-            fit = least_squares(misfit, [2.0, 0.1, 0.0, 0.0], loss="soft_l1", f_scale=0.02, args=(error, speed, current))
+            fit = least_squares(
+                misfit, [2.0, 0.1, 0.0, 0.0], loss="soft_l1", f_scale=0.02, args=(error, speed, current)
+            )
             sigma = 1.48 * float(np.median(np.abs(fit.fun)))
             for name, joints in motions.items():
                 x = joints[j]
@@ -78,7 +86,14 @@ def main(argv: list[str]) -> int:
         print(__doc__)
         return 0 if argv else 2
     found = late(Path(argv[0]).expanduser())
-    print(json.dumps({"late": {n: round(v, 1) for n, v in found.items() if v > SURE}, "not": {n: round(v, 1) for n, v in found.items() if v <= SURE}}))
+    print(
+        json.dumps(
+            {
+                "late": {n: round(v, 1) for n, v in found.items() if v > SURE},
+                "not": {n: round(v, 1) for n, v in found.items() if v <= SURE},
+            }
+        )
+    )
     return 0
 
 

@@ -34,14 +34,44 @@ COLUMNS: tuple[Column, ...] = (
     # The servo's loop (paper, "Actuator Model Randomization").
     Column("kp", "N.m/rad", 0.0, 0.0, 1e5, "proportional gain; duty per rad when drive is voltage"),
     Column("kd", "N.m.s/rad", 0.0, 0.0, 1e4, "gain on the measured velocity; duty per rad/s when drive is voltage"),
-    Column("speed_feedforward", "N.m.s/rad", 0.0, 0.0, 1e4, "added to the PD: gain * r', r' the backward difference of the targets; duty per rad/s when drive is voltage"),
-    Column("acceleration_feedforward", "N.m.s2/rad", 0.0, 0.0, 1e4, "added to the PD: gain * r'', the difference of r'; duty per rad/s2 when drive is voltage"),
-    Column("integral_gain", "N.m/(rad.s)", 0.0, 0.0, 1e6, "added to the PD: gain * integral of the error, which waits at the torque limit; duty per rad.s when drive is voltage"),
+    Column(
+        "speed_feedforward",
+        "N.m.s/rad",
+        0.0,
+        0.0,
+        1e4,
+        "added to the PD: gain * r', r' the backward difference of the targets; duty per rad/s when drive is voltage",
+    ),
+    Column(
+        "acceleration_feedforward",
+        "N.m.s2/rad",
+        0.0,
+        0.0,
+        1e4,
+        "added to the PD: gain * r'', the difference of r'; duty per rad/s2 when drive is voltage",
+    ),
+    Column(
+        "integral_gain",
+        "N.m/(rad.s)",
+        0.0,
+        0.0,
+        1e6,
+        "added to the PD: gain * integral of the error, which waits at the torque limit; duty per rad.s when drive is "
+        "voltage",
+    ),
     Column("deadband", "rad", 0.0, 0.0, 1.0, "no torque while |target - position| is less (the paper's epsilon)"),
     Column("torque_limit", "N.m", INF, 0.0, INF, "stall torque tau0: the clamp at zero speed"),
     Column("no_load_speed", "rad/s", INF, 1e-3, INF, "speed at which the torque-speed line reaches zero"),
-    Column("braking_slope", "1", 1.0, -1.0, 1.0, "fall of the torque limit with speed while braking, over its fall while driving: "
-           "limit = torque_limit * max(0, 1 - braking_slope * |speed| / no_load_speed); 1 the paper's, 0 all of it, -1 the driving line goes on"),
+    Column(
+        "braking_slope",
+        "1",
+        1.0,
+        -1.0,
+        1.0,
+        "fall of the torque limit with speed while braking, over its fall while driving: "
+        "limit = torque_limit * max(0, 1 - braking_slope * |speed| / no_load_speed); 1 the paper's, 0 all of it, -1 "
+        "the driving line goes on",
+    ),
     Column("efficiency", "1", 1.0, 0.0, 2.0, "eta: torque at the joint over motor torque"),
     Column("delay", "s", 0.0, 0.0, 0.5, "time from a target being sent to the servo acting on it"),
     Column("lag", "s", 0.0, 0.0, 1.0, "time constant of a first-order lag on the motor torque"),
@@ -51,8 +81,18 @@ COLUMNS: tuple[Column, ...] = (
     Column("friction_asymmetry", "1", 0.0, -2.0, 2.0, "(level moving positive - level moving negative) / mean"),
     Column("stribeck_peak", "N.m", 0.0, 0.0, 1e3, "breakaway friction in excess of the sliding level"),
     Column("stribeck_speed", "rad/s", 1.0, 1e-4, 1e3, "speed at which that excess is down to 1/e (if stribeck_peak)"),
-    Column("stribeck_exponent", "1", 2.0, 0.2, 6.0, "how it falls with speed: exp(-(|speed| / stribeck_speed)^exponent)"),
-    Column("presliding", "rad", 0.0, 0.0, 1.0, "how far the joint gives way elastically before its dry friction slides: friction * z, dz/dq = (1 - z sign(speed)) / presliding"),
+    Column(
+        "stribeck_exponent", "1", 2.0, 0.2, 6.0, "how it falls with speed: exp(-(|speed| / stribeck_speed)^exponent)"
+    ),
+    Column(
+        "presliding",
+        "rad",
+        0.0,
+        0.0,
+        1.0,
+        "how far the joint gives way elastically before its dry friction slides: friction * z, dz/dq = (1 - z "
+        "sign(speed)) / presliding",
+    ),
     Column("viscous_friction", "N.m.s/rad", 0.0, 0.0, 1e4, "friction proportional to speed"),
     Column("load_friction", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the motor drives the load"),
     Column("load_friction_backdriven", "1", 0.0, 0.0, 10.0, "dry friction per motor torque while the load drives it"),
@@ -60,7 +100,14 @@ COLUMNS: tuple[Column, ...] = (
     Column("torque_ripple", "N.m", 0.0, 0.0, 1e3, "amplitude of a torque periodic in the position (cogging, gear)"),
     Column("ripple_per_turn", "1", 1.0, 0.0, 1e4, "periods in one turn of the joint (if torque_ripple)"),
     Column("ripple_phase", "rad", 0.0, -6.3, 6.3, "phase of the ripple at position zero"),
-    Column("ripple_shape", "1", 0.0, -1.0, 1.0, "0 sinusoid, 1 sawtooth that rises and drops, -1 one that falls and jumps up; between: a mixture"),
+    Column(
+        "ripple_shape",
+        "1",
+        0.0,
+        -1.0,
+        1.0,
+        "0 sinusoid, 1 sawtooth that rises and drops, -1 one that falls and jumps up; between: a mixture",
+    ),
     # Encoder of the loop and of the reported position: measured = scale * position + offset.
     Column("position_offset", "rad", 0.0, -7.0, 7.0, "encoder zero error, added to the measured position"),
     Column("position_scale", "1", 1.0, 0.5, 2.0, "encoder scale: measured over true position"),
@@ -69,13 +116,36 @@ COLUMNS: tuple[Column, ...] = (
     Column("eccentric_cos", "rad", 0.0, -1.0, 1.0, "encoder error, cosine of the position - 1"),
     # Firmware.
     Column("speed_lag", "s", 0.0, 0.0, 1.0, "time constant of the filter on the velocity that kd acts on"),
-    Column("deadband_kind", "1", 0.0, 0.0, 2.0, "inside the deadband 0: no torque, 1: the error counts as zero, 2: it counts from the edge on"),
+    Column(
+        "deadband_kind",
+        "1",
+        0.0,
+        0.0,
+        2.0,
+        "inside the deadband 0: no torque, 1: the error counts as zero, 2: it counts from the edge on",
+    ),
     # Between motor and joint: a rotor of its own, joined to the link by a spring with a gap.
     Column("backlash", "rad", 0.0, 0.0, 2.0, "total free play between motor and joint"),
-    Column("rebound", "1", 0.1, 0.0, 1.0, "damping ratio of the transmission: of its elasticity, or of the impact at the ends of its play"),
+    Column(
+        "rebound",
+        "1",
+        0.1,
+        0.0,
+        1.0,
+        "damping ratio of the transmission: of its elasticity, or of the impact at the ends of its play",
+    ),
     Column("softness", "rad/N.m", 0.0, 0.0, 1e4, "1 / stiffness of the transmission"),
-    Column("hardening", "1/(N.m)2", 0.0, 0.0, 1e6, "its stiffness is 1 + hardening * torque^2 times as large under load"),
-    Column("rotor", "kg.m2", 0.0, 0.0, 1e3, "reflected inertia of the rotor (if play or elasticity); 0: the model's armature"),
+    Column(
+        "hardening", "1/(N.m)2", 0.0, 0.0, 1e6, "its stiffness is 1 + hardening * torque^2 times as large under load"
+    ),
+    Column(
+        "rotor",
+        "kg.m2",
+        0.0,
+        0.0,
+        1e3,
+        "reflected inertia of the rotor (if play or elasticity); 0: the model's armature",
+    ),
     # Temperature: relative changes per degree of `warmth`.
     Column("thermal_torque", "1/degC", 0.0, -0.2, 0.2, "change of the torque constant"),
     Column("thermal_friction", "1/degC", 0.0, -0.5, 0.5, "change of all friction: dry, of the load, viscous"),
@@ -84,13 +154,15 @@ COLUMNS: tuple[Column, ...] = (
     # Other joints.
     Column("sag", "1/N.m", 0.0, 0.0, 1e3, "supply lost per N.m that the motors of the other joints give"),
     Column("coupling", "1", 0.0, -10.0, 10.0, "how far the target is dragged along per rad that another joint moves"),
-    Column("coupling_from", "1", 0.0, 0.0, 1e3, "which joint: its number in the mechanism's order, from 0 (if coupling)"),
+    Column(
+        "coupling_from", "1", 0.0, 0.0, 1e3, "which joint: its number in the mechanism's order, from 0 (if coupling)"
+    ),
     # Torque of nothing that is known: a regression of what a diagnosis could not name, marked as such (gap/standin.py).
     Column("standin_constant", "N.m", 0.0, -1e3, 1e3, "stand-in: constant torque on the joint"),
     Column("standin_position", "N.m/rad", 0.0, -1e3, 1e3, "stand-in: torque per position"),
     Column("standin_speed", "N.m.s/rad", 0.0, -1e3, 1e3, "stand-in: torque per speed (negative brakes)"),
     Column("standin_drag", "N.m.s2/rad2", 0.0, -1e3, 1e3, "stand-in: torque per speed times |speed| (negative brakes)"),
-)  # fmt: skip
+)
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
@@ -102,7 +174,16 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "presliding": ("presliding",),
     "shape": ("stribeck_exponent", "ripple_shape"),
     "controller": ("speed_feedforward", "acceleration_feedforward", "integral_gain"),
-    "rare": ("eccentric_sin", "eccentric_cos", "speed_lag", "deadband_kind", "thermal_torque", "thermal_friction", "thermal_resistance", "coupling"),
+    "rare": (
+        "eccentric_sin",
+        "eccentric_cos",
+        "speed_lag",
+        "deadband_kind",
+        "thermal_torque",
+        "thermal_friction",
+        "thermal_resistance",
+        "coupling",
+    ),
 }
 """What is compiled into a servo only where one of these columns differs from its neutral value."""
 WITH: dict[str, tuple[str, ...]] = {"play": ("rebound", "hardening", "rotor"), "rare": ("warmth", "coupling_from")}

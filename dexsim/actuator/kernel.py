@@ -3,12 +3,11 @@ is here takes them to the end of a step. `reference.py` has both in NumPy.
 
 The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is taken as zero: targets are held):
 
-    e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder
-    tau_c  = kp * e - kd * qd_m                                            (+ `laws.other_terms`: feed-forward, integral)
-    tau_b  = 0 if |e| < deadband else tau_c
-    limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b: 1 driving, braking_slope while it brakes
-    motor  = clip(tau_b, -limit, +limit)                                   what the motor's current shows
-    joint  = efficiency * lag(motor) + ripple(q) - friction
+    e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder tau_c
+    = kp * e - kd * qd_m                                            (+ `laws.other_terms`: feed-forward, integral) tau_b
+    = 0 if |e| < deadband else tau_c limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b: 1
+    driving, braking_slope while it brakes motor  = clip(tau_b, -limit, +limit)                                   what
+    the motor's current shows joint  = efficiency * lag(motor) + ripple(q) - friction
 
 Voltage drive: duty = clip(kp * e - kd * qd_m, -1, 1), motor = torque_limit * (duty * supply - qd / no_load_speed).
 
@@ -43,7 +42,7 @@ it slides (`presliding`) is a spring there: level * z goes to qfrc_applied, its 
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -102,19 +101,23 @@ RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE = INDEX["torque_ripple"], INDEX["ripple_pe
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
 SPEED_LAG, DEADBAND_KIND = INDEX["speed_lag"], INDEX["deadband_kind"]
-BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor"))
+BACKLASH, REBOUND, SOFTNESS, HARDENING, ROTOR_INERTIA = (
+    INDEX[n] for n in ("backlash", "rebound", "softness", "hardening", "rotor")
+)
 THERMAL_TORQUE, THERMAL_FRICTION, THERMAL_RESISTANCE, WARMTH = (
     INDEX[n] for n in ("thermal_torque", "thermal_friction", "thermal_resistance", "warmth")
 )
 BRAKING = INDEX["braking_slope"]
 STRIBECK_EXPONENT, PRESLIDING, RIPPLE_SHAPE = (INDEX[n] for n in ("stribeck_exponent", "presliding", "ripple_shape"))
-FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain"))
+FEED_SPEED, FEED_ACCELERATION, INTEGRAL_GAIN = (
+    INDEX[n] for n in ("speed_feedforward", "acceleration_feedforward", "integral_gain")
+)
 SAG, COUPLING, COUPLING_FROM = INDEX["sag"], INDEX["coupling"], INDEX["coupling_from"]
 REST, REST_POSITION = INDEX["standin_constant"], INDEX["standin_position"]
 REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
-@lru_cache(maxsize=None)
+@cache
 def drives(real):
     """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in
     `servo.Servo`."""
@@ -186,7 +189,7 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
     return wp.vector(speed, acceleration)
 
 
-@lru_cache(maxsize=None)
+@cache
 def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and
     `FEATURES`.
@@ -201,7 +204,8 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
 
     @wp.struct
-    class Rotor:  # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
+    # the motor's side, where the last step has left it: the joint itself where there is no play or elasticity
+    class Rotor:
         q: real
         v: real
         inertia: real  # its own; 0 where the joint's armature stands for it
@@ -328,8 +332,20 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
             if dragged != real(0.0):
                 other = wp.clamp(int(d.params[w, j, COUPLING_FROM]), 0, d.dof_q.shape[0] - 1)
                 target += dragged * (d.qpos[w, d.dof_q[other]] - d.home[w, other])
-        u = pd(target - s.q, s.v, s.v_end, s.rate, s.scale, d.params[w, j, KP], d.params[w, j, KD], d.params[w, j, DEADBAND],
-               kind, dt, real(0.0), s.share)  # fmt: skip
+        u = pd(
+            target - s.q,
+            s.v,
+            s.v_end,
+            s.rate,
+            s.scale,
+            d.params[w, j, KP],
+            d.params[w, j, KD],
+            d.params[w, j, DEADBAND],
+            kind,
+            dt,
+            real(0.0),
+            s.share,
+        )
         if wp.static(not controller):
             return wp.vector(u[0], u[1], u[2])
         wish = target_rates(d.state, w, j, queue, end - dt, dt)
@@ -361,7 +377,9 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
         return t
 
     @wp.func
-    def drive_torque(dt: real, u: vec3, v: real, x: real, lower: real, upper: real, steep: real, inertia: real, m: Motor):
+    def drive_torque(
+        dt: real, u: vec3, v: real, x: real, lower: real, upper: real, steep: real, inertia: real, m: Motor
+    ):
         """What a torque drive gives of a torque; x: |v| over the no-load speed; steep: `braking_slope`."""
         t = Torque()
         t.now = wp.clamp(u[0], -lower, upper)
@@ -586,7 +604,7 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
     return servo
 
 
-@lru_cache(maxsize=None)
+@cache
 def send_kernel(real):
     """Appends a target to the queues of the masked worlds; the oldest entry falls out."""
 
@@ -614,7 +632,7 @@ def send_kernel(real):
     return send
 
 
-@lru_cache(maxsize=None)
+@cache
 def reset_kernel(real, extended: bool = False):
     """Puts the masked worlds' drives at rest: no torque stored, enabled, the given target since ever."""
 
@@ -642,7 +660,7 @@ def reset_kernel(real, extended: bool = False):
     return reset
 
 
-@lru_cache(maxsize=None)
+@cache
 def given_kernel(real):
     """What all motors of a world give, from the last step: sum of |torque| [N.m], for a supply that sags."""
 

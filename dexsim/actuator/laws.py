@@ -8,7 +8,6 @@ from typing import Any
 
 import warp as wp
 
-
 # -- encoder -----------------------------------------------------------------------------------------------------------
 
 
@@ -224,7 +223,20 @@ def ripple_wave(angle: Any, shape: Any):
 
 
 @wp.func
-def pd(e: Any, v: Any, v_end: Any, rate: Any, scale: Any, kp: Any, kd: Any, width: Any, kind: Any, dt: Any, age: Any, share: Any):
+def pd(
+    e: Any,
+    v: Any,
+    v_end: Any,
+    rate: Any,
+    scale: Any,
+    kp: Any,
+    kd: Any,
+    width: Any,
+    kind: Any,
+    dt: Any,
+    age: Any,
+    share: Any,
+):
     """(now, end, slope, error that counts [rad], acts) of kp e - kd qd_m: torque [N.m] now; at the end of a step of dt
     [s] at unchanged speed, kp (e - rate dt) - kd v_end; by how much less per speed of the motor gained until then
     [N.m.s/rad].
@@ -274,7 +286,8 @@ def other_terms(asked: Any, feed: Any, integral: Any, gain: Any, rate: Any, scal
     return wp.vector(now, end, slope)
 
 
-HOLDS = wp.constant(2.0)  # intervals between targets for which their speed counts, if no other target comes: one may be late
+# intervals between targets for which their speed counts, if no other target comes: one may be late
+HOLDS = wp.constant(2.0)
 SHORTEST = wp.constant(1.0e-3)  # of a step: targets nearer in time than this are one
 
 

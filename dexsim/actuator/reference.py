@@ -89,10 +89,15 @@ def servo(
     two = play & ((p["backlash"] > 0.0) | (p["softness"] > 0.0))
     v_drive = np.where(two & ~fresh, line_a + np.asarray(line_b) * v, v)
     rotor_q = np.where(two & ~fresh, rotor + dt * v_drive, q)
-    rotor_inertia = np.where(two, np.maximum(np.where(p["rotor"] == 0.0, base_armature, p["rotor"]), LEAST_ROTOR * inertia), 0.0)
+    rotor_inertia = np.where(
+        two, np.maximum(np.where(p["rotor"] == 0.0, base_armature, p["rotor"]), LEAST_ROTOR * inertia), 0.0
+    )
     on_rotor = two & np.asarray(loop_motor)
     turned, turning = np.where(on_rotor, rotor_q, turned), np.where(on_rotor, v_drive, turning)
-    scale = p["position_scale"] + (p["eccentric_sin"] * np.cos(turned) - p["eccentric_cos"] * np.sin(turned) if rare else 0.0)  # of a speed here
+    # of a speed here
+    scale = p["position_scale"] + (
+        p["eccentric_sin"] * np.cos(turned) - p["eccentric_cos"] * np.sin(turned) if rare else 0.0
+    )
     v_m = scale * turning
     q_m = p["position_scale"] * turned + p["position_offset"]
     v_d, v_next, kd_blend, kind = v_m, v_m, 1.0, np.zeros_like(v)
@@ -216,7 +221,9 @@ def servo(
     y = v_drive * dt / np.where(gives, p["presliding"], 1.0)
     taken = np.where(gives & ~fresh, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
     sliding = np.where(gives, np.where(two, own, level), 0.0)
-    viscous = viscous + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (1.0 + np.abs(y))
+    viscous = viscous + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (
+        1.0 + np.abs(y)
+    )
     of_motor = of_motor - sliding * taken
 
     one = {
@@ -228,18 +235,46 @@ def servo(
     other = one
     if play:
         with np.errstate(divide="ignore", invalid="ignore"):
-            other = _rotor(p, of_motor - 0.5 * p["friction_asymmetry"] * own, slope_motor, on_drive, on_rotor, np.where(gives, 0.0, own), viscous, rotor_q, v_drive,
-                           rotor_inertia, inertia, q, v, dt, p["kp"] * tau0 if voltage else p["kp"])  # fmt: skip
+            other = _rotor(
+                p,
+                of_motor - 0.5 * p["friction_asymmetry"] * own,
+                slope_motor,
+                on_drive,
+                on_rotor,
+                np.where(gives, 0.0, own),
+                viscous,
+                rotor_q,
+                v_drive,
+                rotor_inertia,
+                inertia,
+                q,
+                v,
+                dt,
+                p["kp"] * tau0 if voltage else p["kp"],
+            )
         rest, rest_slope = applied - drawn, damping - slope_motor  # of the stand-in: on the link itself
         other["qfrc_applied"] = other["qfrc_applied"] + rest + rest_slope * v
         other["dof_damping"] = base_damping + rest_slope
         other["dof_frictionloss"] = np.broadcast_to(base_frictionloss, v.shape)
     out = {name: np.where(two, other[name], one[name]) for name in one}
-    armature = np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) + np.where(two, other.get("armature", 0.0), 0.0) if play else base_armature
-    return out | {"torque": motor_now, "dof_armature": armature, "filtered": filtered, "rotor": rotor_q, "integral": integral, "taken": taken}
+    armature = (
+        np.maximum(base_armature - rotor_inertia, -BORROWED * inertia) + np.where(two, other.get("armature", 0.0), 0.0)
+        if play
+        else base_armature
+    )
+    return out | {
+        "torque": motor_now,
+        "dof_armature": armature,
+        "filtered": filtered,
+        "rotor": rotor_q,
+        "integral": integral,
+        "taken": taken,
+    }
 
 
-def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain) -> dict[str, np.ndarray]:
+def _rotor(
+    p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain
+) -> dict[str, np.ndarray]:
     """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and
     armature of what passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop
     [N.m/rad]."""
@@ -253,7 +288,10 @@ def _rotor(p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rot
     free_a = rotor_inertia / dt + viscous + on_drive
     push = rotor_inertia / dt * w + of_motor + on_drive * w
     slides = np.abs(push) > own
-    free = np.where(slides, (push - np.sign(push) * own + on_loop * v) / free_a, 0.0), np.where(slides, -on_loop / free_a, 0.0)
+    free = (
+        np.where(slides, (push - np.sign(push) * own + on_loop * v) / free_a, 0.0),
+        np.where(slides, -on_loop / free_a, 0.0),
+    )
     twist = rotor_q + dt * (free[0] + free[1] * v) - q - dt * v
     side = np.sign(twist) * gap2
     stretch = stiff * (rotor_q - q - side)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import torch
@@ -37,7 +38,8 @@ class Servo:
         control_period: shortest time between targets [s], so that the queue outlasts the longest delay (else 8).
         driven, loop, reported: names of the joints that the motor drives, that the loop's encoder reads and that
             `position()` reports, where a mechanism has separate rotor joints; default `joints`.
-        varied: names of the columns that will be given values other than the table's (by randomization, say): what of the
+        varied: names of the columns that will be given values other than the table's (by randomization, say): what of
+        the
             kernel is left out where no drive needs it (`columns.FEATURES`) follows from the table and from these.
 
     Where the table states play or elasticity (`backlash`, `softness`), a rotor of its own is simulated, and the table's
@@ -50,8 +52,8 @@ class Servo:
         torque [N, J] motor torque as its current shows it, at the start of the last physics step: after clipping and
             lag, before efficiency and friction, positive along positive joint position [N.m];
         base_damping, base_frictionloss, base_armature [N, J] the model's own joint damping, friction and armature, to
-            which the servo's are added (an armature loses its rotor where there is play). Randomize these, not the model
-            fields: the servo overwrites them before each physics step, the armature only where play is simulated;
+            which the servo's are added (an armature loses its rotor where there is play). Randomize these, not the
+            model fields: the servo overwrites them before each physics step, the armature only where play is simulated;
         misread: whether the encoders may report other positions than the joints have;
         home [N, J] positions [rad] from which a joint that drags another is counted (default: the model's qpos0);
         inertia [N, J] about the joints [kg.m2], for the integration only: an estimate serves.
@@ -86,7 +88,8 @@ class Servo:
         named = {*_stated(table, self.joints), *varied}
         self.features = frozenset(FEATURE_OF[name] for name in named if name in FEATURE_OF)
         self.queue, self.control_period = 8, control_period
-        if control_period:  # the newest entry, one a period through the longest delay, and one before (three, where they have rates)
+        # the newest entry, one a period through the longest delay, and one before (three, where they have rates)
+        if control_period:
             longest = table.bounds(self.joints)[1][:, INDEX["delay"]].max()
             self.queue = max(8, math.ceil(longest / control_period) + 3 + 2 * ("controller" in self.features))
         self.slots = {name: i for i, name in enumerate(SLOTS)}
@@ -94,7 +97,9 @@ class Servo:
             self.slots[f"stamp{k}"] = QUEUE + k
             self.slots[f"target{k}"] = QUEUE + self.queue + k
         before_play = "play" in self.features and "motor" in table.encoder("position", self.joints)
-        self.misread = before_play or bool(named & {"position_offset", "position_scale", "eccentric_sin", "eccentric_cos"})
+        self.misread = before_play or bool(
+            named & {"position_offset", "position_scale", "eccentric_sin", "eccentric_cos"}
+        )
         extended = bool(self.features & EXTENDED)
         if extended:
             self.slots |= {name: QUEUE + 2 * self.queue + i for i, name in enumerate(EXTRA_SLOTS)}
@@ -128,9 +133,14 @@ class Servo:
         self.base_armature[:] = as_tensor(mjm.dof_armature[dof])
         self.home[:] = as_tensor(mjm.qpos0[dof_q])
         rotor_inside = driven is None and loop is None
-        sides = {which: [rotor_inside and side == "motor" for side in table.encoder(which, self.joints)] for which in ("loop", "position")}
+        sides = {
+            which: [rotor_inside and side == "motor" for side in table.encoder(which, self.joints)]
+            for which in ("loop", "position")
+        }
         self._loop_motor = index([int(x) for x in sides["loop"]])
-        self._position_motor = torch.as_tensor(sides["position"], device=self.params.device) if any(sides["position"]) else None
+        self._position_motor = (
+            torch.as_tensor(sides["position"], device=self.params.device) if any(sides["position"]) else None
+        )
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
@@ -141,8 +151,22 @@ class Servo:
         self._wp = engine.wp
         self._fields = {name: engine.wp_field(name) for name in FIELDS}
         self._drives = drives(real)()
-        own = ("params", "state", "torque", "inertia", "base_damping", "base_frictionloss", "base_armature", "home", "given",
-               "dof", "dof_q", "loop_q", "loop_dof", "loop_motor")  # fmt: skip
+        own = (
+            "params",
+            "state",
+            "torque",
+            "inertia",
+            "base_damping",
+            "base_frictionloss",
+            "base_armature",
+            "home",
+            "given",
+            "dof",
+            "dof_q",
+            "loop_q",
+            "loop_dof",
+            "loop_motor",
+        )
         for name in own:
             setattr(self._drives, name, getattr(self, f"_{name}"))
         for name in ("time", "qpos", "qvel", "qfrc_applied"):
@@ -161,7 +185,10 @@ class Servo:
         """UserError if the kernel was built without what a column needs: neither the table nor `varied` names it."""
         feature = FEATURE_OF.get(column(name).name)
         if feature and feature not in self.features:
-            raise UserError(f"servo column '{name}' is not simulated here: state one of {', '.join(FEATURES[feature])} in the servo's file.")
+            raise UserError(
+                f"servo column '{name}' is not simulated here: state one of {', '.join(FEATURES[feature])} in the "
+                "servo's file."
+            )
 
     # -- targets ------------------------------------------------------------
 
@@ -192,9 +219,15 @@ class Servo:
     # -- the step ------------------------------------------------------------
 
     def before_each(self) -> None:
-        """Launches the servo for one physics step: the engine's `before_each` (capturable; one launch, two where a supply sags)."""
+        """Launches the servo for one physics step: the engine's `before_each` (capturable; one launch, two where a
+        supply sags)."""
         if "sag" in self.features:
-            wp.launch(self._sum, dim=self._shape[0], inputs=[self._shape[1], self._torque, self._given], device=self.engine.device)
+            wp.launch(
+                self._sum,
+                dim=self._shape[0],
+                inputs=[self._shape[1], self._torque, self._given],
+                device=self.engine.device,
+            )
         self._launch(self._servo, self.engine.dt, self.queue, self._drives)
 
     # -- what an observer reads ------------------------------------------------------------
@@ -215,18 +248,22 @@ class Servo:
         """What the encoders report [N, J] where they stand at q [N, J] (rad)."""
         out = self.column("position_scale") * q + self.column("position_offset")
         if "rare" in self.features:
-            out = out + self.column("eccentric_sin") * torch.sin(q) + self.column("eccentric_cos") * (torch.cos(q) - 1.0)
+            out = (
+                out + self.column("eccentric_sin") * torch.sin(q) + self.column("eccentric_cos") * (torch.cos(q) - 1.0)
+            )
         return out
 
     def unmeasured(self, reported: torch.Tensor) -> torch.Tensor:
         """The position [N, J] at which the encoders report so [N, J] (rad): the inverse of `measured`."""
         q = (reported - self.column("position_offset")) / self.column("position_scale")
-        for _ in range(6 if "rare" in self.features else 0):  # an eccentricity is a small part of the position: each turn wins a digit or more
+        # an eccentricity is a small part of the position: each turn wins a digit or more
+        for _ in range(6 if "rare" in self.features else 0):
             q = q + (reported - self.measured(q)) / self.column("position_scale")
         return q
 
     def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a play."""
+        """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a
+        play."""
         q, v = self.engine.t.qpos[:, self._reported_q], self.engine.t.qvel[:, self._reported_dof]
         if self._position_motor is None or "play" not in self.features:
             return q, v
@@ -270,15 +307,24 @@ def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None
         source, bounds = nominal[j, INDEX["coupling_from"]], table.value(joint, "coupling")
         used = not bounds.unknown and (bounds.low != 0.0 or bounds.high != 0.0)
         if used and (source not in range(len(joints)) or source == j):
-            raise UserError(f"{table.source}: joints.{joint}.coupling_from is {source:g}; it must be the number of another joint, 0 to {len(joints) - 1}: "
-                            + ", ".join(f"{k} {name}" for k, name in enumerate(joints) if k != j))  # fmt: skip
+            raise UserError(
+                f"{table.source}: joints.{joint}.coupling_from is {source:g}; it must be the number of another joint, "
+                f"0 to {len(joints) - 1}: "
+                + ", ".join(f"{k} {name}" for k, name in enumerate(joints) if k != j)
+            )
 
 
 def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
-    """Columns that the table gives a value, or a range, other than the neutral one for some joint; unknown ones are neutral."""
+    """Columns that the table gives a value, or a range, other than the neutral one for some joint; unknown ones are
+    neutral."""
     nominal, (low, high), unknown = table.nominal(joints), table.bounds(joints), table.unknown(joints)
-    return [c.name for i, c in enumerate(COLUMNS)
-            if ((~unknown[:, i]) & ((nominal[:, i] != c.neutral) | (low[:, i] != c.neutral) | (high[:, i] != c.neutral))).any()]
+    return [
+        c.name
+        for i, c in enumerate(COLUMNS)
+        if (
+            (~unknown[:, i]) & ((nominal[:, i] != c.neutral) | (low[:, i] != c.neutral) | (high[:, i] != c.neutral))
+        ).any()
+    ]
 
 
 def _addresses(mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int):

@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Iterable, Literal, Sequence
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -53,7 +54,9 @@ class Content(msgspec.Struct):
 
     drive: Literal[DRIVES] = "torque"
     joints: dict[str, dict[str, Any] | None] | None = None
-    current_per_torque: typed.Positive | Literal["unknown"] | dict[str, typed.Positive | Literal["unknown"] | None] | None = None
+    current_per_torque: (
+        typed.Positive | Literal["unknown"] | dict[str, typed.Positive | Literal["unknown"] | None] | None
+    ) = None
     control_rate: typed.Positive | None = None
     loop_rate: typed.Positive | None = None
     loop_encoder: Side | dict[str, Side] | None = None
@@ -157,7 +160,9 @@ class ServoTable:
             if key not in KEYS:
                 hint = did_you_mean(key, KEYS)
                 raise UserError(f"{source}: key '{key}' does not exist.{hint} Valid keys: {', '.join(KEYS)}")
-        top = typed.convert({k: v if k in ("drive", "joints") else _numbers(v) for k, v in raw.items()}, Content, source)
+        top = typed.convert(
+            {k: v if k in ("drive", "joints") else _numbers(v) for k, v in raw.items()}, Content, source
+        )
         joints = top.joints or {}
         entries: dict[str, dict[str, Value]] = {}
         for joint, columns in joints.items():
@@ -170,8 +175,17 @@ class ServoTable:
                     hint = did_you_mean(name, NAMES)
                     raise UserError(f"{where}: no such servo column.{hint} Valid columns: {', '.join(NAMES)}")
                 entries[str(joint)][name] = parse_value(value, COLUMNS[INDEX[name]], where)
-        return cls(top.drive, entries, top.current_per_torque, top.control_rate, top.loop_rate, top.loop_encoder or "joint",
-                   top.position_encoder or "joint", top.supply_voltage, source)  # fmt: skip
+        return cls(
+            top.drive,
+            entries,
+            top.current_per_torque,
+            top.control_rate,
+            top.loop_rate,
+            top.loop_encoder or "joint",
+            top.position_encoder or "joint",
+            top.supply_voltage,
+            source,
+        )
 
     def to_dict(self) -> dict:
         """The file's content again: `from_dict(table.to_dict())` is the same table."""
@@ -292,7 +306,8 @@ def _plain(value: Value) -> Any:
 
 
 def _numbers(value: Any) -> Any:
-    """Numbers that YAML reads as text (1e-3) as such, by joint where it is a mapping; whatever else there is as it is."""
+    """Numbers that YAML reads as text (1e-3) as such, by joint where it is a mapping; whatever else there is as it
+    is."""
     if isinstance(value, dict):
         return {joint: _numbers(v) for joint, v in value.items()}
     number = _number(value)

@@ -17,24 +17,25 @@ from dexsim.console import program
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
-    from dexsim.gap.search.time_limit import TimeLimit
     from dexsim.gap.result import Settings
+    from dexsim.gap.search.time_limit import TimeLimit
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
        python diagnose.py demo=true [out=DIR]
        python diagnose.py columns=true
 
-Find what the simulator leaves out of a recorded mechanism: where it goes wrong, which physics is missing, its size, and the
-proof on recordings not used for the fit. Joints by their motion, current and duty; touch by /tactile and what is known of the
-object (/object_pose, or a body of the model) and of its force (/external_force). A joint is judged while nothing is touched.
+Find what the simulator leaves out of a recorded mechanism: where it goes wrong, which physics is missing, its size, and
+the proof on recordings not used for the fit. Joints by their motion, current and duty; touch by /tactile and what is
+known of the object (/object_pose, or a body of the model) and of its force (/external_force). A joint is judged while
+nothing is touched.
 
 writes to out=:
   report.html           one page: open it in a browser
   diagnosis.json        the same for programs
   servo.yaml            the fitted drives with intervals: python train.py servo_file=FILE randomizes inside them
-  tactile.yaml          where something of touch was found: python train.py tactile_file=FILE randomizes inside its intervals
+  tactile.yaml          where something of touch was found: python train.py tactile_file=FILE draws inside
   model.xml             where masses or inertias were fitted: python train.py model_file=FILE
-  servo_standin.yaml    servo.yaml with a torque that stands in for what no effect explains, where that helps; it names nothing
+  servo_standin.yaml    servo.yaml with a torque that stands in for what no effect explains, where that helps
   next_recording.mcap   commands to send, where another recording would settle a question
 
 examples:
@@ -43,8 +44,10 @@ examples:
   python diagnose.py demo=true
 
 settings (key=default):
-  recordings=                 MCAP files, bag folders, or CSV and NPZ files with named columns: [a.mcap,b.csv,...] or a pattern 'runs/*.mcap'
-  held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the time, is kept out
+  recordings=                 MCAP files, bag folders, or CSV and NPZ files with named columns: [a.mcap,b.csv,...] or
+                              a pattern 'runs/*.mcap'
+  held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the
+                              time, is kept out
   model=                      MuJoCo or URDF file; the xHand by default
   servo=                      servo.yaml believed of its drives; the xHand's by default
   out=out/diagnosis           folder for the results
@@ -53,15 +56,34 @@ settings (key=default):
   limit=                      seconds to take at most: the best answer by then, saying so. Ctrl-C does the same at once
   next=true                   also write the commands of the next recording, where one would help
   seed=0                      of the bootstraps
-  replay=mujoco               engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp, on the device), none
-  device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits the cores that are used
-  demo=false                  make recordings with a hidden effect, diagnose them, then open the answer: true (command_delay), or backlash,
-                              compliance, coulomb_friction, deadband, load_friction, stribeck_friction
+  replay=mujoco               engine in which the answer is replayed: mujoco (C MuJoCo), warp (MuJoCo-Warp, on the
+                              device), none
+  device=cpu                  cpu | cuda | cuda:1: where hypotheses are simulated. On a CPU, OMP_NUM_THREADS limits
+                              the cores that are used
+  demo=false                  make recordings with a hidden effect, diagnose them, then open the answer: true
+                              (command_delay),
+                              or backlash, compliance, coulomb_friction, deadband, load_friction, stribeck_friction
   columns=false               list the columns of servo.yaml with unit, neutral value and meaning
   meta.KEY=                   metadata that the recordings lack, e.g. meta.gravity="0 0 -9.81"
-  remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state, remap.position.elbow=enc1
+  remap.OURS=                 their name of a topic, a joint or a column, e.g. remap./joint_states=/xhand/state,
+                              remap.position.elbow=enc1
 """
-KEYS = ("recordings", "held_out", "model", "servo", "out", "effects", "next", "seed", "device", "replay", "demo", "columns", "limit", "joints")
+KEYS = (
+    "recordings",
+    "held_out",
+    "model",
+    "servo",
+    "out",
+    "effects",
+    "next",
+    "seed",
+    "device",
+    "replay",
+    "demo",
+    "columns",
+    "limit",
+    "joints",
+)
 
 
 def parse(argv: list[str]) -> dict:
@@ -79,7 +101,10 @@ def parse(argv: list[str]) -> dict:
             out[group][name] = text
             continue
         if key not in KEYS:
-            raise UserError(f"setting '{key}' does not exist.{did_you_mean(key, KEYS)} Valid: {', '.join(KEYS)}, meta.KEY, remap.OURS")
+            raise UserError(
+                f"setting '{key}' does not exist.{did_you_mean(key, KEYS)} Valid: {', '.join(KEYS)}, meta.KEY, "
+                "remap.OURS"
+            )
         if key in ("recordings", "held_out", "effects", "joints"):
             text = text.strip()
             items = text[1:-1].split(",") if text.startswith("[") and text.endswith("]") else [text]
@@ -144,7 +169,9 @@ def main(argv: list[str]) -> int:
         outputs.claim(out, "out=", (*RESULTS, "recordings"))
         print("Making recordings of a pendulum whose drive hides something ...", flush=True)
         with outputs.staged(out) as stage:
-            paths, model, servo, demo = maker.make(stage / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle")
+            paths, model, servo, demo = maker.make(
+                stage / "recordings", given["demo"], seed=given.get("seed", 0), joint="knuckle"
+            )
         made = [str(out / p.relative_to(stage)) for p in (*paths, model, servo)]
         given |= {"recordings": made[:-2], "model": made[-2], "servo": made[-1]}
     if "recordings" not in given:
@@ -205,13 +232,26 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
         known = (*EFFECTS, *(e for e in TOUCH_EFFECTS if e not in EFFECTS))
         for e in given["effects"]:
             if e not in known:
-                raise UserError(f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}")
+                raise UserError(
+                    f"effects: '{e}' is not in the catalogue.{did_you_mean(e, known)} It has: {', '.join(known)}"
+                )
         allowed = set(given["effects"])
     return Settings(
-        inputs.files(given["recordings"], "recordings"), out, inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
-        given.get("model"), given.get("servo"), given.get("seed", 0), device, given.get("next", True), allowed, replay=given.get("replay", "mujoco"), meta=given["meta"],
-        remap=given["remap"], limit=given.get("limit"), joints=set(given["joints"]) if given.get("joints") else None,
-    )  # fmt: skip
+        inputs.files(given["recordings"], "recordings"),
+        out,
+        inputs.files(given["held_out"], "held_out") if given.get("held_out") else None,
+        given.get("model"),
+        given.get("servo"),
+        given.get("seed", 0),
+        device,
+        given.get("next", True),
+        allowed,
+        replay=given.get("replay", "mujoco"),
+        meta=given["meta"],
+        remap=given["remap"],
+        limit=given.get("limit"),
+        joints=set(given["joints"]) if given.get("joints") else None,
+    )
 
 
 def started(device: str) -> str:
@@ -236,7 +276,11 @@ def available(device: str) -> str:
         raise UserError(f"device={device}: must be cpu, cuda or cuda:0, cuda:1, ...")
     if int(number) < count:
         return f"cuda:{number}"  # torch wants the number
-    have = f"it has {count}, counted from 0" if count else "no NVIDIA driver or none visible, see nvidia-smi and CUDA_VISIBLE_DEVICES"
+    have = (
+        f"it has {count}, counted from 0"
+        if count
+        else "no NVIDIA driver or none visible, see nvidia-smi and CUDA_VISIBLE_DEVICES"
+    )
     print(f"device={device}: this machine has no such GPU ({have}); the CPU is used", flush=True)
     return "cpu"
 
@@ -258,7 +302,11 @@ class Progress:
             return
         self.said, self.searched, spent = now, int(done), now - self.start
         left = f", about {spent * (total - done) / done:.0f} s left" if 0.1 <= done < total else ""
-        text = f"  searching {name} ({int(done) + 1}/{total}){left}" if done < total else f"  searched {total} in {spent:.0f} s"
+        text = (
+            f"  searching {name} ({int(done) + 1}/{total}){left}"
+            if done < total
+            else f"  searched {total} in {spent:.0f} s"
+        )
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 
@@ -275,14 +323,21 @@ def verdict(d) -> str:
     for f in data["findings"][: 4 - bool(plain)]:
         where = place(f)
         sizes = ", ".join(
-            f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}" for k, p in f["parameters"].items() if isinstance(p["value"], float)
+            f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}"
+            for k, p in f["parameters"].items()
+            if isinstance(p["value"], float)
         )
         hint = " (a hint)" if f.get("hint") else ""
         lines.append(f"  {f['effect']} @ {where}, confidence {f['confidence']:.2f}{hint}: {sizes or f['regime']}")
         if f["indistinguishable"]:
-            lines.append(f"    cannot be told from {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}: {f['separating_experiment']}")
+            lines.append(
+                f"    cannot be told from {', '.join(x for x in f['indistinguishable'] if x != f['effect'])}: "
+                f"{f['separating_experiment']}"
+            )
     if data["next_recording"]:
         lines.append(f"  record next: {data['next_recording']['why']}")
     if d.notes:
-        lines.append(f"  note: {d.notes[0]}" + (f" (and {len(d.notes) - 1} more in report.html)" if len(d.notes) > 1 else ""))
+        lines.append(
+            f"  note: {d.notes[0]}" + (f" (and {len(d.notes) - 1} more in report.html)" if len(d.notes) > 1 else "")
+        )
     return "\n".join(lines[:11])

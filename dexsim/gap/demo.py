@@ -15,9 +15,12 @@ from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import Hardware, realistic
 from dexsim.recording.schema import COMMANDS, Series
 
-DRAWN = """<geom name="base" type="box" size="0.016 0.022 0.012" pos="0 0 0.016" contype="0" conaffinity="0" mass="0" group="2"/>"""
-LINK = """<geom name="link" type="capsule" size="0.009" fromto="0 0 -0.012 0 0 -0.088" contype="0" conaffinity="0" mass="0" group="2"/>"""
-# MuJoCo's dry friction brakes along an exponential of solreffriction's time constant: at its default of 20 ms it turns against
+DRAWN = """<geom name="base" type="box" size="0.016 0.022 0.012" pos="0 0 0.016"
+ contype="0" conaffinity="0" mass="0" group="2"/>"""
+LINK = """<geom name="link" type="capsule" size="0.009" fromto="0 0 -0.012 0 0 -0.088"
+ contype="0" conaffinity="0" mass="0" group="2"/>"""
+# MuJoCo's dry friction brakes along an exponential of solreffriction's time constant: at its default of 20 ms it turns
+# against
 # the motion before a fast reversal, which no drive does
 MODEL = """<mujoco model="pendulum">
   <compiler angle="radian"/>
@@ -33,7 +36,16 @@ MODEL = """<mujoco model="pendulum">
 """
 BELIEVED = {
     "drive": "torque",
-    "joints": {"*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}},
+    "joints": {
+        "*": {
+            "kp": 2.0,
+            "kd": 0.04,
+            "torque_limit": 0.8,
+            "no_load_speed": 12.0,
+            "coulomb_friction": 0.015,
+            "viscous_friction": 0.004,
+        }
+    },
     "loop_rate": 1000,
 }
 HIDDEN = {e.id: e.demo for e in CATALOGUE if e.demo}
@@ -53,17 +65,25 @@ def commands(kind: int, seconds: float, rng: np.random.Generator) -> tuple[np.nd
     return t, 0.4 * np.sin(2 * np.pi * np.cumsum(f) * 0.01)
 
 
-def make(folder: Path, effect: str = StribeckFriction.id, seed: int = 0, seconds: float = 6.0, joint: str = "joint") -> tuple[list[Path], Path, Path, dict]:
-    """Writes four recordings of one joint that hides an effect of HIDDEN (another name: nothing), the model and the believed servo; returns their paths and the hidden columns."""
+def make(
+    folder: Path, effect: str = StribeckFriction.id, seed: int = 0, seconds: float = 6.0, joint: str = "joint"
+) -> tuple[list[Path], Path, Path, dict]:
+    """Writes four recordings of one joint that hides an effect of HIDDEN (another name: nothing), the model and the
+    believed servo; returns their paths and the hidden columns."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     model, servo = folder / "rig.xml", folder / "rig.yaml"
-    drawn = MODEL.replace("<worldbody>", f"<worldbody>{DRAWN}").replace('name="joint"', f'name="{joint}"').replace('<geom name="bob"', f'{LINK}<geom name="bob"')
+    drawn = (
+        MODEL.replace("<worldbody>", f"<worldbody>{DRAWN}")
+        .replace('name="joint"', f'name="{joint}"')
+        .replace('<geom name="bob"', f'{LINK}<geom name="bob"')
+    )
     model.write_text(drawn, encoding="utf-8")
     believed = BELIEVED | ({"loop_encoder": "motor"} if effect in EFFECTS and EFFECTS[effect].demo_on_motor else {})
     servo.write_text(yaml.safe_dump(believed, sort_keys=False), encoding="utf-8")
     true = yaml.safe_load(yaml.safe_dump(believed))
-    for name in ("kp", "kd", "torque_limit", "coulomb_friction", "viscous_friction"):  # as real machines are: a little off
+    # as real machines are: a little off
+    for name in ("kp", "kd", "torque_limit", "coulomb_friction", "viscous_friction"):
         true["joints"]["*"][name] *= 1 + 0.03 * rng.uniform(-1, 1)
     hidden = HIDDEN.get(effect, {})
     true["joints"]["*"] |= hidden

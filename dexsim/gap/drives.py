@@ -1,4 +1,5 @@
-"""The drives: what each joint's motion shows that simulation leaves out, joint by joint, judged on recordings kept out."""
+"""The drives: what each joint's motion shows that simulation leaves out, joint by joint, judged on recordings kept
+out."""
 
 from __future__ import annotations
 
@@ -29,14 +30,16 @@ from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.steps import NothingToJudge, Steps
 from dexsim.gap.touch.result import TouchResult
 
-OTHERWISE = 0.1  # of what is left of a joint: by as much it must change with what is known of the others to be searched again
-UNSETTLED = 1.7  # x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
+# of what is left of a joint: by as much it must change with what is known of the others to be searched again
+OTHERWISE = 0.1
+# x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
+UNSETTLED = 1.7
 Answers = list[tuple[JointSearch, Outcome | None]]
 
 
 class Drives(Steps):
-    """The drives of a mechanism. w: what is asked and has been read; felt: touch, which is judged before: a joint is judged where nothing is
-    touched."""
+    """The drives of a mechanism. w: what is asked and has been read; felt: touch, which is judged before: a joint is
+    judged where nothing is touched."""
 
     def __init__(self, w: Inquiry, felt: TouchResult):
         self.w, self.felt = w, felt
@@ -44,7 +47,8 @@ class Drives(Steps):
         # model: a case a joint, what is kept out of the fit, the noise
         self.cases: list[Case] = []
         self.left_out: dict[str, str] = {}  # effects that are not considered, with reasons
-        # search: what recorded torque, duty and current say; joints whose closed loop says nothing of them; an answer a joint
+        # search: what recorded torque, duty and current say; joints whose closed loop says nothing of them; an answer a
+        # joint
         self.stages: Sequence[stage_tests.Stage] = ()
         self.by_torque: Sequence[tuple] = ()
         self.mute: set[str] = set()
@@ -59,7 +63,8 @@ class Drives(Steps):
         p = self.parts
         return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test)
 
-    # -- read ------------------------------------------------------------------------------------------------------------------
+    # -- read
+    # ------------------------------------------------------------------------------------------------------------------
     def read(self) -> None:
         """The stretches in which every joint moves by its own drive alone."""
         w = self.w
@@ -86,7 +91,9 @@ class Drives(Steps):
         moving = any(max(float(np.ptp(r.q[:, j])) for r in w.runs) > 2e-3 for j in joints)
         commanded = any(max(float(np.ptp(r.cmd[:, j])) for r in w.runs) > 1e-4 for j in joints)
         if not moving and not commanded:
-            raise NothingToJudge("Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged")
+            raise NothingToJudge(
+                "Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged"
+            )
 
     def _within_the_stops(self) -> None:
         """The runs without what only those kept out press: ends of a motion that no recording for the fit has shown."""
@@ -107,7 +114,8 @@ class Drives(Steps):
         w.runs, w.held = external_force.without(self.pushes, w.runs, w.held, w.notes)
         w.clock.lap("forces from outside")
 
-    # -- model -----------------------------------------------------------------------------------------------------------------
+    # -- model
+    # -----------------------------------------------------------------------------------------------------------------
     def model(self) -> None:
         """A case a joint: its plant along the motion, what is kept out of the fit, the noise floor."""
         w, s = self.w, self.w.settings
@@ -120,7 +128,10 @@ class Drives(Steps):
         if s.joints is not None:
             self.cases = [c for c in self.cases if c.joint in s.joints]
             if not self.cases:
-                raise UserError(f"joints: none of {', '.join(sorted(s.joints))} is in the recordings ({', '.join(w.runs[0].joints)})")
+                raise UserError(
+                    f"joints: none of {', '.join(sorted(s.joints))} is in the recordings "
+                    f"({', '.join(w.runs[0].joints)})"
+                )
         w.clock.lap("model along the motion")
         group = conditions(w.runs)
         drives = [json.dumps(plain(r.servo.to_dict()), sort_keys=True) for r in w.runs]
@@ -130,9 +141,11 @@ class Drives(Steps):
         self.noise = Noise(*errors.floor(w.runs, self.cases), errors.floors(w.runs, self.cases)[0])
         w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
 
-    # -- search ----------------------------------------------------------------------------------------------------------------
+    # -- search
+    # ----------------------------------------------------------------------------------------------------------------
     def search(self) -> None:
-        """Which effects each joint has; again where what was found in one moves the others otherwise than was thought."""
+        """Which effects each joint has; again where what was found in one moves the others otherwise than was
+        thought."""
         w = self.w
         self._left = len(self.cases)  # joints that are still to be searched: they share the time
         linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
@@ -156,7 +169,11 @@ class Drives(Steps):
         if w.limit.cut:
             why = "it was interrupted" if w.limit.stopped else f"the limit of {w.limit.seconds:g} s"
             joints = ", ".join(sorted(w.limit.cut))
-            w.notes.insert(0, f"the search of {joints} ended early ({why}): this is the best answer by then, further effects were not looked for")
+            w.notes.insert(
+                0,
+                f"the search of {joints} ended early ({why}): this is the best answer by then, further effects were "
+                "not looked for",
+            )
         w.clock.lap("search")
 
     def _begun(self, k: int, tell: Callable[[float], None]) -> JointSearch:
@@ -200,12 +217,16 @@ class Drives(Steps):
         unsettled = [
             k
             for k, (search, found) in enumerate(answers)
-            if found is not None and search.case.joint not in self.mute and (found.best.members or found.best.fit.loss > UNSETTLED)
+            if found is not None
+            and search.case.joint not in self.mute
+            and (found.best.members or found.best.fit.loss > UNSETTLED)
         ]
         if len(unsettled) < 2 or any(found is None for _, found in answers):
             return
         self._coupled_by([found.best for _, found in answers])
-        unsettled = [k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), answers[k][1])]
+        unsettled = [
+            k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), answers[k][1])
+        ]
         self._left = len(unsettled)
         joints = [self.cases[k].joint for k in unsettled]
         renewed = together(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
@@ -218,7 +239,9 @@ class Drives(Steps):
         self.stages = stage_tests.tests(cases, w.runs, p.train, w.settings.seed)
         for x in self.stages[:4]:
             w.say(f"  {x.text}")
-        self.by_torque = torque_told.found(cases, w.runs, p.train, p.test, w.settings.seed, self.mj_model, p.span_train, p.span_test)
+        self.by_torque = torque_told.found(
+            cases, w.runs, p.train, p.test, w.settings.seed, self.mj_model, p.span_train, p.span_test
+        )
         self.behind = torque_told.texts(self.by_torque)
         self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
         w.notes += torque_told.believe(self.by_torque)
@@ -227,7 +250,8 @@ class Drives(Steps):
             w.say(f"  {x}")
         w.clock.lap("stage tests")
 
-    # -- locate, judge, report -------------------------------------------------------------------------------------------------
+    # -- locate, judge, report
+    # -------------------------------------------------------------------------------------------------
     def locate(self) -> None:
         """Where each joint's residual lives: speed, load, time since reversal, ..."""
         seed, kept = self.w.settings.seed, self.kept
@@ -255,7 +279,10 @@ class Drives(Steps):
         assemble(d, w.settings, self.answers, self.kept, self.noise, p.how, w.channel, self.plains)
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:
-            w.notes.append(f"not judged: {', '.join(p.not_judged)}; what was kept out visits it and no recording that is fitted does")
+            w.notes.append(
+                f"not judged: {', '.join(p.not_judged)}; what was kept out visits it and no recording that is fitted "
+                "does"
+            )
         d.stages = [x.text for x in self.stages] + self.behind
         add_behind(d, torque_told.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
         torque_told.hand_on(self.by_torque, d, self.outcomes, p.test, p.span_test, self.stages)
@@ -270,20 +297,35 @@ class Drives(Steps):
                 continue
             claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
             trial = search.polish(outcome.best if claimed else outcome.none)
-            found = residual_fit.fit(case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed)
+            found = residual_fit.fit(
+                case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed
+            )
             if found is not None:
                 d.standins.append(found)
                 d.notes.append(found.text)
 
     def confirm(self, d: Diagnosis) -> None:
-        """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the sentence says so."""
+        """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the
+        sentence says so."""
         w, s, p = self.w, self.w.settings, self.parts
         if s.replay == "none":
             return
-        cases, finer = [case for case, _, _ in self.outcomes], [replace(case, plant=search.whole) for case, search, _ in self.outcomes]
+        cases, finer = (
+            [case for case, _, _ in self.outcomes],
+            [replace(case, plant=search.whole) for case, search, _ in self.outcomes],
+        )
         try:
             found = full_model.confirm(
-                w.m, w.runs, cases, self._hypotheses(d), p.test, p.span_test, self.noise.floor, s.device, s.replay, finer=finer
+                w.m,
+                w.runs,
+                cases,
+                self._hypotheses(d),
+                p.test,
+                p.span_test,
+                self.noise.floor,
+                s.device,
+                s.replay,
+                finer=finer,
             )
         except UserError as error:
             d.notes.append(f"not replayed in the engine that trains: {error}")
@@ -308,18 +350,26 @@ class Drives(Steps):
             joint = f["where"]["joints"][0]
             other = rival_of(*searches[joint], f["effect"], rivals[0]) if rivals else None
             if other is not None:
-                return [*out, full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)})]
+                return [
+                    *out,
+                    full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}),
+                ]
         return out
 
 
 def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str]:
     """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
     every: dict[str, Any] = TOUCH_EFFECTS | EFFECTS
-    return [f"{e} cannot be seen here: {left_out[e]}; to see it: {every[e].experiment}" for e in sorted(asked or ()) if e in left_out]
+    return [
+        f"{e} cannot be seen here: {left_out[e]}; to see it: {every[e].experiment}"
+        for e in sorted(asked or ())
+        if e in left_out
+    ]
 
 
 def _other(search: JointSearch, found: Outcome) -> bool:
-    """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was thought."""
+    """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was
+    thought."""
     for trial in (found.none, found.best):
         with search._fix(trial.members):
             loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
@@ -345,7 +395,10 @@ def _limits(model, runs: list[Run]) -> list[str]:
         mn, mx = min(r.q[:, j].min() for r in runs), max(r.q[:, j].max() for r in runs)
         margin = 0.02 * (high - low) + 0.01
         if mn < low - margin or mx > high + margin:
-            notes.append(f"{name} moved {mn:.3g} to {mx:.3g}, beyond the model's range {low:.3g} to {high:.3g} (degrees for radians in the"
-                         " model, another zero, or another joint?); the range is not used")  # fmt: skip
+            notes.append(
+                f"{name} moved {mn:.3g} to {mx:.3g}, beyond the model's range {low:.3g} to {high:.3g} (degrees for "
+                "radians in the"
+                " model, another zero, or another joint?); the range is not used"
+            )
             model.jnt_limited[joint] = 0
     return notes

@@ -36,7 +36,8 @@ class Settings:
     meta: dict[str, str] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
     limit: float | None = None  # s of wall time for all; the best answer by then
-    time_limit: TimeLimit | None = None  # made from `limit` where it is not given; its `stop()` ends the search with the best so far
+    # made from `limit` where it is not given; its `stop()` ends the search with the best so far
+    time_limit: TimeLimit | None = None
     replay: str = "mujoco"  # see `confirm.REPLAY`
 
 
@@ -62,7 +63,8 @@ class Diagnosis:
     notes: list[str]
     curves: list[Curve] = field(default_factory=list)
     spots: list[bins.Spot] = field(default_factory=list)
-    joints: dict[str, dict[str, float]] = field(default_factory=dict)  # by joint: before, after, sigma; as_fitted: after, where it was taken back
+    # by joint: before, after, sigma; as_fitted: after, where it was taken back
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)
     outcomes: list[Outcome] = field(default_factory=list)
     servo: ServoTable | None = None
     model_spec: Any = None
@@ -73,7 +75,8 @@ class Diagnosis:
     touch: TouchResult | None = None
     lengths: dict[str, float] = field(default_factory=dict)  # of each recording [s]
     standins: list[residual_fit.StandIn] = field(default_factory=list)
-    mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)  # (joint, recording): mean |error| before, after
+    # (joint, recording): mean |error| before, after
+    mae: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     untrained: list[str] = field(default_factory=list)
     confirmation: full_model.Confirmation | None = None
     evidence: list[confidence.Evidence] = field(default_factory=list)  # behind each finding of a joint
@@ -83,8 +86,17 @@ def empty(verdict: str = "unusable") -> dict[str, Any]:
     """diagnosis.json with nothing in it."""
     zero = {"recordings": [], "error": "position_rmse_rad"}
     zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
-    return {"schema": 1, "verdict": verdict, "noise_floor": {"position_rad": None, "how": "quantum"}, "nuisance": {}, "baseline": {}, "held_out": zero,
-            "findings": [], "unexplained": {"fraction_of_gap": None, "depends_on": [], "not_considered": {}}, "next_recording": None}
+    return {
+        "schema": 1,
+        "verdict": verdict,
+        "noise_floor": {"position_rad": None, "how": "quantum"},
+        "nuisance": {},
+        "baseline": {},
+        "held_out": zero,
+        "findings": [],
+        "unexplained": {"fraction_of_gap": None, "depends_on": [], "not_considered": {}},
+        "next_recording": None,
+    }
 
 
 class Clock:

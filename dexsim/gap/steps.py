@@ -1,4 +1,5 @@
-"""The steps that every part of a machine is taken through, its drives (`gap.drives`) and its touch (`gap.touch.diagnosis`) alike."""
+"""The steps that every part of a machine is taken through, its drives (`gap.drives`) and its touch
+(`gap.touch.diagnosis`) alike."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ class NothingToJudge(Exception):
 
 
 class Steps(ABC):
-    """One part of a machine under diagnosis. Each step keeps what it found out for the next ones; any may raise NothingToJudge."""
+    """One part of a machine under diagnosis. Each step keeps what it found out for the next ones; any may raise
+    NothingToJudge."""
 
     @abstractmethod
     def read(self) -> None:
@@ -28,7 +30,8 @@ class Steps(ABC):
 
     @abstractmethod
     def locate(self) -> None:
-        """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the recordings."""
+        """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the
+        recordings."""
 
     @abstractmethod
     def judge(self) -> None:

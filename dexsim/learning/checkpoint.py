@@ -4,10 +4,10 @@ A checkpoint is a ``torch.save`` zip of tensors, numbers and text, read with ``w
 code. It is written beside its place, synced and renamed, so that the previous one survives a full disk or a crash.
 
 Keys (all of them always there in a ``train`` file; a ``policy`` file leaves out those marked t):
-  format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty});
-  layout ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps);
-  actor (state dict, its running normalization included); t critic, t optimizer, t env (the environment's counters,
-  curriculum and random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states.
+  format, version, kind ("train" | "policy"); config (JSON text, resolved); versions, git ({commit, dirty}); layout
+  ({joints, action, observations: {group: [[name, size], ...]}}); iteration, steps (environment steps); actor (state
+  dict, its running normalization included); t critic, t optimizer, t env (the environment's counters, curriculum and
+  random state), t rng (torch, cuda, numpy, python). A ``train`` file may hold worlds, the worlds' states.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ def write(path: str | Path, data: bytes) -> Path:
             part.unlink()
         kept = "; the previous file there is whole" if path.exists() else ""
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise SaveError(f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}") from None
+            raise SaveError(
+                f"cannot save {path}: the disk is full ({len(data) / 2**20:.1f} MiB needed){kept}"
+            ) from None
         raise SaveError(f"cannot save {path}: {error.strerror}{kept}") from None
     return path
 
@@ -118,7 +120,10 @@ def load(path: str | Path, device: str = "cpu") -> dict[str, Any]:
     if missing:
         raise UserError(f"{path}: damaged checkpoint, it lacks {', '.join(missing)}")
     if "${" in str(data["config"]):  # what train.py stores is resolved; another's could read this machine's environment
-        raise UserError(f"{path}: refused, its config holds an interpolation (${{...}}), which that of a dexsim checkpoint never does")
+        raise UserError(
+            f"{path}: refused, its config holds an interpolation (${{...}}), which that of a dexsim checkpoint never "
+            "does"
+        )
     try:
         data["config"] = json.loads(data["config"])
     except (TypeError, ValueError, RecursionError):
@@ -145,15 +150,21 @@ def _check_whole(path: Path) -> None:
                             " tensors, numbers and text")
         with zipfile.ZipFile(path) as archive:
             if head != b"PK" or min(i.header_offset for i in archive.infolist()) != 0:
-                raise UserError(f"{path}: refused, something else stands before its archive, which a dexsim checkpoint never has")
+                raise UserError(
+                    f"{path}: refused, something else stands before its archive, which a dexsim checkpoint never has"
+                )
             if any(i.compress_type != zipfile.ZIP_STORED for i in archive.infolist()):
-                raise UserError(f"{path}: refused, its parts are compressed, which those of a dexsim checkpoint never are")
+                raise UserError(
+                    f"{path}: refused, its parts are compressed, which those of a dexsim checkpoint never are"
+                )
             bad = archive.testzip()
     except (zipfile.BadZipFile, NotImplementedError, EOFError, ValueError, RuntimeError) as error:
         if isinstance(error, UserError):
             raise
         what = "truncated" if head == b"PK" else "empty" if not head else "not a checkpoint"
-        raise UserError(f"{path}: {what} ({path.stat().st_size} bytes); use another checkpoint of its run folder") from None
+        raise UserError(
+            f"{path}: {what} ({path.stat().st_size} bytes); use another checkpoint of its run folder"
+        ) from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     if bad:
@@ -220,7 +231,8 @@ def git_state(folder: Path | None = None) -> dict[str, Any]:
 
 
 def provenance(data: dict[str, Any]) -> str:
-    """A checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where tracked files differed from it."""
+    """A checkpoint's origin in words: iteration, steps and the commit it was trained at, "+changes" where tracked files
+    differed from it."""
     git = data["git"]
     commit = git["commit"][:12] + ("+changes" if git["dirty"] else "") if git["commit"] != "unknown" else "unknown"
     return f"iteration {data['iteration']}, {data['steps']:,} steps, trained at commit {commit}"

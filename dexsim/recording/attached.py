@@ -1,4 +1,5 @@
-"""The resolved config that a simulated recording carries (config.yaml), as far as it is read again: the object and the solver."""
+"""The resolved config that a simulated recording carries (config.yaml), as far as it is read again: the object and the
+solver."""
 
 from __future__ import annotations
 
@@ -68,7 +69,11 @@ def fault(text: str | None, source: str) -> str:
     try:
         raw: Any = yaml_text.parse(text, source)
         if raw is not None:
-            typed.convert({k: raw[k] for k in Config.__struct_fields__ if k in raw} if isinstance(raw, dict) else raw, Config, source)
+            typed.convert(
+                {k: raw[k] for k in Config.__struct_fields__ if k in raw} if isinstance(raw, dict) else raw,
+                Config,
+                source,
+            )
     except UserError as error:
         return str(error)
     return ""

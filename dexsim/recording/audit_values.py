@@ -173,7 +173,8 @@ def spikes(r: Recording) -> Iterator[Finding]:
                     series.topic,
                     float(series.t[at[0]]),
                     len(at),
-                    f"{name} of {joint}: {len(at)} single samples ({100 * len(at) / len(x):.2g} %) far from their neighbours",
+                    f"{name} of {joint}: {len(at)} single samples ({100 * len(at) / len(x):.2g} %) far from their "
+                    "neighbours",
                     "warning",
                     joint,
                     float(series.t[at[-1]]),

@@ -113,8 +113,8 @@ def pose(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
 
 
 def imu(stamp_ns: int, frame: str, values: np.ndarray) -> bytes:
-    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0). A part that
-    is not a number is not measured, which the message says by -1 as the first entry of its covariance."""
+    """sensor_msgs/Imu from [10] orientation w x y z, angular velocity, linear acceleration; covariances unknown (0). A
+    part that is not a number is not measured, which the message says by -1 as the first entry of its covariance."""
     v = np.asarray(values, dtype="<f8")
     c = Cdr()
     c.header(stamp_ns, frame)

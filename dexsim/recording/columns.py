@@ -1,8 +1,9 @@
 """A CSV or NPZ file with named columns as a recording: time, and command, position, effort ... of each joint.
 
-Columns are named `QUANTITY.JOINT`, `JOINT.QUANTITY`, `QUANTITY_JOINT`, `JOINT_QUANTITY` (also with / : or a blank between), or
-`QUANTITY` alone where there is one joint; a unit may follow: `position.elbow [deg]`, `elbow_position_deg`, `time_ms`. An NPZ file may
-hold arrays [T, J] with `joint_names`. `remap.QUANTITY.JOINT=COLUMN` (`remap.time=COLUMN`) names columns that are called otherwise.
+Columns are named `QUANTITY.JOINT`, `JOINT.QUANTITY`, `QUANTITY_JOINT`, `JOINT_QUANTITY` (also with / : or a blank
+between), or `QUANTITY` alone where there is one joint; a unit may follow: `position.elbow [deg]`, `elbow_position_deg`,
+`time_ms`. An NPZ file may hold arrays [T, J] with `joint_names`. `remap.QUANTITY.JOINT=COLUMN` (`remap.time=COLUMN`)
+names columns that are called otherwise.
 """
 
 from __future__ import annotations
@@ -26,8 +27,23 @@ MAX_BYTES = 1 << 30  # of a file, unpacked
 MAX_VALUES = 50_000_000  # numbers in a file
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "time": ("time", "timestamp", "stamp", "t", "host_time"),
-    "command": ("command", "cmd", "target", "setpoint", "reference", "desired", "goal", "goal_position", "target_position",
-                "command_position", "position_command", "commanded_position", "desired_position", "q_des", "q_cmd"),
+    "command": (
+        "command",
+        "cmd",
+        "target",
+        "setpoint",
+        "reference",
+        "desired",
+        "goal",
+        "goal_position",
+        "target_position",
+        "command_position",
+        "position_command",
+        "commanded_position",
+        "desired_position",
+        "q_des",
+        "q_cmd",
+    ),
     "position": ("position", "pos", "angle", "measured", "measured_position", "present_position", "q"),
     "velocity": ("velocity", "vel", "speed", "present_velocity", "qd", "dq"),
     "effort": ("effort", "torque", "tau", "current", "present_current", "motor_current", "motor_torque"),
@@ -35,19 +51,28 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
     "duty": ("duty", "pwm", "duty_cycle", "present_pwm"),
     "enabled": ("enabled", "enable", "torque_enable", "torque_enabled"),
     "supply_voltage": ("supply_voltage", "supply", "voltage", "bus_voltage", "input_voltage"),
-}  # fmt: skip
+}
 """Quantity -> the names that columns may give it."""
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "position": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3, "turn": 2 * np.pi, "rev": 2 * np.pi},
-    "velocity": {"rad/s": 1.0, "rads": 1.0, "rad_s": 1.0, "deg/s": np.pi / 180, "degs": np.pi / 180, "deg_s": np.pi / 180, "rpm": 2 * np.pi / 60, "m/s": 1.0,
-                 "mm/s": 1e-3},
+    "velocity": {
+        "rad/s": 1.0,
+        "rads": 1.0,
+        "rad_s": 1.0,
+        "deg/s": np.pi / 180,
+        "degs": np.pi / 180,
+        "deg_s": np.pi / 180,
+        "rpm": 2 * np.pi / 60,
+        "m/s": 1.0,
+        "mm/s": 1e-3,
+    },
     "effort": {"a": 1.0, "ma": 1e-3, "nm": 1.0, "n.m": 1.0, "n": 1.0, "mnm": 1e-3, "mn.m": 1e-3},
     "temperature": {"degc": 1.0, "c": 1.0},
     "duty": {"1": 1.0, "%": 0.01, "percent": 0.01},
     "enabled": {},
     "supply_voltage": {"v": 1.0, "mv": 1e-3},
-}  # fmt: skip
+}
 UNITS["command"] = UNITS["position"]
 _WORDS = sorted(((w, q) for q, words in QUANTITIES.items() for w in words), key=lambda x: -len(x[0]))
 _CURRENT = ("current", "present_current", "motor_current")
@@ -58,7 +83,8 @@ _CLOCK_STEP = 0.5  # s between samples from which on a time without a unit is no
 class Table:
     """A file's columns by quantity and joint, in SI units: time [T] s by topic, value[quantity][joint] [T].
 
-    meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or left out."""
+    meta: what the columns themselves state (effort_is); start_ns: host time of t = 0; findings: what was assumed or
+    left out."""
 
     joints: list[str]
     time: dict[str, np.ndarray]
@@ -70,7 +96,11 @@ class Table:
     def samples(self, quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """(t [T] s, value [T, J]) of one quantity, rows without any number left out."""
         t, columns = self.time[quantity], self.value.get(quantity, {})
-        rows = np.stack([columns.get(j, np.full(len(t), np.nan)) for j in self.joints], 1) if columns else np.zeros((len(t), 0))
+        rows = (
+            np.stack([columns.get(j, np.full(len(t), np.nan)) for j in self.joints], 1)
+            if columns
+            else np.zeros((len(t), 0))
+        )
         keep = np.isfinite(rows).any(1)
         return t[keep], rows[keep]
 
@@ -78,7 +108,8 @@ class Table:
 def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) -> Table:
     """The table in a CSV, TSV or NPZ file. remap: see the module, and our joint name -> theirs (left to the caller).
 
-    meta: position_unit, effort_unit and time_unit hold for columns without a unit of their own. Raises UserError naming what is missing."""
+    meta: position_unit, effort_unit and time_unit hold for columns without a unit of their own. Raises UserError naming
+    what is missing."""
     named = {k: v for k, v in remap.items() if k.split(".")[0] in QUANTITIES}
     raw, findings = _npz(path) if path.suffix.lower() == ".npz" else _csv(path)
     if not raw:
@@ -90,10 +121,19 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
     for column, (quantity, joint, unit, word) in roles.items():
         if joint in found.get(quantity, {}):
             other = next(c for c, r in roles.items() if r[:2] == (quantity, joint))
-            raise UserError(f"recording {path}: columns '{other}' and '{column}' are both {quantity}"
-                            f"{' of ' + joint if joint else ''}; say which with remap.{quantity}{'.' + joint if joint else ''}=COLUMN")  # fmt: skip
+            raise UserError(
+                f"recording {path}: columns '{other}' and '{column}' are both {quantity}"
+                f"{' of ' + joint if joint else ''}; say which with "
+                f"remap.{quantity}{'.' + joint if joint else ''}=COLUMN"
+            )
         if quantity == "effort":
-            effort.add("current_A" if word in _CURRENT or unit in ("a", "ma") else "torque_Nm" if word != "effort" or unit else "")
+            effort.add(
+                "current_A"
+                if word in _CURRENT or unit in ("a", "ma")
+                else "torque_Nm"
+                if word != "effort" or unit
+                else ""
+            )
         scale = _scale(path, quantity, unit, meta)
         found.setdefault(quantity, {})[joint] = raw[column] * scale
         if joint and quantity not in ("time", "supply_voltage"):
@@ -104,24 +144,35 @@ def read_table(path: Path, remap: Mapping[str, str], meta: Mapping[str, str]) ->
         joints = ["joint"]
     for q in unnamed:
         if len(joints) > 1:
-            raise UserError(f"recording {path}: column '{_column(roles, q, '')}' names no joint, and there are {len(joints)}"
-                            f" ({', '.join(joints)}); say whose it is with remap.{q}.JOINT='{_column(roles, q, '')}'")  # fmt: skip
+            raise UserError(
+                f"recording {path}: column '{_column(roles, q, '')}' names no joint, and there are {len(joints)}"
+                f" ({', '.join(joints)}); say whose it is with remap.{q}.JOINT='{_column(roles, q, '')}'"
+            )
         found[q] = {joints[0]: found[q].pop("")} | found[q]
     if not {"position", "command"} & set(found):
-        raise UserError(f"recording {path}: no column of position or command; columns: {_list(raw)}. Name them like 'position.elbow',"
-                        " or say which with remap.position.JOINT=COLUMN")  # fmt: skip
+        raise UserError(
+            f"recording {path}: no column of position or command; columns: {_list(raw)}. Name them like "
+            "'position.elbow',"
+            " or say which with remap.position.JOINT=COLUMN"
+        )
     unused = [c for c in raw if c not in roles]
     if unused:
-        findings.append(Finding("topic", "", np.nan, len(unused), f"columns that are not read: {_list(unused)}", "info"))
+        findings.append(
+            Finding("topic", "", np.nan, len(unused), f"columns that are not read: {_list(unused)}", "info")
+        )
     stated = {"effort_is": effort.pop()} if len(effort) == 1 and "" not in effort else {}
     if len(effort) > 1:
-        raise UserError(f"recording {path}: effort is a current in one column and a torque in another; keep one of them with remap.effort.JOINT=COLUMN")
+        raise UserError(
+            f"recording {path}: effort is a current in one column and a torque in another; keep one of them with "
+            "remap.effort.JOINT=COLUMN"
+        )
     time, start = _clock(path, found, roles, meta, list(raw))
     return Table(joints, time, {q: c for q, c in found.items() if q != "time"}, stated, start, findings)
 
 
 def _roles(path: Path, columns: list[str], named: Mapping[str, str]) -> dict[str, tuple[str, str, str, str]]:
-    """Column -> (quantity, joint or "", unit or "", the word it was known by); columns that say nothing known are left out."""
+    """Column -> (quantity, joint or "", unit or "", the word it was known by); columns that say nothing known are left
+    out."""
     out: dict[str, tuple[str, str, str, str]] = {}
     for key, column in named.items():
         quantity, _, joint = key.partition(".")
@@ -147,8 +198,11 @@ def _role(column: str) -> tuple[str, str, str, str] | None:
             return quantity, "", unit, word
     for word, quantity in sorted(_WORDS, key=lambda x: x[1] != "time"):
         inner = r"[\s_-]*".join(map(re.escape, word.split("_")))
-        between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"  # one letter is a quantity only beside a mark no word has inside
-        found = re.fullmatch(rf"\W*{inner}{between}(.+?)[\])}}]*", name, re.I) or re.fullmatch(rf"\W*(.+?){between}{inner}[\])}}]*", name, re.I)
+        # one letter is a quantity only beside a mark no word has inside
+        between = r"[\s./:\[\](){}_-]+" if len(word) > 1 else r"[./:\[(]+"
+        found = re.fullmatch(rf"\W*{inner}{between}(.+?)[\])}}]*", name, re.I) or re.fullmatch(
+            rf"\W*(.+?){between}{inner}[\])}}]*", name, re.I
+        )
         if found is None:
             continue
         joint = found.group(1)
@@ -175,26 +229,42 @@ def _unit(column: str) -> tuple[str, str]:
 
 def _known(name: str) -> bool:
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    return any(plain == w or (len(w) > 1 and (plain.startswith(w + "_") or plain.endswith("_" + w))) for ws in QUANTITIES.values() for w in ws)
+    return any(
+        plain == w or (len(w) > 1 and (plain.startswith(w + "_") or plain.endswith("_" + w)))
+        for ws in QUANTITIES.values()
+        for w in ws
+    )
 
 
 def _scale(path: Path, quantity: str, unit: str, meta: Mapping[str, str]) -> float:
-    key = {"command": "position_unit", "position": "position_unit", "velocity": "position_unit", "effort": "effort_unit", "time": "time_unit"}.get(quantity)
+    key = {
+        "command": "position_unit",
+        "position": "position_unit",
+        "velocity": "position_unit",
+        "effort": "effort_unit",
+        "time": "time_unit",
+    }.get(quantity)
     if not unit:
         stated = meta.get(key or "")
         if stated is None:
             return 1.0
         return UNITS["time"][stated] if quantity == "time" else schema.UNIT_KEYS[key][stated]
     if unit not in UNITS[quantity]:
-        raise UserError(f"recording {path}: {quantity} in '{unit}' is not read; units: {', '.join(UNITS[quantity]) or 'none'}")
+        raise UserError(
+            f"recording {path}: {quantity} in '{unit}' is not read; units: {', '.join(UNITS[quantity]) or 'none'}"
+        )
     return UNITS[quantity][unit]
 
 
-def _clock(path: Path, found: dict, roles: dict, meta: Mapping[str, str], columns: list[str]) -> tuple[dict[str, np.ndarray], int]:
+def _clock(
+    path: Path, found: dict, roles: dict, meta: Mapping[str, str], columns: list[str]
+) -> tuple[dict[str, np.ndarray], int]:
     """Time [s] since the start by quantity, and the start in ns of the epoch (0 where the file counts from zero)."""
     clocks = found.get("time", {})
     if not clocks:
-        raise UserError(f"recording {path}: no column of time; columns: {_list(columns)}. Say which it is with remap.time=COLUMN")
+        raise UserError(
+            f"recording {path}: no column of time; columns: {_list(columns)}. Say which it is with remap.time=COLUMN"
+        )
     if "" not in clocks and "position" in clocks:
         clocks[""] = clocks["position"]
     out, first = {}, np.inf
@@ -206,24 +276,34 @@ def _clock(path: Path, found: dict, roles: dict, meta: Mapping[str, str], column
             raise UserError(f"recording {path}: no time for {quantity}; name a column 'time' or 'time.{quantity}'")
         for joint, x in found[quantity].items():
             if len(x) != len(t):
-                raise UserError(f"recording {path}: {quantity}{' of ' + joint if joint else ''} has {len(x)} values and its time {len(t)}")
+                raise UserError(
+                    f"recording {path}: {quantity}{' of ' + joint if joint else ''} has {len(x)} values and its time "
+                    f"{len(t)}"
+                )
         steps = np.diff(t[np.isfinite(t)])
         step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
         unit = any(r[0] == "time" and r[2] for r in roles.values()) or "time_unit" in meta
         if step > _CLOCK_STEP and not unit and len(t) > 5:
-            raise UserError(f"recording {path}: time steps by {step:g}, which seconds hardly do; say its unit with meta.time_unit=s, ms, us or ns")
+            raise UserError(
+                f"recording {path}: time steps by {step:g}, which seconds hardly do; say its unit with "
+                "meta.time_unit=s, ms, us or ns"
+            )
         out[quantity] = t
         if np.isfinite(t).any():
             first = min(first, float(np.nanmedian(t[:5])) if step else float(np.nanmin(t)), float(t[np.isfinite(t)][0]))
     if not np.isfinite(first):
         raise UserError(f"recording {path}: its time holds no number")
     if abs(first) > 9e9:
-        raise UserError(f"recording {path}: time begins at {first:.4g} s, beyond any date; say its unit with meta.time_unit=s, ms, us or ns")
+        raise UserError(
+            f"recording {path}: time begins at {first:.4g} s, beyond any date; say its unit with meta.time_unit=s, "
+            "ms, us or ns"
+        )
     return {q: t - first for q, t in out.items()}, round(first * 1e9) if first > 1e6 else 0
 
 
 def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
-    """Columns of a text file: separated by commas, semicolons or tabs, a line of names before the numbers; lines from # on are left out."""
+    """Columns of a text file: separated by commas, semicolons or tabs, a line of names before the numbers; lines from #
+    on are left out."""
     text = files.text(path, MAX_BYTES, "recording")
     lines = text.lstrip("\ufeff").splitlines()
     body = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
@@ -231,8 +311,10 @@ def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         heads = [line.lstrip("# \t") for line in lines if line.lstrip().startswith("#")]
         body = ([heads[-1]] if heads else []) + body
     if len(body) < 2 or _numeric(body[0]):
-        raise UserError(f"recording {path}: no line of column names before numbers; the first line must name the columns,"
-                        " e.g. time,command.elbow,position.elbow")  # fmt: skip
+        raise UserError(
+            f"recording {path}: no line of column names before numbers; the first line must name the columns,"
+            " e.g. time,command.elbow,position.elbow"
+        )
     separator = max(",;\t", key=body[0].count)
     if not body[0].count(separator):
         raise UserError(f"recording {path}: its first line has no comma, semicolon or tab between names")
@@ -245,10 +327,26 @@ def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
     if twice:
         raise UserError(f"recording {path}: two columns are called '{twice}'; give each its own name")
     if len(names) * len(rows) > MAX_VALUES:
-        raise UserError(f"recording {path}: {len(names) * len(rows)} values; at most {MAX_VALUES} are read: cut it into several files")
+        raise UserError(
+            f"recording {path}: {len(names) * len(rows)} values; at most {MAX_VALUES} are read: cut it into several "
+            "files"
+        )
     bad = sum(len(r) != len(names) for r in rows[1:])
     rows = [r for r in rows[1:] if len(r) == len(names)]
-    findings = [Finding("malformed", "", np.nan, bad, f"{bad} lines have not as many values as there are names; left out", "error")] if bad else []
+    findings = (
+        [
+            Finding(
+                "malformed",
+                "",
+                np.nan,
+                bad,
+                f"{bad} lines have not as many values as there are names; left out",
+                "error",
+            )
+        ]
+        if bad
+        else []
+    )
     out, words = {}, 0
     for k, name in enumerate(names):
         column, unread = _floats([r[k] for r in rows])
@@ -256,7 +354,16 @@ def _csv(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
             out[name] = column
             words += unread
     if words:
-        findings.append(Finding("unreadable", "", np.nan, words, f"{words} entries are not numbers (a number is like 1.5e-3); taken as missing", "error"))
+        findings.append(
+            Finding(
+                "unreadable",
+                "",
+                np.nan,
+                words,
+                f"{words} entries are not numbers (a number is like 1.5e-3); taken as missing",
+                "error",
+            )
+        )
     return out, findings
 
 
@@ -290,7 +397,10 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         with zipfile.ZipFile(path) as archive:
             size = sum(i.file_size for i in archive.infolist())
         if size > MAX_BYTES:
-            raise UserError(f"recording {path}: unpacks to {size / 2**30:.3g} GiB; at most {MAX_BYTES / 2**30:g} GiB is read: cut it into several files")
+            raise UserError(
+                f"recording {path}: unpacks to {size / 2**30:.3g} GiB; at most {MAX_BYTES / 2**30:g} GiB is read: cut "
+                "it into several files"
+            )
         with np.load(path, allow_pickle=False) as archive:
             arrays = {str(k): archive[k] for k in archive.files}
     except UserError:
@@ -299,7 +409,10 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         text = " ".join(str(error).split())[:200] or type(error).__name__
         hint = "; save plain arrays of numbers, no objects" if "pickle" in text.lower() else ""
         raise UserError(f"recording {path}: is not an NPZ file that can be read: {text}{hint}") from None
-    names = next((arrays.pop(k) for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"), None)
+    names = next(
+        (arrays.pop(k) for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"),
+        None,
+    )
     out: dict[str, np.ndarray] = {}
     for key, x in arrays.items():
         if x.dtype.kind not in "fiub":
@@ -309,9 +422,13 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
         if x.ndim == 1 and x.size:
             out[key] = x.astype(float)
         elif x.ndim == 2 and x.shape[1] and x.shape[0]:
-            labels = [str(n) for n in np.ravel(names)] if names is not None else [f"joint{j}" for j in range(x.shape[1])]
+            labels = (
+                [str(n) for n in np.ravel(names)] if names is not None else [f"joint{j}" for j in range(x.shape[1])]
+            )
             if len(labels) != x.shape[1]:
-                raise UserError(f"recording {path}: '{key}' has {x.shape[1]} columns, but joint_names has {len(labels)}")
+                raise UserError(
+                    f"recording {path}: '{key}' has {x.shape[1]} columns, but joint_names has {len(labels)}"
+                )
             out |= {f"{key}.{label}": x[:, j].astype(float) for j, label in enumerate(labels)}
     return out, []
 

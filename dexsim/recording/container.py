@@ -168,8 +168,11 @@ def _plain(opcode: int, body: bytes, length: int, out: Container) -> None:
     except _BROKEN as error:
         out.damage.append((None, 1, f"a record (opcode {opcode}) cannot be read: {error or type(error).__name__}"))
     if out.unpacked > out.most or len(out.messages) > MAX_MESSAGES:
-        raise TooMuch(f"recording {out.path}: its messages come to more than {out.most / 2**20:.0f} MiB or {MAX_MESSAGES} of them;"
-                      " cut it into several files, or leave cameras out")  # fmt: skip
+        raise TooMuch(
+            f"recording {out.path}: its messages come to more than {out.most / 2**20:.0f} MiB or {MAX_MESSAGES} of "
+            "them;"
+            " cut it into several files, or leave cameras out"
+        )
 
 
 def _unzip(packed: bytes) -> bytes:
@@ -203,7 +206,9 @@ def _chunk(body: bytes, cut: bool, out: Container) -> None:
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
             span = chunk.message_start_time
             if chunk.uncompressed_size > MAX_CHUNK:
-                raise ValueError(f"it unpacks to {chunk.uncompressed_size / 2**20:.0f} MiB; at most {MAX_CHUNK >> 20} are read")
+                raise ValueError(
+                    f"it unpacks to {chunk.uncompressed_size / 2**20:.0f} MiB; at most {MAX_CHUNK >> 20} are read"
+                )
             if chunk.compression == "zstd":
                 data = _unzip(chunk.data)
             elif chunk.compression == "lz4":

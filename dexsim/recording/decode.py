@@ -42,7 +42,11 @@ def _usual(channel: Channel, schema: Schema | None, kind: str) -> bool:
     """Whether the messages are of the standard definition, whose fields need not be looked for."""
     if channel.message_encoding != "cdr" or schema is None or schema.name != kind:
         return False
-    lines = lambda text: [" ".join(x.split("#")[0].split()[:2]).replace("/msg/", "/") for x in text.splitlines() if x.split("#")[0].strip("= \t")]  # noqa: E731
+
+    def lines(text: str) -> list[str]:
+        stated = [x.split("#")[0] for x in text.splitlines()]
+        return [" ".join(x.split()[:2]).replace("/msg/", "/") for x in stated if x.strip("= \t")]
+
     text = schema.data.decode("utf-8", "replace")
     return schema.encoding != "ros2msg" or not text.strip() or lines(text) == lines(DEFINITIONS[kind])
 
@@ -55,7 +59,9 @@ def joint_reader(channel: Channel, schema: Schema | None, part: str) -> Callable
         def standard(data: bytes) -> JointSample:
             m = decode(data)
             stamp = m.header.stamp
-            return JointSample(m.name, m.position, m.velocity, m.effort, stamp.sec * 1_000_000_000 + stamp.nanosec or None)
+            return JointSample(
+                m.name, m.position, m.velocity, m.effort, stamp.sec * 1_000_000_000 + stamp.nanosec or None
+            )
 
         return standard
 
@@ -221,7 +227,9 @@ def _ros2(schema: Schema | None) -> Callable[[bytes], Any]:
     try:
         return ros2.decoder(schema.name, encoding, text)
     except ros2.BadDefinition as error:
-        raise Unreadable(f"the {'IDL ' if encoding == 'ros2idl' else ''}definition of {schema.name} is not read: {error}") from None
+        raise Unreadable(
+            f"the {'IDL ' if encoding == 'ros2idl' else ''}definition of {schema.name} is not read: {error}"
+        ) from None
 
 
 def _protobuf(schema: Schema | None) -> Callable[[bytes], Any]:

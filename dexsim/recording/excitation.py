@@ -29,8 +29,8 @@ CHECK_STEP, FRAME = 0.004, 0.008  # s: physics step and spacing of contact check
 @dataclass
 class Limits:
     """What a motion may reach. speed: fraction of the no-load speed; torque: fraction of the stall torque; margin:
-    share of a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours; current: A that no
-    motor may draw (None: only `torque` limits it)."""
+    share of a joint's range kept free at both ends; clearance [m] between bodies that are not neighbours; current: A
+    that no motor may draw (None: only `torque` limits it)."""
 
     speed: float = 0.6
     torque: float = 0.8

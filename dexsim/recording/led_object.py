@@ -34,8 +34,8 @@ MARKER = 0.015  # m, radius of what stands for an object of unknown shape: seen,
 
 @dataclass(frozen=True)
 class Stated:
-    """An object as somebody describes it. shape: of the library; size [1 to 3] m: its extents (box: x y z; sphere: diameter; capsule:
-    diameter, length; other shapes: the longest extent), empty: as the library has it."""
+    """An object as somebody describes it. shape: of the library; size [1 to 3] m: its extents (box: x y z; sphere:
+    diameter; capsule: diameter, length; other shapes: the longest extent), empty: as the library has it."""
 
     shape: str
     size: tuple[float, ...] = ()
@@ -52,10 +52,14 @@ class Stated:
         own = [2 * x for x in _library_size(shape)] if shape.kind in TYPES else [float(shape.extents.max())]
         size = [float(x) for x in self.size] or own
         if len(size) != count or not all(1e-3 <= x <= 1.0 for x in size):
-            raise UserError(f"object_size={','.join(f'{x:g}' for x in size)}: a {self.shape} has {count} extent{'s' * (count > 1)}"
-                            " from 0.001 to 1 m")
+            raise UserError(
+                f"object_size={','.join(f'{x:g}' for x in size)}: a {self.shape} has {count} extent{'s' * (count > 1)}"
+                " from 0.001 to 1 m"
+            )
         if shape.kind == "capsule" and size[1] <= size[0]:
-            raise UserError(f"object_size={size[0]:g},{size[1]:g}: a capsule's length (with its caps) must be over its diameter")
+            raise UserError(
+                f"object_size={size[0]:g},{size[1]:g}: a capsule's length (with its caps) must be over its diameter"
+            )
         if shape.kind == "capsule":
             half = [size[0] / 2, (size[1] - size[0]) / 2, 0.0]
         elif shape.kind in TYPES:
@@ -73,20 +77,30 @@ def _library_size(shape: Any) -> list[float]:
 
 
 def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None) -> str:
-    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction: "led". The object follows its
-    recorded path: fingers press on it, it does not yield, so forces follow the error of the joints rather than the balance of
-    a grasp. "marked": its path is known and its shape is not, a small ball that touches nothing shows where it was. "none": no
-    path was recorded, or the mechanism is not the hand. stated: what it is; default: what the recording says."""
+    """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction: "led". The
+    object follows its recorded path: fingers press on it, it does not yield, so forces follow the error of the joints
+    rather than the balance of a grasp. "marked": its path is known and its shape is not, a small ball that touches
+    nothing shows where it was. "none": no path was recorded, or the mechanism is not the hand. stated: what it is;
+    default: what the recording says."""
     config = yaml.safe_load(recording.config) if recording.config else None
     config = config if isinstance(config, dict) else {}
     about = config.get("recorded_world", {}).get("object") if stated is None else stated.about()
-    if recording.object_pose is None or m.robot != "xhand_right" or not np.isfinite(recording.object_pose.value).all(1).any():
+    if (
+        recording.object_pose is None
+        or m.robot != "xhand_right"
+        or not np.isfinite(recording.object_pose.value).all(1).any()
+    ):
         return "none"
     body = m.spec.worldbody.add_body(name=NAME, pos=recording.object_pose.value[0, :3])
     body.add_freejoint(name=JOINT)
     if not about or about["shape"] not in library():
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[MARKER, 0, 0], contype=0, conaffinity=0, rgba=[0.9, 0.6, 0.1, 0.8], mass=0.01
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[MARKER, 0, 0],
+            contype=0,
+            conaffinity=0,
+            rgba=[0.9, 0.6, 0.1, 0.8],
+            mass=0.01,
         )
         return "marked"
     shape, size = library()[about["shape"]], np.array(about["size"], float)

@@ -112,9 +112,27 @@ def _physical(model: mujoco.MjModel, where: str) -> None:
         ("gravity", model.opt.gravity[None], -100.0, "a number from -100 to 100 m/s2", lambda k: "option"),
         ("mass", model.body_mass, 0.0, "a number >= 0 [kg]", lambda k: f"body '{model.body(k).name}'"),
         ("inertia", model.body_inertia, 0.0, "numbers >= 0 [kg m2]", lambda k: f"body '{model.body(k).name}'"),
-        ("armature", model.dof_armature, 0.0, "a number >= 0 [kg m2]", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
-        ("damping", model.dof_damping, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
-        ("frictionloss", model.dof_frictionloss, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'"),
+        (
+            "armature",
+            model.dof_armature,
+            0.0,
+            "a number >= 0 [kg m2]",
+            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
+        ),
+        (
+            "damping",
+            model.dof_damping,
+            0.0,
+            "a number >= 0",
+            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
+        ),
+        (
+            "frictionloss",
+            model.dof_frictionloss,
+            0.0,
+            "a number >= 0",
+            lambda k: f"joint '{model.joint(model.dof_jntid[k]).name}'",
+        ),
         ("stiffness", model.jnt_stiffness, 0.0, "a number >= 0", lambda k: f"joint '{model.joint(k).name}'"),
         ("range", model.jnt_range, -1e6, "two finite numbers", lambda k: f"joint '{model.joint(k).name}'"),
         ("position", model.body_pos, -1e4, "three finite numbers [m]", lambda k: f"body '{model.body(k).name}'"),
@@ -127,7 +145,10 @@ def _physical(model: mujoco.MjModel, where: str) -> None:
             raise UserError(f"{where}: {whose(k)}: {name} is {' '.join(f'{x:g}' for x in rows[k])}; it must be {must}")
     for k in range(model.njnt):
         if not model.dof_M0[model.jnt_dofadr[k]] > 0:
-            raise UserError(f"{where}: joint '{model.joint(k).name}' moves nothing that has mass or inertia; give its body a mass, or the joint an armature")
+            raise UserError(
+                f"{where}: joint '{model.joint(k).name}' moves nothing that has mass or inertia; give its body a "
+                "mass, or the joint an armature"
+            )
 
 
 def for_recording(

@@ -29,13 +29,14 @@ def read(
     joints: Sequence[str] | None = None,
     audit: bool = True,
 ) -> Recording:
-    """The recording in an MCAP file, in a folder that `ros2 bag record -s mcap` wrote, or in a CSV or NPZ file with named columns
-    (`columns.py`).
+    """The recording in an MCAP file, in a folder that `ros2 bag record -s mcap` wrote, or in a CSV or NPZ file with
+    named columns (`columns.py`).
 
     Arguments:
         remap: our topic -> theirs ("/joint_states": "/xhand/state"), "#a.b" behind it for a sub-message; our joint name
             -> theirs ("index_joint1": "finger2_mcp"). A topic that differs only by a namespace, and joint names that
-            differ only by a prefix, are found without. Of a CSV or NPZ file: "position.elbow" (or "time") -> the column.
+            differ only by a prefix, are found without. Of a CSV or NPZ file: "position.elbow" (or "time") -> the
+            column.
         meta: metadata values that win over what the recording says.
         joints: names of the model's joints: their order, and others are left out. None: the xHand's where the names
             fit, else those of the recording.
@@ -53,7 +54,9 @@ def read(
     else:
         containers = [open_container(p) for p in _files(path)]
         reading = _Reading(path, containers, remap)
-        stated, findings = metadata.collect(path, metadata.own_record([m for c in containers for m in c.metadata]), meta)
+        stated, findings = metadata.collect(
+            path, metadata.own_record([m for c in containers for m in c.metadata]), meta
+        )
     reading.findings += findings
     recording = reading.build(stated, joints)
     if audit:
@@ -111,7 +114,9 @@ class _Reading:
             raise UserError(
                 f"recording {path}: no message that can be read; topics: {self._describe_topics()}" + self._losses()
             )
-        self.start_ns = min(self._first(s.messages) for theirs, _ in self.sources.values() for s in self.streams[theirs] if s.messages)
+        self.start_ns = min(
+            self._first(s.messages) for theirs, _ in self.sources.values() for s in self.streams[theirs] if s.messages
+        )
 
     def _damage(self, c: Container) -> None:
         where = f"{c.path.name}: " if c.path != self.path else ""
@@ -233,7 +238,11 @@ class _Reading:
                 try:
                     value = reader(m.data)
                 except Exception as error:  # a damaged message may fail anywhere in a decoder
-                    bad, why, when = bad + 1, why or " ".join(str(error).split())[:200] or type(error).__name__, min(when, t) if bad else t
+                    bad, why, when = (
+                        bad + 1,
+                        why or " ".join(str(error).split())[:200] or type(error).__name__,
+                        min(when, t) if bad else t,
+                    )
                     continue
                 times.append(t)
                 out.append(value)
@@ -246,8 +255,11 @@ class _Reading:
                 raise UserError(f"recording {self.path}: none of the {bad} messages of {theirs} can be decoded: {why}")
         return self._in_order(ours, np.array(times), out, written)
 
-    def _in_order(self, ours: str, t: np.ndarray, out: list[Any], written: Sequence[slice] | None = None) -> tuple[np.ndarray, list[Any]]:
-        """Samples in order of time, without those whose time cannot be theirs; `written`: which were written one after another."""
+    def _in_order(
+        self, ours: str, t: np.ndarray, out: list[Any], written: Sequence[slice] | None = None
+    ) -> tuple[np.ndarray, list[Any]]:
+        """Samples in order of time, without those whose time cannot be theirs; `written`: which were written one after
+        another."""
         keep = np.zeros(len(t), bool)
         for part in written if written is not None else [slice(0, len(t))]:
             keep[part] = timeline.kept(t[part])
@@ -259,9 +271,16 @@ class _Reading:
             around = t[keep] if keep.any() else np.zeros(1)
             near = np.clip(np.searchsorted(np.flatnonzero(keep), lost[[0, -1]]), 0, len(around) - 1)
             self.findings.append(
-                Finding("time_not_monotonic", ours, float(around[near[0]]), len(lost),
-                        f"host time {what}: {len(lost)} of {len(t)} samples, whose time cannot be theirs, are left out", "error", end=float(around[near[1]]))
-            )  # fmt: skip
+                Finding(
+                    "time_not_monotonic",
+                    ours,
+                    float(around[near[0]]),
+                    len(lost),
+                    f"host time {what}: {len(lost)} of {len(t)} samples, whose time cannot be theirs, are left out",
+                    "error",
+                    end=float(around[near[1]]),
+                )
+            )
             t, out = t[keep], [out[i] for i in np.flatnonzero(keep)]
         back = np.flatnonzero(np.diff(t) < 0)
         if len(back):
@@ -517,8 +536,11 @@ class _TableReading(_Reading):
         self.path, self.table, self.findings, self.breaks = path, table, list(table.findings), []
         topics = [k for k in remap if _is_topic(k)]
         if topics:
-            raise UserError(f"recording {path}: has columns, no topics (remap.{topics[0]}); say remap.QUANTITY.JOINT=COLUMN, quantities:"
-                            f" {', '.join(columns.QUANTITIES)}")  # fmt: skip
+            raise UserError(
+                f"recording {path}: has columns, no topics (remap.{topics[0]}); say remap.QUANTITY.JOINT=COLUMN, "
+                "quantities:"
+                f" {', '.join(columns.QUANTITIES)}"
+            )
         self.joint_remap = {k: v for k, v in remap.items() if k.split(".")[0] not in columns.QUANTITIES}
         self.start_ns, self.config, self.sources = table.start_ns, None, {}
 
@@ -526,7 +548,11 @@ class _TableReading(_Reading):
         """The metadata, with what the columns' names tell; the values are SI already."""
         for key in schema.UNIT_KEYS:
             if key in stated:
-                self.findings.append(Finding("unit", "", NAN, 1, f"{key}={stated[key]}: of columns without a unit, converted to SI", "info"))
+                self.findings.append(
+                    Finding(
+                        "unit", "", NAN, 1, f"{key}={stated[key]}: of columns without a unit, converted to SI", "info"
+                    )
+                )
         return self.table.meta | {k: v for k, v in stated.items() if k not in schema.UNIT_KEYS}
 
     def _decode(self, ours: str, make: Any) -> tuple[np.ndarray, list[Any]]:
@@ -541,14 +567,24 @@ class _TableReading(_Reading):
                 own, value = table.samples(q)
                 same = len(own) == len(t) and np.array_equal(own, t)
                 rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
-            out = [decode.JointSample(table.joints, x, *(rest[q][i] if q in rest else empty for q in ("velocity", "effort")), None) for i, x in enumerate(rows)]
+            out = [
+                decode.JointSample(
+                    table.joints, x, *(rest[q][i] if q in rest else empty for q in ("velocity", "effort")), None
+                )
+                for i, x in enumerate(rows)
+            ]
         elif ours == schema.COMMANDS:
             if "command" not in table.value:
                 return empty, []
             t, rows = table.samples("command")
             out = [decode.JointSample(table.joints, x, empty, empty, None) for x in rows]
         else:
-            quantity = {schema.TEMPERATURES: "temperature", schema.DUTY: "duty", schema.ENABLED: "enabled", schema.SUPPLY: "supply_voltage"}.get(ours)
+            quantity = {
+                schema.TEMPERATURES: "temperature",
+                schema.DUTY: "duty",
+                schema.ENABLED: "enabled",
+                schema.SUPPLY: "supply_voltage",
+            }.get(ours)
             if quantity not in table.value:
                 return empty, []
             if quantity == "supply_voltage":
@@ -559,7 +595,9 @@ class _TableReading(_Reading):
             out = [((len(x),), x) for x in rows]
         return self._in_order(ours, t, out)
 
-    def _their_joints(self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None) -> list[str]:
+    def _their_joints(
+        self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
+    ) -> list[str]:
         return list(self.table.joints)
 
 

@@ -1,6 +1,7 @@
 """ROS 2 messages (CDR) of any type, from the definition that the recording carries, by `rosbags`.
 
-`rosbags` turns a definition into Python code. Definitions come from strangers: only names and sizes that can be of a message reach it.
+`rosbags` turns a definition into Python code. Definitions come from strangers: only names and sizes that can be of a
+message reach it.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class BadDefinition(ValueError):
 def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
     """A function from the bytes of a message (CDR) to an object with its fields; arrays of numbers are NumPy's.
 
-    name: "pkg/msg/Name"; encoding: "ros2msg" or "ros2idl", as MCAP stores them. Raises BadDefinition; the function raises ValueError, or what
-    the reading of a damaged message leads to."""
+    name: "pkg/msg/Name"; encoding: "ros2msg" or "ros2idl", as MCAP stores them. Raises BadDefinition; the function
+    raises ValueError, or what the reading of a damaged message leads to."""
     parts = [p for p in re.split(r"::|/", name) if p]
     if len(text) > MAX_DEFINITION or not 2 <= len(parts) <= 3 or not _NAME.match("/".join(parts)):
         raise BadDefinition(f"its name is no message's, or it has more than {MAX_DEFINITION} characters")
@@ -47,7 +48,17 @@ def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
         read = store.get_msgdef(root)
     except BadDefinition:
         raise
-    except (TypesysError, ValueError, KeyError, TypeError, AttributeError, AssertionError, SyntaxError, RecursionError, IndexError) as error:
+    except (
+        TypesysError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+        SyntaxError,
+        RecursionError,
+        IndexError,
+    ) as error:
         raise BadDefinition(" ".join(str(error).split())[:200] or type(error).__name__) from None
 
     def decode(data: bytes) -> Any:

@@ -56,7 +56,8 @@ UNIT_KEYS: dict[str, dict[str, float]] = {
     "effort_unit": {"A": 1.0, "mA": 1e-3, "N.m": 1.0, "N": 1.0, "mN.m": 1e-3},
     "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }
-"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported (time_unit: of a CSV or NPZ file)."""
+"""Optional keys for a foreign recording in other units: converted once, by the reader, and reported (time_unit: of a
+CSV or NPZ file)."""
 
 _HEADER = """std_msgs/Header header
 """
@@ -133,7 +134,11 @@ float64[9] linear_acceleration_covariance"""
 }
 """ROS 2 type -> message definition, as rosbag2 stores it."""
 
-ALLOWED: dict[str, tuple[float, float]] = {"gravity": (-100.0, 100.0), "tactile_axis_sign": (-1.0, 1.0), "tactile_lsb": (1e-9, 1e3)}
+ALLOWED: dict[str, tuple[float, float]] = {
+    "gravity": (-100.0, 100.0),
+    "tactile_axis_sign": (-1.0, 1.0),
+    "tactile_lsb": (1e-9, 1e3),
+}
 """What the numbers of a key may be: m/s2, sign, N a count. Gravity may be zero: of a joint that it does not load."""
 SEVERITIES = ("info", "warning", "error")
 
@@ -297,7 +302,9 @@ def numbers(text: str, count: int, key: str, where: str) -> np.ndarray:
         )
     low, high = ALLOWED.get(key, (-np.inf, np.inf))
     if ((values < low) | (values > high)).any():
-        raise UserError(f"{where}: metadata {key}='{shown(text)}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=...")
+        raise UserError(
+            f"{where}: metadata {key}='{shown(text)}' must lie in {low:g} .. {high:g}; correct it with meta.{key}=..."
+        )
     return values
 
 

@@ -1,7 +1,7 @@
 """Single samples far from their neighbours: a disturbed bus, a torn message, a bit that fell over.
 
-What a sample is compared with is the median of its neighbours, and how far it may be off is read from the better nine tenths of all
-samples: up to a tenth of them may be spikes, two of them beside each other, without hiding one another.
+What a sample is compared with is the median of its neighbours, and how far it may be off is read from the better nine
+tenths of all samples: up to a tenth of them may be spikes, two of them beside each other, without hiding one another.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ AFTER = 0.06
 
 
 def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
-    """[T] bool: samples of x [T] that are single spikes (at most two in a row); none where x is not finite nearly everywhere."""
+    """[T] bool: samples of x [T] that are single spikes (at most two in a row); none where x is not finite nearly
+    everywhere."""
     out = np.zeros(len(x), bool)
     ok = np.flatnonzero(np.isfinite(x))
     if len(ok) < 20:
@@ -48,7 +49,13 @@ def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
         near = np.where(np.isnan(near), np.r_[near[1:], np.nan], near)
     right = np.r_[near[1:], np.nan]
     apart = np.abs(right - left)
-    back = np.isnan(apart) | (apart < 0.5 * np.minimum(np.abs(v - np.where(np.isnan(left), v - off, left)), np.abs(v - np.where(np.isnan(right), v - off, right))))
+    back = np.isnan(apart) | (
+        apart
+        < 0.5
+        * np.minimum(
+            np.abs(v - np.where(np.isnan(left), v - off, left)), np.abs(v - np.where(np.isnan(right), v - off, right))
+        )
+    )
     far &= back
     if far.mean() > MOST:
         return out

@@ -76,10 +76,10 @@ EVERY = 32
 class PlayRecorder:
     """Records an episode of chosen worlds of a hand environment; others are not touched.
 
-    worlds: which ones, or how many from the first. The first whole episode that lasts `least` s is kept, else the longest. A
-    launch a physics step copies the chosen rows on the device; they come to the host every `EVERY` control steps, so that no
-    step waits for them. Attach before the episodes begin; `save` writes what there is. An episode's recording ends when the
-    world is reset, or when gravity turns (a recording has one direction of gravity).
+    worlds: which ones, or how many from the first. The first whole episode that lasts `least` s is kept, else the
+    longest. A launch a physics step copies the chosen rows on the device; they come to the host every `EVERY` control
+    steps, so that no step waits for them. Attach before the episodes begin; `save` writes what there is. An episode's
+    recording ends when the world is reset, or when gravity turns (a recording has one direction of gravity).
     """
 
     def __init__(self, env: Any, worlds: int | Sequence[int], config: dict[str, Any], least: float = LEAST):
@@ -91,8 +91,10 @@ class PlayRecorder:
         except (TypeError, ValueError):
             chosen = []
         if not chosen or len(set(chosen)) != len(chosen) or min(chosen) < 0 or max(chosen) >= env.num_envs:
-            raise UserError(f"record_worlds={worlds}: must be a number from 1 to {env.num_envs}, the number of worlds, or a list of"
-                            f" different ones, 0 to {env.num_envs - 1}")
+            raise UserError(
+                f"record_worlds={worlds}: must be a number from 1 to {env.num_envs}, the number of worlds, or a list of"
+                f" different ones, 0 to {env.num_envs - 1}"
+            )
         self.env, self.config = env, config
         engine, servo = env.engine, env.servo
         self.worlds = torch.tensor(chosen, device=env.device)
@@ -132,7 +134,15 @@ class PlayRecorder:
         self._slot.zero_()
         o = env.objects
         # what an episode is about, as it is before a step may end it; copies
-        about = [env.servo.params[w], o.variant[w], o.size[w], o.mass[w], o.friction[w], o.stiffness[w], o.damping_ratio[w]]
+        about = [
+            env.servo.params[w],
+            o.variant[w],
+            o.size[w],
+            o.mass[w],
+            o.friction[w],
+            o.stiffness[w],
+            o.damping_ratio[w],
+        ]
         about += [env.object_velocity[w, 3:], *([env.seen[w]] if self._imu else [])]
         out = self._step(actions)
         raw = env.touch.raw3 if env.touch.raw3 is not None else env.touch.raw
@@ -171,7 +181,8 @@ class PlayRecorder:
 
     @staticmethod
     def place(path: str | Path) -> Path:
-        """`path` as a file that can be written, its folder made. Raises UserError: before a long play, rather than after it."""
+        """`path` as a file that can be written, its folder made. Raises UserError: before a long play, rather than
+        after it."""
         path = Path(path).expanduser()
         path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
         there = path.exists()
@@ -219,7 +230,9 @@ class PlayRecorder:
             "tactile_lsb": "1",
             "gravity": gravity,
             "notes": "; ".join([notes, *e.notes]),
-            "servo": yaml.safe_dump(self._believed() or self.env.servo.table.to_dict() | {"joints": servo}, sort_keys=False),
+            "servo": yaml.safe_dump(
+                self._believed() or self.env.servo.table.to_dict() | {"joints": servo}, sort_keys=False
+            ),
         }
         tactile, imu = None, None
         if e.touch:
@@ -230,7 +243,9 @@ class PlayRecorder:
         if e.turned:
             value = np.stack(e.turned)
             # no accelerometer is simulated: not a number, as a driver that has none says
-            imu = Series(command_t, np.concatenate([value, np.full((len(value), 3), np.nan)], 1), IMU, command_t.copy(), "object")
+            imu = Series(
+                command_t, np.concatenate([value, np.full((len(value), 3), np.nan)], 1), IMU, command_t.copy(), "object"
+            )
         config = yaml.safe_dump(self.config | {"recorded_world": world}, sort_keys=False)
         return Recording(
             Path("play.mcap"),
@@ -246,8 +261,8 @@ class PlayRecorder:
         )
 
     def _believed(self) -> dict[str, Any] | None:
-        """The drives as the policy believes them, where it plays in another world (reality=), which does not tell its own: a recording
-        from there says no more than one of a real hand."""
+        """The drives as the policy believes them, where it plays in another world (reality=), which does not tell its
+        own: a recording from there says no more than one of a real hand."""
         belief = self.config.get("belief")
         return ServoTable.from_dict(belief["servo"]).to_dict() if belief else None
 
@@ -264,7 +279,8 @@ class PlayRecorder:
             for j, joint in enumerate(self.joints)
         }
         about_object = {"shape": shape.name, "kind": shape.kind, "size": [float(x) for x in size]} | {
-            k: float(v) for k, v in (("mass", mass), ("friction", friction), ("stiffness", stiffness), ("damping_ratio", damping))
+            k: float(v)
+            for k, v in (("mass", mass), ("friction", friction), ("stiffness", stiffness), ("damping_ratio", damping))
         }
         return {"index": index, "object": about_object}, servo
 
@@ -309,8 +325,8 @@ class _Track:
         done: np.ndarray,
         touch: np.ndarray | None,
     ) -> None:
-        """One control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows [K, W],
-        target [J] and touch as they are after it."""
+        """One control step: what the episode is `about` and how its IMU was turned [7] as they were before it, rows [K,
+        W], target [J] and touch as they are after it."""
         if self.over:
             return
         e, start = self._now, float(rows[0, 0])

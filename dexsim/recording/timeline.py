@@ -1,4 +1,5 @@
-"""Times that cannot be of the samples they stand at: clocks that were set back, stamps that jump for a moment, samples far from all others."""
+"""Times that cannot be of the samples they stand at: clocks that were set back, stamps that jump for a moment, samples
+far from all others."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ LOST = 0.3
 def kept(t: np.ndarray) -> np.ndarray:
     """[T] bool: the samples whose times t [T] s, in the order they were written, can be theirs.
 
-    Where times only change places (by less than REORDERED), all can. Else the longest series of times that never goes back, of those
-    that do not stand far from all others (ALONE, FEW). O(T log T)."""
+    Where times only change places (by less than REORDERED), all can. Else the longest series of times that never goes
+    back, of those that do not stand far from all others (ALONE, FEW). O(T log T)."""
     on = np.isfinite(t) & (np.abs(t) < 1e12)
     index = np.flatnonzero(on)
     if len(index) < 2:
@@ -64,8 +65,9 @@ def _longest(t: np.ndarray) -> np.ndarray:
 
 
 def gaps(t: np.ndarray, on: np.ndarray) -> list[tuple[float, float]]:
-    """Stretches [s] in which times of samples that stay (on [T]) may be of either of two clocks: where at least LOST s and three samples in a
-    row were left out, from the earliest to the latest of them. Another topic may have kept those that this one left out."""
+    """Stretches [s] in which times of samples that stay (on [T]) may be of either of two clocks: where at least LOST s
+    and three samples in a row were left out, from the earliest to the latest of them. Another topic may have kept those
+    that this one left out."""
     index = np.flatnonzero(on)
     if len(index) < 2:
         return []
@@ -81,8 +83,8 @@ def gaps(t: np.ndarray, on: np.ndarray) -> list[tuple[float, float]]:
 
 
 def stretch(t: np.ndarray, pause: float = 1.0) -> tuple[float, float]:
-    """(first, last) time [s] of the longest series of samples at times t [T] s, sorted, without a pause as long: what is laid on an even
-    grid is laid over this, never over all that the stamps span."""
+    """(first, last) time [s] of the longest series of samples at times t [T] s, sorted, without a pause as long: what
+    is laid on an even grid is laid over this, never over all that the stamps span."""
     edges = np.r_[0, np.flatnonzero(np.diff(t) > pause) + 1, len(t)]
     k = int(np.argmax(np.diff(edges)))
     return float(t[edges[k]]), float(t[edges[k + 1] - 1])

@@ -169,7 +169,10 @@ class Writer:
 def write(path: str | Path, recording: Recording) -> None:
     """Write a whole `Recording`, all topics in order of time: beside its place, and renamed. Raises UserError."""
     r, path = recording, Path(path).expanduser()
-    with _placed(path) as part, Writer(part, r.joints, r.meta | {"joint_names": ",".join(r.joints)}, r.start_ns, r.config) as w:
+    with (
+        _placed(path) as part,
+        Writer(part, r.joints, r.meta | {"joint_names": ",".join(r.joints)}, r.start_ns, r.config) as w,
+    ):
         for _, _, add, args in sorted(_samples(r, w), key=lambda item: (item[0], item[1])):
             add(*args)
 

@@ -27,13 +27,16 @@ def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
 
 
 def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
-    """(noise floor of each joint's position error, how): from repeats where there are any, never below the noise of its samples.
+    """(noise floor of each joint's position error, how): from repeats where there are any, never below the noise of its
+    samples.
 
-    Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can explain."""
+    Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can
+    explain."""
     sums, count = np.zeros(len(runs[0].joints)), 0
     for i, a in enumerate(runs):
         for b in runs[i + 1 :]:
-            if a.name == b.name or not same_commands(a, b):  # pieces of one recording are aligned only by where they were cut
+            # pieces of one recording are aligned only by where they were cut
+            if a.name == b.name or not same_commands(a, b):
                 continue
             t = np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
             # repeats are aligned by their commands, which were sent at the same times from the start
@@ -46,11 +49,13 @@ def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
     return {c.joint: max(float(np.sqrt(sums[c.index] / count)), c.sigma) for c in cases}, "repeats"
 
 
-def free_run(case: Case, params: list[Param], x: np.ndarray, windows: Windows, fixed=(), underway: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def free_run(
+    case: Case, params: list[Param], x: np.ndarray, windows: Windows, fixed=(), underway: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Simulated position and motor torque [n] at the windows' samples, from their first sample on without correction.
 
-    underway: the position at which a window begins in motion, and its speed there, are fitted to its first `FIRST` seconds: what a few
-    samples on one side say of a speed is off by far where a target has just jumped."""
+    underway: the position at which a window begins in motion, and its speed there, are fitted to its first `FIRST`
+    seconds: what a few samples on one side say of a speed is off by far where a target has just jumped."""
     plants = expand(case.plant, params, x[None])
     for name, value in fixed:
         plants[:, :, INDEX[name]] = value
@@ -59,14 +64,17 @@ def free_run(case: Case, params: list[Param], x: np.ndarray, windows: Windows, f
 
 
 def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """Position and torque [1, n] of one guess [1, R, C], windows that begin in motion from where their first samples say they did."""
+    """Position and torque [1, n] of one guess [1, R, C], windows that begin in motion from where their first samples
+    say they did."""
     sigma, window, t = case.sigma, windows.sample_window, case.plant.t[windows.sample_row]
     first = np.flatnonzero(np.r_[True, np.diff(window) != 0]) if len(window) else np.zeros(0, int)
     moving = np.abs(case.regimes["_speed"][windows.sample_row[first]]) > UNDERWAY * case.scales.speed
     if not moving.any():
         return case.plant.simulate(plants, windows)
     size = np.array([START_NOISE * sigma, START_SPEED * case.scales.speed])
-    q, tau = case.plant.simulate(np.repeat(plants, 3, 0), windows, np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]]]))
+    q, tau = case.plant.simulate(
+        np.repeat(plants, 3, 0), windows, np.array([[0.0, 0.0], [size[0], 0.0], [0.0, size[1]]])
+    )
     slope, measured, which = q[1:] - q[0], case.plant.q[windows.sample_row], np.flatnonzero(moving)
     starts = []
     for k in which:
@@ -80,7 +88,9 @@ def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray
     return q[:1], tau[:1]
 
 
-def rms_interval(squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = 0.5) -> tuple[float, float, float]:
+def rms_interval(
+    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = 0.5
+) -> tuple[float, float, float]:
     """(rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all joints."""
     rng = np.random.default_rng(seed)
     sums, counts = [], []

@@ -19,19 +19,29 @@ from dexsim.gap.rules import JUDGE
 
 
 def handed(p: Param, case: Case) -> bool:
-    """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its inaccuracy."""
-    return not (p.nuisance and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "presliding", "effort_gain") and p.key not in case.ranges and p.key not in case.unknown)
+    """Whether training is given a fitted parameter: not the figures of the plant's own that only absorb its
+    inaccuracy."""
+    return not (
+        p.nuisance
+        and p.key in ("delay", "lag", "speed_lag", "inertia", "gravity", "damping", "presliding", "effort_gain")
+        and p.key not in case.ranges
+        and p.key not in case.unknown
+    )
 
 
 def undamped(trial, kp: float) -> float:
-    """What the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) = kp q - kp age v. The loop
-    that trains acts on the position of now, so it is given kd without it."""
-    return next((kp * float(x) for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.columns == ("feedback_delay",)), 0.0)
+    """What the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) = kp q -
+    kp age v. The loop that trains acts on the position of now, so it is given kd without it."""
+    return next(
+        (kp * float(x) for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.columns == ("feedback_delay",)),
+        0.0,
+    )
 
 
 def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]:
-    """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of the mechanism's
-    joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it from."""
+    """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of
+    the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it
+    from."""
     out, fitted = {}, {name for p in trial.fit.params for name in p.columns}
     for x in trial.members:
         for name, value in x.variant.fixed:
@@ -43,8 +53,9 @@ def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]
 
 
 def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
-    """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the table has no
-    column for. Where something changes with temperature, training is given the temperatures that were recorded."""
+    """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the
+    table has no column for. Where something changes with temperature, training is given the temperatures that were
+    recorded."""
     left, fields = [], model_columns()
     for p, x, (low, high) in zip(trial.fit.params, trial.fit.x, bounds, strict=True):
         if not handed(p, case):
@@ -77,10 +88,13 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
 
 
 def earned(finding: dict[str, Any]) -> float:
-    """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or more off the error
-    on what was kept out (against all others fitted again without it), less by what other names claim of it, which would go on in another
-    way where nothing was recorded."""
-    error, others = finding.get("held_out") or {}, sum(float(x["confidence"]) for x in finding.get("alternatives") or ())
+    """0 to 1: what an effect has earned as a part of the drive, whatever its name is worth: 1 where it takes a tenth or
+    more off the error on what was kept out (against all others fitted again without it), less by what other names claim
+    of it, which would go on in another way where nothing was recorded."""
+    error, others = (
+        finding.get("held_out") or {},
+        sum(float(x["confidence"]) for x in finding.get("alternatives") or ()),
+    )
     if not error or error["before"] is None or error["after"] is None:
         return 0.0
     less = float(np.clip((error["before"] - error["after"]) / (JUDGE.earns * error["before"] + 1e-12), 0.0, 1.0))
@@ -88,10 +102,10 @@ def earned(finding: dict[str, Any]) -> float:
 
 
 def widen(table: ServoTable, case: Case, member, confidence: float, earned: float = 0.0) -> bool:
-    """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of a half and
-    less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the belief as the effect is sure;
-    and of that way only the share that is not `earned`: a policy meets the drive, not the name. The fitted values stay. Returns whether a
-    range changed."""
+    """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of
+    a half and less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the
+    belief as the effect is sure; and of that way only the share that is not `earned`: a policy meets the drive, not the
+    name. The fitted values stay. Returns whether a range changed."""
     changed, share = False, min(1.0, 2.0 * (1.0 - confidence)) * (1.0 - earned)
     if share <= 0.0:
         return False
@@ -109,25 +123,32 @@ def widen(table: ServoTable, case: Case, member, confidence: float, earned: floa
 
 
 def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]]) -> list[str]:
-    """Writes effects that live in the model into its spec (by_member: fitted values by effect; trial: None for values alone); returns what was
-    changed, in words."""
+    """Writes effects that live in the model into its spec (by_member: fitted values by effect; trial: None for values
+    alone); returns what was changed, in words."""
     notes = {m.id: m.variant.note for m in trial.members} if trial is not None else {}
-    return [x for e in CATALOGUE if e.id in by_member for x in e.to_model(spec, case, by_member[e.id], notes.get(e.id, {}))]
+    return [
+        x for e in CATALOGUE if e.id in by_member for x in e.to_model(spec, case, by_member[e.id], notes.get(e.id, {}))
+    ]
 
 
 MODEL_FILES = "model_files"  # folder beside model.xml
 
 
 def save_model(spec, path: Path) -> None:
-    """The model as `path`, with the mesh, height field and texture files that it names by relative paths copied into `model_files` beside
-    it, so that it loads from there; nothing is written anywhere else, whatever those paths say."""
+    """The model as `path`, with the mesh, height field and texture files that it names by relative paths copied into
+    `model_files` beside it, so that it loads from there; nothing is written anywhere else, whatever those paths say."""
     import shutil
 
     spec, folder, places = spec.copy(), Path(spec.modelfiledir or "."), {}
     for things, where in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir), (spec.textures, spec.texturedir)):
         for thing in things:
             source = folder / (where or ".") / thing.file
-            if not thing.file or Path(thing.file).is_absolute() or Path(where or ".").is_absolute() or not source.is_file():
+            if (
+                not thing.file
+                or Path(thing.file).is_absolute()
+                or Path(where or ".").is_absolute()
+                or not source.is_file()
+            ):
                 continue
             source = source.resolve()
             if source not in places:

@@ -1,8 +1,9 @@
 """The few final hypotheses once more, in the engine and the servo that train policies.
 
-The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out of
-the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's columns
-and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one batch.
+The search simulates each joint alone in the gap's own plant. Here the whole mechanism runs free over what was kept out
+of the fit, all joints at once, under the same commands: in C MuJoCo or, where asked, in MuJoCo-Warp, with the servo's
+columns and model fields that are handed on, and nothing else. Every hypothesis and every recording is a world of one
+batch.
 """
 
 from __future__ import annotations
@@ -52,12 +53,13 @@ class Hypothesis:
 
 @dataclass
 class World:
-    """One free run: what drives it and where it begins. All in the units the encoders report, J joints of the mechanism.
+    """One free run: what drives it and where it begins. All in the units the encoders report, J joints of the
+    mechanism.
 
-    rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first position
-    and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K, J] (NaN
-    keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]: from where a joint
-    that drags another is counted (None: q)."""
+    rows [J, C]: servo columns; table: of the drive (its kind and clock); gravity [3]; duration s; q, v [J]: first
+    position and speed; target [J]: in force before the first of the commands; stamps [K] s from the start, targets [K,
+    J] (NaN keeps the last); enabled: None or (times, [n, J]); warmth: the same, in degC above the reference; home [J]:
+    from where a joint that drags another is counted (None: q)."""
 
     rows: np.ndarray
     table: ServoTable
@@ -75,9 +77,9 @@ class World:
 
 @dataclass
 class Confirmation:
-    """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the gap's own
-    plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot be given;
-    recordings: replayed; agrees: see `agree`."""
+    """What the engine leaves. engine: which; errors: rms [rad] over all joints by hypothesis, in the engine and in the
+    gap's own plant; joints: the same of the final hypothesis by joint; missing: fitted parameters that training cannot
+    be given; recordings: replayed; agrees: see `agree`."""
 
     engine: str
     step_s: float
@@ -98,13 +100,27 @@ class Confirmation:
             return f"Replayed in the engine that trains{together or ','} {1e3 * engine:.3g} {unit} are left: confirmed."
         believed = next(iter(self.errors.values()))[0]
         if not self.missing and len(self.errors) > 1 and engine <= JUDGE.mostly * believed:
-            return f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, more than in the search's own plant."
-        because = f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
-        return f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own plant leaves {1e3 * plant:.3g} ({because})."
+            return (
+                f"Replayed in the engine that trains, {1e3 * engine:.3g} {unit} of {1e3 * believed:.3g} are left, "
+                "more than in the search's own plant."
+            )
+        because = (
+            f"its servo has no {', '.join(self.missing)}" if self.missing else "where the search takes each joint alone"
+        )
+        return (
+            f"Not confirmed by the engine that trains: it leaves {1e3 * engine:.3g} {unit} where the search's own "
+            f"plant leaves {1e3 * plant:.3g} ({because})."
+        )
 
     def entry(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
-        out = {"engine": self.engine, "step_s": self.step_s, "recordings": self.recordings, "agrees": self.agrees, "not_handed_on": self.missing}
+        out = {
+            "engine": self.engine,
+            "step_s": self.step_s,
+            "recordings": self.recordings,
+            "agrees": self.agrees,
+            "not_handed_on": self.missing,
+        }
         out["engine_at_tasks_step"] = {"step_s": TASKS, "after": self.at_tasks_step}
         out |= {name: {"engine": a, "plant": b} for name, (a, b) in self.errors.items()}
         return out | {"joints": {j: {"engine": a, "plant": b} for j, (a, b) in self.joints.items()}}
@@ -195,25 +211,57 @@ def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypot
         home[place] = run.qs[0] if run.qs is not None else run.q[0]
         samples = windows.sample_row[windows.sample_window == w]
         end = float(cases[0].plant.t[samples[-1]])
-        out.append(World(rows, run.servo, np.asarray(run.gravity, float), end - start, q, v, target, run.cmd_t[first:] - start, targets, enabled, warmth, home))
+        out.append(
+            World(
+                rows,
+                run.servo,
+                np.asarray(run.gravity, float),
+                end - start,
+                q,
+                v,
+                target,
+                run.cmd_t[first:] - start,
+                targets,
+                enabled,
+                warmth,
+                home,
+            )
+        )
     return out
 
 
-def free_runs(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str = "cpu", timestep: float = STEP,
-              engine: str = "auto", torque: bool = False) -> list:
-    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive and gravity;
-    torque: (positions, motor torques [T, J] as their current shows them) instead."""
+def free_runs(
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    worlds: Sequence[World],
+    device: str = "cpu",
+    timestep: float = STEP,
+    engine: str = "auto",
+    torque: bool = False,
+) -> list:
+    """Reported positions [T, J] of each world at every step, from its first position and speed on, as one batch a drive
+    and gravity; torque: (positions, motor torques [T, J] as their current shows them) instead."""
     groups: dict[tuple, list[int]] = {}
     for i, w in enumerate(worlds):
         groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     for members in groups.values():
-        for i, q in zip(members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True):
+        for i, q in zip(
+            members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True
+        ):
             out[i] = q
     return out
 
 
-def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], device: str, timestep: float, engine: str, torque: bool) -> list:
+def _batch(
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    worlds: Sequence[World],
+    device: str,
+    timestep: float,
+    engine: str,
+    torque: bool,
+) -> list:
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -225,7 +273,13 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
     spacing = spacing[spacing > 1e-6]
     varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]
-    servo = Servo(engine, joints, table, control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None, varied=varied)
+    servo = Servo(
+        engine,
+        joints,
+        table,
+        control_period=max(float(np.percentile(spacing, 5)), 1e-3) if len(spacing) else None,
+        varied=varied,
+    )
     real = engine.t.qpos.dtype
     up = lambda x, dtype=real: torch.as_tensor(np.asarray(x), dtype=dtype, device=engine.t.qpos.device)  # noqa: E731
     servo.params.copy_(up(rows))
@@ -238,7 +292,8 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     engine.set_state(torch.ones(N, dtype=torch.bool, device=engine.t.qpos.device), up(qpos), up(qvel))
     now = np.stack([w.target for w in worlds])
     servo.reset(None, up(now))
-    if rows[:, :, SERVO_INDEX["integral_gain"]].any():  # a drive that has been on before: its integral holds the load, as in the plant
+    # a drive that has been on before: its integral holds the load, as in the plant
+    if rows[:, :, SERVO_INDEX["integral_gain"]].any():
         held = _gravity(engine.mjm, qpos, dofs) / np.maximum(rows[:, :, SERVO_INDEX["efficiency"]], 0.01)
         if worlds[0].table.drive == "voltage":
             held /= rows[:, :, SERVO_INDEX["torque_limit"]] * rows[:, :, SERVO_INDEX["supply"]]
@@ -246,7 +301,11 @@ def _batch(spec: mujoco.MjSpec, joints: Sequence[str], worlds: Sequence[World], 
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
     given = torch.zeros_like(seen) if torque else None
-    warm = [i for i, w in enumerate(worlds) if w.warmth is not None] if "warmth" in varied or "rare" in servo.features else []
+    warm = (
+        [i for i, w in enumerate(worlds) if w.warmth is not None]
+        if "warmth" in varied or "rare" in servo.features
+        else []
+    )
     sent = [0] * N
     freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
     for k in range(steps):
@@ -292,10 +351,22 @@ def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: Sequence[int]) -> np
     return np.array(out)
 
 
-def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses: Sequence[Hypothesis], test: list[int], span_test,
-            floor: float, device: str = "cpu", replay: str = "mujoco", timestep: float = STEP, finer: Sequence[Case] = ()) -> Confirmation | None:
-    """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over what was
-    kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
+def confirm(
+    m: Mechanism,
+    runs: Sequence[Run],
+    cases: Sequence[Case],
+    hypotheses: Sequence[Hypothesis],
+    test: list[int],
+    span_test,
+    floor: float,
+    device: str = "cpu",
+    replay: str = "mujoco",
+    timestep: float = STEP,
+    finer: Sequence[Case] = (),
+) -> Confirmation | None:
+    """Replays the hypotheses (the first is the believed one, the second, if any, the final one, others its rivals) over
+    what was kept out. finer: the cases with the plants in which the errors of the search's own plant are judged. None
+    where nothing can be replayed. Raises UserError where the model or a drive does not serve."""
     device = "cpu" if replay == "mujoco" else device
     windows = [c.plant.windows(None, test, span=span_test, every_run=True) for c in cases]
     if not cases or not len(windows[0].window):
@@ -336,7 +407,9 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
             if not on.any():
                 continue
             same = ws if fine is case else fine.plant.windows(None, test, span=span_test, every_run=True)
-            fast = free_run(fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed])[0][on]
+            fast = free_run(
+                fine, trial.fit.params, trial.fit.x, same, [f for x in trial.members for f in x.variant.fixed]
+            )[0][on]
             there, miss = error(found[i], timestep, case, ws)
             square.append(miss)
             own.append((case.plant.q[ws.sample_row[on]] - fast) ** 2)
@@ -351,11 +424,22 @@ def confirm(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], hypotheses
     if not np.isfinite(engine):
         raise UserError("the engine's state did not stay finite")
     names = list(dict.fromkeys(runs[int(r)].name for r in windows[0].run[use]))
-    return Confirmation("MuJoCo-Warp" if replay == "warp" else "C MuJoCo", timestep, errors, joints, missing_of(hypotheses[final]), names,
-                        agree(engine, plant, floor, before), floor, at_tasks_step, simulated)
+    return Confirmation(
+        "MuJoCo-Warp" if replay == "warp" else "C MuJoCo",
+        timestep,
+        errors,
+        joints,
+        missing_of(hypotheses[final]),
+        names,
+        agree(engine, plant, floor, before),
+        floor,
+        at_tasks_step,
+        simulated,
+    )
 
 
 def agree(engine: float, plant: float, floor: float, before: float) -> bool:
-    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.apart times as much, or what it leaves beyond that is
-    JUDGE.little beside the error before (the figures by which the plant absorbs its own inaccuracy are not handed on)."""
+    """Whether the engine's replay confirms the plant's: it leaves no more than JUDGE.apart times as much, or what it
+    leaves beyond that is JUDGE.little beside the error before (the figures by which the plant absorbs its own
+    inaccuracy are not handed on)."""
     return engine <= max(JUDGE.apart * max(plant, floor), math.hypot(plant, JUDGE.little * before))

@@ -32,7 +32,15 @@ def reasons(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None)
             out[e] = first if same else "; ".join(f"{j}: {r}" for j, r in lacking.items())
         else:
             out[e] = "; ".join(f"on {j}: {r}" for j, r in lacking.items())
-    touch = "no /tactile is recorded" if not felt.tactile else "nothing is touched" if not felt.contact else "no force could be predicted" if felt.before is None else ""
+    touch = (
+        "no /tactile is recorded"
+        if not felt.tactile
+        else "nothing is touched"
+        if not felt.contact
+        else "no force could be predicted"
+        if felt.before is None
+        else ""
+    )
     for e in TOUCH_EFFECTS:
         if e in EFFECTS:
             continue
@@ -50,4 +58,8 @@ def not_fitted(cases: Sequence) -> list[str]:
         for name in c.unknown:
             if unknown(name, c.scales) is None:
                 by.setdefault(name, []).append(c.joint)
-    return [f"{name} is unknown on {', '.join(joints)} and cannot be fitted to these recordings by itself: it is taken as absent" for name, joints in by.items()]
+    return [
+        f"{name} is unknown on {', '.join(joints)} and cannot be fitted to these recordings by itself: it is taken as "
+        "absent"
+        for name, joints in by.items()
+    ]

@@ -2,8 +2,8 @@
 
     torque = constant + position * q + speed * v + drag * v |v|
 
-It names nothing. Inverse dynamics along the measured motion with the best hypothesis leaves a torque; the four numbers are
-fitted to it, judged on recordings kept out, and written to `servo_standin.yaml` as the servo's `standin_*` columns.
+It names nothing. Inverse dynamics along the measured motion with the best hypothesis leaves a torque; the four numbers
+are fitted to it, judged on recordings kept out, and written to `servo_standin.yaml` as the servo's `standin_*` columns.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ BLOCK = 0.5  # s
 
 @dataclass
 class StandIn:
-    """Four numbers [4] (N.m, N.m/rad, N.m.s/rad, N.m.s2/rad2) with 90 % intervals; held-out rms before and after [rad]."""
+    """Four numbers [4] (N.m, N.m/rad, N.m.s/rad, N.m.s2/rad2) with 90 % intervals; held-out rms before and after
+    [rad]."""
 
     joint: str
     value: np.ndarray
@@ -38,8 +39,11 @@ class StandIn:
     @property
     def text(self) -> str:
         """What it does, in words."""
-        return (f"{self.joint}: a stand-in torque (constant, position, speed, drag) takes the held-out error from {1e3 * self.before:.3g} to "
-                f"{1e3 * self.after:.3g} mrad; it names nothing (servo_standin.yaml)")  # fmt: skip
+        return (
+            f"{self.joint}: a stand-in torque (constant, position, speed, drag) takes the held-out error from "
+            f"{1e3 * self.before:.3g} to "
+            f"{1e3 * self.after:.3g} mrad; it names nothing (servo_standin.yaml)"
+        )
 
 
 def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tuple[np.ndarray, np.ndarray]:
@@ -71,12 +75,22 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
         motor = _lagged(t, motor, p("lag"))
     slope = 0.05 * max(case.scales.speed, 1e-9)
     level = p("coulomb_friction") + p("stribeck_peak") * np.exp(-((v / p("stribeck_speed")) ** 2))
-    level = level + np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction")) * np.abs(motor) + case.constants.friction
-    friction = level * np.sign(v) + 0.5 * p("friction_asymmetry") * level + (p("viscous_friction") + case.constants.damping) * v
+    level = (
+        level
+        + np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction")) * np.abs(motor)
+        + case.constants.friction
+    )
+    friction = (
+        level * np.sign(v)
+        + 0.5 * p("friction_asymmetry") * level
+        + (p("viscous_friction") + case.constants.damping) * v
+    )
     ripple = p("torque_ripple") * np.sin(p("ripple_per_turn") * q + p("ripple_phase"))
     inertia = s("inertia") * p("inertia_scale") + p("armature")
     needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
-    needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (s("own_cos") + s("own_inertia") * a)
+    needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
+        s("own_cos") + s("own_inertia") * a
+    )
     on = np.abs(v) > slope
     if r.enabled is not None:
         on &= r.enabled[:, j] > 0.5
@@ -98,7 +112,16 @@ def basis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(q), q, v, v * np.abs(v)], 1)
 
 
-def fit(case: Case, runs: list[Run], trial: Trial, train: list[int], test: list[int], span_train=None, span_test=None, seed: int = 0) -> StandIn | None:
+def fit(
+    case: Case,
+    runs: list[Run],
+    trial: Trial,
+    train: list[int],
+    test: list[int],
+    span_train=None,
+    span_test=None,
+    seed: int = 0,
+) -> StandIn | None:
     """The stand-in of one joint; None where it would not take JUDGE.standin off the held-out error."""
     x, y, block = [], [], []
     for r in train:
@@ -134,7 +157,9 @@ def fit(case: Case, runs: list[Run], trial: Trial, train: list[int], test: list[
     return StandIn(case.joint, value, np.minimum(low, value), np.maximum(high, value), before, after)
 
 
-def _held_out(case: Case, runs: list[Run], trial: Trial, value: np.ndarray, test: list[int], span_test) -> tuple[float, float]:
+def _held_out(
+    case: Case, runs: list[Run], trial: Trial, value: np.ndarray, test: list[int], span_test
+) -> tuple[float, float]:
     """Held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
     plant = case.plant
     windows = plant.windows(None, test, span=span_test)

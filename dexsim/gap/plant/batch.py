@@ -15,22 +15,25 @@ from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants
 
 THREADS = 2  # CPU launches release the interpreter: two run side by side
-BLOCK = 32  # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there are
+# threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there
+# are
+BLOCK = 32
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
 
 
 class Lane:
-    """One thread's way to a GPU: a stream of its own, so that the launches of several joints overlap, and memory that is
-    allocated once (an allocation or a release in between would wait for every stream)."""
+    """One thread's way to a GPU: a stream of its own, so that the launches of several joints overlap, and memory that
+    is allocated once (an allocation or a release in between would wait for every stream)."""
 
     pinned = True  # memory of the CPU that the GPU copies by itself
 
     def __init__(self, device: str):
         self.device = device
         self.stream = wp.Stream(device)
-        wp.get_device(device).context_guard.__enter__()  # for the thread's life: it also waits for its stream outside of the lock
+        # for the thread's life: it also waits for its stream outside of the lock
+        wp.get_device(device).context_guard.__enter__()
         self._room: dict[str, wp.array] = {}
         self._host: dict[str, wp.array] = {}
 
@@ -51,7 +54,8 @@ class Lane:
         return wp.array(ptr=of.ptr + 8 * at, shape=shape, dtype=wp.float64, device=self.device)
 
     def up(self, given: Sequence[np.ndarray]) -> list[wp.array]:
-        """The arrays on the device, by one copy; valid until this is called again, which must not be before the stream was waited for."""
+        """The arrays on the device, by one copy; valid until this is called again, which must not be before the stream
+        was waited for."""
         ends = np.cumsum([0, *(x.size for x in given)])
         here, there = self.host("in", int(ends[-1])), self.room("in", int(ends[-1]))
         np.concatenate([np.ravel(x) for x in given], out=here.numpy()[: ends[-1]])
@@ -143,7 +147,10 @@ class JointPlant:
         self._series = []  # long recordings of many joints are gigabytes: one copy is enough
         self._consts = np.zeros(pk.CONSTS)
         c = self.constants
-        kp = max(float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])), 1e-9)
+        kp = max(
+            float(np.max([p[INDEX["kp"]] * (p[INDEX["torque_limit"]] if self.voltage else 1) for p in self.nominal])),
+            1e-9,
+        )
         stiff = 30.0 * kp + c.inertia * (2 * np.pi * 40.0) ** 2
         self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
                            c.low, c.high, stiff, c.slide, 0)
@@ -182,8 +189,15 @@ class JointPlant:
         """Rows of a run in the measurements."""
         return slice(self._rows[run], self._rows[run + 1])
 
-    def windows(self, length: float | None, runs: list[int] | None = None, warm: float = 0.15, stride: float | None = None,
-                span: dict[int, tuple[float, float]] | None = None, every_run: bool = False) -> Windows:
+    def windows(
+        self,
+        length: float | None,
+        runs: list[int] | None = None,
+        warm: float = 0.15,
+        stride: float | None = None,
+        span: dict[int, tuple[float, float]] | None = None,
+        every_run: bool = False,
+    ) -> Windows:
         """Windows of `length` s (None: whole runs), each after `warm` s in which the recorded motion is held.
 
         span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint.
@@ -229,9 +243,14 @@ class JointPlant:
                 row.extend(range(self._rows[r] + lo, self._rows[r] + hi))
                 run_of.append(r)
         return Windows(
-            np.array(window, np.int32).reshape(-1, 8), np.array(window_t), np.array(step, np.int32), np.array(part, float),
-            np.array(of, int), np.array(row, int), np.array(run_of, int),
-        )  # fmt: skip
+            np.array(window, np.int32).reshape(-1, 8),
+            np.array(window_t),
+            np.array(step, np.int32),
+            np.array(part, float),
+            np.array(of, int),
+            np.array(row, int),
+            np.array(run_of, int),
+        )
 
     def simulate(self, params: np.ndarray, windows: Windows, inits: np.ndarray | None = None,
                  open_stage: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -261,14 +280,22 @@ class JointPlant:
             mine = lane(self.device)
             with wp.ScopedStream(mine.stream, sync_enter=False):
                 host, out = mine.host("out", 2 * H * n), mine.room("out", 2 * H * n)
-                moves, constants, *guesses = mine.up([inits, consts, *(params[:, group[0]] for group in groups.values())])
+                moves, constants, *guesses = mine.up(
+                    [inits, consts, *(params[:, group[0]] for group in groups.values())]
+                )
                 at, parts = 0, []
                 for group, guess in zip(groups.values(), guesses, strict=True):
                     keep, count, rest = self._inputs(windows, tuple(group), self.device)
                     size = H * len(keep)
                     oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
                     given = recorded(guess, moves, constants, *rest, oq, ot)
-                    wp.launch(pk.plant_kernel(), dim=(count, H), inputs=[0, self.dt, given], device=self.device, block_dim=BLOCK)
+                    wp.launch(
+                        pk.plant_kernel(),
+                        dim=(count, H),
+                        inputs=[0, self.dt, given],
+                        device=self.device,
+                        block_dim=BLOCK,
+                    )
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
@@ -283,11 +310,15 @@ class JointPlant:
         return self.device == "cpu" or threads <= FEW
 
     def _inputs(self, windows: Windows, group: tuple[int, ...], device: str) -> tuple[np.ndarray, int, list[wp.array]]:
-        """(samples of the windows that are of these runs, number of windows, the kernel's arrays of them), made once a device."""
+        """(samples of the windows that are of these runs, number of windows, the kernel's arrays of them), made once a
+        device."""
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
-            self._d[device] = [_up(x, device=device, copy=False) for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))]
+            self._d[device] = [
+                _up(x, device=device, copy=False)
+                for x in (self.series, np.concatenate(self._cmd_t), np.concatenate(self._cmd))
+            ]
         key = (group, device)
         if key not in windows.device:
             pick = np.flatnonzero(np.isin(windows.run, group))
@@ -295,10 +326,15 @@ class JointPlant:
             w = windows.window[pick].copy()
             w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
             windows.device[key] = (
-                np.flatnonzero(keep), len(pick),
-                [_up(w, wp.int32, device), _up(windows.window_t[pick], device=device), _up(windows.sample_step[keep], wp.int32, device),
-                 _up(windows.sample_part[keep], device=device)],
-            )  # fmt: skip
+                np.flatnonzero(keep),
+                len(pick),
+                [
+                    _up(w, wp.int32, device),
+                    _up(windows.window_t[pick], device=device),
+                    _up(windows.sample_step[keep], wp.int32, device),
+                    _up(windows.sample_part[keep], device=device),
+                ],
+            )
         keep, count, arrays = windows.device[key]
         return keep, count, [*self._d[device], *arrays]
 
@@ -336,7 +372,8 @@ def recorded(*arrays: wp.array) -> pk.Recorded:
 
 
 def nominal_row(servo_row: np.ndarray, rotor: float) -> np.ndarray:
-    """[C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor [kg.m2]: where the row has none."""
+    """[C] plant parameters of a servo table's row (infinite limits made large), all extras neutral. rotor [kg.m2]:
+    where the row has none."""
     row = NEUTRAL.copy()
     row[: len(servo_row)] = servo_row
     row[INDEX["rotor"]] = row[INDEX["rotor"]] or rotor

@@ -41,8 +41,10 @@ class Case:
     regimes: dict[str, np.ndarray] = field(default_factory=dict)  # what residuals are set against, by measurement row
     moved: bool = True
     loop_rate: float | None = None
-    factors: dict[str, tuple[float, float]] = field(default_factory=dict)  # of what the model says, by nuisance, where more than BELIEF is known
-    told: bool = False  # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
+    # of what the model says, by nuisance, where more than BELIEF is known
+    factors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
+    told: bool = False
 
 
 def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
@@ -53,10 +55,14 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
     quantum = 0.0
     if len(steps):
         smallest = steps[0]
-        if len(steps) < 0.2 * len(x) + 20 and np.mean(np.abs(steps[:20] / smallest - np.round(steps[:20] / smallest)) < 0.05) > 0.9:
+        if (
+            len(steps) < 0.2 * len(x) + 20
+            and np.mean(np.abs(steps[:20] / smallest - np.round(steps[:20] / smallest)) < 0.05) > 0.9
+        ):
             quantum = float(smallest)
     changes = np.abs(np.diff(x))
-    if not quantum and np.mean(changes == 0.0) > REPEATS and (changes > 1e-7).any():  # steps of an encoder that are not all alike
+    # steps of an encoder that are not all alike
+    if not quantum and np.mean(changes == 0.0) > REPEATS and (changes > 1e-7).any():
         quantum = float(np.quantile(changes[changes > 1e-7], 0.1))
     if len(x) < 9:
         return max(quantum / np.sqrt(12), 1e-9), quantum
@@ -75,7 +81,9 @@ def noise(t: np.ndarray, x: np.ndarray) -> tuple[float, float]:
     return max(rms, quantum / np.sqrt(12), 1e-9), quantum
 
 
-def demand(row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np.ndarray, clip: bool = True) -> np.ndarray:
+def demand(
+    row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np.ndarray, clip: bool = True
+) -> np.ndarray:
     """Motor torque [S] that the believed law gives along the measured motion, delay and lag aside. N.m"""
     p = lambda n: row[SERVO_INDEX[n]]  # noqa: E731
     pd = p("kp") * (cmd - q) - p("kd") * v
@@ -85,11 +93,22 @@ def demand(row: np.ndarray, voltage: bool, cmd: np.ndarray, q: np.ndarray, v: np
         return tau0 * out - (tau0 / p("no_load_speed") * v if np.isfinite(p("no_load_speed")) else 0.0)
     if not clip:
         return pd
-    limit = p("torque_limit") * np.maximum(1 - np.abs(v) / p("no_load_speed"), 0) if np.isfinite(p("torque_limit")) else np.inf
+    limit = (
+        p("torque_limit") * np.maximum(1 - np.abs(v) / p("no_load_speed"), 0)
+        if np.isfinite(p("torque_limit"))
+        else np.inf
+    )
     return np.clip(pd, -limit, limit)
 
 
-def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float = 1e-3, progress=None, only: set[str] | None = None) -> list[Case]:
+def build(
+    model: mujoco.MjModel,
+    runs: list[Run],
+    device: str = "cpu",
+    dt: float = 1e-3,
+    progress=None,
+    only: set[str] | None = None,
+) -> list[Case]:
     """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     joints = runs[0].joints
     J = len(joints)
@@ -115,7 +134,9 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
         inertia = float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
         rotor = c.armature if c.armature > 0 else 0.3 * inertia
         servo = runs[0].servo
-        plant = JointPlant(joint, c, dt, voltage, servo.encoder("loop", [joint])[0], servo.encoder("position", [joint])[0], device)
+        plant = JointPlant(
+            joint, c, dt, voltage, servo.encoder("loop", [joint])[0], servo.encoder("position", [joint])[0], device
+        )
         others = _draggers(model, joints, j, runs)
         believed = [_drags(run, rows[i][j], others) for i, run in enumerate(runs)]
         for i, run in enumerate(runs):
@@ -136,8 +157,18 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
             elif run.torque is not None:
                 exact["drive"] = np.nan_to_num(run.torque[:, j])
             effort = None if run.torque is None else run.torque[:, j]
-            plant.add(run.name, nominal_row(believed[i], rotor), mech[i][0], mech[i][1][j], run.cmd_t, run.cmd[:, j], run.t,
-                      run.q[:, j], effort, exact)  # fmt: skip
+            plant.add(
+                run.name,
+                nominal_row(believed[i], rotor),
+                mech[i][0],
+                mech[i][1][j],
+                run.cmd_t,
+                run.cmd[:, j],
+                run.t,
+                run.q[:, j],
+                effort,
+                exact,
+            )
         plant.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
         plant.finish()
         cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
@@ -145,7 +176,8 @@ def build(model: mujoco.MjModel, runs: list[Run], device: str = "cpu", dt: float
 
 
 def _believed(run: Run, joints: Sequence[str]) -> np.ndarray:
-    """[J, C] servo columns of a recording, with what is believed of a drive of which nothing is said: that it brakes with its full torque."""
+    """[J, C] servo columns of a recording, with what is believed of a drive of which nothing is said: that it brakes
+    with its full torque."""
     rows = run.servo.nominal(joints)
     for row, joint in zip(rows, joints, strict=True):
         if not _stated(run.servo, joint, "braking_slope"):
@@ -158,8 +190,8 @@ def _stated(table: ServoTable, joint: str, column: str) -> bool:
 
 
 def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
-    """Median over recordings of each one's median over its pieces (a contact cuts one into several): noise is the sensor's, and a recording
-    that moves too fast to tell the two apart counts once."""
+    """Median over recordings of each one's median over its pieces (a contact cuts one into several): noise is the
+    sensor's, and a recording that moves too fast to tell the two apart counts once."""
     by: dict[str, list[float]] = {}
     for run, value in zip(runs, values, strict=True):
         by.setdefault(run.name, []).append(value)
@@ -172,7 +204,11 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     q, v, a = (cat(lambda i, n=n: getattr(runs[i], n)[:, j]) for n in ("qs", "vs", "as_"))
     tau = cat(lambda i: torques[i][:, j])
     cmd = cat(lambda i: runs[i].command_at(runs[i].t)[:, j])
-    asked = cat(lambda i: demand(rows[i][j], voltage, runs[i].command_at(runs[i].t)[:, j], runs[i].q[:, j], runs[i].vs[:, j], clip=False))
+    asked = cat(
+        lambda i: demand(
+            rows[i][j], voltage, runs[i].command_at(runs[i].t)[:, j], runs[i].q[:, j], runs[i].vs[:, j], clip=False
+        )
+    )
     if voltage:
         limit = rows[0][j][SERVO_INDEX["torque_limit"]]
     else:
@@ -180,13 +216,18 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
     estimates = [noise(run.t, run.q[:, j]) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
-    series = lambda name: np.concatenate([np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]])  # noqa: E731
-                                          for i in range(len(runs))])
+
+    def series(name: str) -> np.ndarray:
+        each = [np.interp(runs[i].t, mech[i][0], mech[i][1][j][:, SERIES_INDEX[name]]) for i in range(len(runs))]
+        return np.concatenate(each)
+
     gravity, load_t, load_i = series("gravity_cos"), series("load_cos"), series("load_inertia")
     spring = max(float(np.median([r[j][SERVO_INDEX["kp"]] for r in rows])) * (limit if voltage else 1.0), 1e-9)
     big = lambda x, p=95: float(np.percentile(np.abs(x), p)) if len(x) else 0.0  # noqa: E731
     load = gravity + series("rest") + inertia * a
-    tau_scale = max(min(big(tau), 3 * big(load) + 1e-12) if big(tau) > 0 else big(load), 1e-3 * spring * max(np.ptp(q), 1e-6), 1e-9)
+    tau_scale = max(
+        min(big(tau), 3 * big(load) + 1e-12) if big(tau) > 0 else big(load), 1e-3 * spring * max(np.ptp(q), 1e-6), 1e-9
+    )
     nominal = {name: float(np.median([r[j][i] for r in rows])) for i, name in enumerate(SERVO_NAMES)}
     nominal["torque_limit"] = min(nominal["torque_limit"], 1e9)
     nominal["no_load_speed"] = min(nominal["no_load_speed"], 1e9)
@@ -199,17 +240,36 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         heat = cat(lambda i: runs[i].temperature[:, j])
         warm = float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
     scales = Scales(
-        tau=tau_scale, demand=max(big(asked, 99.8) if not voltage else limit, tau_scale), speed=max(big(v), 1e-6),
-        peak_speed=max(big(v, 99.8), 1e-6), error=max(big(cmd - plant.q, 90), sigma), stiffness=spring, inertia=inertia,
-        gravity=big(gravity, 99), span=max(float(np.ptp(q)), 1e-9), sigma=sigma, nominal=nominal,
+        tau=tau_scale,
+        demand=max(big(asked, 99.8) if not voltage else limit, tau_scale),
+        speed=max(big(v), 1e-6),
+        peak_speed=max(big(v, 99.8), 1e-6),
+        error=max(big(cmd - plant.q, 90), sigma),
+        stiffness=spring,
+        inertia=inertia,
+        gravity=big(gravity, 99),
+        span=max(float(np.ptp(q)), 1e-9),
+        sigma=sigma,
+        nominal=nominal,
         others=tuple(runs[0].joints[o] for o in others[:4]),
-        others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99), load_torque=big(load_t), load_inertia=float(np.median(load_i)),
-        tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"}, warm=warm, slide=constants.slide, voltage=voltage,
-        effort=effort_noise > 0, saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
-        base_friction=constants.friction, base_damping=constants.damping, armature=constants.armature,
-        own_torque=big(series("own_cos")), own_inertia=float(np.median(series("own_inertia"))), leaf_mass=constants.leaf_mass, own_mass=constants.own_mass,
+        others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99),
+        load_torque=big(load_t),
+        load_inertia=float(np.median(load_i)),
+        tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"},
+        warm=warm,
+        slide=constants.slide,
+        voltage=voltage,
+        effort=effort_noise > 0,
+        saturates=float(np.mean(np.abs(asked) >= limit * 0.98)),
+        base_friction=constants.friction,
+        base_damping=constants.damping,
+        armature=constants.armature,
+        own_torque=big(series("own_cos")),
+        own_inertia=float(np.median(series("own_inertia"))),
+        leaf_mass=constants.leaf_mass,
+        own_mass=constants.own_mass,
         apart=plant.loop == "motor" and plant.position == "joint",
-    )  # fmt: skip
+    )
     table = runs[0].servo
     ranges, unknown = {}, []
     for name in SERVO_NAMES:
@@ -220,20 +280,42 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
             ranges[name] = (value.low, value.high)
     regimes_extra = {"_gravity": gravity}
     for k in range(4):
-        moved_by = lambda i, k=k: runs[i].qs[:, others[k]] - runs[i].qs[0, others[k]] if k < len(others) else np.zeros(len(runs[i].t))  # noqa: E731
+
+        def moved_by(i: int, k: int = k) -> np.ndarray:
+            q = runs[i].qs
+            return q[:, others[k]] - q[0, others[k]] if k < len(others) else np.zeros(len(runs[i].t))
+
         regimes_extra[f"_drag{k}"] = cat(moved_by)
     regimes_extra["_error"] = cmd - plant.q
     regimes_extra["_speed"] = v
-    regimes_extra["_command_rate"] = np.concatenate([np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs])
-    regimes_extra["_torque_rate"] = np.concatenate([np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)])
+    regimes_extra["_command_rate"] = np.concatenate(
+        [np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs]
+    )
+    regimes_extra["_torque_rate"] = np.concatenate(
+        [np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)]
+    )
     regimes_extra["_added"], regimes_extra["_added_own"] = load_t, series("own_cos")
     regimes_extra["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
     moved = scales.span > 6 * sigma
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
     regimes |= regimes_extra
     stated = frozenset(n for k in (joint, ALL) for n in table.entries.get(k, {}))
-    return Case(joint, j, plant, constants, scales, sigma, quantum, effort_noise, ranges, tuple(unknown), stated, regimes, moved,
-                table.loop_rate)
+    return Case(
+        joint,
+        j,
+        plant,
+        constants,
+        scales,
+        sigma,
+        quantum,
+        effort_noise,
+        ranges,
+        tuple(unknown),
+        stated,
+        regimes,
+        moved,
+        table.loop_rate,
+    )
 
 
 def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[str, np.ndarray]:
@@ -251,10 +333,17 @@ def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[
                 sign = s
             since[i] = min(t[i] - last, 9.0)
     out = {
-        "time since reversal": since, "speed": np.abs(v), "acceleration": np.abs(a), "load": np.abs(load), "position": q,
-        "direction": np.sign(v), "driven against its load": np.sign(v * tau), "position error": np.abs(cmd - q),
-        "saturation": np.abs(asked) / limit if np.isfinite(limit) else np.zeros_like(t), "time": t.copy(),
-    }  # fmt: skip
+        "time since reversal": since,
+        "speed": np.abs(v),
+        "acceleration": np.abs(a),
+        "load": np.abs(load),
+        "position": q,
+        "direction": np.sign(v),
+        "driven against its load": np.sign(v * tau),
+        "position error": np.abs(cmd - q),
+        "saturation": np.abs(asked) / limit if np.isfinite(limit) else np.zeros_like(t),
+        "time": t.copy(),
+    }
     out |= {"_torque": tau, "_asked": asked, "_load": load, "_friction": 0.0 * tau}
     if runs[0].temperature is not None:
         out["temperature"] = np.concatenate([r.temperature[:, j] for r in runs])
@@ -266,12 +355,17 @@ def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[
 
 
 def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, armature: float) -> None:
-    """Writes rate, acceleration and link-side torque of another joint (its series [n, E] at times [n]) as dragger k of a joint."""
+    """Writes rate, acceleration and link-side torque of another joint (its series [n, E] at times [n]) as dragger k of
+    a joint."""
     speed = other[:, SERIES_INDEX["v"]]
     acceleration = np.gradient(speed, times)
     series[:, SERIES_INDEX[f"drag_v{k}"]] = speed
     series[:, SERIES_INDEX[f"drag_a{k}"]] = acceleration
-    load = (other[:, SERIES_INDEX["inertia"]] - armature) * acceleration + other[:, SERIES_INDEX["gravity_cos"]] + other[:, SERIES_INDEX["rest"]]
+    load = (
+        (other[:, SERIES_INDEX["inertia"]] - armature) * acceleration
+        + other[:, SERIES_INDEX["gravity_cos"]]
+        + other[:, SERIES_INDEX["rest"]]
+    )
     series[:, SERIES_INDEX[f"pull{k}"]] = load
 
 
@@ -298,16 +392,16 @@ def _draggers(model, joints, j, runs) -> list[int]:
 
 
 def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: Sequence[np.ndarray], voltage: bool) -> np.ndarray:
-    """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed: by commands of
-    those moments, which are finer than the samples. N.m"""
+    """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed:
+    by commands of those moments, which are finer than the samples. N.m"""
     cmd = run.command_at(times)
     q, v = SERIES_INDEX["q"], SERIES_INDEX["v"]
     return np.abs(np.stack([demand(rows[j], voltage, cmd[:, j], x[:, q], x[:, v]) for j, x in enumerate(series)], 1))
 
 
 def _drags(run: Run, row: np.ndarray, others: list[int]) -> np.ndarray:
-    """A joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of which the first four are
-    simulated, and the one that is believed to drag goes first), not among the mechanism's joints."""
+    """A joint's servo columns [C] with `coupling_from` counted among the plant's draggers (joints `others`, of which
+    the first four are simulated, and the one that is believed to drag goes first), not among the mechanism's joints."""
     row = row.copy()
     if row[SERVO_INDEX["coupling"]]:
         name = (run.counted or run.joints)[int(row[SERVO_INDEX["coupling_from"]])]

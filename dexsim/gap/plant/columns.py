@@ -19,14 +19,36 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("tilt_x", 0.0, "rad", "gravity turned about the world's x"),
     ("tilt_y", 0.0, "rad", "gravity turned about the world's y"),
     ("tilt_z", 0.0, "rad", "gravity turned about the world's z"),
-    ("linkage", 0.0, "1", "the same where the link is tied to its motor and the other joint: the motor turns by as much, with its rotor and friction"),
+    (
+        "linkage",
+        0.0,
+        "1",
+        "the same where the link is tied to its motor and the other joint: the motor turns by as much, with its rotor "
+        "and friction",
+    ),
     ("reaction", 0.0, "1", "the other end of a linkage: share of another joint's load that pulls on this one"),
-    ("feedback_delay", 0.0, "s", "age of the position that the loop acts on: it is sampled, and its torque holds until the next sample"),
-    ("limit_speed", 0.5, "1", "speed that the torque limit falls with: 0 the motor's, 1 what the loop takes for it (they part with play, elasticity, scale, filter)"),
+    (
+        "feedback_delay",
+        0.0,
+        "s",
+        "age of the position that the loop acts on: it is sampled, and its torque holds until the next sample",
+    ),
+    (
+        "limit_speed",
+        0.5,
+        "1",
+        "speed that the torque limit falls with: 0 the motor's, 1 what the loop takes for it (they part with play, "
+        "elasticity, scale, filter)",
+    ),
     ("bias", 0.0, "N.m", "constant torque on the joint"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),
-    ("effort_fresh", 0.0, "1", "0: the shown effort is the one that acts, 1: the one that the loop would ask for at that moment"),
+    (
+        "effort_fresh",
+        0.0,
+        "1",
+        "0: the shown effort is the one that acts, 1: the one that the loop would ask for at that moment",
+    ),
     ("readout_scale", 1.0, "1", "reported over what the encoder shows, where the loop has another encoder"),
     ("readout_offset", 0.0, "rad", "added to what is reported, where the loop has another encoder"),
     ("com_out", 0.0, "m", "centre of the added mass, out from the hinge beyond the last link's centre of mass"),
@@ -56,7 +78,8 @@ SERIES: tuple[str, ...] = (
     "warmth",  # temperature above the reference, degC
     "enabled",
     "drive",  # recorded motor torque (or duty) where a stage is tested with its recorded input
-    "com_out_cos", "com_out_sin", "com_out_inertia",  # what the added mass's place adds: per kg.m, inertia linear in the place
+    # what the added mass's place adds: per kg.m, inertia linear in the place
+    "com_out_cos", "com_out_sin", "com_out_inertia",
     "com_across_cos", "com_across_sin", "com_across_inertia",
     "drag0", "drag1", "drag2", "drag3",  # motion of the joints that may drag this one, from its first sample, rad
     "drag_v0", "drag_v1", "drag_v2", "drag_v3", "drag_a0", "drag_a1", "drag_a2", "drag_a3",  # its rate and acceleration

@@ -1,8 +1,10 @@
-"""Motions sharper than their samples: what joints that hang on each other do to each other, from the simulation's own accelerations.
+"""Motions sharper than their samples: what joints that hang on each other do to each other, from the simulation's own
+accelerations.
 
-Differentiating samples smears out every start and stop, and the neighbours of a joint feel its acceleration. Here each joint
-is simulated along the recording with what is believed, and only the small difference from what was measured is smoothed. Once
-something was fitted, `again` does the same with that: what is left to be smoothed is smaller, and so is its error.
+Differentiating samples smears out every start and stop, and the neighbours of a joint feel its acceleration. Here each
+joint is simulated along the recording with what is believed, and only the small difference from what was measured is
+smoothed. Once something was fitted, `again` does the same with that: what is left to be smoothed is smaller, and so is
+its error.
 """
 
 from __future__ import annotations
@@ -22,13 +24,24 @@ from dexsim.gap.read.runs import Run, local_polynomial
 WIDTH = 0.06  # s: of the smoothing of the difference
 EVERY = 2e-3  # s between the samples of the sharpened motion
 PASSES = 2
-SHAKES = 0.03  # of a joint's typical torque: what reaches it from the motion of others before it matters how sharply that is known
+# of a joint's typical torque: what reaches it from the motion of others before it matters how sharply that is known
+SHAKES = 0.03
 
 
-def sharpen(model: mujoco.MjModel, runs: list[Run], cases: list[Case], device: str, dt: float, progress=None, only: set[str] | None = None) -> list[Case]:
-    """The cases (at last those of `only`) built again along sharpened motions (`Run.fine`); as they are where there is one joint only.
+def sharpen(
+    model: mujoco.MjModel,
+    runs: list[Run],
+    cases: list[Case],
+    device: str,
+    dt: float,
+    progress=None,
+    only: set[str] | None = None,
+) -> list[Case]:
+    """The cases (at last those of `only`) built again along sharpened motions (`Run.fine`); as they are where there is
+    one joint only.
 
-    Else the list `cases` is emptied: together, long recordings of many joints before and after would not fit into memory.
+    Else the list `cases` is emptied: together, long recordings of many joints before and after would not fit into
+    memory.
     """
     if len(cases) < 2:
         return cases
@@ -46,21 +59,28 @@ def coupled(cases: Sequence[Case]) -> bool:
     return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > SHAKES * c.scales.tau for c in cases)
 
 
-def again(model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted: Sequence[Any], device: str, dt: float) -> list[Case]:
-    """The cases of all joints built anew along motions sharpened with what was fitted to each (trials, in the order of the cases). Where
-    a joint's encoder was found not to show its position, the others are moved by where it is."""
+def again(
+    model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted: Sequence[Any], device: str, dt: float
+) -> list[Case]:
+    """The cases of all joints built anew along motions sharpened with what was fitted to each (trials, in the order of
+    the cases). Where a joint's encoder was found not to show its position, the others are moved by where it is."""
     at = []
     for case, trial in zip(cases, fitted, strict=True):
         with_fixed = expand(case.plant, trial.fit.params, trial.fit.x[None])
         for name, value in (f for m in trial.members for f in m.variant.fixed):
             with_fixed[:, :, INDEX[name]] = value
         at.append(with_fixed)
-    motion = [[_one(case.plant, i, run.t, run.q[:, j], at[j]) for j, case in enumerate(cases)] for i, run in enumerate(runs)]
+    motion = [
+        [_one(case.plant, i, run.t, run.q[:, j], at[j]) for j, case in enumerate(cases)] for i, run in enumerate(runs)
+    ]
     misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
         for i, run in enumerate(runs):
-            columns = [_true(motion[i][j], at[j][0, i]) if j in misread and j != own else motion[i][j] for j in range(len(cases))]
+            columns = [
+                _true(motion[i][j], at[j][0, i]) if j in misread and j != own else motion[i][j]
+                for j in range(len(cases))
+            ]
             run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
         return build(model, runs, device=device, dt=dt)
 
@@ -77,7 +97,9 @@ def again(model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted:
 def _true(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndarray, ...]:
     """Motion (times, q, v, a) as an encoder shows it -> as it is, by plant parameters [C]."""
     t, q, v, a = shown
-    scale, offset, es, ec = (row[INDEX[k]] for k in ("position_scale", "position_offset", "eccentric_sin", "eccentric_cos"))
+    scale, offset, es, ec = (
+        row[INDEX[k]] for k in ("position_scale", "position_offset", "eccentric_sin", "eccentric_cos")
+    )
     x = (q - offset) / scale
     for _ in range(3):
         x = (q - offset - es * np.sin(x) - ec * (np.cos(x) - 1)) / scale
@@ -86,8 +108,11 @@ def _true(shown: tuple[np.ndarray, ...], row: np.ndarray) -> tuple[np.ndarray, .
     return t, x, speed, (a + (es * np.sin(x) + ec * np.cos(x)) * speed**2) / rate
 
 
-def _one(plant: JointPlant, run: int, t: np.ndarray, q: np.ndarray, at: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-    """Times [n] s, and position, speed and acceleration [n] of one joint in one run; at [1, R, C]: plant parameters (None: believed)."""
+def _one(
+    plant: JointPlant, run: int, t: np.ndarray, q: np.ndarray, at: np.ndarray | None = None
+) -> tuple[np.ndarray, ...]:
+    """Times [n] s, and position, speed and acceleration [n] of one joint in one run; at [1, R, C]: plant parameters
+    (None: believed)."""
     every = max(int(round(EVERY / plant.dt)), 1)
     times, windows = fine_windows(plant, run, every)
     x = plant.simulate(plant.base()[None] if at is None else at, windows)[0][0]
@@ -110,4 +135,6 @@ def fine_windows(plant: JointPlant, run: int, every: int) -> tuple[np.ndarray, W
     window[0, 3], window[0, 4] = 0, len(steps)
     n = len(steps)
     times = whole.window_t[0] + plant.dt * steps
-    return times, Windows(window, whole.window_t[:1], steps, np.zeros(n), np.zeros(n, int), np.zeros(n, int), whole.run[:1])
+    return times, Windows(
+        window, whole.window_t[:1], steps, np.zeros(n), np.zeros(n, int), np.zeros(n, int), whole.run[:1]
+    )

@@ -12,7 +12,7 @@ approximated by a smooth law.
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -79,7 +79,9 @@ XQ, XV, XI, XGC, XGS, XR, XLI, XLC, XLS = (
     X[n] for n in ("q", "v", "inertia", "gravity_cos", "gravity_sin", "rest", "load_inertia", "load_cos", "load_sin")
 )
 XTXC, XTXS, XTYC, XTYS, XTZC, XTZS = (X[f"tilt_{a}_{b}"] for a in "xyz" for b in ("cos", "sin"))
-XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive"))
+XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (
+    X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive")
+)
 P_OWN = INDEX["own_payload"]
 XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
@@ -113,7 +115,20 @@ class Recorded:
     out_torque: wp.array2d(dtype=f64)  # [H, n]
 
 
-FIELDS = ("params", "inits", "consts", "series", "cmd_t", "cmd", "window", "window_t", "sample_step", "sample_part", "out_q", "out_torque")
+FIELDS = (
+    "params",
+    "inits",
+    "consts",
+    "series",
+    "cmd_t",
+    "cmd",
+    "window",
+    "window_t",
+    "sample_step",
+    "sample_part",
+    "out_q",
+    "out_torque",
+)
 
 
 @wp.struct
@@ -422,8 +437,8 @@ def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
 
 @wp.func
 def turned(gc: f64, gs: f64, dq: f64):
-    """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated. Near there, where a step mostly is, by
-    Taylor's series, true to 4e-12 and several times as fast."""
+    """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated. Near there, where a
+    step mostly is, by Taylor's series, true to 4e-12 and several times as fast."""
     if wp.abs(dq) > f64(0.15):
         return gc * wp.cos(dq) + gs * wp.sin(dq)
     x = dq * dq
@@ -559,8 +574,20 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 
 
 @wp.func
-def two_bodies(c: Recorded, h: int, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, rotor: f64, dt: f64,
-               p: Guess, n: Now):  # fmt: skip
+def two_bodies(
+    c: Recorded,
+    h: int,
+    x: State,
+    t: Torque,
+    applied: f64,
+    load: f64,
+    level: f64,
+    stop_d: f64,
+    rotor: f64,
+    dt: f64,
+    p: Guess,
+    n: Now,
+):
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
     the step."""
     zero = f64(0.0)
@@ -775,7 +802,7 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
     return x
 
 
-@lru_cache(maxsize=None)
+@cache
 def plant_kernel():
     """The kernel: one thread a guess and window. first: number of the launch's first guess; dt: step of the grid
     [s]."""

@@ -10,7 +10,8 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 
-RATE, FINE = 100.0, 250.0  # Hz at which the model is evaluated (along a sharpened motion); the series are interpolated between
+# Hz at which the model is evaluated (along a sharpened motion); the series are interpolated between
+RATE, FINE = 100.0, 250.0
 
 
 @dataclass
@@ -180,8 +181,9 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
 
 
 def _places(model: mujoco.MjModel, data: mujoco.MjData, ids, leaves) -> np.ndarray:
-    """[J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a joint feels it: out
-    from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a joint feels nothing)."""
+    """[J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a joint
+    feels it: out from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a joint
+    feels nothing)."""
     mujoco.mj_resetData(model, data)
     mujoco.mj_kinematics(model, data)
     out = np.empty((len(ids), 2, 3))

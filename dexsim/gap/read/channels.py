@@ -1,7 +1,9 @@
-"""Signals that are not what they say, found before any physics: what they are, and what must be left out because of them.
+"""Signals that are not what they say, found before any physics: what they are, and what must be left out because of
+them.
 
-The reader's audit names what a recording alone shows. Beside the model and the commands more can be told: degrees on both sides,
-a position that runs against its target or before it, readings that are repeated while the joint moves, an encoder that stops.
+The reader's audit names what a recording alone shows. Beside the model and the commands more can be told: degrees on
+both sides, a position that runs against its target or before it, readings that are repeated while the joint moves, an
+encoder that stops.
 """
 
 from __future__ import annotations
@@ -28,13 +30,22 @@ HOLDS = 1.5  # x the error at which dry friction has held the joint before
 TURN = 180 / np.pi
 
 
-def finding(kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9) -> dict[str, Any]:
+def finding(
+    kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9
+) -> dict[str, Any]:
     """A finding bad_channel as `diagnosis.json` has it."""
     return {
-        "effect": "bad_channel", "confidence": confidence, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
-        "where": {"joints": [joint] if joint else [], "taxels": [], "topics": topics}, "regime": f"{kind}: {text}", "when": when,
-        "parameters": {}, "held_out": None,
-    }  # fmt: skip
+        "effect": "bad_channel",
+        "confidence": confidence,
+        "alternatives": [],
+        "indistinguishable": [],
+        "separating_experiment": None,
+        "where": {"joints": [joint] if joint else [], "taxels": [], "topics": topics},
+        "regime": f"{kind}: {text}",
+        "when": when,
+        "parameters": {},
+        "held_out": None,
+    }
 
 
 def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
@@ -42,28 +53,51 @@ def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
     out = {}
     for r in recordings:
         for f in r.findings:
-            if f.severity == "error" and f.kind in SPOILS and f.joint and f.text.split(" ")[0] in ("position", "command"):
+            if (
+                f.severity == "error"
+                and f.kind in SPOILS
+                and f.joint
+                and f.text.split(" ")[0] in ("position", "command")
+            ):
                 out.setdefault((r.path.name, f.joint), f"{f.kind}: {f.text}")
     return out
 
 
 def secondary(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The findings without those that follow from another: an effort's sign is read against the position."""
-    wrong = {j for f in findings for j in f["where"]["joints"] if f["regime"].split(":")[0] in SPOILS and "position" in f["regime"]}
-    return [f for f in findings if not (f["regime"].startswith(("sign_mismatch", "lost_sign")) and set(f["where"]["joints"]) & wrong)]
+    wrong = {
+        j
+        for f in findings
+        for j in f["where"]["joints"]
+        if f["regime"].split(":")[0] in SPOILS and "position" in f["regime"]
+    }
+    return [
+        f
+        for f in findings
+        if not (f["regime"].startswith(("sign_mismatch", "lost_sign")) and set(f["where"]["joints"]) & wrong)
+    ]
 
 
 def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str], str]
             ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], str], dict[str, list[tuple[float, float]]]]:
-    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by run in s in which
-    nothing is known of a joint). `known`: what the audit has named already. Repeated readings are taken out of the runs, which can then be
-    used, but for those stretches."""
+    """(findings that runs, model and commands show together, (run, joint) that must be left out -> why, stretches by
+    run in s in which nothing is known of a joint). `known`: what the audit has named already. Repeated readings are
+    taken out of the runs, which can then be used, but for those stretches."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     out = dict(known)
     long = {joint: repeated.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
 
-    def add(kind: str, text: str, run: Run, joint: str, topics: list[str], spans: list[tuple[float, float]], confidence: float = 0.9, drop: bool = True):
+    def add(
+        kind: str,
+        text: str,
+        run: Run,
+        joint: str,
+        topics: list[str],
+        spans: list[tuple[float, float]],
+        confidence: float = 0.9,
+        drop: bool = True,
+    ):
         entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
         entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
         if drop:
@@ -80,21 +114,51 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             cmd = run.command_at(run.t)[:, j]
             limits = _range(model, joint)
             if limits is not None and _degrees(q, cmd, limits):
-                add("unit", f"position and target of {joint} reach {np.abs(q).max():.3g}, where the model allows {np.abs(limits).max():.3g}: degrees? "
-                    "(state meta.position_unit=deg)", run, joint, [STATES, COMMANDS], whole)  # fmt: skip
+                add(
+                    "unit",
+                    f"position and target of {joint} reach {np.abs(q).max():.3g}, where the model allows "
+                    f"{np.abs(limits).max():.3g}: degrees? "
+                    "(state meta.position_unit=deg)",
+                    run,
+                    joint,
+                    [STATES, COMMANDS],
+                    whole,
+                )
                 continue
             if np.ptp(cmd) > 1e-3 and np.ptp(q) > 0.2 * np.ptp(cmd) and _sign(run, q, j) < -0.7:
-                add("sign", f"{joint} follows the negative of its target: another direction of its position or its commands", run, joint, [STATES, COMMANDS], whole)
+                add(
+                    "sign",
+                    f"{joint} follows the negative of its target: another direction of its position or its commands",
+                    run,
+                    joint,
+                    [STATES, COMMANDS],
+                    whole,
+                )
                 continue
             lead = _lead(run, j)
             if lead > EARLY:
-                add("clock_skew", f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on different clocks", run, joint,
-                    [COMMANDS, STATES], whole)  # fmt: skip
+                add(
+                    "clock_skew",
+                    f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
+                    "different clocks",
+                    run,
+                    joint,
+                    [COMMANDS, STATES],
+                    whole,
+                )
                 continue
             stop = _stops(runs, run, joint, cmd)
             if stop is not None:
-                add("stuck", f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a drive that is off", run, joint,
-                    [STATES], [(stop, run.t[-1])], 0.7)  # fmt: skip
+                add(
+                    "stuck",
+                    f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a "
+                    "drive that is off",
+                    run,
+                    joint,
+                    [STATES],
+                    [(stop, run.t[-1])],
+                    0.7,
+                )
                 continue
             held, single = _held(run.t, q), repeated.duplicates(run.t, q)
             for a, b in long[joint][i]:
@@ -103,23 +167,42 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                     blind.setdefault(run.name, []).append((float(run.t[a]), float(run.t[b])))
             if held.any():
                 edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
-                add("stale", f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old readings, sent again", run, joint,
-                    [STATES], [(run.t[a], run.t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)], drop=False)  # fmt: skip
+                add(
+                    "stale",
+                    f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old "
+                    "readings, sent again",
+                    run,
+                    joint,
+                    [STATES],
+                    [(run.t[a], run.t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)],
+                    drop=False,
+                )
             elif single.any():
-                add("stale", f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: old readings, sent again", run, joint,
-                    [STATES], [(run.t[0], run.t[-1])], drop=False)  # fmt: skip
+                add(
+                    "stale",
+                    f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: "
+                    "old readings, sent again",
+                    run,
+                    joint,
+                    [STATES],
+                    [(run.t[0], run.t[-1])],
+                    drop=False,
+                )
             stale |= held | single
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
     return list(found.values()), out, blind
 
 
-def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], model: mujoco.MjModel, held: Sequence[int] = ()) -> list[Run]:
+def drop(
+    runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], model: mujoco.MjModel, held: Sequence[int] = ()
+) -> list[Run]:
     """The runs without what must be left out of them.
 
-    A joint that others of the recordings tell of stays in a run in which it is spoiled, as one of `Run.left_out`: it is not judged there, and
-    what the joints beside it feel of it is that of its targets (where those are spoiled too, of a joint at rest). A joint that is spoiled in
-    every run, in all that are held out (`held`) or in all others, goes altogether; a run without joints is gone."""
+    A joint that others of the recordings tell of stays in a run in which it is spoiled, as one of `Run.left_out`: it is
+    not judged there, and what the joints beside it feel of it is that of its targets (where those are spoiled too, of a
+    joint at rest). A joint that is spoiled in every run, in all that are held out (`held`) or in all others, goes
+    altogether; a run without joints is gone."""
     every = {j for run in runs for j in run.joints}
     sides = [[r for i, r in enumerate(runs) if (i in held) == side] for side in ((True, False) if held else (False,))]
     told = {j for j in every if all(any(j in r.joints and (r.name, j) not in out for r in part) for part in sides)}
@@ -128,7 +211,11 @@ def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], mod
         wrong = [j for j in run.joints if (run.name, j) in out]
         notes += [f"{run.name}: {j} is left out ({out[run.name, j]})" for j in wrong]
         bad = [j for j in run.joints if j not in told]
-        notes += [f"{run.name}: {j} is left out, for no recording on one side of the fit tells of it" for j in bad if j not in wrong]
+        notes += [
+            f"{run.name}: {j} is left out, for no recording on one side of the fit tells of it"
+            for j in bad
+            if j not in wrong
+        ]
         if all((run.name, j) in out for j in run.joints):
             continue
         run.left_out = frozenset(j for j in wrong if j in told)
@@ -148,7 +235,8 @@ def drop(runs: list[Run], out: dict[tuple[str, str], str], notes: list[str], mod
 
 
 def _pauses(run: Run) -> list[tuple[float, float]]:
-    """Stretches [s] without samples, and those over which the clock was set anew: a joint is judged before and after them."""
+    """Stretches [s] without samples, and those over which the clock was set anew: a joint is judged before and after
+    them."""
     step = np.diff(run.t)
     long = np.flatnonzero(step > max(BLIND, 8 * float(np.median(step))))
     out = [(float(run.t[k]), float(run.t[k + 1])) for k in long]
@@ -158,7 +246,8 @@ def _pauses(run: Run) -> list[tuple[float, float]]:
 
 
 def _assume(run: Run, j: int, follows: bool, model: mujoco.MjModel) -> None:
-    """What a joint without usable readings is taken to do: to follow its targets smoothly, or to rest where the model does."""
+    """What a joint without usable readings is taken to do: to follow its targets smoothly, or to rest where the model
+    does."""
     if follows:
         rate = 1 / max(float(np.median(np.diff(run.t))), 1e-4)
         width = int(np.clip(round(0.1 * rate), 1, len(run.t) // 4))
@@ -217,7 +306,8 @@ def _lead(run: Run, j: int) -> float:
     dc = np.convolve(np.gradient(run.command_at(wide)[:, j]), np.ones(9) / 9, "same")
     power = np.concatenate([[0.0], np.cumsum(dc**2)])
     norm = np.sqrt(np.maximum(power[len(grid) :] - power[: -len(grid)], 0.0)) * np.linalg.norm(dq) + 1e-12
-    scores = signal.correlate(dc, dq, "valid", "fft") / norm  # by the sample at which the target's stretch begins: shift = 80 - sample
+    # by the sample at which the target's stretch begins: shift = 80 - sample
+    scores = signal.correlate(dc, dq, "valid", "fft") / norm
     best = int(np.argmax(scores))
     causal = float(scores[: after + 1].max())
     # periodic motion fits at many shifts: only a clear gain before the target counts
@@ -225,8 +315,8 @@ def _lead(run: Run, j: int) -> float:
 
 
 def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float | None:
-    """When [s] the position stops for good although its target goes on; None where it does not, and where dry friction may hold it: where its
-    target goes no further away than it has been when the joint broke away from rest before."""
+    """When [s] the position stops for good although its target goes on; None where it does not, and where dry friction
+    may hold it: where its target goes no further away than it has been when the joint broke away from rest before."""
     j = run.joints.index(joint)
     q = run.q[:, j]
     last = np.flatnonzero(q != q[-1])
@@ -243,7 +333,8 @@ def _stops(runs: Sequence[Run], run: Run, joint: str, cmd: np.ndarray) -> float 
 
 
 def _holds(run: Run, j: int, end: int) -> float:
-    """The largest error [rad] at which a joint stood still for 50 ms and more, and then moved, in the samples before `end`."""
+    """The largest error [rad] at which a joint stood still for 50 ms and more, and then moved, in the samples before
+    `end`."""
     q = run.q[:end, j]
     error = np.abs(run.command_at(run.t[:end])[:, j] - q)
     rests = [(a, b) for a, b in repeated.rests(q) if b + 1 < end and run.t[b] - run.t[a] >= REST]
@@ -251,7 +342,8 @@ def _holds(run: Run, j: int, end: int) -> float:
 
 
 def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S] readings that repeat the one before and end in a jump that a joint of this speed cannot make in one sample."""
+    """[S] readings that repeat the one before and end in a jump that a joint of this speed cannot make in one
+    sample."""
     same = np.r_[False, np.diff(q) == 0]
     step = np.abs(np.diff(q))
     moving = step[step > 0]

@@ -17,8 +17,8 @@ TIMES = 2  # separate times that it must meet the end
 def used(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
     """Narrows the model's ranges to the ends that joints meet; in words, one line each.
 
-    An end is where a joint stands still at its outermost position, again and again, while its target goes on and the torque asked
-    for is far above what friction or gravity could hold. The joint's drive says nothing there.
+    An end is where a joint stands still at its outermost position, again and again, while its target goes on and the
+    torque asked for is far above what friction or gravity could hold. The joint's drive says nothing there.
     """
     said = []
     data = mujoco.MjData(model)
@@ -34,30 +34,41 @@ def used(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
                 low, high = -1e6, 1e6
             low, high = (end, high) if side < 0 else (low, end)
             model.jnt_range[joint], model.jnt_limited[joint] = (low, high), 1
-            beyond = f"the model's range goes on to {limit:.3g}" if np.isfinite(limit) else "the model has no limit there"
-            said.append(f"{where}: {name} meets an end of its motion at {end:.4g} while its target goes on; {beyond}. The end is used: put it into the model")
+            beyond = (
+                f"the model's range goes on to {limit:.3g}" if np.isfinite(limit) else "the model has no limit there"
+            )
+            said.append(
+                f"{where}: {name} meets an end of its motion at {end:.4g} while its target goes on; {beyond}. The end "
+                "is used: put it into the model"
+            )
     return said
 
 
 def unforeseen(model: mujoco.MjModel, runs: list[Run]) -> dict[str, list[tuple[float, float]]]:
-    """By recording: the stretches (start, end in s) in which joints of `runs`, which are kept out of the fit, press against ends that
-    the model does not have. What nothing in the fit has shown is not used to simulate them, and not held against a drive either."""
+    """By recording: the stretches (start, end in s) in which joints of `runs`, which are kept out of the fit, press
+    against ends that the model does not have. What nothing in the fit has shown is not used to simulate them, and not
+    held against a drive either."""
     out: dict[str, list[tuple[float, float]]] = {}
     data = mujoco.MjData(model)
     for j, name in enumerate(runs[0].joints if runs else ()):
         joint = model.joint(name).id
-        for side, limit in zip((-1, 1), model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf), strict=True):
+        for side, limit in zip(
+            (-1, 1), model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf), strict=True
+        ):
             found = _end(model, data, runs, j, side)
             if found is not None and side * (limit - found[0]) > found[2]:
                 for run in runs:
                     on = (side * run.q[:, j] > side * found[0] - found[2]).astype(int)
                     edges = np.flatnonzero(np.diff(np.r_[0, on, 0]))
-                    out.setdefault(run.name, []).extend((float(run.t[a]), float(run.t[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+                    out.setdefault(run.name, []).extend(
+                        (float(run.t[a]), float(run.t[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
+                    )
     return {name: spans for name, spans in out.items() if spans}
 
 
 def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str, float] | None:
-    """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it meets none."""
+    """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it
+    meets none."""
     outer = max(float((side * r.q[:, j]).max()) for r in runs)
     near = NEAR * (max(float(r.q[:, j].max()) for r in runs) - min(float(r.q[:, j].min()) for r in runs))
     errors = [side * (r.command_at(r.t)[:, j] - r.q[:, j]) for r in runs]
@@ -75,7 +86,12 @@ def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str, f
         edges = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             q, target = run.q[a:b, j], run.q[a:b, j] + side * error[a:b]
-            if run.t[b - 1] - run.t[a] < LAST or np.ptp(target) < 3 * np.ptp(q) or np.ptp(q) > near or not _hard(model, data, run, j, a + int(np.argmax(error[a:b]))):
+            if (
+                run.t[b - 1] - run.t[a] < LAST
+                or np.ptp(target) < 3 * np.ptp(q)
+                or np.ptp(q) > near
+                or not _hard(model, data, run, j, a + int(np.argmax(error[a:b])))
+            ):
                 continue
             ends.append(float(np.median(q)))
             names.append(run.name)

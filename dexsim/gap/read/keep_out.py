@@ -1,8 +1,9 @@
-"""What is kept out of the fit: a condition whose regimes are fitted elsewhere, and ends of recordings with regimes that it does not visit.
+"""What is kept out of the fit: a condition whose regimes are fitted elsewhere, and ends of recordings with regimes that
+it does not visit.
 
-A limit that is reached in one recording only can neither be learned if that recording is kept out nor be judged if it is not. So the
-condition is kept out whose regimes the other conditions visit too; and of recordings that alone visit a regime which it does not, the end is
-kept out beside it.
+A limit that is reached in one recording only can neither be learned if that recording is kept out nor be judged if it
+is not. So the condition is kept out whose regimes the other conditions visit too; and of recordings that alone visit a
+regime which it does not, the end is kept out beside it.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ MOST = 0.45  # of all time that may be kept out
 
 @dataclass
 class Split:
-    """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words; not_judged: regimes
-    that only what is kept out visits."""
+    """train, test: indices of runs; span_train, span_test: the parts of them [s], None for whole runs; how: in words;
+    not_judged: regimes that only what is kept out visits."""
 
     train: list[int]
     test: list[int]
@@ -67,7 +68,9 @@ def visits(runs: Sequence[Run], cases: Sequence[Case]) -> tuple[list[str], np.nd
     found = regimes(cases)
     plant = cases[0].plant
     step = [float(np.median(np.diff(r.t))) if len(r.t) > 1 else 0.0 for r in runs]
-    time = np.array([[on[plant.rows(i)].sum() * step[i] for i in range(len(runs))] for on in found.values()]).reshape(len(found), len(runs))
+    time = np.array([[on[plant.rows(i)].sum() * step[i] for i in range(len(runs))] for on in found.values()]).reshape(
+        len(found), len(runs)
+    )
     return list(found), time
 
 
@@ -100,8 +103,8 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
 
 
 def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> int | None:
-    """The condition that leaves the fewest regimes without a recording to fit, of those the one that visits most; the last of them. None
-    where there are too few conditions."""
+    """The condition that leaves the fewest regimes without a recording to fit, of those the one that visits most; the
+    last of them. None where there are too few conditions."""
     numbers = sorted(set(group))
     if len(numbers) < 3:
         return None
@@ -122,8 +125,8 @@ def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> i
 
 
 def _ends(runs, train, test, time, found, plant) -> dict[int, float]:
-    """Where the end of a fitted recording begins that is kept out too [s], by run: those that visit regimes which `test` does not, before
-    that moment and after."""
+    """Where the end of a fitted recording begins that is kept out too [s], by run: those that visit regimes which
+    `test` does not, before that moment and after."""
     out: dict[int, float] = {}
     missing = [k for k in range(len(time)) if time[k, test].sum() < LEAST_TIME <= time[k, train].sum()]
     on = list(found.values())

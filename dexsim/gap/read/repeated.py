@@ -1,9 +1,10 @@
 """Readings that repeat old ones for a while: a bus that sends again what it read last, an encoder that is not read.
 
-Quantised readings of a joint at rest repeat honestly, and so do those of one that sticks while its target creeps. Two things
-give a frozen one away, both by what the same joint does elsewhere in its recordings. It ends in a jump: between two samples the
-reading goes faster than just before and just after, by more than a mass can (noise, quantum and stick-slip make such pulses too,
-but not one of this size). And its target went a way in the meantime that the joint has never let pass before.
+Quantised readings of a joint at rest repeat honestly, and so do those of one that sticks while its target creeps. Two
+things give a frozen one away, both by what the same joint does elsewhere in its recordings. It ends in a jump: between
+two samples the reading goes faster than just before and just after, by more than a mass can (noise, quantum and
+stick-slip make such pulses too, but not one of this size). And its target went a way in the meantime that the joint has
+never let pass before.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def rests(q: np.ndarray) -> list[tuple[int, int]]:
 
 
 def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S - 1] how far the step after each sample goes beyond what the faster of the steps beside it would give in its time; 0
-    where one beside it goes the other way just as far (a reading that comes back is a spike, not a jump)."""
+    """[S - 1] how far the step after each sample goes beyond what the faster of the steps beside it would give in its
+    time; 0 where one beside it goes the other way just as far (a reading that comes back is a spike, not a jump)."""
     dt, dq = np.maximum(np.diff(t), 1e-6), np.diff(q)
     speed = dq / dt
     before, after = np.r_[0.0, speed[:-1]], np.r_[speed[1:], 0.0]
@@ -42,8 +43,8 @@ def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, int]]]:
-    """Of each run, (first, last) sample of the stretches in which the joint's readings are old ones; `last` is the last old one. Runs
-    without the joint have none."""
+    """Of each run, (first, last) sample of the stretches in which the joint's readings are old ones; `last` is the last
+    old one. Runs without the joint have none."""
     seen: list[tuple[int, int, int, float, float]] = []  # run, first, last, pulse at its end, way of the target
     pulse, spans = [], []
     for k, run in enumerate(runs):
@@ -71,6 +72,7 @@ def stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, int]]]:
 
 
 def duplicates(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[S] bool: single readings that repeat the one before in a steady motion and are made up for by the next; none where there are few."""
+    """[S] bool: single readings that repeat the one before in a steady motion and are made up for by the next; none
+    where there are few."""
     again = repeats(t, q)
     return again if again.sum() >= max(FEW, OFTEN * len(t)) else np.zeros(len(t), bool)

@@ -13,12 +13,12 @@ from dexsim.actuator.table import ServoTable
 class Run:
     """One recording, J joints; times in s from the recording's first sample, positions in rad (m for a slide).
 
-    cmd_t [K], cmd [K, J]: targets, held until the next; t [S], q [S, J]: measured positions.
-    Optional, None where not logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or
-    the plain current in A where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V.
-    gravity: the world's, m/s2, [3]. servo: the table believed for this recording; counted: the mechanism's joints, by whose number its
-    `coupling_from` counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of them.
-    breaks: stretches [s] over which its clock cannot be trusted.
+    cmd_t [K], cmd [K, J]: targets, held until the next; t [S], q [S, J]: measured positions. Optional, None where not
+    logged: v [S, J] rad/s as reported; torque [S, J] motor torque the effort shows, N.m, or the plain current in A
+    where `torque_unit` says so; duty, temperature, enabled [S, J]; supply [S] V. gravity: the world's, m/s2, [3].
+    servo: the table believed for this recording; counted: the mechanism's joints, by whose number its `coupling_from`
+    counts (empty: `joints`). left_out: joints of which this recording tells nothing; their q is what is assumed of
+    them. breaks: stretches [s] over which its clock cannot be trusted.
     """
 
     name: str
@@ -120,7 +120,8 @@ def same_commands(a: Run, b: Run) -> bool:
 
 
 def spans(t: np.ndarray, on: np.ndarray, join: float) -> list[tuple[float, float]]:
-    """Stretches of time (start, end) [s] in which `on` [S] holds at the samples t [S] s, those less than `join` s apart joined."""
+    """Stretches of time (start, end) [s] in which `on` [S] holds at the samples t [S] s, those less than `join` s apart
+    joined."""
     out: list[tuple[float, float]] = []
     if not on.any():
         return out

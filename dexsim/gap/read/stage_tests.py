@@ -19,9 +19,9 @@ GOOD_FIT, GOOD_SLOPE = 0.95, 0.05
 
 @dataclass
 class Stage:
-    """The law of one joint's drive against what was logged. slope: logged over predicted, with its 90 % interval by a block
-    bootstrap; offset in the logged unit; delay [s] at which they agree best; fit: share of the variance explained;
-    residual rms over the logged rms."""
+    """The law of one joint's drive against what was logged. slope: logged over predicted, with its 90 % interval by a
+    block bootstrap; offset in the logged unit; delay [s] at which they agree best; fit: share of the variance
+    explained; residual rms over the logged rms."""
 
     joint: str
     signal: str
@@ -40,11 +40,16 @@ class Stage:
     @property
     def text(self) -> str:
         """The result in words."""
-        head = f"{self.joint}: the believed law explains {100 * self.fit:.0f} % of the logged {self.signal}, at {self.slope:.3f} of its size"
+        head = (
+            f"{self.joint}: the believed law explains {100 * self.fit:.0f} % of the logged {self.signal}, at "
+            f"{self.slope:.3f} of its size"
+        )
         head += f" ({self.slope_low:.3f} to {self.slope_high:.3f})"
         if abs(self.delay) >= 0.002:
             head += f", {1e3 * self.delay:.0f} ms {'later' if self.delay > 0 else 'earlier'}"
-        return head + ("; what is missing lies after the motor" if self.sound else "; the drive itself is not as believed")
+        return head + (
+            "; what is missing lies after the motor" if self.sound else "; the drive itself is not as believed"
+        )
 
 
 def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -> list[Stage]:
@@ -72,7 +77,14 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
             law = []
             for d in shifts + row[INDEX["delay"]]:
                 cmd = run.command_at(run.t - d)[:, j]
-                law.append(np.clip(kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j])) - kd * np.interp(run.t - d, run.t, run.vs[:, j]), -top, top))
+                law.append(
+                    np.clip(
+                        kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j]))
+                        - kd * np.interp(run.t - d, run.t, run.vs[:, j]),
+                        -top,
+                        top,
+                    )
+                )
             x.append(np.array(law)[:, on])
             y.append(logged[on])
             block.append(1000 * r + (run.t[on] / 0.5).astype(int))
@@ -92,6 +104,16 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
         slopes = (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)
         slope, offset = np.polyfit(p, logged, 1)
         fit = 1 - np.var(logged - slope * p - offset) / np.var(logged)
-        out.append(Stage(case.joint, signal, float(slope), float(np.quantile(slopes, 0.05)), float(np.quantile(slopes, 0.95)), float(offset),
-                         float(shifts[best]), float(fit)))  # fmt: skip
+        out.append(
+            Stage(
+                case.joint,
+                signal,
+                float(slope),
+                float(np.quantile(slopes, 0.05)),
+                float(np.quantile(slopes, 0.95)),
+                float(offset),
+                float(shifts[best]),
+                float(fit),
+            )
+        )
     return out

@@ -41,7 +41,10 @@ def text(
     x: float, y: float, words: str, anchor: str = "start", size: float = 11, colour: str = SOFT, weight: int = 400
 ) -> str:
     """A line of text at x, y."""
-    return f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{colour}" text-anchor="{anchor}" font-weight="{weight}">{html.escape(words)}</text>'
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{colour}" text-anchor="{anchor}" '
+        f'font-weight="{weight}">{html.escape(words)}</text>'
+    )
 
 
 def curves(
@@ -73,7 +76,8 @@ def curves(
         a, b = max(a, t0), min(b, t1)
         if b > a:
             out.append(
-                f'<rect x="{float(at(a)):.1f}" y="8" width="{max(float(at(b) - at(a)), 0.8):.1f}" height="{height - 34}" fill="#f3e9d2"/>'
+                f'<rect x="{float(at(a)):.1f}" y="8" width="{max(float(at(b) - at(a)), 0.8):.1f}" '
+                f'height="{height - 34}" fill="#f3e9d2"/>'
             )
     for v in _ticks(low, high):
         out.append(f'<line x1="{left}" x2="{width - right}" y1="{y(v):.1f}" y2="{y(v):.1f}" stroke="{GRID}"/>')
@@ -115,12 +119,14 @@ def bars(rows: Sequence[tuple[str, float, float | None, float | None, str]], uni
         y = k * step + 4
         out.append(text(left - 10, y + 20, name, "end", 13, INK))
         out.append(
-            f'<rect x="{left}" y="{y + 4}" width="{max(x(value) - left, 1.5):.1f}" height="{step - 14}" rx="3" fill="{colour}"/>'
+            f'<rect x="{left}" y="{y + 4}" width="{max(x(value) - left, 1.5):.1f}" height="{step - 14}" rx="3" '
+            f'fill="{colour}"/>'
         )
         end = x(value)
         if low is not None and high is not None:
             out.append(
-                f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 16}" y2="{y + 16}" stroke="{INK}" stroke-width="1.4"/>'
+                f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 16}" y2="{y + 16}" stroke="{INK}" '
+                'stroke-width="1.4"/>'
             )
             out += [
                 f'<line x1="{x(v):.1f}" x2="{x(v):.1f}" y1="{y + 12}" y2="{y + 20}" stroke="{INK}" stroke-width="1.4"/>'
@@ -139,14 +145,18 @@ def interval(value: float, low: float, high: float, width: int = 190) -> str:
     zero = a < 0 < b or (a > 0 and a < 0.35 * b) or (b < 0 and b > 0.35 * a)
     a, b = (min(a, 0.0), max(b, 0.0)) if zero else (a, b)
     x = lambda v: 6 + (v - a) / (b - a) * (width - 12)  # noqa: E731
-    out = [f'<svg class="iv" width="{width}" height="26" viewBox="0 0 {width} 26" role="img" aria-label="{value:.4g}, {low:.4g} to {high:.4g}">',
-           f'<line x1="6" x2="{width - 6}" y1="10" y2="10" stroke="{GRID}" stroke-width="2"/>']  # fmt: skip
+    out = [
+        f'<svg class="iv" width="{width}" height="26" viewBox="0 0 {width} 26" role="img" aria-label="{value:.4g}, '
+        f'{low:.4g} to {high:.4g}">',
+        f'<line x1="6" x2="{width - 6}" y1="10" y2="10" stroke="{GRID}" stroke-width="2"/>',
+    ]
     if zero:
         out.append(
             f'<line x1="{x(0):.1f}" x2="{x(0):.1f}" y1="4" y2="16" stroke="{SOFT}"/>' + text(x(0), 25, "0", "middle", 9)
         )
     out.append(
-        f'<line x1="{x(lo):.1f}" x2="{x(hi):.1f}" y1="10" y2="10" stroke="{AFTER}" stroke-width="5" stroke-linecap="round" opacity="0.45"/>'
+        f'<line x1="{x(lo):.1f}" x2="{x(hi):.1f}" y1="10" y2="10" stroke="{AFTER}" stroke-width="5" '
+        'stroke-linecap="round" opacity="0.45"/>'
     )
     out.append(f'<circle cx="{x(value):.1f}" cy="10" r="4.5" fill="{AFTER}"/>')
     return "".join(out) + "</svg>"
@@ -165,7 +175,8 @@ def strips(rows: Sequence[tuple[str, float, list[tuple[float, float]]]], width: 
         out.append(f'<rect x="{left}" y="{y}" width="{stop * scale:.1f}" height="{step - 8}" rx="2" fill="#eef1f4"/>')
         for a, b in spans:
             out.append(
-                f'<rect x="{left + a * scale:.1f}" y="{y}" width="{max((b - a) * scale, 0.8):.1f}" height="{step - 8}" fill="#d99a2b"/>'
+                f'<rect x="{left + a * scale:.1f}" y="{y}" width="{max((b - a) * scale, 0.8):.1f}" '
+                f'height="{step - 8}" fill="#d99a2b"/>'
             )
     for v in _ticks(0, end, 6):
         out.append(text(left + v * scale, height - 3, f"{v:.3g} s", "middle"))
@@ -183,7 +194,8 @@ def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, le
         y = k * step + 3
         out.append(text(left - 8, y + 14, name if len(name) < 64 else name[:61] + "...", "end", 12, INK))
         out.append(
-            f'<rect x="{left}" y="{y}" width="{max(x(value) - left, 0):.1f}" height="{step - 8}" fill="{BEFORE}" opacity="0.75"/>'
+            f'<rect x="{left}" y="{y}" width="{max(x(value) - left, 0):.1f}" height="{step - 8}" fill="{BEFORE}" '
+            'opacity="0.75"/>'
         )
         out.append(
             f'<line x1="{x(low):.1f}" x2="{x(high):.1f}" y1="{y + 9}" y2="{y + 9}" stroke="{INK}" stroke-width="1.6"/>'

@@ -19,8 +19,9 @@ from dexsim.gap.touch import handed_on as touch_handed
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
-    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and tactile.yaml, all of
-    them or none; returns what was written. Raises UserError where one would go over a file that is not ours."""
+    """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and
+    tactile.yaml, all of them or none; returns what was written. Raises UserError where one would go over a file that is
+    not ours."""
     from dexsim.gap.report.page import page
 
     d.notes = grouped(d.notes)
@@ -29,7 +30,9 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
         if d.servo is not None:
             d.servo.save(stage / "servo.yaml")
             names.append("servo.yaml")
-        if d.touch is not None and touch_handed.save(touch_handed.handed(d.touch.findings, d.touch.facts), stage / "tactile.yaml"):
+        if d.touch is not None and touch_handed.save(
+            touch_handed.handed(d.touch.findings, d.touch.facts), stage / "tactile.yaml"
+        ):
             names.append("tactile.yaml")
         if d.standins:
             residual_fit.write(d.servo, d.standins, stage / "servo_standin.yaml")
@@ -43,7 +46,9 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
                 d.notes.append(f"model.xml could not be written: {error}")
         asked, more = specified(d.data)
         more |= {"notes": d.notes, "seconds": d.shares}
-        data = {"diagnosis.json": asked, "details.json": more} | ({"evidence.json": [e.plain() for e in d.evidence]} if d.evidence else {})
+        data = {"diagnosis.json": asked, "details.json": more} | (
+            {"evidence.json": [e.plain() for e in d.evidence]} if d.evidence else {}
+        )
         for name, value in data.items():
             (stage / name).write_text(json.dumps(plain(value), indent=1, allow_nan=False), encoding="utf-8")
         (stage / "report.html").write_text(page(d), encoding="utf-8")
@@ -53,14 +58,25 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     return [out / name for name in (*names, "report.html")]
 
 
-RESULTS = ("diagnosis.json", "details.json", "evidence.json", "servo.yaml", "tactile.yaml", "servo_standin.yaml", "model.xml", MODEL_FILES,
-           "next_recording.mcap", "report.html")  # fmt: skip
+RESULTS = (
+    "diagnosis.json",
+    "details.json",
+    "evidence.json",
+    "servo.yaml",
+    "tactile.yaml",
+    "servo_standin.yaml",
+    "model.xml",
+    MODEL_FILES,
+    "next_recording.mcap",
+    "report.html",
+)
 """Everything that `save` and the plan of the next recording may write."""
 BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexplained", "not_considered"))
 
 
 def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for details.json)."""
+    """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for
+    details.json)."""
     asked, more = copy.deepcopy(data), {}
     for *parents, key in BEYOND:
         there = asked[parents[0]] if parents else asked

@@ -1,7 +1,7 @@
 """What to record next: the safe motion on which the leading hypotheses, as fitted, disagree most.
 
-Candidates are the motions of `dexsim.recording.excitation` at the size that is safe. Both hypotheses are simulated over each;
-what the refitted figures could make up for is taken out; what is left counts in units of the joint's noise.
+Candidates are the motions of `dexsim.recording.excitation` at the size that is safe. Both hypotheses are simulated over
+each; what the refitted figures could make up for is taken out; what is left counts in units of the joint's noise.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ ENOUGH = 3.0  # x the noise: a motion on which they differ by as much settles it
 
 @dataclass
 class Choice:
-    """Kinds of motion, the best first, and by how many times the noise the hypotheses differ on each; chosen: what to record."""
+    """Kinds of motion, the best first, and by how many times the noise the hypotheses differ on each; chosen: what to
+    record."""
 
     scores: dict[str, float]
     chosen: list[str]
@@ -36,7 +37,10 @@ class Choice:
         """The choice in words."""
         ranked = sorted(self.scores.items(), key=lambda s: -s[1])
         if not self.settles:
-            return f"none settles it: the two differ by {ranked[0][1]:.1f} times the noise on {ranked[0][0]}, and by less on the others"
+            return (
+                f"none settles it: the two differ by {ranked[0][1]:.1f} times the noise on {ranked[0][0]}, and by "
+                "less on the others"
+            )
         first = f"on {ranked[0][0]} the two differ by {ranked[0][1]:.1f} times the noise"
         return first + (f" ({', '.join(f'{k} {v:.1f}' for k, v in ranked[1:])})" if len(ranked) > 1 else "")
 
@@ -54,7 +58,9 @@ def rival_of(search: JointSearch, outcome, effect: str, rival: str | None) -> Tr
     return search.fitted.get(frozenset(rest)) if rest else outcome.none
 
 
-def choose(m: Mechanism, search: JointSearch, a: Trial, b: Trial, seed: int = 0, kinds: Sequence[str] = KINDS, most: int = 2) -> Choice:
+def choose(
+    m: Mechanism, search: JointSearch, a: Trial, b: Trial, seed: int = 0, kinds: Sequence[str] = KINDS, most: int = 2
+) -> Choice:
     """The motions of one joint that tell hypothesis a from b. Raises UserError where nothing safe can be planned."""
     case = search.case
     made = plan(m, [case.joint], list(kinds), seed, repeats=0)
@@ -67,8 +73,8 @@ def choose(m: Mechanism, search: JointSearch, a: Trial, b: Trial, seed: int = 0,
 
 
 def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Trial, p: Plan) -> dict[str, float]:
-    """rms difference of the positions that two hypotheses predict on each kind of motion of a plan, over the joint's noise,
-    with what the refitted figures of `a` could make up for taken out."""
+    """rms difference of the positions that two hypotheses predict on each kind of motion of a plan, over the joint's
+    noise, with what the refitted figures of `a` could make up for taken out."""
     every = max(1, round(1 / RATE / float(p.run.t[1] - p.run.t[0])))
     t = p.run.t[::every]
     column = m.joints.index(case.joint)

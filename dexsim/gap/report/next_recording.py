@@ -18,7 +18,13 @@ from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
 
-def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (), recordings: Sequence[Any] = ()) -> None:
+def plan_next(
+    d: Diagnosis,
+    s: Settings,
+    m: Mechanism,
+    outcomes: Sequence[tuple[Case, JointSearch, Outcome]] = (),
+    recordings: Sequence[Any] = (),
+) -> None:
     """What to record next, written ready to send where a safe plan exists."""
     data = d.data
     named = [f for f in data["findings"] if modelled(f)]
@@ -29,16 +35,26 @@ def plan_next(d: Diagnosis, s: Settings, m: Mechanism, outcomes: Sequence[tuple[
         return
     if unsure:
         f = unsure[0]
-        rivals = list(dict.fromkeys(f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])]))
+        rivals = list(
+            dict.fromkeys(f["indistinguishable"] or [f["effect"], *(a["effect"] for a in f["alternatives"][:1])])
+        )
         joints = f["where"]["joints"]
         kinds = sorted({k for e in rivals for k in EFFECTS.get(e, Effect).motions})
-        head = f"to tell {' from '.join(rivals)} on {joints[0]}" if len(rivals) > 1 else f"to make sure of {rivals[0]} on {joints[0]}"
+        head = (
+            f"to tell {' from '.join(rivals)} on {joints[0]}"
+            if len(rivals) > 1
+            else f"to make sure of {rivals[0]} on {joints[0]}"
+        )
         experiment = separating(rivals) if all(r in EFFECTS for r in rivals) else EFFECTS[f["effect"]].experiment
         why = f"{head}: {experiment}"
         choice = _choice(d, s, m, outcomes, f, rivals)
         if choice is not None:
             kinds = choice.chosen
-            why = f"{head}: {' and '.join(kinds)}, because {choice.text}" if choice.settles else f"{why}. Of the motions that can be planned here, {choice.text}"
+            why = (
+                f"{head}: {' and '.join(kinds)}, because {choice.text}"
+                if choice.settles
+                else f"{why}. Of the motions that can be planned here, {choice.text}"
+            )
     elif data["verdict"] in ("unknown", "partly_explained"):
         worst = max(d.joints, key=lambda j: d.joints[j]["after"]) if d.joints else None
         joints, kinds = ([worst] if worst else None), ["triangles", "ladder", "chirp", "steps", "holds"]
@@ -74,9 +90,13 @@ def _choice(d: Diagnosis, s: Settings, m: Mechanism, outcomes, f: dict, rivals: 
 
 
 def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Sequence[Any]) -> None:
-    """The presses again, as they were sent, with what was missing: nothing else is known to be safe against the object."""
+    """The presses again, as they were sent, with what was missing: nothing else is known to be safe against the
+    object."""
     names = " from ".join(dict.fromkeys(f["indistinguishable"] or [f["effect"]]))
-    why = f"to tell {names} on {place(f)}: {entry(f).experiment}; the same commands, with /external_force of a load cell recorded beside /tactile"
+    why = (
+        f"to tell {names} on {place(f)}: {entry(f).experiment}; the same commands, with /external_force of a load "
+        "cell recorded beside /tactile"
+    )
     d.data["next_recording"] = {"why": why, "commands": None}
     pads = {w["recording"] for w in f["when"]}
     sent = [r for r in recordings if r.path.name in pads and len(r.commands)]
@@ -86,7 +106,11 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
 
     best = max(sent, key=lambda r: sum(w["end"] - w["start"] for w in f["when"] if w["recording"] == r.path.name))
     meta = {k: v for k, v in best.meta.items() if k in ("robot", "gravity")} | {
-        "source": "sim", "effort_is": "none", "effort_sign": "+1", "notes": f"commands to send, not a measurement: those of {best.path.name}"}  # fmt: skip
+        "source": "sim",
+        "effort_is": "none",
+        "effort_sign": "+1",
+        "notes": f"commands to send, not a measurement: those of {best.path.name}",
+    }
     with outputs.staged(s.out) as stage:
         with Writer(stage / "next_recording.mcap", best.joints, meta, start_ns=1_000_000_000) as w:
             for t, row in zip(best.commands.t, best.commands.value, strict=True):

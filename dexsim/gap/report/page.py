@@ -1,6 +1,8 @@
-"""report.html: one page that stands alone, read in a minute. Its figures are inline SVG: no script, no network, no font.
+"""report.html: one page that stands alone, read in a minute. Its figures are inline SVG: no script, no network, no
+font.
 
-A class and a template each section: the class (`gap.report.sections`) says what is shown, the template (`templates/`) how it looks.
+A class and a template each section: the class (`gap.report.sections`) says what is shown, the template (`templates/`)
+how it looks.
 """
 
 from __future__ import annotations
@@ -17,7 +19,11 @@ if TYPE_CHECKING:
     from dexsim.gap.result import Diagnosis
 
 ENVIRONMENT = Environment(
-    loader=PackageLoader("dexsim.gap.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    loader=PackageLoader("dexsim.gap.report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
 )
 
 

@@ -20,14 +20,16 @@ def pad(error: np.ndarray, marked: set[int], size: float = 15.0) -> str:
     most = max(float(error.max()), 1e-9)
     width, height = COLUMNS * size + 2, ROWS * size + 2
     out = [
-        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error of each taxel">'
+        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error '
+        'of each taxel">'
     ]
     for k, e in enumerate(error):
         c, r = divmod(k, ROWS)
         x, y = 1 + c * size, 1 + (ROWS - 1 - r) * size
         ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
         out.append(
-            f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>'
+            f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" '
+            f'fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>'
         )
     return "".join(out) + "</svg>"
 
@@ -163,7 +165,8 @@ def mechanism(
             if inside:
                 a, b = at(data.xanchor[inside[-1]])[0], at(data.xanchor[i])[0]
                 out.append(
-                    f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" stroke-width="2"/>'
+                    f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" '
+                    'stroke-width="2"/>'
                 )
                 break
             parent = int(model.body_parentid[parent])
@@ -174,7 +177,9 @@ def mechanism(
                 mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
                 size = 2.2 if scale < 4000 else 5.0
                 out.append(
-                    f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} mN</title></circle>'
+                    f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
+                    f'fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} '
+                    'mN</title></circle>'
                 )
     top = max([*error.values(), 1e-12])
     labels = []
@@ -187,7 +192,8 @@ def mechanism(
             else ""
         )
         out.append(
-            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>'
+            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" '
+            f'stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>'
         )
         if names[i] in found:
             labels.append((x, y, names[i]))
@@ -195,6 +201,7 @@ def mechanism(
         side = "end" if x > 0.62 * width else "start"
         dx = -17 if side == "end" else 17
         out.append(
-            f'<g stroke="#fff" stroke-width="3" paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
+            '<g stroke="#fff" stroke-width="3" '
+            f'paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
         )
     return "".join(out) + "</svg>"

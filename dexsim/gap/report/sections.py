@@ -24,7 +24,11 @@ VERDICTS = {
     "explained": ("Explained", "good"), "partly_explained": ("Partly explained", "warn"), "unknown": ("Unknown", "bad"),
     "none": ("Nothing missing", "good"), "unusable": ("Cannot be judged", "bad"),
 }  # fmt: skip
-FLOORS = {"repeats": "repeats of the same commands", "split": "the scatter of single samples", "quantum": "the encoder's step"}
+FLOORS = {
+    "repeats": "repeats of the same commands",
+    "split": "the scatter of single samples",
+    "quantum": "the encoder's step",
+}
 MOST = 6  # joints beside the picture; the rest is in the details
 
 
@@ -57,7 +61,14 @@ class Hero(Section):
             if said.endswith(text):
                 said, replayed = said[: -len(text)].rstrip(), text
         kept = h.get("how") or ", ".join(h["recordings"])
-        return {"word": word, "tone": tone, "said": said, "replayed": replayed, "judged": h["before"] is not None, "kept": kept}
+        return {
+            "word": word,
+            "tone": tone,
+            "said": said,
+            "replayed": replayed,
+            "judged": h["before"] is not None,
+            "kept": kept,
+        }
 
 
 class Where(Section):
@@ -70,18 +81,34 @@ class Where(Section):
         if d.mechanism is None or not (d.joints or d.touch is not None):
             return None
         named = {j for f in d.data["findings"] for j in f["where"]["joints"]}
-        marked = {t for f in d.data["findings"] if "taxels" in f["parameters"] for t in f["where"]["taxels"] if len(f["where"]["taxels"]) <= 40}
+        marked = {
+            t
+            for f in d.data["findings"]
+            if "taxels" in f["parameters"]
+            for t in f["where"]["taxels"]
+            if len(f["where"]["taxels"]) <= 40
+        }
         taxels = d.touch.error if d.touch is not None else None
         before = {j: v["before"] for j, v in d.joints.items()}
         height = 400 if d.joints else 240
-        picture, words = mechanism(d.mechanism.spec.compile(), before, named, taxels, marked, self.unit, height=height), []
+        picture, words = (
+            mechanism(d.mechanism.spec.compile(), before, named, taxels, marked, self.unit, height=height),
+            [],
+        )
         if d.joints:
             words.append("Joints by their error before; ringed where something was found.")
             picture += scale(max(before.values()), self.unit)
         if taxels is not None:
-            words.append("The lattices are the pads' taxels, tip above, coloured by their error before; ringed where they are named.")
+            words.append(
+                "The lattices are the pads' taxels, tip above, coloured by their error before; ringed where they are "
+                "named."
+            )
         several = len(d.joints) + (len(d.touch.pads) if d.touch else 0) > 1
-        spots = _ratios(d, ((4, "position"), (2, "effort")), len(d.joints) > 1, 560, 250) if len(d.joints) <= 2 and d.spots else None
+        spots = (
+            _ratios(d, ((4, "position"), (2, "effort")), len(d.joints) > 1, 560, 250)
+            if len(d.joints) <= 2 and d.spots
+            else None
+        )
         return {
             "picture": Markup(picture),
             "pads": None if taxels is None else self._pads(taxels, marked),
@@ -149,7 +176,9 @@ class Findings(Section):
             "name": _name(f["effect"]),
             "where": where,
             "confidence": f"{100 * f['confidence']:.0f}",
-            "words": f"{_capital(spoken(f))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}." if e is not None else f"{where}: {f['regime']}.",
+            "words": f"{_capital(spoken(f))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}."
+            if e is not None
+            else f"{where}: {f['regime']}.",
             "parameters": [_parameter(key, p) for key, p in f["parameters"].items() if p["value"] is not None],
             "strip": self._strip(f),
             "before": number(k * h["before"]) if h else "",
@@ -178,9 +207,14 @@ class Findings(Section):
     def _lost(self, f: dict[str, Any]) -> dict[str, Any]:
         """The runner-up and why it lost, or the set that cannot be told apart."""
         rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
-        out: dict[str, Any] = dict.fromkeys(("set", "separating", "lone", "open", "rival", "then", "wins", "replayed"), "")
+        out: dict[str, Any] = dict.fromkeys(
+            ("set", "separating", "lone", "open", "rival", "then", "wins", "replayed"), ""
+        )
         if f["indistinguishable"]:
-            return out | {"set": " and ".join(_name(x) for x in f["indistinguishable"]), "separating": f["separating_experiment"]}
+            return out | {
+                "set": " and ".join(_name(x) for x in f["indistinguishable"]),
+                "separating": f["separating_experiment"],
+            }
         if not f["held_out"]:  # found before any fit: a signal, or a push from outside
             return out
         if not rivals:
@@ -205,7 +239,10 @@ class Findings(Section):
     def _nearest(self) -> list[dict[str, str]]:
         """The effects that a search priced highest and did not find."""
         scanned = sorted(((o.joint, *x) for o in self.d.outcomes for x in o.scanned), key=lambda r: -r[2])[:5]
-        return [{"joint": j, "effect": _name(e), "gain": f"{100 * gain:.1f}", "chance": f"{p:.2f}"} for j, e, gain, p in scanned]
+        return [
+            {"joint": j, "effect": _name(e), "gain": f"{100 * gain:.1f}", "chance": f"{p:.2f}"}
+            for j, e, gain, p in scanned
+        ]
 
 
 class Curves(Section):
@@ -218,7 +255,10 @@ class Curves(Section):
         found = {j for f in d.data["findings"] for j in f["where"]["joints"]}
         order = sorted(d.curves, key=lambda c: (c.joint not in found, -d.joints[c.joint]["before"]))
         felt = d.touch.curves[:3] if d.touch is not None else []
-        joints, pads = [self._joint(c, c.joint in found) for c in order[: max(1, min(3, len(found)))]], [self._pad(c) for c in felt]
+        joints, pads = (
+            [self._joint(c, c.joint in found) for c in order[: max(1, min(3, len(found)))]],
+            [self._pad(c) for c in felt],
+        )
         if not joints and not pads:
             return None
         grey = "command" if joints else "load cell" if any(c.load is not None for c in felt) else ""
@@ -274,9 +314,15 @@ class Details(Section):
     def _notes(self) -> list[str]:
         d, left, notes = self.d, self.d.data["unexplained"], list(self.d.notes)
         if d.untrained:
-            notes.append("fitted, but not a column of the servo table, so training does not carry it: " + ", ".join(d.untrained))
+            notes.append(
+                "fitted, but not a column of the servo table, so training does not carry it: " + ", ".join(d.untrained)
+            )
         if left["depends_on"]:
-            notes.insert(0, f"{100 * (left['fraction_of_gap'] or 0):.0f} % of the gap is left; it depends on " + "; ".join(left["depends_on"]))
+            notes.insert(
+                0,
+                f"{100 * (left['fraction_of_gap'] or 0):.0f} % of the gap is left; it depends on "
+                + "; ".join(left["depends_on"]),
+            )
         return notes
 
     def _confirmed(self) -> dict[str, Any]:
@@ -288,7 +334,10 @@ class Details(Section):
             "recordings": ", ".join(c.recordings),
             "tasks_step": f"{1e3 * TASKS:g}",
             "at_tasks_step": number(1e3 * c.at_tasks_step),
-            "rows": [{"name": name.replace("_", " "), "engine": number(1e3 * a), "plant": number(1e3 * b)} for name, (a, b) in c.errors.items()],
+            "rows": [
+                {"name": name.replace("_", " "), "engine": number(1e3 * a), "plant": number(1e3 * b)}
+                for name, (a, b) in c.errors.items()
+            ],
         }
 
 
@@ -313,12 +362,17 @@ def _capital(text: str) -> str:
 
 
 def _ratios(d: Diagnosis, most: tuple[tuple[int, str], ...], named: bool = True, *size: int) -> Markup:
-    """The regimes in which the error before is largest, the strongest bin of each; so many of each signal. named: with their joint."""
+    """The regimes in which the error before is largest, the strongest bin of each; so many of each signal. named: with
+    their joint."""
     best: dict[tuple[str, str, str], Any] = {}
     for s in d.spots:
         best.setdefault((s.joint, s.of, s.regime), s)
     chosen = [s for count, of in most for s in [x for x in best.values() if x.of == of][:count]]
-    return Markup(charts.ratios([(f"{s.joint}: {s.text}" if named else s.text, s.ratio, s.ratio_low, s.ratio_high) for s in chosen], *size))
+    return Markup(
+        charts.ratios(
+            [(f"{s.joint}: {s.text}" if named else s.text, s.ratio, s.ratio_low, s.ratio_high) for s in chosen], *size
+        )
+    )
 
 
 def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, str]]:
@@ -326,7 +380,9 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, st
     plain, found, rows = d.data["baseline"].get("joints", {}), d.data["findings"], []
     for j, v in sorted(d.joints.items(), key=lambda x: -x[1]["before"])[:most]:
         names = [_name(f["effect"]) + " (hint)" * f.get("hint", False) for f in found if j in f["where"]["joints"]]
-        rows.append(_row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}"))
+        rows.append(
+            _row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}")
+        )
     for finger, v in (d.touch.pads if d.touch else {}).items():
         mine = f"{xhand.FINGERS.index(finger)}:"
         names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
@@ -341,10 +397,18 @@ def _row(where: str, names: list[str], v: dict[str, float], plain: str, noise: s
 
 def _parameter(key: str, p: dict[str, Any]) -> dict[str, Any]:
     """A row of a finding's parameters: a number with its interval, a list, or words."""
-    value, out = p["value"], {"label": key.replace("_", " "), "unit": "" if p["unit"] == "1" else p["unit"], "chart": None}
+    value, out = (
+        p["value"],
+        {"label": key.replace("_", " "), "unit": "" if p["unit"] == "1" else p["unit"], "chart": None},
+    )
     if isinstance(value, list):
         return out | {"text": ", ".join(f"{v:.3g}" for v in value[:8]) + (" ..." if len(value) > 8 else "")}
     if isinstance(value, str):
         return out | {"text": value if len(value) < 60 else value[:57] + "...", "unit": ""}
     low, high = number(p["low"]), number(p["high"])
-    return out | {"text": number(value, 4), "low": low, "high": high, "chart": Markup(charts.interval(value, p["low"], p["high"]))}
+    return out | {
+        "text": number(value, 4),
+        "low": low,
+        "high": high,
+        "chart": Markup(charts.interval(value, p["low"], p["high"])),
+    }

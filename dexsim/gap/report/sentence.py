@@ -10,13 +10,20 @@ from dexsim.gap.result import Diagnosis
 from dexsim.recording.mechanism import Mechanism
 
 
-
 def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     """The verdict in one or two sentences."""
     h = data["held_out"]
     metric = h["error"]
     effort = metric.startswith("effort")
-    unit = ("mN" if metric.endswith("_N") else "mN.m") if effort else "mN" if metric.startswith("tactile") else "mm" if metric.endswith("_m") else "mrad"
+    unit = (
+        ("mN" if metric.endswith("_N") else "mN.m")
+        if effort
+        else "mN"
+        if metric.startswith("tactile")
+        else "mm"
+        if metric.endswith("_m")
+        else "mrad"
+    )
     if unit == "mN" and not effort:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
@@ -24,25 +31,49 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
     pushed = [f for f in data["findings"] if entry(f) is not None and not modelled(f)]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
-    prefix = f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} ({bad[0]['regime']}). " if bad else ""
+    prefix = (
+        f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} "
+        f"({bad[0]['regime']}). "
+        if bad
+        else ""
+    )
     prefix += "".join(f"{spoken(f)[:1].upper() + spoken(f)[1:]} {words_of(f, d.mechanism)}{_size(f)}. " for f in pushed)
     if data["verdict"] == "none":
-        return prefix + f"Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
+        return (
+            prefix
+            + "Nothing in the catalogue is missing: the simulator follows recordings not used for the fit to "
+              f"{before:.2g} {unit}; {limit}."
+        )
     if data["verdict"] == "explained" and not named and bad:
-        return prefix + f"Beside that nothing is missing: the simulator follows recordings not used for the fit to {before:.2g} {unit}; {limit}."
+        return (
+            prefix
+            + f"Beside that nothing is missing: the simulator follows recordings not used for the fit to {before:.2g} "
+              f"{unit}; {limit}."
+        )
     if not named:
-        depends = "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2]) if data["unexplained"]["depends_on"] else ""
-        return prefix + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where {limit}{depends}."
+        depends = (
+            "; it depends on " + ", ".join(data["unexplained"]["depends_on"][:2])
+            if data["unexplained"]["depends_on"]
+            else ""
+        )
+        return (
+            prefix
+            + f"Something is missing that no effect of the catalogue explains: {number(before)} {unit} are left where "
+              f"{limit}{depends}."
+        )
     of = ""
     alone = {j for f in named for j in f["where"]["joints"]}
-    if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):  # not thinned by joints that are well
+    # not thinned by joints that are well
+    if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):
         of, mine = " of that joint", d.joints[next(iter(alone))]
         before, after = 1e3 * mine["before"], 1e3 * mine["after"]
     parts = []
     for f in named[:2]:
         words = words_of(f, d.mechanism)
         others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
-        parts.append(f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else ""))
+        parts.append(
+            f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else "")
+        )
     first = named[0]["where"]["joints"]
     if not first or first[0] in spoken(named[0])[1:]:
         parts[0] = parts[0][:1].upper() + parts[0][1:]
@@ -51,7 +82,10 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     it = "it" if len(named) == 1 else "them"
     if h["before"] is None:
         return prefix + "; ".join(parts) + more + "."
-    tail = f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on recordings not used for the fit"
+    tail = (
+        f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on "
+        "recordings not used for the fit"
+    )
     return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
 
 
@@ -68,8 +102,16 @@ def spoken(f: dict) -> str:
     if joint not in xhand.JOINTS:
         return joint if "joint" in joint.lower() else f"joint {joint}"
     finger, _, rest = joint.partition("_")
-    whose = {"thumb": "the thumb's", "mid": "the middle finger's", "pinky": "the little finger's"}.get(finger, f"the {finger} finger's")
-    kind = "sideways joint" if "bend" in rest and finger != "thumb" else "bending joint" if "bend" in rest else f"{ORDER.get(rest[-1], '')} joint".strip()
+    whose = {"thumb": "the thumb's", "mid": "the middle finger's", "pinky": "the little finger's"}.get(
+        finger, f"the {finger} finger's"
+    )
+    kind = (
+        "sideways joint"
+        if "bend" in rest and finger != "thumb"
+        else "bending joint"
+        if "bend" in rest
+        else f"{ORDER.get(rest[-1], '')} joint".strip()
+    )
     return f"{whose} {kind} ({joint})"
 
 
@@ -96,7 +138,12 @@ def place(f: dict) -> str:
         pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
         count = len(f["where"]["taxels"])
         fingers = " and ".join(xhand.FINGERS[p] for p in pads)
-        return f"the {fingers}'s pad" if count > 12 or "taxels" not in f["parameters"] else f"the {fingers}'s pad (taxel{'s' * (count > 1)} {', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+        return (
+            f"the {fingers}'s pad"
+            if count > 12 or "taxels" not in f["parameters"]
+            else f"the {fingers}'s pad (taxel{'s' * (count > 1)} "
+                 f"{', '.join(t.split(':')[1] for t in f['where']['taxels'])})"
+        )
     return ", ".join(f["where"]["topics"])
 
 
@@ -112,4 +159,7 @@ def _size(f: dict) -> str:
         return f" ({name} {np.degrees(number[0]):.3g} degrees)"
     if p["unit"] == "s" and len(number) == 1:
         return f" ({name.replace('_', ' ')} {1e3 * number[0]:.3g} ms)"
-    return f" ({name.replace('_', ' ')} {' '.join(f'{v:.3g}' for v in number)}{' ' + p['unit'] if p['unit'] not in ('1', '') else ''})"
+    return (
+        f" ({name.replace('_', ' ')} "
+        f"{' '.join(f'{v:.3g}' for v in number)}{' ' + p['unit'] if p['unit'] not in ('1', '') else ''})"
+    )

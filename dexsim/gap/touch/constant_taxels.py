@@ -66,15 +66,25 @@ def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, flo
 def finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
     """Gains of 0 of taxels ("pad:k"), as `diagnosis.json` has a finding."""
     return {
-        "effect": TactileGain.id, "confidence": confidence, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
-        "where": {"joints": [], "taxels": names, "topics": ["/tactile"]}, "regime": regime, "when": [],
-        "parameters": {"gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"}, "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""}},
+        "effect": TactileGain.id,
+        "confidence": confidence,
+        "alternatives": [],
+        "indistinguishable": [],
+        "separating_experiment": None,
+        "where": {"joints": [], "taxels": names, "topics": ["/tactile"]},
+        "regime": regime,
+        "when": [],
+        "parameters": {
+            "gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"},
+            "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""},
+        },
         "held_out": None,
-    }  # fmt: skip
+    }
 
 
 def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
-    """The finding of a pad's taxels that read the same although the plant has them pressed. silent: their reading [N] by number."""
+    """The finding of a pad's taxels that read the same although the plant has them pressed. silent: their reading [N]
+    by number."""
     if not silent:
         return None
     kinds = {"dead": [k for k, v in silent.items() if v == 0], "stuck": [k for k, v in silent.items() if v != 0]}

@@ -27,7 +27,6 @@ from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 
 
-
 @dataclass
 class Pad:
     """One pad under way: what each step found out of it, for the next ones."""
@@ -46,7 +45,8 @@ class Pad:
 
 
 class Touch(Steps):
-    """The touch of all recordings. held: names of those kept out of the fit; allowed: effects that are considered, None for all."""
+    """The touch of all recordings. held: names of those kept out of the fit; allowed: effects that are considered, None
+    for all."""
 
     def __init__(
         self,
@@ -80,7 +80,8 @@ class Touch(Steps):
             seconds = sum(float(np.sum(r.z.sum(1) > 0.1) * np.median(np.diff(r.t))) for r in runs)
             if seconds < TOUCH.short:
                 pad.notes.append(
-                    f"the {pad.name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least {TOUCH.short:g} s)"
+                    f"the {pad.name}'s pad is touched for {seconds:.1f} s only: its forces are not judged (at least "
+                    f"{TOUCH.short:g} s)"
                 )
                 continue
             names = {r.recording for r in runs}
@@ -88,7 +89,9 @@ class Touch(Steps):
             if not pad.kept and len(names) >= 3:
                 pad.kept = {runs[-1].recording}
             data = self.data
-            pad.search = PadSearch(runs, pad.kept, data.scale_known, data.thermometer, self.seed + pad.number, self.allowed)
+            pad.search = PadSearch(
+                runs, pad.kept, data.scale_known, data.thermometer, self.seed + pad.number, self.allowed
+            )
 
     def search(self) -> None:
         """Which effects each pad has."""

@@ -1,4 +1,5 @@
-"""A pad's plant fitted to what was recorded: which residuals count, least squares, gains of single taxels, intervals."""
+"""A pad's plant fitted to what was recorded: which residuals count, least squares, gains of single taxels,
+intervals."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Sample:
 
 @dataclass
 class TouchTrial:
-    """A hypothesis: effects, values, gains and order of taxels (None where not fitted), residuals in sigmas by block."""
+    """A hypothesis: effects, values, gains and order of taxels (None where not fitted), residuals in sigmas by
+    block."""
 
     ids: tuple[str, ...]
     values: dict[str, float]
@@ -47,9 +49,18 @@ class TouchTrial:
 
 
 class PadFit:
-    """One pad's readings and the plant fitted to them. held: names of recordings kept out; with none, the last quarter of each recording's time."""
+    """One pad's readings and the plant fitted to them. held: names of recordings kept out; with none, the last quarter
+    of each recording's time."""
 
-    def __init__(self, runs: list[PadRun], held: set[str], scale_known: bool, thermometer: bool, seed: int = 0, allowed: set[str] | None = None):
+    def __init__(
+        self,
+        runs: list[PadRun],
+        held: set[str],
+        scale_known: bool,
+        thermometer: bool,
+        seed: int = 0,
+        allowed: set[str] | None = None,
+    ):
         self.runs, self.scale_known, self.allowed = runs, scale_known, allowed
         self.rng = np.random.default_rng(seed)
         self.load = all(r.load is not None for r in runs)
@@ -80,7 +91,9 @@ class PadFit:
         self.thermometer = thermometer
 
     def _slid(self) -> bool:
-        return any(np.ptp(r.slide[np.interp(r.grid, r.t, r.z.sum(1)) > 0.3], axis=0).max(initial=0.0) > 2e-4 for r in self.runs)
+        return any(
+            np.ptp(r.slide[np.interp(r.grid, r.t, r.z.sum(1)) > 0.3], axis=0).max(initial=0.0) > 2e-4 for r in self.runs
+        )
 
     def _noise(self) -> float:
         """N, of one reading: from the counts, or the scatter about a local parabola where there are none."""
@@ -90,14 +103,18 @@ class PadFit:
         return max(lsb / np.sqrt(12), min(scatter, 5 * lsb) if lsb else scatter, 1e-4)
 
     def _silent(self) -> dict[int, float]:
-        """Taxels whose reading never changes although they are pressed: taxel -> the reading [N] (0: dead, else stuck)."""
+        """Taxels whose reading never changes although they are pressed: taxel -> the reading [N] (0: dead, else
+        stuck)."""
         z = np.concatenate([r.z for r in self.runs])
         p = np.concatenate([readings(r, self.base) for r in self.runs])
         step = max(r.lsb for r in self.runs)
         still = np.ptp(z, axis=0) <= max(0.5 * step, 1e-9)
         pressed = p.max(0) > max(8 * self.noise, 4 * step)
         # the object may touch beside where the joints say: neighbours on both sides must feel it
-        near = [sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside)) for beside in neighbours()[: z.shape[1]]]
+        near = [
+            sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside))
+            for beside in neighbours()[: z.shape[1]]
+        ]
         pressed &= np.array(near)
         stuck = still & (z[0] > 2 * step)
         return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
@@ -110,11 +127,15 @@ class PadFit:
             quiet = 1.0 * r.lsb
             mask = ((r.z > quiet) | (expected > quiet)) & ~r.full
             mask[:, list(self.silent)] = False
-            sigma = np.sqrt(self.noise**2 + (TOUCH.plant * np.maximum(r.z, 0.0)) ** 2 + (TOUCH.timing * _rate(r.t, r.z)) ** 2)
+            sigma = np.sqrt(
+                self.noise**2 + (TOUCH.plant * np.maximum(r.z, 0.0)) ** 2 + (TOUCH.timing * _rate(r.t, r.z)) ** 2
+            )
             out.append(self._sample(r, i, "taxels", mask, sigma, r.t, held))
             if self.load:
                 touched = (r.load > 0.05 * r.load.max()) | (cell(r, v) > 0.05)
-                wide = np.sqrt(self.load_noise**2 + (TOUCH.plant * r.load) ** 2 + (TOUCH.timing * _rate(r.grid, r.load)) ** 2)
+                wide = np.sqrt(
+                    self.load_noise**2 + (TOUCH.plant * r.load) ** 2 + (TOUCH.timing * _rate(r.grid, r.load)) ** 2
+                )
                 # the grid is denser than the readings: neighbours say the same
                 mine = touched & (np.arange(len(r.grid)) % 2 == 0)
                 out.append(self._sample(r, i, "cell", mine, wide, r.grid, held))
@@ -147,13 +168,19 @@ class PadFit:
 
     def stage_of(self) -> np.ndarray:
         """Number of the stage (0 taxels, 1 cell, 2 shear) of each residual."""
-        return np.concatenate([np.full(int(s.mask.sum()), ("taxels", "cell", "shear").index(s.stage)) for s in self.samples])
+        return np.concatenate(
+            [np.full(int(s.mask.sum()), ("taxels", "cell", "shear").index(s.stage)) for s in self.samples]
+        )
 
     def _keys(self, ids: tuple[str, ...], mapped: bool = False) -> tuple[str, ...]:
         effects = [TOUCH_EFFECTS[e] for e in ids]
         keys = [k for e in effects for k in e.fits if not (e.by_taxel and mapped)]
         # single taxels' gains leave nothing to a common one
-        keys += ([] if mapped and self.scale_known else ["scale"]) + ["zero", "along", "across", "spread"] + (["skin"] if self.shear else [])
+        keys += (
+            ([] if mapped and self.scale_known else ["scale"])
+            + ["zero", "along", "across", "spread"]
+            + (["skin"] if self.shear else [])
+        )
         if not any("clock" in e.replaces for e in effects):
             keys.append("clock")
         return tuple(dict.fromkeys(keys))
@@ -168,9 +195,18 @@ class PadFit:
             return -0.7 / self.warm, 0.7 / self.warm
         return p.low, p.high
 
-    def fit(self, ids: tuple[str, ...], start: dict[str, float], where: np.ndarray | None = None, gains=None, order=None, evaluations: int = 60,
-            still: tuple[str, ...] = ()) -> TouchTrial:
-        """Least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default: training), from `start`."""
+    def fit(
+        self,
+        ids: tuple[str, ...],
+        start: dict[str, float],
+        where: np.ndarray | None = None,
+        gains=None,
+        order=None,
+        evaluations: int = 60,
+        still: tuple[str, ...] = (),
+    ) -> TouchTrial:
+        """Least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default: training),
+        from `start`."""
         keys = tuple(k for k in self._keys(ids, gains is not None) if k not in still)
         where = self.train if where is None else where
         low, high = np.array([self._bounds(k) for k in keys]).T
@@ -180,7 +216,9 @@ class PadFit:
         free = {k for k in keys if PARAMS[k].nuisance and not (k == "scale" and not self.scale_known)}
         centre = np.array([PARAMS[k].neutral for k in keys])
         soft = np.array([1.0 if k in free else 0.0 for k in keys])
-        x0 = np.clip([start.get(k, PARAMS[k].neutral) for k in keys], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+        x0 = np.clip(
+            [start.get(k, PARAMS[k].neutral) for k in keys], low + 1e-6 * (high - low), high - 1e-6 * (high - low)
+        )
 
         def values(x):
             fixed = {"scale": start["scale"]} if "scale" not in keys and "scale" in start else {}
@@ -191,8 +229,16 @@ class PadFit:
             # a nuisance is believed within its scale: a prior as strong as one block of readings
             return np.concatenate([self.residual(values(x), gains, order)[where], 3.0 * soft * (x - centre) / scale])
 
-        found = least_squares(error, x0 / scale, bounds=(low / scale, high / scale), loss="soft_l1", f_scale=3.0, diff_step=1e-2, x_scale=1.0,
-                              max_nfev=max(6, evaluations // max(len(keys), 1)))  # fmt: skip
+        found = least_squares(
+            error,
+            x0 / scale,
+            bounds=(low / scale, high / scale),
+            loss="soft_l1",
+            f_scale=3.0,
+            diff_step=1e-2,
+            x_scale=1.0,
+            max_nfev=max(6, evaluations // max(len(keys), 1)),
+        )
         v = values(found.x * scale)
         n = int(where.sum())
         return TouchTrial(ids, v, gains, order, keys, found.jac[:n] / scale, self.residual(v, gains, order))
@@ -247,8 +293,8 @@ class PadFit:
         return float(np.where(a <= 3, a * a, 6 * a - 9).sum())
 
     def _rounding(self, trial: TouchTrial) -> np.ndarray:
-        """[P] rms by which the numbers come back wrong from their own readings in whole counts, at three slightly different
-        levels: a held force rounds to the same side for as long as it is held, which no scatter shows."""
+        """[P] rms by which the numbers come back wrong from their own readings in whole counts, at three slightly
+        different levels: a held force rounds to the same side for as long as it is held, which no scatter shows."""
         if not trial.keys or not any(r.lsb for r in self.runs):
             return np.zeros(len(trial.keys))
         kept = [r.z for r in self.runs]
@@ -259,15 +305,21 @@ class PadFit:
                     exact = level * readings(r, trial.values, trial.gains, trial.order)
                     r.z = np.round(exact / r.lsb) * r.lsb if r.lsb else exact
                 again = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 18)
-                off.append([(again.values[k] - trial.values[k]) if k not in ("gain", "scale", "stiffness") else 0.0 for k in trial.keys])
+                off.append(
+                    [
+                        (again.values[k] - trial.values[k]) if k not in ("gain", "scale", "stiffness") else 0.0
+                        for k in trial.keys
+                    ]
+                )
         finally:
             for r, z in zip(self.runs, kept, strict=True):
                 r.z = z
         return np.sqrt(np.mean(np.square(off), 0))
 
     def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
-        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what whole counts do
-        to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in squares."""
+        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what
+        whole counts do to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
+        squares."""
         keys = trial.keys
         fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
         J, r = fitted.jac, np.clip(fitted.res[self.train], -3, 3)
@@ -282,7 +334,11 @@ class PadFit:
         cov = A @ (scores.T @ scores * n / max(n - 1, 1) + prior) @ A
         variance = np.maximum(np.diag(cov), 0.0) * scale**2
         self.cross(trial)
-        folds = np.array([[f[k] for k in fitted.keys] for f in trial.folds]) if len(trial.folds) > 1 else np.zeros((1, len(fitted.keys)))
+        folds = (
+            np.array([[f[k] for k in fitted.keys] for f in trial.folds])
+            if len(trial.folds) > 1
+            else np.zeros((1, len(fitted.keys)))
+        )
         m = len(folds)
         variance += (m - 1) / max(m, 1) * ((folds - folds.mean(0)) ** 2).sum(0)
         variance += self._rounding(fitted) ** 2

@@ -2,8 +2,9 @@
 
 Which setting an effect writes stands in its class (`dexsim.gap.effects`).
 
-A world has one friction and one stiffness for all fingertips: their ranges hold what was found on every fingertip, and what was
-believed where a fingertip was judged and nothing was found. The range of what is not sure holds what was believed as well.
+A world has one friction and one stiffness for all fingertips: their ranges hold what was found on every fingertip, and
+what was believed where a fingertip was judged and nothing was found. The range of what is not sure holds what was
+believed as well.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from dexsim.tactile.pads import PAD_COLUMNS
 SHARED = ("object.friction", "contact.stiffness")  # a world has one for all fingertips
 
 HEAD = """\
-# What diagnose.py found of touch and contact: python train.py task=grasp tactile_file=FILE (play.py too) lays it over the tactile
-# group and the task's ranges. value is the best guess; low to high is drawn anew in each world at each episode.
+# What diagnose.py found of touch and contact: python train.py task=grasp tactile_file=FILE (play.py too) lays it over
+# the tactile group and the task's ranges. value is the best guess; low to high is drawn anew in each world at each
+# episode.
 """
 
 
@@ -61,8 +63,10 @@ def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts]) -> Handed
         unsure = ", not sure: its range holds what was believed" if doubt else ""
         out.said.append(f"{name}: {either}, confidence {f['confidence']:.2f}{unsure}")
         if doubt:
-            out.doubts.append(f"{f['effect']} on the {name}'s pad is not sure: in tactile.yaml its range holds what was "
-                              f"believed as well{lost}")  # fmt: skip
+            out.doubts.append(
+                f"{f['effect']} on the {name}'s pad is not sure: in tactile.yaml its range holds what was "
+                f"believed as well{lost}"
+            )
     for name, drift in drifts.items():
         values = pads[name].values
         values["gain"] = times(values.get("gain"), drift)
@@ -81,7 +85,9 @@ def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts]) -> Handed
         if by_pad:
             out.randomize[key] = ranged(_hull(key, by_pad, facts), *RANGES[key][1:])
     if "object.friction" in out.randomize:
-        out.tactile["friction"] = ranged(_hull("object.friction", shared["object.friction"], facts), *COLUMNS["friction"][1:3])
+        out.tactile["friction"] = ranged(
+            _hull("object.friction", shared["object.friction"], facts), *COLUMNS["friction"][1:3]
+        )
     return out
 
 
@@ -96,8 +102,8 @@ def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
 
 
 def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
-    """Stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares one, and force over depth
-    under and over which a tenth of the force is felt; None where nothing is pressed."""
+    """Stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares one, and
+    force over depth under and over which a tenth of the force is felt; None where nothing is pressed."""
     on = (force > 0.2) & (depth > 1e-4)
     if on.sum() < 5:
         return None
@@ -109,13 +115,18 @@ def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
 
 
 def save(h: Handed, path: Path) -> bool:
-    """Writes the file, whole or not at all. Where there is nothing to hand on, returns False, and an earlier diagnosis's file goes."""
+    """Writes the file, whole or not at all. Where there is nothing to hand on, returns False, and an earlier
+    diagnosis's file goes."""
     content = {k: v for k, v in (("tactile", h.tactile), ("randomize", h.randomize)) if v}
     if not content:
         if path.is_file() and path.read_text(encoding="utf-8").startswith(HEAD):
             path.unlink()
         return False
-    text = HEAD + "".join(f"# {line}\n" for line in h.said) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130)
+    text = (
+        HEAD
+        + "".join(f"# {line}\n" for line in h.said)
+        + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130)
+    )
     part = path.with_name(f".{path.name}.part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)

@@ -1,4 +1,5 @@
-"""One pad's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, facts for training."""
+"""One pad's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, facts
+for training."""
 
 from __future__ import annotations
 
@@ -19,13 +20,13 @@ from dexsim.gap.touch.search import PadOutcome, PadSearch
 from dexsim.gap.touch.settings import Fit, PadFacts
 
 
-
 class PadAnswer:
     """A searched pad on what was kept out.
 
-    before, after: squared errors [N^2] of the signals in which something was found (readings, the cell's force, shear) without any effect and
-    with what was found; times: of each [s], unique over the recordings; bounds: 90 % intervals of the fitted parameters; numbers: rms [N] for
-    the page; facts: what training is told beside the findings. felt: whether what was kept out feels anything; nothing is judged otherwise."""
+    before, after: squared errors [N^2] of the signals in which something was found (readings, the cell's force, shear)
+    without any effect and with what was found; times: of each [s], unique over the recordings; bounds: 90 % intervals
+    of the fitted parameters; numbers: rms [N] for the page; facts: what training is told beside the findings. felt:
+    whether what was kept out feels anything; nothing is judged otherwise."""
 
     def __init__(self, search: PadSearch, outcome: PadOutcome, kept: set[str]):
         self.search, self.outcome, self.kept = search, outcome, kept
@@ -49,7 +50,10 @@ class PadAnswer:
         self.left = float(np.sqrt(e1.mean()))  # what the plant leaves, constant taxels apart
         self.numbers = {"before": rms(self.before), "after": rms(self.after), "noise": search.noise}
         if self.constant is not None:
-            self.constant["held_out"] = {"before": self.numbers["before"], "after": rms(np.concatenate([e0, silent[1]]))}
+            self.constant["held_out"] = {
+                "before": self.numbers["before"],
+                "after": rms(np.concatenate([e0, silent[1]])),
+            }
 
     def findings(self) -> list[dict[str, Any]]:
         """What was found, as `diagnosis.json` says it."""
@@ -72,7 +76,9 @@ class PadAnswer:
         same = [r for r in rivals if touch_confusable(r[0], e) and r[1] >= TOUCH.set_share][:2]
         earned = float(np.clip((b - a) / (JUDGE.earns * b + 1e-12), 0.0, 1.0)) if np.isfinite(a) else 0.5
         if earned <= TOUCH.earned:
-            self.notes.append(f"{e} on the {self.name}'s pad earned its place in training but not on what was kept out; not claimed")
+            self.notes.append(
+                f"{e} on the {self.name}'s pad earned its place in training but not on what was kept out; not claimed"
+            )
             return None
         taxels, parameters = self._parameters(e)
         return {
@@ -93,7 +99,9 @@ class PadAnswer:
         search, best, run = self.search, self.best, self.search.runs[0]
         common = (best.values["gain"], *self.bounds["gain"]) if "gain" in best.keys else None
         warmest = max(float(r.warm.max()) for r in search.runs)
-        return PadFacts(dict(search.silent), common, self._rest(), self._chord(), warmest, run.stiffness, run.friction, search.shear)
+        return PadFacts(
+            dict(search.silent), common, self._rest(), self._chord(), warmest, run.stiffness, run.friction, search.shear
+        )
 
     def nuisance(self) -> dict[str, float]:
         """The refitted beliefs by the keys of `diagnosis.json`."""
@@ -111,7 +119,8 @@ class PadAnswer:
         return loss > TOUCH.structured**2 and self.left > TOUCH.structured * self.floor
 
     def _rest(self) -> Fit | None:
-        """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where they do not."""
+        """Gain of the taxels that hardly felt anything, where those that did agree on one that is not 1; None where
+        they do not."""
         search, t = self.search, self.best
         if t.gains is None:
             return None
@@ -126,7 +135,8 @@ class PadAnswer:
         return (value, low, high) if abs(value - 1) > TOUCH.gain_off and high - low < abs(value - 1) else None
 
     def _chord(self) -> Fit | None:
-        """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are known; None without one."""
+        """The linear contact that stands for a fitted rubber over the recorded presses, as far as its numbers are
+        known; None without one."""
         t = self.best
         if not any("c10" in TOUCH_EFFECTS[e].fits for e in t.ids):
             return None
@@ -150,7 +160,12 @@ class PadAnswer:
             f = factor.get(key, 1.0)
             low, high = self.bounds.get(key, (t.values[key], t.values[key]))
             unit = "1/s" if key == "drift" and not search.thermometer else PARAMS[key].unit
-            out[name] = {"value": float(f * t.values[key]), "low": float(f * low), "high": float(f * high), "unit": unit}
+            out[name] = {
+                "value": float(f * t.values[key]),
+                "low": float(f * low),
+                "high": float(f * high),
+                "unit": unit,
+            }
         felt = sum((r.z > max(2 * r.lsb, 3 * search.noise)).sum(0) for r in search.runs)
         taxels = [f"{self.pad}:{k}" for k in np.flatnonzero(felt > 3)]
         return taxels, out | {k: word(v) for k, v in effect.words_beside.items()}

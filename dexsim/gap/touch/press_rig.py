@@ -1,7 +1,8 @@
-"""A press rig with hidden effects, for tests and the demo of touch: one xHand fingertip, a ball on two slides, 120 taxels, a load cell.
+"""A press rig with hidden effects, for tests and the demo of touch: one xHand fingertip, a ball on two slides, 120
+taxels, a load cell.
 
-The ball's motion and the contact's depth come from MuJoCo's geometry (the tip's hull), the readings from the touch kernels that
-train policies (`dexsim.tactile`): neither is the diagnosis's own plant.
+The ball's motion and the contact's depth come from MuJoCo's geometry (the tip's hull), the readings from the touch
+kernels that train policies (`dexsim.tactile`): neither is the diagnosis's own plant.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ LSB, RATE = 0.1, 90.0
 
 
 def spec(finger: str = "index") -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
-    """The rig: the finger's distal body fixed at the origin, a ball on a slide against the pad's middle and one along it.
-    Also the pressed point [3] m, the direction in which the ball presses [3] and the one in which it slides [3]."""
+    """The rig: the finger's distal body fixed at the origin, a ball on a slide against the pad's middle and one along
+    it. Also the pressed point [3] m, the direction in which the ball presses [3] and the one in which it slides [3]."""
     from dexsim.assets import xhand
 
     f = xhand.FINGERS.index(finger)
@@ -39,15 +40,32 @@ def spec(finger: str = "index") -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, 
     out.add_mesh(name="tip", uservert=_vertices(hand, tip))
     pad = out.worldbody.add_body(name=xhand.TIP_BODIES[f], pos=[0, 0, 0.1])
     # the hand's tip is a hull inside the skin, rounded by its margin
-    pad.add_geom(name="tip", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="tip", margin=float(hand.compile().geom(f"tip_{finger}").margin[0]),
-                 contype=0, conaffinity=0, mass=0.01)
+    pad.add_geom(
+        name="tip",
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="tip",
+        margin=float(hand.compile().geom(f"tip_{finger}").margin[0]),
+        contype=0,
+        conaffinity=0,
+        mass=0.01,
+    )
     at = point + normal * (RADIUS + 2e-3) + [0, 0, 0.1]
     side = out.worldbody.add_body(name="slider", pos=at.tolist())
     side.add_joint(name="slide", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=along.tolist(), range=[-0.01, 0.01])
-    side.add_geom(name="slider", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=(normal * 0.05).tolist(), mass=0.1, contype=0, conaffinity=0)
+    side.add_geom(
+        name="slider",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[1e-3, 0, 0],
+        pos=(normal * 0.05).tolist(),
+        mass=0.1,
+        contype=0,
+        conaffinity=0,
+    )
     ball = side.add_body(name="indenter")
     ball.add_joint(name="press", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(-normal).tolist(), range=[-0.002, 0.006])
-    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.1, contype=0, conaffinity=0)
+    ball.add_geom(
+        name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.1, contype=0, conaffinity=0
+    )
     return out, point, -normal, along
 
 
@@ -68,23 +86,44 @@ def path(kind: int, seconds: float, rng: np.random.Generator, slides: bool) -> t
         x = np.interp(t, [at, at + ramp, at + ramp + hold, at + 2 * ramp + hold], [0, 1, 1, 0]) * deep
         q[:, 1] = np.maximum(q[:, 1], x)
         if slides:
-            q[:, 0] += np.interp(t, [at + ramp, at + ramp + 0.5 * hold, at + ramp + hold], [0, 1, 0]) * rng.uniform(1e-3, 3e-3)
+            q[:, 0] += np.interp(t, [at + ramp, at + ramp + 0.5 * hold, at + ramp + hold], [0, 1, 0]) * rng.uniform(
+                1e-3, 3e-3
+            )
         else:
-            q[:, 0] += np.interp(t, [at - 0.2, at], [0, 1]) * rng.uniform(-2e-3, 2e-3) * (t < at + 2 * ramp + hold + 0.05)
+            q[:, 0] += (
+                np.interp(t, [at - 0.2, at], [0, 1]) * rng.uniform(-2e-3, 2e-3) * (t < at + 2 * ramp + hold + 0.05)
+            )
         at += 2 * ramp + hold + rng.uniform(0.25, 0.6)
     return t, q
 
 
-def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, finger: str = "index", load_cell: bool = True, stiffness: float = 7000.0,
-           friction: float = 0.8, sensor: dict | None = None, gains: dict[int, float] | None = None, swapped: Sequence[tuple[int, int]] = (),
-           stuck: dict[int, float] | None = None, crosstalk: float = 0.0, rubber: tuple[float, float] | None = None, drift: float = 0.0,
-           slides: bool = False, shear: bool = False, pressed: Sequence[np.ndarray] = ()) -> tuple[list[Path], Path, Path]:  # fmt: skip
+def record(
+    folder: Path,
+    count: int = 3,
+    seconds: float = 8.0,
+    seed: int = 0,
+    finger: str = "index",
+    load_cell: bool = True,
+    stiffness: float = 7000.0,
+    friction: float = 0.8,
+    sensor: dict | None = None,
+    gains: dict[int, float] | None = None,
+    swapped: Sequence[tuple[int, int]] = (),
+    stuck: dict[int, float] | None = None,
+    crosstalk: float = 0.0,
+    rubber: tuple[float, float] | None = None,
+    drift: float = 0.0,
+    slides: bool = False,
+    shear: bool = False,
+    pressed: Sequence[np.ndarray] = (),
+) -> tuple[list[Path], Path, Path]:
     """Writes `count` recordings, the rig's model and its servo; returns their paths.
 
-    stiffness N/m, friction: of the contact. sensor: settings of `dexsim.tactile` (hysteresis, delay, ...). gains: taxel -> gain;
-    swapped: pairs of taxels; stuck: taxel -> N; crosstalk: share of its force that a taxel gives its neighbours; rubber: (c10,
-    c01) Pa of a Mooney-Rivlin skin in place of the linear contact; drift: relative gain lost or won a second over all recordings.
-    pressed: contact forces [T] N of each recording that are given, in place of what the spring makes of the depth.
+    stiffness N/m, friction: of the contact. sensor: settings of `dexsim.tactile` (hysteresis, delay, ...). gains: taxel
+    -> gain; swapped: pairs of taxels; stuck: taxel -> N; crosstalk: share of its force that a taxel gives its
+    neighbours; rubber: (c10, c01) Pa of a Mooney-Rivlin skin in place of the linear contact; drift: relative gain lost
+    or won a second over all recordings. pressed: contact forces [T] N of each recording that are given, in place of
+    what the spring makes of the depth.
     """
     import yaml
 
@@ -97,7 +136,22 @@ def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, fi
     paths = []
     for k in range(count):
         t, q = path(k, seconds, rng, slides)
-        recording = _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor or {}, rubber, slides or shear, crosstalk, pressed[k] if len(pressed) else None)
+        recording = _one(
+            model,
+            s,
+            finger,
+            t,
+            q,
+            rng,
+            load_cell,
+            stiffness,
+            friction,
+            sensor or {},
+            rubber,
+            slides or shear,
+            crosstalk,
+            pressed[k] if len(pressed) else None,
+        )
         z = recording.tactile.value
         f = _finger(finger)
         z[:, f] *= 1 + drift * (recording.tactile.t + k * seconds)[:, None, None]
@@ -116,9 +170,14 @@ def record(folder: Path, count: int = 3, seconds: float = 8.0, seed: int = 0, fi
 
 
 def as_trained(content: dict) -> dict:
-    """The settings of `record` for the rig that training would have with a tactile.yaml (its content): every best guess, and what
-    was believed elsewhere."""
-    value = lambda x: {k: value(v) for k, v in x.items()} if isinstance(x, dict) and "value" not in x else x["value"] if isinstance(x, dict) else x  # noqa: E731
+    """The settings of `record` for the rig that training would have with a tactile.yaml (its content): every best
+    guess, and what was believed elsewhere."""
+
+    def value(x):
+        if not isinstance(x, dict):
+            return x
+        return x["value"] if "value" in x else {k: value(v) for k, v in x.items()}
+
     tactile, shared = content.get("tactile", {}), content.get("randomize", {})
     out: dict = {"sensor": {"pads": value(tactile["pads"])}} if "pads" in tactile else {}
     for name, key in (("contact.stiffness", "stiffness"), ("object.friction", "friction")):
@@ -133,7 +192,9 @@ def _finger(finger: str) -> int:
     return xhand.FINGERS.index(finger)
 
 
-def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk, pressed) -> Recording:
+def _one(
+    model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk, pressed
+) -> Recording:
     import torch
 
     from dexsim.assets import xhand
@@ -160,8 +221,12 @@ def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, ru
     settings = {"raw": True, "others": False, "period": 0.5 / RATE, "friction": friction, "shear": shear} | sensor
     if rubber:
         kind = "thumb" if finger == "thumb" else "finger"
-        settings |= {"sum": "spring", "law": "mooney_rivlin", "rubber": {"c10": rubber[0], "c01": rubber[1], "thickness": 2e-3},
-                     "stiffness": {"mooney_rivlin": {kind: 1.0, "thumb": 1.0, "finger": 1.0}}}  # fmt: skip
+        settings |= {
+            "sum": "spring",
+            "law": "mooney_rivlin",
+            "rubber": {"c10": rubber[0], "c01": rubber[1], "thickness": 2e-3},
+            "stiffness": {"mooney_rivlin": {kind: 1.0, "thumb": 1.0, "finger": 1.0}},
+        }
     touch = Tactile(posed, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "indenter", settings, pairs=pads,
                     tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])  # fmt: skip
     touch.shape_id.fill_(0)
@@ -196,10 +261,24 @@ def _one(model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, ru
     joints = ("slide", "press")
     lsb = 1e-5
     value = np.round(now / lsb) * lsb
-    meta = DEFAULTS | {"source": "sim", "robot": "press_rig", "joint_names": ",".join(joints), "effort_is": "none", "tactile_unit": "count",
-                       "tactile_lsb": f"{LSB:g}", "notes": "a fingertip pressed by a ball"}  # fmt: skip
-    recording = Recording(Path("press.mcap"), meta, joints, Series(t, q, COMMANDS, t.copy()), States(Series(seen, value, STATES, seen.copy())),
-                          tactile=Series(seen, out, TACTILE), start_ns=1_000_000_000)  # fmt: skip
+    meta = DEFAULTS | {
+        "source": "sim",
+        "robot": "press_rig",
+        "joint_names": ",".join(joints),
+        "effort_is": "none",
+        "tactile_unit": "count",
+        "tactile_lsb": f"{LSB:g}",
+        "notes": "a fingertip pressed by a ball",
+    }
+    recording = Recording(
+        Path("press.mcap"),
+        meta,
+        joints,
+        Series(t, q, COMMANDS, t.copy()),
+        States(Series(seen, value, STATES, seen.copy())),
+        tactile=Series(seen, out, TACTILE),
+        start_ns=1_000_000_000,
+    )
     if load_cell:
         cell[:, 0] += 0.02 * rng.standard_normal(n)
         recording.external_force = Series(seen, cell, EXTERNAL_FORCE, seen.copy(), "indenter")

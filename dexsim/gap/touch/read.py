@@ -29,8 +29,12 @@ RATE = 100.0  # Hz of the grid on which touch is simulated
 LONGEST = 60.0  # s of one recording that are simulated: the stretch with the most touch
 GRIP = 6.0  # counts of normal force from which a taxel's shear is summed
 NEAR = 4e-3  # m: what comes nearer than this to a pad may press it
-KINDS = {mujoco.mjtGeom.mjGEOM_SPHERE: "sphere", mujoco.mjtGeom.mjGEOM_BOX: "box", mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-         mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder"}  # fmt: skip
+KINDS = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+}
 
 
 @dataclass
@@ -131,8 +135,11 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
             continue
         layout = layout or xhand_layout()
         if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):
-            out.notes.append(f"{r.path.name}: /tactile has {r.tactile.value.shape[1]} x {r.tactile.value.shape[2]} taxels, the layout "
-                             f"{r.meta['tactile_layout']} has {layout.pads} x {layout.taxels}: touch is not judged")  # fmt: skip
+            out.notes.append(
+                f"{r.path.name}: /tactile has {r.tactile.value.shape[1]} x {r.tactile.value.shape[2]} taxels, the "
+                "layout "
+                f"{r.meta['tactile_layout']} has {layout.pads} x {layout.taxels}: touch is not judged"
+            )
             continue
         force, known = newtons(r)
         out.scale_known &= known
@@ -148,7 +155,8 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
         on = [f for f in pressed if layout.bodies[f] in [model.body(i).name for i in range(model.nbody)]]
         for f in set(pressed) - set(on):
             out.notes.append(
-                f"{r.path.name}: pad {layout.names[f]} is pressed, but the model has no body '{layout.bodies[f]}' to carry it"
+                f"{r.path.name}: pad {layout.names[f]} is pressed, but the model has no body '{layout.bodies[f]}' to "
+                "carry it"
             )
         if not things:
             out.blind += [(r.path.name, f) for f in pressed]
@@ -160,8 +168,11 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
             else:
                 out.runs.append(run)
     if out.blind and not out.runs:
-        out.notes.append("touch is recorded, but not what was touched (no /object_pose with a shape, no such body in the model): dead, stuck and "
-                         "swapped taxels can still be told, forces cannot be predicted")  # fmt: skip
+        out.notes.append(
+            "touch is recorded, but not what was touched (no /object_pose with a shape, no such body in the model): "
+            "dead, stuck and "
+            "swapped taxels can still be told, forces cannot be predicted"
+        )
     if out.runs and not out.scale_known:
         out.notes.append(
             "tactile_lsb is unknown: the common scale of the taxels is fitted, so a gain common to all cannot be told"
@@ -256,8 +267,28 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     if thing.body is None:
         o = yaml.safe_load(r.config)["recorded_world"]["object"]
         stiffness, friction = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
-    return PadRun(r.path.name, f, grid, dist, along, across, depth, slide, layout.area[f, :K], t, z, shear, load, full, warm, lsb,
-                  stiffness, friction, _doubt(model, layout.bodies[f], thing), counted)  # fmt: skip
+    return PadRun(
+        r.path.name,
+        f,
+        grid,
+        dist,
+        along,
+        across,
+        depth,
+        slide,
+        layout.area[f, :K],
+        t,
+        z,
+        shear,
+        load,
+        full,
+        warm,
+        lsb,
+        stiffness,
+        friction,
+        _doubt(model, layout.bodies[f], thing),
+        counted,
+    )
 
 
 def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
@@ -336,8 +367,13 @@ def _hull_depth(r, m, model, grid, thing: _Thing, pad: str) -> np.ndarray | None
     """[G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses (their
     margin rounds them); None where the pad has none that are convex."""
     body = model.body(pad).id
-    tips = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) == body and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
-            and (model.geom_margin[g] > 0 or model.geom_contype[g] or model.geom_conaffinity[g])]  # fmt: skip
+    tips = [
+        g
+        for g in range(model.ngeom)
+        if int(model.geom_bodyid[g]) == body
+        and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
+        and (model.geom_margin[g] > 0 or model.geom_contype[g] or model.geom_conaffinity[g])
+    ]
     if not tips:
         return None
     data, where = mujoco.MjData(model), np.zeros(6)

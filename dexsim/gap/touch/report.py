@@ -72,9 +72,20 @@ def _beside(d: Diagnosis, felt: TouchResult) -> None:
 
 def _metric(data: dict, felt: TouchResult) -> None:
     (b, bl, bh), (a, al, ah) = felt.before, felt.after
-    data["held_out"] = {"recordings": felt.recordings, "error": "tactile_rmse_N", "before": b, "after": a, "before_low": bl, "before_high": bh,
-                        "after_low": al, "after_high": ah, "how": "presses kept out of the fit"}  # fmt: skip
+    data["held_out"] = {
+        "recordings": felt.recordings,
+        "error": "tactile_rmse_N",
+        "before": b,
+        "after": a,
+        "before_low": bl,
+        "before_high": bh,
+        "after_low": al,
+        "after_high": ah,
+        "how": "presses kept out of the fit",
+    }
     gap = b**2 - felt.floor**2
     data["unexplained"]["fraction_of_gap"] = (
-        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * felt.floor else 0.0
+        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4)
+        if gap > 0 and b > JUDGE.within * felt.floor
+        else 0.0
     )

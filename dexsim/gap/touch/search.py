@@ -44,7 +44,8 @@ class PadSearch(PadFit):
             if any(x.widens for x in listed):
                 listed += [e for e in TOUCH_CATALOGUE if e.widens and e not in listed and self._possible(current, e)]
             options = [t for e in listed if (t := self._try(current, e)) is not None]
-            if self.scale_known and any(e.by_taxel for e in listed):  # one number for the pad, beside one for each taxel
+            # one number for the pad, beside one for each taxel
+            if self.scale_known and any(e.by_taxel for e in listed):
                 options.append(self._common(current, 120))
             for t in options:
                 trials[frozenset(t.ids)] = t
@@ -54,10 +55,15 @@ class PadSearch(PadFit):
             good = [t for t in options[:4] if self._earns(t, current)]
             if not good:
                 break
-            # a gain for every taxel must do clearly better than one number
-            priced = lambda t, had=current.gains is not None: self.cross(t).sum() * (1.0 if t.gains is None or had else TOUCH.map_price)  # noqa: E731
+
+            def priced(t: TouchTrial, had: bool = current.gains is not None) -> float:
+                """A gain for every taxel must do clearly better than one number."""
+                return self.cross(t).sum() * (1.0 if t.gains is None or had else TOUCH.map_price)
+
             least = min(map(priced, good))
-            current = min((t for t in good if priced(t) <= (1 + TOUCH.close) * least), key=lambda t: self.size(t.res) * priced(t))
+            current = min(
+                (t for t in good if priced(t) <= (1 + TOUCH.close) * least), key=lambda t: self.size(t.res) * priced(t)
+            )
         current = self._drop(current, trials)
         if current.ids and current.gains is None:  # the numbers, to their end
             full = self.fit(current.ids, current.values, None, current.gains, current.order, 240)
@@ -77,8 +83,8 @@ class PadSearch(PadFit):
         return effect.possible(self)
 
     def scan(self, current: TouchTrial, most: int = 4) -> list[TouchEffect]:
-        """The effects that would remove most of what `current` leaves, by a linear score at their starts with the refitted
-        numbers projected out; gains of single taxels are always tried."""
+        """The effects that would remove most of what `current` leaves, by a linear score at their starts with the
+        refitted numbers projected out; gains of single taxels are always tried."""
         if current.jac is None:
             current = self.fit(current.ids, current.values, None, current.gains, current.order, 12)
         r0 = np.clip(current.res[self.train], -10, 10)
@@ -94,7 +100,9 @@ class PadSearch(PadFit):
                 continue
             best = 0.0
             for s in effect.begin(self):
-                d = project((current.res - self.residual(current.values | s, current.gains, current.order))[self.train] * weight)
+                d = project(
+                    (current.res - self.residual(current.values | s, current.gains, current.order))[self.train] * weight
+                )
                 dd = float(d @ d)
                 if dd > 1e-9 * total:
                     c = np.clip(float(d @ clean) / dd, 0.0, 3.0)
@@ -111,10 +119,12 @@ class PadSearch(PadFit):
         ids = (*current.ids, e)
         tries = []
         if effect.by_taxel:
-            # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against the believed geometry
+            # single taxels must not be taken for a shifted object or a wider contact: order and gains first, against
+            # the believed geometry
             believed = {k: p.neutral for k, p in PARAMS.items() if p.nuisance and (k != "scale" or self.scale_known)}
             order = self._swaps(current.values | believed)
-            if order is None:  # where the object lies may be off, but a wider contact looks like what exchanged taxels do
+            # where the object lies may be off, but a wider contact looks like what exchanged taxels do
+            if order is None:
                 place = {k: v for k, v in current.values.items() if k != "spread"}
                 order = self._swaps(self.fit(current.ids, place, None, None, None, 40, ("spread",)).values)
             base = current if order is None else self.fit(current.ids, current.values, None, None, order, 24)
@@ -123,14 +133,20 @@ class PadSearch(PadFit):
                 gains = self.gain_map(base, self.train)
                 base = self.fit(current.ids, base.values, None, gains, base.order, 24)
             gains = self.gain_map(base, self.train)
-            tries.append(TouchTrial(ids, base.values, gains, base.order, base.keys, None, self.residual(base.values, gains, base.order)))
+            tries.append(
+                TouchTrial(
+                    ids, base.values, gains, base.order, base.keys, None, self.residual(base.values, gains, base.order)
+                )
+            )
             if self.scale_known:
                 tries.append(self._common(current, 60))
             # a map where one number does not: a third less error, beside the price of its 120 numbers
             if len(tries) == 2 and self.size(tries[0].res) > TOUCH.map_better * self.size(tries[1].res):
                 tries = tries[1:]
             return tries[0]
-        starts = sorted(effect.begin(self), key=lambda s: self.size(self.residual(current.values | s, current.gains, current.order)))
+        starts = sorted(
+            effect.begin(self), key=lambda s: self.size(self.residual(current.values | s, current.gains, current.order))
+        )
         tries = [self.fit(ids, current.values | s, None, current.gains, current.order, 50) for s in starts[:2]]
         best = min(tries, key=lambda t: self.size(t.res))
         if best.gains is not None:
@@ -140,11 +156,26 @@ class PadSearch(PadFit):
 
     def _common(self, current: TouchTrial, evaluations: int) -> TouchTrial:
         """The hypothesis with one gain for all of the pad."""
-        ratio = float(np.median([r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9) for r in self.runs]))
-        return self.fit((*current.ids, TactileGain.id), current.values | {"gain": ratio}, None, current.gains, current.order, evaluations)
+        ratio = float(
+            np.median(
+                [
+                    r.z.sum() / max(readings(r, current.values, current.gains, current.order).sum(), 1e-9)
+                    for r in self.runs
+                ]
+            )
+        )
+        return self.fit(
+            (*current.ids, TactileGain.id),
+            current.values | {"gain": ratio},
+            None,
+            current.gains,
+            current.order,
+            evaluations,
+        )
 
     def _swaps(self, values: dict[str, float]) -> np.ndarray | None:
-        """Order of the taxels [K] in which exchanged pairs are put right, by what `values` predict; None where there are none."""
+        """Order of the taxels [K] in which exchanged pairs are put right, by what `values` predict; None where there
+        are none."""
         K = self.runs[0].z.shape[1]
         z = np.concatenate([r.z for r in self.runs])
         p = np.concatenate([readings(r, values, None, None) for r in self.runs])
@@ -159,7 +190,9 @@ class PadSearch(PadFit):
         out, used = np.arange(K), set()
         gain = own[:, None] + own[None] - left - left.T
         # each of the two must fit the other's place far better than its own
-        good = (left < TOUCH.swapped * own[:, None]) & (left.T < TOUCH.swapped * own[None]) & (gain > 200 * self.noise**2)
+        good = (
+            (left < TOUCH.swapped * own[:, None]) & (left.T < TOUCH.swapped * own[None]) & (gain > 200 * self.noise**2)
+        )
         pairs = sorted(((gain[i, j], i, j) for i, j in zip(*np.nonzero(np.triu(good, 1)), strict=True)), reverse=True)
         for _, i, j in pairs:
             if i not in used and j not in used:
@@ -233,5 +266,7 @@ class PadSearch(PadFit):
         sums = table[:, index].sum(-1)
         weight = np.exp(-np.clip((sums / sums.min(0) - 1) / TOUCH.told_apart, 0, 50))
         shares = (weight / weight.sum(0)).mean(1)
-        rows = sorted(((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1])
+        rows = sorted(
+            ((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1]
+        )
         return rows, float(shares[0])
