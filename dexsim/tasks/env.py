@@ -346,7 +346,7 @@ class HandEnv(VecEnv):
                 self.obs[group] = torch.zeros_like(value)
             good = value.isfinite().all(1)
             self._blind |= ~good
-            self.obs[group].copy_(torch.where(good[:, None], value, torch.zeros_like(value)))
+            self.obs[group].copy_(torch.where(good[:, None], value, 0.0))
 
     def place(
         self,
@@ -390,7 +390,7 @@ class HandEnv(VecEnv):
         ok = ~self.nan[:, None]
 
         def clean(x: torch.Tensor) -> torch.Tensor:
-            return torch.where(ok, x, torch.zeros_like(x)).to(torch.float32)
+            return torch.where(ok, x, 0.0).to(torch.float32)
 
         self.q.copy_(clean(t.qpos[:, self.joint_q]))
         self.qd.copy_(clean(t.qvel[:, self.joint_v]))
