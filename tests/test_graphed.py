@@ -13,7 +13,7 @@ import torch  # isort: skip  (ppo sets what rsl-rl needs before it is imported)
 from rsl_rl.algorithms import PPO  # isort: skip
 from tensordict import TensorDict  # isort: skip
 
-from dexsim.learning.graphed import GraphedUpdate, unsupported  # isort: skip
+from dexsim.learning.graphed import GraphedUpdate, sample_without_waiting, unsupported  # isort: skip
 
 WORLDS, STEPS = 12, 8
 MODEL = {"class_name": "MLPModel", "hidden_dims": [16, 8], "activation": "elu", "obs_normalization": True}
@@ -77,6 +77,20 @@ def test_it_learns_what_rsl_rl_learns(settings):
     for k, state in a["optimizer_state_dict"]["state"].items():
         for name, value in state.items():
             torch.testing.assert_close(b["optimizer_state_dict"]["state"][k][name], value, rtol=1e-4, atol=1e-7)
+
+
+def test_actions_are_drawn_as_ever():
+    """Without the look at the standard deviation: the same numbers, and weights that load as before."""
+    theirs, ours = ppo(), ppo()
+    sample_without_waiting(ours.actor)
+    for _ in range(3):
+        obs, state = observations(), torch.get_rng_state()
+        with torch.no_grad():
+            a = theirs.act(obs)
+            torch.set_rng_state(state)
+            assert torch.equal(a, ours.act(obs)) and not ours.transition.actions.requires_grad
+    assert ours.actor.state_dict().keys() == theirs.actor.state_dict().keys()
+    assert learn(theirs, theirs, 2) == learn(ours, ours, 2)
 
 
 def test_the_adaptive_rate_moves_both_ways():

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
 from torch import nn
 
 LOWEST, HIGHEST, FACTOR = 1e-5, 1e-2, 1.5
@@ -36,6 +37,23 @@ def unsupported(alg: Any) -> str | None:
     if type(alg.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
         return "the optimizer is not Adam"
     return None
+
+
+def sample_without_waiting(actor: Any) -> None:
+    """Let a Gaussian actor draw its actions without reading the device: the same numbers, to the bit.
+
+    `torch.normal` looks whether a standard deviation is negative, which makes the CPU wait for the GPU at every step;
+    one that is an exponential or clamped to above 0 cannot be.
+    """
+    distribution = getattr(actor, "distribution", None)
+    if type(distribution) is not GaussianDistribution:
+        return
+
+    def sample() -> torch.Tensor:
+        mean, std = distribution.params
+        return torch.randn_like(mean).mul_(std).add_(mean).detach()
+
+    distribution.sample = sample
 
 
 class GraphedUpdate:

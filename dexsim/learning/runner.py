@@ -65,6 +65,8 @@ class Runner(OnPolicyRunner):
         # Recorded on CUDA only: on a CPU there is nothing to gain, and rsl-rl's own is the reference.
         record = device.startswith("cuda") and cfg.get("graphed_update", True) and not graphed.unsupported(self.alg)
         self._updater = graphed.GraphedUpdate(self.alg) if record else self.alg
+        if device.startswith("cuda"):
+            graphed.sample_without_waiting(self.alg.get_policy())
         self._meter = Meter(env.num_envs, device)
         self._layout = checkpoint.layout_of(env)
         self._fresh = True
