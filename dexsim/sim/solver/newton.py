@@ -69,7 +69,10 @@ class NewtonSolver:
         self.m, self.d = m, d
         self.most = _whole(d.njmax)
         self.rows = min(_whole(rows), self.most)
-        self.worlds_per_block, self.registers, self.fast_math = 1, 0, False
+        self.worlds_per_block, self.registers = 1, 0
+        # Approximate roots and quotients (2 units in the last place) on a GPU, as MuJoCo-Warp's line search has them. A
+        # CPU's compiler takes more liberties: not to know what is not finite, for one
+        self.fast_math = d.qacc.device.is_cuda
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
