@@ -51,7 +51,7 @@ def quick():
 
     with pytest.MonkeyPatch.context() as patch:
         model = measure.HandKinematics()
-        patch.setattr(measure, "HandKinematics", lambda: model)
+        patch.setattr(measure, "HandKinematics", lambda hand: model)
         patch.setattr(loop.gc, "collect", lambda: 0)
         yield
 
