@@ -96,14 +96,15 @@ def content(pads: bool = True) -> dict:
     names = [j for f in (*fingers, thumb) for j in f["joints"]]
     wire = [names[k] for k in (6, 7, 8, 0, 3, 1, 4, 2, 5)]  # not the model's order
     opened = dict(zip(names, (0.0, 0.3, 0.3, 0.0, -0.3, -0.3, -0.4, 0.1, 0.1), strict=True))
-    cupped = dict(zip(names, (0.0, 0.9, 1.1, 0.0, -0.9, -1.1, 0.0, 0.4, 0.5), strict=True))
+    cupped = dict(zip(names, (0.0, 0.8, 1.8, 0.0, -0.8, -1.8, 0.0, 0.45, 0.8), strict=True))
     return {
         "format": "dexsim-hand", "version": 1, "name": "made", "handedness": "left", "model": "made.xml",
         "servo": "servo.yaml",
         "joints": [{"name": j, "effort": 0.5, "speed": 8.0} for j in wire],
         "palm": {"body": "hull", "position": [0.0, 0.0, 0.002], "forward": [0.0, 1.0, 0.0], "normal": [0.0, 0.0, 2.0]},
         "fingers": [*fingers, thumb], "opposing": ["t"],
-        "poses": {"open": opened, "cupped": cupped}, "span": 0.06,
+        "poses": {"open": opened, "cupped": cupped}, "span": 0.08,
+        "places": {"catch": [0.026, -0.004, 0.0]},
         "guessed": ["palm.normal"],
     }  # fmt: skip
 
@@ -111,7 +112,7 @@ def content(pads: bool = True) -> dict:
 def made_hand(folder: Path, pads: bool = True, model: str | None = None, **changed: object) -> Path:
     """Write the hand's folder; `changed` replaces fields of hand.yaml. Returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    parts = (("a", 0.022, "", "0 1.7"), ("b", -0.012, "-", "-1.7 0"))
+    parts = (("a", 0.022, "", "0 2.1"), ("b", -0.012, "-", "-2.1 0"))
     fingers = "".join(_FINGER.format(n=n, x=x, s=sign, range=span) for n, x, sign, span in parts)
     (folder / "made.xml").write_text((model or _MODEL).replace("{fingers}", fingers), encoding="ascii")
     servo = {"joints": {"*": {"kp": 2.0, "kd": 0.05, "torque_limit": 0.5, "no_load_speed": 8.0, "delay": 0.01}}}

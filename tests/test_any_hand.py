@@ -77,7 +77,7 @@ def test_observations_follow_the_hand(hands, pads):
 def test_lengths_are_in_units_of_the_hand(hands):
     env = make_env(config(hands[True], "grasp"), 4, "cpu", 1, "mujoco")
     large = make_env(config(hands[True], "grasp", "hand_scale=1.5"), 4, "cpu", 1, "mujoco")
-    assert env.unit == pytest.approx(0.6) and large.unit == pytest.approx(0.9)
+    assert env.unit == pytest.approx(0.8) and large.unit == pytest.approx(1.2)
     assert torch.allclose(large.centre0, 1.5 * env.centre0) and large.f_max == pytest.approx(env.f_max / 1.5)
     assert torch.allclose(large.objects.size[:, 0] / env.objects.size[:, 0], torch.full((4,), 1.5))
     mirrored = make_env(config(hands[True], "grasp", "hand_mirror=true"), 4, "cpu", 1, "mujoco")
@@ -115,12 +115,12 @@ def test_held_poses_are_looked_for_where_there_are_none(tmp_path, monkeypatch):
         asked.append((count, sizes))
         row = torch.zeros(count, 9)
         pose = torch.tensor([0.03, 0.0, 0.08, 1.0, 0, 0, 0]).repeat(count, 1)
-        return GraspSet(torch.full((count,), 0.03), row, row, pose)
+        return GraspSet(torch.full((count,), 0.04), row, row, pose)
 
     monkeypatch.setattr(make_grasps, "generate", instead)
     for _ in range(2):
         make_env(config(folder, "rotate"), 4, "cpu", 1, "mujoco")
-    assert len(asked) == 1 and asked[0][1] == pytest.approx((0.027, 0.036)) and (folder / "held_cubes.npz").is_file()
+    assert len(asked) == 1 and asked[0][1] == pytest.approx((0.036, 0.048)) and (folder / "held_cubes.npz").is_file()
 
 
 @pytest.mark.parametrize("task, pads", [("rotate", True), ("grasp", False)])
