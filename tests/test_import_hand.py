@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
-from dexsim.import_hand import command, geometry, moves, shapes, taxels
+from dexsim.import_hand import command, folder, geometry, moves, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
 from tests import hands
 
@@ -23,9 +24,9 @@ from tests import hands
 @pytest.fixture(scope="module")
 def claw(tmp_path_factory) -> Path:
     """The made-up hand imported once; not to be changed."""
-    folder = tmp_path_factory.mktemp("claw")
-    import_hand(hands.write(folder / "robot"), folder / "hand", picture=False)
-    return folder / "hand"
+    place = tmp_path_factory.mktemp("claw")
+    import_hand(hands.write(place / "robot"), place / "hand", picture=False)
+    return place / "hand"
 
 
 def test_what_the_tree_and_the_axes_say(claw):
@@ -138,6 +139,10 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
     (hand / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     (hand / "servo.yaml").write_text((hand / "servo.yaml").read_text() + "# measured\n")
     (hand / "notes.txt").write_text("mine")
+    note = json.loads((hand / ".import.json").read_text())
+    (hand / "check.png").write_bytes(b"a picture")
+    note["files"]["check.png"] = folder.sha(hand / "check.png")  # as `check` notes it
+    (hand / ".import.json").write_text(json.dumps(note))
     result = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
     now = yaml.safe_load((hand / "hand.yaml").read_text())
     assert now["joints"][-3] == {"name": "thumb_turn", "effort": pytest.approx(effort + 0.3), "speed": 7}
@@ -149,6 +154,7 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
     assert "palm.normal" in now["guessed"] and "poses.cupped" in now["guessed"]
     assert sorted(result.kept) == ["notes.txt", "servo.yaml"] and "palm.position" in result.corrected
     assert (hand / "servo.yaml").read_text().endswith("# measured\n") and (hand / "notes.txt").read_text() == "mine"
+    assert (hand / "check.png").read_bytes() == b"a picture"
     again = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
     assert yaml.safe_load((hand / "hand.yaml").read_text()) == now, again.lines
     load_hand(hand)

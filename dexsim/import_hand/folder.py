@@ -17,6 +17,7 @@ from dexsim.errors import UserError
 from dexsim.import_hand import corrections
 
 HAND = "hand.yaml"
+SHOWN = ("check.png", "check.mp4")  # what `check` wrote: it stays until the next check
 
 
 def claim(folder: Path) -> dict[str, Any] | None:
@@ -67,9 +68,11 @@ def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
         if name in (HAND, corrections.NOTE):
             continue
         ours = name in sums and sha(path) == sums[name]
+        if ours and name not in SHOWN:
+            continue
+        (new / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, new / name)
         if not ours:
-            (new / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, new / name)
             kept.append(name)
 
 
