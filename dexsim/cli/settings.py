@@ -120,6 +120,8 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
         if item.type == OverrideType.DEL:
             _parent(cfg, key)  # raises when it is not there
             owner, _, last = key.rpartition(".")
+            if not owner:
+                raise UserError(f"~{key}: every run has this setting; give it a value, {key}=...")
             node = OmegaConf.select(cfg, owner) if owner else cfg
             OmegaConf.set_struct(node, False)
             node.pop(last)

@@ -52,7 +52,7 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     if data is None:
         cfg = _from_files(config_dir, request)
     else:
-        cfg = _from_checkpoint(data, config_dir, request, {"run": None, "out": None, "device": None})
+        cfg = _from_checkpoint(data, source, config_dir, request, {"run": None, "out": None, "device": None})
     device = _rank_device(cfg)
     if data is None:
         cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
@@ -94,7 +94,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
         raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
     if data is not None:
-        cfg = _from_checkpoint(data, config_dir, request, {})
+        cfg = _from_checkpoint(data, play["checkpoint"], config_dir, request, {})
     else:
         cfg = _from_files(config_dir, request)
     OmegaConf.update(cfg, "device", play["device"])
@@ -152,12 +152,22 @@ def _from_files(config_dir: Path, request: settings.Request) -> DictConfig:
 
 
 def _from_checkpoint(
-    data: dict[str, Any], config_dir: Path, request: settings.Request, fresh: dict[str, Any]
+    data: dict[str, Any], source: Any, config_dir: Path, request: settings.Request, fresh: dict[str, Any]
 ) -> DictConfig:
-    """The checkpoint's own config, settings of the earlier command forgotten and this command's applied."""
-    own: dict[str, Any] = dict.fromkeys(("model_file", "tactile_file", "objects", "kept_out"))  # new since
+    """The checkpoint's own config, settings of the earlier command forgotten and this command's applied. fresh: what is
+    forgotten. source: its file, for messages."""
+    known: dict = OmegaConf.to_container(OmegaConf.load(config_dir / "config.yaml"))
+    own = {k: v for k, v in known.items() if k not in ("defaults", "sim")}  # a checkpoint from before has not all
+    own |= dict.fromkeys(("model_file", "tactile_file", "objects", "kept_out"))  # new since
     own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0, "object_scale": 1.0, "object_hulls": PARTS}
-    cfg = OmegaConf.create(own | copy.deepcopy(data["config"]) | fresh)
+    stored = own | copy.deepcopy(data["config"]) | fresh
+    if _another_world(stored):
+        raise UserError(f"{source}: damaged checkpoint, its settings name another world (reality)")
+    try:
+        checks.check(stored if fresh else stored | {"agent": {}})  # a replay has no use for the agent
+    except UserError as error:
+        raise UserError(f"{source}: damaged checkpoint, its settings: {error}") from None
+    cfg = OmegaConf.create(stored)
     if "sim" in cfg:
         cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)
     OmegaConf.set_struct(cfg, True)
@@ -195,7 +205,8 @@ def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
 
 
 def _another_world(plain: dict[str, Any]) -> bool:
-    return (plain.get("reality") or {}).get("name", "none") != "none"  # checkpoints from before have no such group
+    world = plain.get("reality") or {}  # checkpoints from before have no such group
+    return not isinstance(world, dict) or world.get("name", "none") != "none"
 
 
 def _elsewhere(plain: dict[str, Any], play: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import yaml
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
+from dexsim import export
+from dexsim.learning import checkpoint
 from dexsim.recording import Recording, Series, States, schema, write
 
+ROOT = Path(__file__).parents[2]
 JOINTS = ("a", "b")
 SERVO = {
     "drive": "torque", "control_rate": 100, "loop_encoder": {"a": "motor"}, "current_per_torque": {"a": 0.9, "b": "unknown"}, "supply_voltage": 24.0,
@@ -35,6 +40,11 @@ CONFIG = {
     "recorded_world": {"index": 0, "object": {"kind": "box", "shape": "cube", "size": [0.02, 0.02, 0.02], "mass": 0.1, "friction": 0.5, "stiffness": 4000.0,
                                               "damping_ratio": 0.3}},
 }  # fmt: skip
+OVERRIDES = (
+    "task=grasp", "device=cpu", "worlds=4", "task.rewards.force_near=2.0", "task.objects.train=[box,sphere]", "randomize.object.mass=[0.05,0.2]",
+    "sim.timestep=0.007", "agent.actor.hidden_dims=[16,16]", "agent.algorithm.learning_rate=1e-3", "servo=ideal", "tactile.delay=[0.0,0.02]",
+    "task.reward.reach_length=0.05", "randomize.contact.stiffness={log: [4000,9000]}", "task.critic=paper", "save_worlds=true",
+)  # fmt: skip
 TREES = {"servo": SERVO, "calibration": CALIBRATION, "tactile": TACTILE, "metadata": METADATA, "config": CONFIG}
 
 
@@ -73,6 +83,12 @@ def build(folder: Path) -> dict[str, list[Path]]:
         (folder / f"{kind}.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     files = sorted(folder.iterdir())
     out = {"recording": [p for p in files if p.suffix in (".mcap", ".csv", ".npz")]}
+    checkpoint.save(folder / "checkpoint.pt", checkpoint_payload())
+    if not (folder / "bundle").exists():
+        with contextlib.redirect_stdout(io.StringIO()):
+            export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=1)
+    (folder / "overrides.txt").write_text("\n".join(OVERRIDES))
+    out |= {"checkpoint": [folder / "checkpoint.pt"], "manifest": [folder / "bundle" / "manifest.yaml"], "overrides": [folder / "overrides.txt"]}
     return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
 
 
@@ -98,3 +114,22 @@ def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
                     data = json.dumps({"name": JOINTS, "position": x.tolist(), "effort": x.tolist(), "header": {"stamp": {"sec": 1, "nanosec": i}}}).encode()
                 w.add_message(channel, log_time=ns, data=data, publish_time=ns)
         w.finish()
+
+
+def checkpoint_payload() -> dict:
+    """A whole training's checkpoint, its networks and worlds tiny."""
+    import torch
+
+    from dexsim.cli import start
+    from dexsim.paths import CONFIGS
+
+    cfg = start.for_train(["task=grasp", "device=cpu", "worlds=2", "iterations=3"], CONFIGS).cfg
+    weights = {"mlp.0.weight": torch.ones(2, 3), "obs_normalizer._mean": torch.zeros(1, 3), "obs_normalizer.count": torch.tensor(5)}
+    return {
+        "kind": "train", "config": cfg, "versions": {"dexsim": "0.1.0"}, "git": {"commit": "unknown", "dirty": False},
+        "layout": {"joints": ["a", "b"], "action": [["a", -1.0, 1.0, "rad"]], "observations": {"actor": [["x", 3]], "critic": [["x", 3]]}},
+        "iteration": 3, "steps": 144, "actor": weights, "critic": dict(weights),
+        "optimizer": {"state": {0: {"step": torch.tensor(3.0), "exp_avg": torch.zeros(2, 3)}}, "param_groups": [{"lr": 1e-3, "params": [0]}]},
+        "env": {"rng": torch.zeros(16, dtype=torch.uint8), "nan_count": torch.tensor(0)}, "rng": checkpoint.rng_state(),
+        "worlds": {"env.q": torch.zeros(2, 12), "rng": torch.zeros(16, dtype=torch.uint8)},
+    }  # fmt: skip

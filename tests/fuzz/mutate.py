@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import copy
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
 from dexsim.recording import write
@@ -121,9 +124,17 @@ def values(path: Path, rng: np.random.Generator) -> None:
     write(path, r)
 
 
+def clean(folder: Path) -> None:
+    """Empty a folder of cases."""
+    for old in folder.iterdir():
+        shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+
+
 def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Path:
     """Writes the damaged file of a seed; returns where."""
     rng = np.random.default_rng([seed, sum(map(ord, kind))])
+    if kind in ("checkpoint", "manifest", "overrides"):
+        return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](rng, files[kind][0], folder)
     if kind != "recording":
         path = folder / "case.yaml"
         path.write_bytes(text_of(kind, rng))
@@ -138,4 +149,57 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
             pass
     path = folder / f"case{source.suffix}"
     path.write_bytes(bytes_(source.read_bytes(), rng, [p.read_bytes() for p in files[kind]]))
+    return path
+
+
+def _checkpoint(rng: np.random.Generator, source: Path, folder: Path) -> Path:
+    path = folder / "case.pt"
+    how = rng.random()
+    if how < 0.3:
+        path.write_bytes(bytes_(source.read_bytes(), rng, [source.read_bytes()]))
+        return path
+    payload = torch.load(source, weights_only=True)
+    if how < 0.65:  # its settings: JSON text
+        payload["config"] = json.dumps(tree(json.loads(payload["config"]), rng), default=str)
+    else:
+        payload = tree(payload, rng)
+    torch.save(payload, path)
+    return path
+
+
+def _manifest(rng: np.random.Generator, source: Path, folder: Path) -> Path:
+    """The manifest of a bundle whose other files are sound."""
+    case = folder / "case"
+    case.mkdir()
+    for name in ("policy.onnx", "golden.npz", "config.yaml"):
+        (case / name).symlink_to(source.with_name(name).resolve())
+    data = tree(yaml.load(source.read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)), rng)
+    text = yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+    (case / "manifest.yaml").write_bytes(bytes_(text, rng, [text]) if rng.random() < 0.3 else text)
+    return case
+
+
+def _overrides(rng: np.random.Generator, source: Path, folder: Path) -> Path:
+    """Lines of a command: values and names exchanged, dropped, prefixed."""
+    lines = source.read_text().splitlines()
+    for _ in range(int(rng.integers(1, 4))):
+        k = int(rng.integers(0, len(lines)))
+        key, _, value = lines[k].partition("=")
+        odd = ODD[int(rng.integers(0, len(ODD)))]
+        text = odd if isinstance(odd, str) else json.dumps(odd, default=str) if not isinstance(odd, dict) else "{a: 1}"
+        how = rng.integers(0, 7)
+        if how == 0:
+            lines[k] = f"~{key}"
+        elif how == 1:
+            lines[k] = f"+{key}={value}"
+        elif how == 2:
+            lines[k] = f"{key}.{lines[int(rng.integers(0, len(lines)))].partition('=')[0]}={value}"
+        elif how == 3:
+            lines[k] = f"{key.rpartition('.')[0] or key}={text[:200]}"
+        elif how == 4:
+            lines[k] = bytes_(lines[k].encode(), rng, [b"[{nan,inf}]=~+@*&"]).decode("utf-8", "replace")
+        else:
+            lines[k] = f"{key}={text[:200]}"
+    path = folder / "case.txt"
+    path.write_text("\n".join(" ".join(line.split("\n")) for line in lines), encoding="utf-8", errors="surrogatepass")
     return path

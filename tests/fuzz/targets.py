@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +12,11 @@ import numpy as np
 
 from dexsim.actuator.table import ServoTable
 from dexsim.calibration.file import Calibration
+from dexsim.cli import start
+from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.gap.read import channels, inputs
+from dexsim.paths import CONFIGS
 from dexsim.recording import metadata, read
 from dexsim.recording.mechanism import Mechanism
 from dexsim.tactile import file as tactile_file
@@ -73,8 +78,26 @@ def config(path: Path) -> None:
     assert "\n" not in fault(path.read_bytes().decode("utf-8", "replace"), "case config")
 
 
+def checkpoint(path: Path) -> None:
+    """Loaded, and its settings completed, as play does before it builds anything."""
+    start.for_play([f"checkpoint={path}", "device=cpu"], CONFIGS)
+
+
+def manifest(path: Path) -> None:
+    bundle.load(path)
+
+
+def overrides(path: Path) -> None:
+    """The settings of a training, as far as they are checked before anything heavy begins."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    if any(line.lstrip("+~").startswith(("servo_file", "resume", "tactile_file", "model_file")) for line in lines):
+        return
+    with contextlib.redirect_stdout(io.StringIO()):
+        start.for_train(lines, CONFIGS)
+
+
 TARGETS: dict[str, Callable[[Path], None]] = {"recording": recording, "servo": servo, "calibration": calibration, "tactile": tactile, "metadata": beside,
-                                              "config": config}  # fmt: skip
+                                              "config": config, "checkpoint": checkpoint, "manifest": manifest, "overrides": overrides}  # fmt: skip
 
 
 def verdict(kind: str, path: Path) -> str:
@@ -85,5 +108,5 @@ def verdict(kind: str, path: Path) -> str:
         text = str(error)
         if "\n" in text:
             return f"more than one line: {text[:200]!r}"
-        return "refused" if "case" in text or "servo of" in text else f"the file is not named: {text[:200]}"
+        return "refused" if "case" in text or "servo of" in text or kind == "overrides" else f"the file is not named: {text[:200]}"
     return "fine"

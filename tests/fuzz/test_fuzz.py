@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 
 import pytest
@@ -27,16 +28,14 @@ def quiet():
         yield
 
 
-def clean(folder):
-    for old in folder.iterdir():
-        old.unlink()
-
-
 def test_the_corpus_itself_is_sound(files, tmp_path):
     for kind, paths in files.items():
         for path in paths:
             copy = tmp_path / f"case{path.suffix}"
-            copy.write_bytes(path.read_bytes())
+            if kind == "manifest":
+                shutil.copytree(path.parent, copy := tmp_path / "case")
+            else:
+                copy.write_bytes(path.read_bytes())
             assert targets.verdict(kind, copy) == "fine", path
 
 
@@ -45,7 +44,7 @@ def test_damaged_trees(kind, tmp_path):
     @SHORT
     @given(strategies.trees(kind))
     def run(tree):
-        clean(tmp_path)
+        mutate.clean(tmp_path)
         path = tmp_path / "case.yaml"
         path.write_text(yaml.dump(tree, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), allow_unicode=True), encoding="utf-8", errors="surrogatepass")
         assert targets.verdict(kind, path) in WELL
@@ -58,13 +57,14 @@ def test_damaged_files(kind, files, tmp_path):
     @settings(SHORT, max_examples=30)
     @given(strategies.seeds)
     def run(seed):
-        clean(tmp_path)
+        mutate.clean(tmp_path)
         assert targets.verdict(kind, mutate.case(kind, seed, files, tmp_path)) in WELL
 
     run()
 
 
-FOUND = [("servo", 307), ("metadata", 58), ("metadata", 274), ("recording", 324), ("recording", 1416), ("calibration", 1898), ("tactile", 3033)]
+FOUND = [("servo", 307), ("metadata", 58), ("metadata", 274), ("recording", 324), ("recording", 1416), ("calibration", 1898), ("tactile", 3033), ("checkpoint", 96),
+         ("checkpoint", 0), ("checkpoint", 1165), ("overrides", 1153)]
 """Cases of long runs that once broke something."""
 
 
