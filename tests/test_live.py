@@ -474,3 +474,22 @@ def test_the_page_with_its_token_in_a_browser(view, env):
         wide._stopped.set()
         loop.join(10)
         wide.stop()
+
+
+def test_sockets_that_say_nothing_make_room_for_a_page(view):
+    """Two hundred that never finish their handshake: the oldest go, a page is served meanwhile, and all are gone in time."""
+    from dexsim.view import live_gate
+
+    silent = [socket.create_connection(("127.0.0.1", view.port), timeout=10) for _ in range(100)]
+    for k in range(100):
+        silent.append(socket.create_connection(("127.0.0.1", view.port), timeout=10))
+        silent[-1].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: " + b"a" * k)  # a head that does not end
+    page = open_socket(view.port)
+    assert page.recv(timeout=20)
+    assert len(view.gate.waiting) <= live_gate.MOST_WAITING and view.gate.refused >= 200 - live_gate.MOST_WAITING
+    end = time.monotonic() + live_gate.HANDSHAKE_S + 10
+    while view.gate.waiting and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not view.gate.waiting
+    for s in (*silent, page):
+        s.close()

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from dexsim import yaml_text
 from dexsim.cli import folder
 from dexsim.console.tables import table
 from dexsim.errors import UserError
@@ -100,8 +101,6 @@ def _object(own: dict[str, str]) -> Any:
 def run(play: dict[str, Any]) -> int:
     """Read, simulate, compare; writes position.png, effort.png, force.png, metrics.json, simulated.mcap and
     video.mp4."""
-    import yaml
-
     from dexsim.recording import audit, compare, led_object, mechanism
     from dexsim.recording.reader import read
     from dexsim.recording.writer import write
@@ -116,7 +115,7 @@ def run(play: dict[str, Any]) -> int:
     if recording.findings:
         print(audit.table(recording.findings))
     m = mechanism.for_recording(recording, model, play["servo"])
-    config = yaml.safe_load(recording.config) if recording.config else {}
+    config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else {}
     timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
     placed = led_object.add_object(m, recording, play["object"])
     led = placed == "led"

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from dexsim import yaml_text
 from dexsim.assets.objects.own import PARTS
 from dexsim.cli import checks, objects, settings
 from dexsim.cli import help as help_page
@@ -239,7 +240,7 @@ def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
 
         path = Path(servo).expanduser()
         ServoTable.load(path)  # raises UserError
-        cfg["servo"] = yaml.safe_load(path.read_text(encoding="utf-8"))
+        cfg["servo"] = yaml_text.load(path, "servo file")
         cfg["choices"]["servo"] = str(path)
     if tactile is not None:
         from dexsim.tactile.file import lay_over

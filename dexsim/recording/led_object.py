@@ -7,8 +7,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
+from dexsim import yaml_text
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
@@ -82,7 +82,7 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     rather than the balance of a grasp. "marked": its path is known and its shape is not, a small ball that touches
     nothing shows where it was. "none": no path was recorded, or the mechanism is not the hand. stated: what it is;
     default: what the recording says."""
-    config = yaml.safe_load(recording.config) if recording.config else None
+    config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else None
     config = config if isinstance(config, dict) else {}
     about = config.get("recorded_world", {}).get("object") if stated is None else stated.about()
     if (

@@ -13,6 +13,7 @@ import torch
 import warp as wp
 import yaml
 
+from dexsim import yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -203,7 +204,7 @@ class PlayRecorder:
         for k, recording in enumerate(self.recordings()):
             if realistic:
                 recording = as_hardware(recording, seed + k, self.env.servo.current_per_torque.double().cpu().numpy())
-            world = yaml.safe_load(recording.config)["recorded_world"]["index"]
+            world = yaml_text.parse(recording.config, path)["recorded_world"]["index"]
             to = path if len(self.tracks) == 1 else path.with_name(f"{path.stem}_w{world}.mcap")
             write(to, recording)
             out.append(to)

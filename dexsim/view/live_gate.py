@@ -18,6 +18,10 @@ from urllib.parse import parse_qs, urlsplit
 
 MOST_CLIENTS = 24
 """Pages open at once; one more is told to wait."""
+MOST_WAITING = 64
+"""Sockets that have not yet said what they want; one more closes the one that has waited longest."""
+HANDSHAKE_S = 5.0
+"""s after which a socket that has not said it is closed."""
 MOST_BYTES = 1 << 18
 """Of a message from a page; those of the controls have some hundred."""
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
@@ -36,6 +40,7 @@ class Gate:
         self.token = "" if self.loopback else secrets.token_urlsafe(18)
         self.clients = 0
         self.refused = 0
+        self.waiting: dict[int, Any] = {}  # transports of sockets in their handshake, oldest first
         self._lock = threading.Lock()
 
     def reason(self, path: str, headers: Any) -> tuple[int, str] | None:
@@ -76,6 +81,18 @@ class Gate:
                 return False
             self.clients += 1
             return True
+
+    def wait(self, transport: Any) -> None:
+        """A socket has connected and said nothing yet; the one that has waited longest goes where there are too
+        many. Called from the server's own loop only, as `waited` is."""
+        self.waiting[id(transport)] = transport
+        if len(self.waiting) > MOST_WAITING:
+            self.waiting.pop(next(iter(self.waiting))).abort()
+            self.refused += 1
+
+    def waited(self, transport: Any) -> None:
+        """It has said what it wants, or is gone."""
+        self.waiting.pop(id(transport), None)
 
     def leave(self) -> None:
         """Count it out."""
@@ -123,7 +140,22 @@ def gated(gate: Gate) -> Iterator[None]:
             finally:
                 gate.leave()
 
-        kw |= {"max_size": MOST_BYTES, "logger": logger, "open_timeout": 10}
+        class Connection(ws.ServerConnection):
+            def connection_made(self, transport: Any) -> None:
+                gate.wait(transport)
+                super().connection_made(transport)
+
+            def connection_lost(self, error: Exception | None) -> None:
+                gate.waited(self.transport)
+                super().connection_lost(error)
+
+            async def handshake(self, *args: Any, **kw: Any) -> None:
+                try:
+                    await super().handshake(*args, **kw)
+                finally:
+                    gate.waited(self.transport)
+
+        kw |= {"max_size": MOST_BYTES, "logger": logger, "open_timeout": HANDSHAKE_S, "create_connection": Connection}
         return serve(counted, *args, process_request=first, **kw)
 
     ws.serve = with_gate

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-import yaml
 
+from dexsim import yaml_text
+from dexsim.errors import UserError
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read.runs import local_polynomial, spans
 from dexsim.recording.mechanism import Mechanism
@@ -184,8 +185,8 @@ def _things(r: Recording, model: mujoco.MjModel) -> list[_Thing]:
     """What may press a pad, in this recording."""
     if r.object_pose is not None and len(r.object_pose) > 5 and r.config:
         try:
-            o = yaml.safe_load(r.config)["recorded_world"]["object"]
-        except (yaml.YAMLError, KeyError, TypeError):
+            o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
+        except (UserError, KeyError, TypeError):
             o = None
         if o:
             grid = None
@@ -265,7 +266,7 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
         warm = grid + (r.start_ns - origin) * 1e-9
     stiffness, friction = STIFFNESS, FRICTION
     if thing.body is None:
-        o = yaml.safe_load(r.config)["recorded_world"]["object"]
+        o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
         stiffness, friction = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
     return PadRun(
         r.path.name,
