@@ -5,7 +5,10 @@ Names and types are checked before anything heavy is imported, so that a slip is
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,22 +53,23 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
     request = settings.parse(argv, config_dir)
     source = _last(request, "resume")
     data = _load(source) if source is not None else None
-    if data is None:
-        cfg = _from_files(config_dir, request)
-    else:
-        cfg = _from_checkpoint(data, source, config_dir, request, {"run": None, "out": None, "device": None})
-    device = _rank_device(cfg)
-    if data is None:
-        cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
-    plain = _finish(cfg, device)
-    kind = device.partition(":")[0]
-    if _another_world(plain):
-        raise UserError(
-            f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py"
-        )
-    plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
-    plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
-    checks.check(plain)
+    with _blamed(source if data is not None else None, request):
+        if data is None:
+            cfg = _from_files(config_dir, request)
+        else:
+            cfg = _from_checkpoint(data, source, config_dir, request, {"run": None, "out": None, "device": None})
+        device = _rank_device(cfg)
+        if data is None:
+            cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
+        plain = _finish(cfg, device)
+        kind = device.partition(":")[0]
+        if _another_world(plain):
+            raise UserError(
+                f"reality={plain['reality']['name']}: a world to be judged in, not to train in; give it to play.py"
+            )
+        plain["worlds"] = WORLDS[kind] if plain["worlds"] is None else plain["worlds"]
+        plain["iterations"] = ITERATIONS[kind] if plain["iterations"] is None else plain["iterations"]
+        checks.check(plain)
     if checks.get(plain, "agent.logger") == "wandb":
         weights_and_biases.check_installed()  # before anything is built
     return None if only_show and _show(plain) else Start(plain, {}, source, data, settings.typed(request))
@@ -94,29 +98,44 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     if play["policy"] not in (None, "random", "zero", "scripted"):
         raise UserError(f"policy={play['policy']}: must be random, zero or scripted (a trained one is checkpoint=PATH)")
     data = _load(play["checkpoint"]) if play["checkpoint"] is not None else None
-    if data is not None:
-        cfg = _from_checkpoint(data, play["checkpoint"], config_dir, request, {})
-    else:
-        cfg = _from_files(config_dir, request)
-    OmegaConf.update(cfg, "device", play["device"])
-    device = _device(cfg)
-    if data is None:
-        cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
-    plain = _finish(cfg, device)
-    if _another_world(plain):
-        plain, device = _elsewhere(plain, play), "cpu"
-    checks.check(play)
-    if play["view"]:
-        play["worlds"] = play["worlds"] or VIEW_WORLDS
-        plain["tactile"]["raw"] = True  # the page shows every taxel
-    play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
-    plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
-    checks.check(plain | {"agent": {}})
+    with _blamed(play["checkpoint"] if data is not None else None, request):
+        if data is not None:
+            cfg = _from_checkpoint(data, play["checkpoint"], config_dir, request, {})
+        else:
+            cfg = _from_files(config_dir, request)
+        OmegaConf.update(cfg, "device", play["device"])
+        device = _device(cfg)
+        if data is None:
+            cfg = settings.apply_preset(cfg, _preset(cfg, device), request.values)
+        plain = _finish(cfg, device)
+        if _another_world(plain):
+            plain, device = _elsewhere(plain, play), "cpu"
+        checks.check(play)
+        if play["view"]:
+            play["worlds"] = play["worlds"] or VIEW_WORLDS
+            plain["tactile"]["raw"] = True  # the page shows every taxel
+        play["worlds"] = play["worlds"] or min(play["episodes"], MAX_PLAY_WORLDS[device.partition(":")[0]])
+        plain.update(worlds=play["worlds"], seed=play["seed"], iterations=plain["iterations"] or 1)
+        checks.check(plain | {"agent": {}})
     return (
         None
         if only_show and _show(plain | play)
         else Start(plain, play, play["checkpoint"], data, settings.typed(request))
     )
+
+
+@contextlib.contextmanager
+def _blamed(source: Any, request: settings.Request) -> Iterator[None]:
+    """Errors of settings that a checkpoint holds, and this command did not type, name its file."""
+    try:
+        yield
+    except UserError as error:
+        text = str(error)
+        about = re.match(r"[\w.]*", text).group()  # type: ignore[union-attr]  # it matches nothing, too
+        typed = [*request.choices, *(item.key_or_group for item in request.values)]
+        if source is None or str(source) in text or any(about == t or about.startswith(f"{t}.") for t in typed):
+            raise
+        raise UserError(f"{source}: its settings: {text}") from None
 
 
 def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | None, bool]:
@@ -164,10 +183,6 @@ def _from_checkpoint(
     stored = own | copy.deepcopy(data["config"]) | fresh
     if _another_world(stored):
         raise UserError(f"{source}: damaged checkpoint, its settings name another world (reality)")
-    try:
-        checks.check(stored if fresh else stored | {"agent": {}})  # a replay has no use for the agent
-    except UserError as error:
-        raise UserError(f"{source}: damaged checkpoint, its settings: {error}") from None
     cfg = OmegaConf.create(stored)
     if "sim" in cfg:
         cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)

@@ -86,7 +86,7 @@ def build(folder: Path) -> dict[str, list[Path]]:
     checkpoint.save(folder / "checkpoint.pt", checkpoint_payload())
     if not (folder / "bundle").exists():
         with contextlib.redirect_stdout(io.StringIO()):
-            export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=1)
+            export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=2)
     (folder / "overrides.txt").write_text("\n".join(OVERRIDES))
     out |= {"checkpoint": [folder / "checkpoint.pt"], "manifest": [folder / "bundle" / "manifest.yaml"], "overrides": [folder / "overrides.txt"]}
     return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
