@@ -6,10 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
-from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable
+from dexsim.actuator import COLUMNS, FIELDS, Servo, ServoTable, laws
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.reference import servo as servo_reference
+from dexsim.actuator.reference import torque_along
 from dexsim.gap import demo
 from dexsim.gap.judge.full_model import World, free_runs
 from dexsim.gap.plant.batch import JointPlant, nominal_row
@@ -307,3 +309,23 @@ def test_warmth_acts_on_friction_that_grows_with_load(motion):
     columns = {"kp": 100.0, "torque_limit": 0.05, "load_friction": 0.5, "thermal_friction": -0.01, "warmth": 40.0}
     q = motion(columns, [0.0], [1e4], 0.2)[:, 0]
     assert q[-1] == pytest.approx(0.5 * 0.05 * (1 - 0.5 * 0.6) / INERTIA * 0.199**2, rel=0.02)
+
+
+@wp.kernel
+def limited(asked: wp.array(dtype=float), v: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+    i = wp.tid()
+    ends = laws.torque_limits(0.4, wp.abs(v[i]) / 10.0, v[i], 1.0)
+    out[i, 0] = wp.clamp(asked[i], -ends[0], ends[1])
+    out[i, 1] = laws.voltage_torque(asked[i], 0.4, 1.2, 0.4 / 10.0, v[i])
+
+
+def test_the_torque_along_a_measured_motion_follows_the_kernels_laws():
+    rng = np.random.default_rng(0)
+    asked, v = rng.uniform(-1.5, 1.5, 200), rng.uniform(-12.0, 12.0, 200)
+    out = wp.zeros((200, 2), dtype=float, device="cpu")
+    inputs = [wp.array(x, dtype=float, device="cpu") for x in (asked, v)]
+    wp.launch(limited, 200, inputs=[*inputs, out], device="cpu")
+    torque, duty = torque_along(asked, v, 0.4, 10.0, False), torque_along(asked, v, 0.4, 10.0, True, 1.2)
+    assert np.allclose(out.numpy(), np.stack([torque, duty], 1), atol=1e-6) and np.abs(torque).max() > 0.35
+    assert np.array_equal(torque_along(asked, v, np.inf, np.inf, False), asked)
+    assert np.array_equal(torque_along(asked, v, 0.4, 10.0, False, limited=False), asked)

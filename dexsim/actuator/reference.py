@@ -40,6 +40,24 @@ def target_rates(time, stamps, targets, delay, dt) -> tuple[np.ndarray, np.ndarr
     return (share * rates).sum(-1), (share * bends).sum(-1)
 
 
+def torque_along(
+    asked: np.ndarray, v: np.ndarray, stall: float, no_load: float, voltage: bool, supply=1.0, limited: bool = True
+) -> np.ndarray:
+    """Motor torque [S] N.m along a measured motion: `laws.torque_limit` with the same line for driving and braking, or
+    `laws.voltage_torque`.
+
+    asked [S]: what the controller asks for, N.m, of a voltage drive its duty; v [S] rad/s; stall N.m and no_load rad/s
+    (inf: no limit); supply: of its nominal voltage, of a voltage drive alone; limited: False leaves what is asked as it
+    is."""
+    if voltage:
+        duty = np.clip(asked, -1, 1) if limited else asked
+        return stall * duty * supply - (stall / no_load * v if np.isfinite(no_load) else 0.0)
+    if not limited or not np.isfinite(stall):
+        return asked
+    limit = stall * np.maximum(1 - np.abs(v) / no_load, 0.0)
+    return np.clip(asked, -limit, limit)
+
+
 def servo(
     params,
     target,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dexsim.actuator.reference import torque_along
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
@@ -66,11 +67,8 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     error = cmd - q
     asked = p("kp") * error - p("kd") * v
     asked = np.where(np.abs(error) < p("deadband"), 0.0, asked)
-    if plant.voltage:
-        motor = p("torque_limit") * np.clip(asked, -1, 1) * s("supply") - p("torque_limit") / p("no_load_speed") * v
-    else:
-        limit = p("torque_limit") * np.maximum(1 - np.abs(v) / p("no_load_speed"), 0.0)
-        motor = np.clip(asked, -limit, limit)
+    supply = s("supply") if plant.voltage else 1.0
+    motor = torque_along(asked, v, p("torque_limit"), p("no_load_speed"), plant.voltage, supply)
     if p("lag") > 0:
         motor = _lagged(t, motor, p("lag"))
     slope = 0.05 * max(case.scales.speed, 1e-9)

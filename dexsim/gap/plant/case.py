@@ -10,6 +10,7 @@ import numpy as np
 
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
+from dexsim.actuator.reference import torque_along
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES_INDEX
@@ -87,18 +88,7 @@ def demand(
     """Motor torque [S] that the believed law gives along the measured motion, delay and lag aside. N.m"""
     p = lambda n: row[SERVO_INDEX[n]]  # noqa: E731
     pd = p("kp") * (cmd - q) - p("kd") * v
-    if voltage:
-        tau0 = p("torque_limit")
-        out = np.clip(pd, -1, 1) if clip else pd
-        return tau0 * out - (tau0 / p("no_load_speed") * v if np.isfinite(p("no_load_speed")) else 0.0)
-    if not clip:
-        return pd
-    limit = (
-        p("torque_limit") * np.maximum(1 - np.abs(v) / p("no_load_speed"), 0)
-        if np.isfinite(p("torque_limit"))
-        else np.inf
-    )
-    return np.clip(pd, -limit, limit)
+    return torque_along(pd, v, p("torque_limit"), p("no_load_speed"), voltage, limited=clip)
 
 
 def build(
