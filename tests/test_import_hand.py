@@ -135,6 +135,8 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
     content["poses"]["cupped"]["thumb_turn"] = 1.9
     content["palm"]["position"] = [0.01, 0.0, 0.012]
     content["fingers"][1]["name"] = "pointer"
+    content["joints"][2]["armature"] = 3e-4  # optional places, which the importer itself does not fill
+    content["places"] = {"catch": [0.05, 0.0, 0.02]}
     content["guessed"].remove("fingers.middle.tip.normal")  # confirmed as it is
     (hand / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     (hand / "servo.yaml").write_text((hand / "servo.yaml").read_text() + "# measured\n")
@@ -148,6 +150,7 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
     assert now["joints"][-3] == {"name": "thumb_turn", "effort": pytest.approx(effort + 0.3), "speed": 7}
     assert now["palm"]["position"] == [0.01, 0.0, 0.012]
     assert now["poses"]["cupped"]["thumb_turn"] == 1.9
+    assert now["joints"][2]["armature"] == 3e-4 and now["places"] == {"catch": [0.05, 0.0, 0.02]}
     assert [f["name"] for f in now["fingers"]] == ["thumb", "pointer", "middle", "ring"]
     for place in ("palm.position", "fingers.middle.tip.normal"):
         assert place not in now["guessed"]

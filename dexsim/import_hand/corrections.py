@@ -72,6 +72,28 @@ def _same(a: Any, b: Any) -> bool:
     return a == b
 
 
+def lay_over(hand: dict[str, Any], fixes: Corrections) -> None:
+    """Write what a person said and no step asked for (a rotor's inertia, `places`, a file of held poses) into the
+    content of hand.yaml, in place. Whether it fits is for the hand's own checks."""
+    for place, value in fixes.values.items():
+        if place in fixes.used or " " in place:
+            continue
+        node: Any = hand
+        *path, last = place.split(".")
+        for key in path:
+            if isinstance(node, list):
+                node = next((x for x in node if isinstance(x, dict) and x.get("name") == key), None)
+            elif isinstance(node, dict):
+                if node.get(key) is None:
+                    node[key] = {}
+                node = node[key]
+        if isinstance(node, list):
+            node = next((x for x in node if isinstance(x, dict) and x.get("name") == last), None)
+        if isinstance(node, dict):
+            node[last] = value
+            fixes.used.add(place)
+
+
 def written(folder: Path) -> dict[str, Any] | None:
     """What the importer noted in a folder: {"hand": content of hand.yaml, "files": SHA-256 by name}, None: no note."""
     try:

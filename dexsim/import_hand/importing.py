@@ -145,6 +145,7 @@ def import_hand(
     hand = _hand(
         name, model, m, found, motions, thumbs, palm, known, order, open_, closed, search, pads, own, fixes, pick
     )
+    corrections.lay_over(hand, fixes)
     hand["guessed"] = sorted(dict.fromkeys(guessed), key=_rank(hand))
     hand["source"] = {"file": model.name, "written by": "dexsim import-hand"}
     kept: list[str] = []
