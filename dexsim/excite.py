@@ -23,7 +23,7 @@ position, speed and torque and no two bodies come near each other.
 settings (key=default):
   joints=all        comma-separated names of the joints to move
   kinds=all         comma-separated: triangles, ladder, chirp, steps, holds, random
-  model=            MuJoCo or URDF file of another mechanism (default: the xHand)
+  model=            MuJoCo or URDF file of another mechanism, or a hand's folder (default: the xHand)
   servo=            servo.yaml believed of its drives (default: the xHand's)
   seed=0            of the order and the random motion
   rate=100          commands a second

@@ -48,7 +48,7 @@ settings (key=default):
                               a pattern 'runs/*.mcap'
   held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the
                               time, is kept out
-  model=                      MuJoCo or URDF file; the xHand by default
+  model=                      MuJoCo or URDF file, or the folder of a hand; the xHand by default
   servo=                      servo.yaml believed of its drives; the xHand's by default
   out=out/diagnosis           folder for the results
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default

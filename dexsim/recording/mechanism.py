@@ -21,6 +21,8 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
+from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.paths import CONFIGS
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
@@ -69,8 +71,8 @@ def mechanism(
     joints: Sequence[str] | None = None,
     gravity: Sequence[float] | None = None,
 ) -> Mechanism:
-    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping); by default the xHand and
-    its own.
+    """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a hand
+    (its hand.yaml names servo and joints); by default the xHand and its own.
 
     joints: the driven ones; by default those of the xHand, else every hinge and slide of the model. gravity: [3] m/s2,
     world frame. Raises UserError for a model or servo that does not serve.
@@ -79,6 +81,11 @@ def mechanism(
         spec, robot = xhand.hand_spec(), "xhand_right"
         _hold_friction(spec)
         table = _table(servo if servo is not None else xhand_servo_dict())
+    elif (folder := _hand_folder(model)) is not None:
+        hand = load_hand(folder)
+        spec, robot, joints = hand.spec(), hand.robot, hand.joints if joints is None else joints
+        _hold_friction(spec)
+        table = _table(hand.servo_path if servo is None else servo)
     else:
         path = Path(model).expanduser()
         files.check(path, MAX_MODEL, f"model={model}:")
@@ -104,6 +111,13 @@ def mechanism(
     if not chosen:
         raise UserError(f"model={model}: has no named hinge or slide joint to drive")
     return Mechanism(spec, chosen, table, robot)
+
+
+def _hand_folder(model: str | Path) -> Path | None:
+    """The folder of a hand.yaml, where `model` is one."""
+    path = Path(model).expanduser()
+    path = path.parent if path.name == HAND_FILE else path
+    return path if (path / HAND_FILE).is_file() else None
 
 
 def _physical(model: mujoco.MjModel, where: str) -> None:

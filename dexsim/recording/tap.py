@@ -223,7 +223,7 @@ class PlayRecorder:
         notes = f"world {track.world} of a play; object {world['object']['shape']}"
         meta = DEFAULTS | {
             "source": "sim",
-            "robot": "xhand_right",
+            "robot": self.env.hand.robot,
             "joint_names": ",".join(self.joints),
             "effort_is": "torque_Nm",
             "effort_sign": "+1",

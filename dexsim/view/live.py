@@ -20,7 +20,6 @@ import mujoco
 import numpy as np
 import torch
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.sim.scene import OBJECT
 from dexsim.view import live_gate
@@ -76,7 +75,7 @@ class LiveView:
         _check_free(host, port)
         self.env, self.policy, self.name, self._load = env, policy, name, load
         self.wishes = Wishes()
-        self.fingers = list(xhand.FINGERS)
+        self.fingers = list(env.hand.finger_names)
         self._map = panels.TaxelMap(env.touch.layout)
         self._full_taxel, self._full_force, self._full_reward = (
             FULL_TAXEL,
