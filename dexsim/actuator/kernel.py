@@ -3,11 +3,12 @@ is here takes them to the end of a step. `reference.py` has both in NumPy.
 
 The law (paper, "Actuator Model Randomization"; its reference velocity qd_ref is taken as zero: targets are held):
 
-    e      = target - q_m,    q_m = scale * q + offset                     measured position of the loop's encoder tau_c
-    = kp * e - kd * qd_m                                            (+ `laws.other_terms`: feed-forward, integral) tau_b
-    = 0 if |e| < deadband else tau_c limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)             b: 1
-    driving, braking_slope while it brakes motor  = clip(tau_b, -limit, +limit)                                   what
-    the motor's current shows joint  = efficiency * lag(motor) + ripple(q) - friction
+    e      = target - q_m,    q_m = scale * q + offset              measured position of the loop's encoder
+    tau_c  = kp * e - kd * qd_m                                     (+ `laws.other_terms`: feed-forward, integral)
+    tau_b  = 0 if |e| < deadband else tau_c
+    limit  = torque_limit * max(0, 1 - b |qd| / no_load_speed)      b: 1 driving, braking_slope while it brakes
+    motor  = clip(tau_b, -limit, +limit)                            what the motor's current shows
+    joint  = efficiency * lag(motor) + ripple(q) - friction
 
 Voltage drive: duty = clip(kp * e - kd * qd_m, -1, 1), motor = torque_limit * (duty * supply - qd / no_load_speed).
 

@@ -9,7 +9,7 @@ import numpy as np
 from dexsim.assets import xhand
 from dexsim.gap.effects.tactile_gain import TactileGain
 from dexsim.gap.touch.read import newtons
-from dexsim.recording.schema import Recording
+from dexsim.recording.schema import TACTILE, Recording
 
 ROWS = xhand.ROWS  # k = column * 12 + row
 
@@ -71,7 +71,7 @@ def finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
         "alternatives": [],
         "indistinguishable": [],
         "separating_experiment": None,
-        "where": {"joints": [], "taxels": names, "topics": ["/tactile"]},
+        "where": {"joints": [], "taxels": names, "topics": [TACTILE]},
         "regime": regime,
         "when": [],
         "parameters": {

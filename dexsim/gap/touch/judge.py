@@ -18,6 +18,7 @@ from dexsim.gap.touch.handed_on import chord
 from dexsim.gap.touch.plant import PARAMS, contact, readings
 from dexsim.gap.touch.search import PadOutcome, PadSearch
 from dexsim.gap.touch.settings import Fit, PadFacts
+from dexsim.recording.schema import TACTILE
 
 
 class PadAnswer:
@@ -87,7 +88,7 @@ class PadAnswer:
             "alternatives": [{"effect": x, "confidence": round(c, 3)} for x, c in rivals[:3]],
             "indistinguishable": [e, *(x for x, _ in same)] if same else [],
             "separating_experiment": effect.experiment if same else None,
-            "where": {"joints": [], "taxels": taxels, "topics": ["/tactile"]},
+            "where": {"joints": [], "taxels": taxels, "topics": [TACTILE]},
             "regime": effect.shows,
             "when": locate.when(e, search, best),
             "parameters": parameters,
