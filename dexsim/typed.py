@@ -30,6 +30,11 @@ def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
         place = _named(data, kind, str(error), at.removesuffix("`").lstrip(".").replace("[...]", ".*").lstrip("."))
         if what.startswith("Invalid enum value") and (allowed := _allowed(inspect.type_info(kind), place)):
             what = f"must be one of {', '.join(map(str, allowed))}"
+        elif what.startswith("Object contains unknown field"):
+            name = what.split("`")[1]
+            valid = ", ".join(_fields(inspect.type_info(kind), place))
+            what = f"{place}{'.' * bool(place)}{name}: unknown; valid ones: {valid}"
+            raise UserError(f"{source}: {what}{f'; {fix}' if fix else ''}") from None
         shown = f" ({_shown(data, place)})" if place else ""
         fix = f"; {fix}" if fix else ""
         raise UserError(f"{source}: {place or 'its contents'}{shown}: {what[0].lower()}{what[1:]}{fix}") from None
@@ -77,20 +82,36 @@ def _with(node: Any, parts: list[str], value: Any) -> Any:
 
 def _allowed(kind: Any, place: str) -> list[Any]:
     """What a value may be there, where only some words or numbers are."""
+    return [x for t in _types(kind, place) if isinstance(t, inspect.LiteralType) for x in t.values]
+
+
+def _fields(kind: Any, place: str) -> list[str]:
+    """Names that may stand in the mapping there."""
+    return [f.encode_name for t in _types(kind, place) if isinstance(t, inspect.StructType) for f in t.fields]
+
+
+def _types(kind: Any, place: str) -> list[Any]:
+    """What a place may be of."""
     if isinstance(kind, inspect.UnionType):
-        return [x for t in kind.types for x in _allowed(t, place)]
+        return [x for t in kind.types for x in _types(t, place)]
     if isinstance(kind, inspect.Metadata):
-        return _allowed(kind.type, place)
+        return _types(kind.type, place)
     part, _, rest = place.replace("[", ".[").lstrip(".").partition(".")
     if not part:
-        return list(kind.values) if isinstance(kind, inspect.LiteralType) else []
+        return [kind]
     if isinstance(kind, inspect.StructType):
-        return next((_allowed(f.type, rest) for f in kind.fields if f.encode_name == part), [])
+        # names may hold dots themselves
+        inner = [(f, place[len(f.encode_name) :].lstrip(".")) for f in kind.fields if _begins(place, f.encode_name)]
+        return [x for f, rest in inner for x in _types(f.type, rest)]
     if isinstance(kind, inspect.DictType):
-        return _allowed(kind.value_type, rest)
+        return _types(kind.value_type, rest)
     if isinstance(kind, inspect.TupleType):
-        return _allowed(kind.item_types[int(part[1:-1])], rest)
-    return _allowed(kind.item_type, rest) if hasattr(kind, "item_type") else []
+        return _types(kind.item_types[int(part[1:-1])], rest)
+    return _types(kind.item_type, rest) if hasattr(kind, "item_type") else []
+
+
+def _begins(place: str, name: str) -> bool:
+    return place == name or place.startswith((f"{name}.", f"{name}["))
 
 
 def _instance(kind: type, value: Any) -> Any:

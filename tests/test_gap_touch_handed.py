@@ -285,14 +285,14 @@ BAD = [
     ("tactile: {pads: {index: {crosstalk: [0.5, 0.1]}}}", "tactile.pads.index.crosstalk=[0.5, 0.1]: must rise from low to high"),
     ("tactile: {pads: {little: {gain: 0.5}}}", "tactile.pads.little: no such fingertip; fingertips: thumb, index, mid, ring, pinky"),
     ("tactile: {pads: {index: {dead: [200]}}}", "tactile.pads.index: no taxel 200; a fingertip has 120"),
-    ("tactile: {pads: {index: {gian: 0.5}}}", "tactile.pads.index.gian: unknown setting; a pad has: gain"),
-    ("tactile: {delays: 0.1}", "tactile.delays: unknown setting; valid ones: pads, stiffness_scale"),
+    ("tactile: {pads: {index: {gian: 0.5}}}", "tactile.pads.index.gian: unknown; valid ones: gain"),
+    ("tactile: {delays: 0.1}", "tactile.delays: unknown; valid ones: pads, stiffness_scale"),
     ("randomize: {contact.stiffness: [1, 9000]}", "randomize.contact.stiffness=1: must be a number; allowed: 100 to 100000 N/m"),
-    ("randomize: {object.mass: 0.1}", "randomize.object.mass: not a range that touch sets; valid ones: object.friction, contact.stiffness"),
-    ("servo: {}", "servo: unknown; must map tactile and randomize"),
+    ("randomize: {object.mass: 0.1}", "randomize.object.mass: unknown; valid ones: object.friction, contact.stiffness"),
+    ("servo: {}", "servo: unknown; valid ones: tactile, randomize"),
     ("[1, 2]", "must map tactile and randomize"),
     ("tactile: [1", "cannot be read"),
-    ("tactile: 3", "tactile=3: must map settings to values"),
+    ("tactile: 3", "tactile (3): expected `object | null`"),
 ]
 
 

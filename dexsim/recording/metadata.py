@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import yaml
 
-from dexsim import files, yaml_text
+from dexsim import files, typed, yaml_text
 from dexsim.actuator.columns import did_you_mean
 from dexsim.errors import UserError
 from dexsim.recording.schema import (
@@ -24,6 +25,12 @@ from dexsim.recording.schema import (
 )
 
 VALID = (*KEYS, *UNIT_KEYS)
+WORDS = {"effort_is": EFFORT_IS, "tactile_unit": TACTILE_UNIT, "schema": ("1",), "source": ("real", "sim")}
+WORDS |= {key: tuple(units) for key, units in UNIT_KEYS.items()}
+Stated = msgspec.defstruct("Stated", [(key, Literal[WORDS[key]] if key in WORDS else str, "") for key in VALID])
+"""What is stated about a recording, as text by key."""
+Written = dict[str, str | bool | float | dict[str, Any] | list[Any] | None]
+"""A file of metadata beside a recording: plain values, lists of such, and a servo.yaml under `servo`."""
 NAN = float("nan")
 
 
@@ -104,9 +111,7 @@ def _read(path: Path) -> dict[str, Any]:
     raw = yaml_text.parse(files.text(path, files.MAX_YAML, "metadata"), path)
     if raw is None:
         return {}
-    if not isinstance(raw, dict):
-        raise UserError(f"{path}: must map metadata keys to values; valid keys: {', '.join(VALID)}")
-    return raw
+    return typed.convert(raw, Written, path, f"it must map metadata keys to values; valid keys: {', '.join(VALID)}")
 
 
 def _text(value: Any) -> str:
@@ -118,14 +123,7 @@ def _text(value: Any) -> str:
 
 
 def _check(path: Path, stated: Mapping[str, str]) -> None:
-    choices = {"effort_is": EFFORT_IS, "tactile_unit": TACTILE_UNIT, "schema": ("1",), "source": ("real", "sim")}
-    choices |= {key: tuple(units) for key, units in UNIT_KEYS.items()}
-    for key, valid in choices.items():
-        if key in stated and stated[key] not in valid:
-            raise UserError(
-                f"{path}: metadata {key}='{shown(stated[key])}' must be one of {', '.join(valid)};"
-                f" correct it with meta.{key}=..."
-            )
+    typed.convert(dict(stated), Stated, f"{path}: metadata", "correct it with meta.KEY=...")
     for key, count in (("gravity", 3), ("tactile_axis_sign", 3), ("tactile_lsb", 1)):
         if key in stated and stated[key] != "unknown":
             numbers(stated[key], count, key, str(path))

@@ -17,17 +17,28 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
-from dexsim import yaml_text
+import msgspec
+
+from dexsim import typed, yaml_text
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.tactile.config import COLUMNS
-from dexsim.tactile.pads import pad_configs, value_range
+from dexsim.tactile.pads import Pad, Value, pad_configs, value_range
 
 RANGES: dict[str, tuple[str, float, float]] = {
     "object.friction": ("1", 0.05, 3.0),
     "contact.stiffness": ("N/m", 100.0, 1e5),
 }
 """Ranges of `randomize` that the file may set: unit, lowest, highest (what the tasks allow)."""
+_Once = Value | msgspec.UnsetType
+_columns = [(name, _Once, msgspec.UNSET) for name in COLUMNS]
+Touch = msgspec.defstruct("Touch", [("pads", dict[str, Pad], {}), *_columns], forbid_unknown_fields=True)
+_names = {name.replace(".", "_"): name for name in RANGES}
+_ranges = [(name, _Once, msgspec.UNSET) for name in _names]
+Drawn = msgspec.defstruct("Drawn", _ranges, rename=_names, forbid_unknown_fields=True)
+_parts = [("tactile", Touch | None, None), ("randomize", Drawn | None, None)]
+File = msgspec.defstruct("File", _parts, forbid_unknown_fields=True)
+"""What may stand in the file; limits: `COLUMNS`, `RANGES`, `dexsim.tactile.pads`."""
 
 
 def load(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -41,6 +52,7 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
             f"{where} does not exist; tactile_file=PATH must name a tactile.yaml (dexsim diagnose writes one)"
         )
     raw = yaml_text.load(path, "tactile file")
+    typed.convert(raw, File, where, "it must map tactile and randomize to what was found")
     try:
         return _checked(raw)
     except UserError as error:
@@ -62,28 +74,14 @@ def lay_over(cfg: MutableMapping[str, Any], path: str | Path) -> None:
         cfg["randomize"][part][last] = value
 
 
-def _checked(raw: Any) -> dict[str, dict[str, Any]]:
-    if not isinstance(raw, Mapping) or not raw or set(raw) - {"tactile", "randomize"}:
-        extra = (
-            f"{', '.join(str(k) for k in raw if k not in ('tactile', 'randomize'))}: unknown; "
-            if isinstance(raw, Mapping) and raw
-            else ""
-        )
-        raise UserError(f"{extra}must map tactile and randomize to what was found")
+def _checked(raw: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {"tactile": {}, "randomize": {}}
-    for part in out:
-        if not isinstance(raw.get(part) or {}, Mapping):
-            raise UserError(f"{part}={raw[part]}: must map settings to values")
     for key, value in (raw.get("tactile") or {}).items():
         if key == "pads":
             out["tactile"]["pads"] = _pads(value)
-        elif key in COLUMNS:
-            out["tactile"][key] = list(value_range(f"tactile.{key}", value, *COLUMNS[key][:3]))
         else:
-            raise UserError(f"tactile.{key}: unknown setting; valid ones: pads, {', '.join(COLUMNS)}")
+            out["tactile"][key] = list(value_range(f"tactile.{key}", value, *COLUMNS[key][:3]))
     for name, value in (raw.get("randomize") or {}).items():
-        if name not in RANGES:
-            raise UserError(f"randomize.{name}: not a range that touch sets; valid ones: {', '.join(RANGES)}")
         out["randomize"][name] = list(value_range(f"randomize.{name}", value, *RANGES[name]))
     return out
 

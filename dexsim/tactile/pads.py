@@ -22,9 +22,50 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import msgspec
+
+from dexsim import typed
 from dexsim.errors import UserError
 
 Range = tuple[float, float]
+Number = float | str
+"""YAML reads 1e-3 as text: that is accepted (`_number`)."""
+
+
+class Interval(msgspec.Struct, forbid_unknown_fields=True):
+    """A fitted value and where it may lie."""
+
+    value: Number
+    low: Number | msgspec.UnsetType = msgspec.UNSET
+    high: Number | msgspec.UnsetType = msgspec.UNSET
+
+
+Value = Number | list[Number] | Interval
+"""A number, [low, high] or {value, low, high}; `value_range` has the limits."""
+
+
+class Rubber(msgspec.Struct, forbid_unknown_fields=True):
+    """Pa, Pa, m."""
+
+    c10: Value = 0.0
+    c01: Value = 0.0
+    thickness: Value = 2.0e-3
+
+
+class Pad(msgspec.Struct, forbid_unknown_fields=True):
+    """One pad's settings, as a file has them; see above."""
+
+    gain: Value | None = None
+    taxels: dict[int | str, Value] = {}
+    dead: list[Number] = []
+    stuck: dict[int | str, Value] = {}
+    swapped: list[tuple[Number, Number]] = []
+    crosstalk: Value | None = None
+    hysteresis: Value | None = None
+    hysteresis_time: Value | None = None
+    delay: Value | None = None
+    rubber: Rubber | None = None
+
 
 # What is drawn by world and pad: name -> (unit, lowest, highest allowed, value at which it is absent).
 PAD_COLUMNS: dict[str, tuple[str, float, float, float]] = {
@@ -39,7 +80,6 @@ PAD_COLUMNS: dict[str, tuple[str, float, float, float]] = {
 GAIN = PAD_COLUMNS["gain"]
 STUCK = ("N", 0.0, 1e3, 0.0)
 THICKNESS = 2.0e-3  # m, where a pad's rubber states none
-KEYS = ("gain", "taxels", "dead", "stuck", "swapped", "crosstalk", "hysteresis", "hysteresis_time", "delay", "rubber")
 
 
 @dataclass(frozen=True)
@@ -61,26 +101,26 @@ class PadConfig:
 def pad_configs(value: object) -> dict[str, PadConfig]:
     """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is
     allowed."""
-    if not isinstance(value, Mapping):
-        raise UserError(f"tactile.pads={value}: must map names of pads to their settings")
+    typed.convert({"tactile": {"pads": _plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")
     return {str(name): _pad(f"tactile.pads.{name}", entry) for name, entry in value.items()}
 
 
-def _pad(where: str, entry: object) -> PadConfig:
-    if not isinstance(entry, Mapping):
-        raise UserError(f"{where}={entry}: must map settings to values; settings: {', '.join(KEYS)}")
-    for key in entry:
-        if key not in KEYS:
-            raise UserError(f"{where}.{key}: unknown setting; a pad has: {', '.join(KEYS)}")
+def _plain(node: object) -> object:
+    """Other mappings and sequences (a config's) as dicts and lists; names as text."""
+    if isinstance(node, Mapping):
+        return {k if isinstance(k, int) else str(k): _plain(v) for k, v in node.items()}
+    return [_plain(v) for v in node] if isinstance(node, Sequence) and not isinstance(node, str) else node
+
+
+def _pad(where: str, entry: Mapping) -> PadConfig:
+    """entry: checked against `Pad`."""
+    entry = {k: v for k, v in entry.items() if v is not None}
     params = {
-        k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in KEYS if k in entry and k in PAD_COLUMNS
+        k: value_range(f"{where}.{k}", entry[k], *PAD_COLUMNS[k][:3]) for k in PAD_COLUMNS if k in entry
     }
     thickness = THICKNESS
     if "rubber" in entry:
-        rubber = _mapping(f"{where}.rubber", entry["rubber"], "c10, c01 [Pa] and thickness [m] to values")
-        for key in rubber:
-            if key not in ("c10", "c01", "thickness"):
-                raise UserError(f"{where}.rubber.{key}: unknown; valid: c10, c01, thickness")
+        rubber = entry["rubber"]
         params |= {
             k: value_range(f"{where}.rubber.{k}", rubber.get(k, 0.0), *PAD_COLUMNS[k][:3]) for k in ("c10", "c01")
         }
@@ -88,13 +128,12 @@ def _pad(where: str, entry: object) -> PadConfig:
             raise UserError(f"{where}.rubber: the lowest c10 + c01 must be positive [Pa]")
         thickness = value_range(f"{where}.rubber.thickness", rubber.get("thickness", THICKNESS), "m", 1e-5, 0.1)[0]
     taxels = {_index(f"{where}.taxels", k): value_range(f"{where}.taxels.{k}", v, *GAIN[:3])
-              for k, v in _mapping(f"{where}.taxels", entry.get("taxels", {}), "taxels to gains").items()}  # fmt: skip
+              for k, v in entry.get("taxels", {}).items()}  # fmt: skip
     taxels |= {
-        _index(f"{where}.dead", k): (0.0, 0.0) for k in _list(f"{where}.dead", entry.get("dead", []), "of taxels")
+        _index(f"{where}.dead", k): (0.0, 0.0) for k in entry.get("dead", [])
     }
     stuck = {_index(f"{where}.stuck", k): value_range(f"{where}.stuck.{k}", v, *STUCK[:3])[0]
-             for k,
-             v in _mapping(f"{where}.stuck", entry.get("stuck", {}), "taxels to readings [N]").items()}  # fmt: skip
+             for k, v in entry.get("stuck", {}).items()}  # fmt: skip
     return PadConfig(params, taxels, stuck, _swaps(f"{where}.swapped", entry.get("swapped", [])), thickness)
 
 
@@ -141,23 +180,9 @@ def _index(where: str, k: object) -> int:
     return int(number)
 
 
-def _mapping(where: str, value: object, what: str) -> Mapping:
-    if not isinstance(value, Mapping):
-        raise UserError(f"{where}={value}: must map {what}")
-    return value
-
-
-def _list(where: str, value: object, what: str) -> Sequence:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise UserError(f"{where}={value}: must be a list {what}")
-    return value
-
-
-def _swaps(where: str, value: object) -> tuple[tuple[int, int], ...]:
+def _swaps(where: str, value: Sequence) -> tuple[tuple[int, int], ...]:
     out, used = [], set()
-    for pair in _list(where, value, "of pairs of taxels"):
-        if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
-            raise UserError(f"{where}: {pair} is no pair of taxels, e.g. [14, 15]")
+    for pair in value:
         a, b = (_index(where, k) for k in pair)
         if a == b or {a, b} & used:
             raise UserError(f"{where}: taxel {a if a == b or a in used else b} is exchanged twice, or with itself")
