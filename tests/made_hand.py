@@ -17,7 +17,7 @@ _FINGER = """
         <body name="{n}_link">
           <inertial pos="0 0.022 0" mass="0.03" diaginertia="8e-6 4e-6 8e-6"/>
           <joint name="{n}_curl" axis="{s}1 0 0" range="{range}"/>
-          <geom type="capsule" fromto="0 0.01 0 0 0.036 0" size="0.008"/>
+          <geom type="capsule" fromto="0 0.016 0 0 0.036 0" size="0.008"/>
           <body name="{n}_end" pos="0 0.045 0">
             <inertial pos="0 0.017 0" mass="0.015" diaginertia="4e-6 2e-6 4e-6"/>
             <joint name="{n}_bend" axis="{s}1 0 0" range="{range}"/>
@@ -44,7 +44,7 @@ _MODEL = """<mujoco model="made">
         <body name="t_link">
           <inertial pos="0 0 0.022" mass="0.03" diaginertia="8e-6 8e-6 4e-6"/>
           <joint name="t_curl" axis="0 1 0" range="-0.2 1.5"/>
-          <geom type="capsule" fromto="0 0 0.01 0 0 0.036" size="0.008"/>
+          <geom type="capsule" fromto="0 0 0.016 0 0 0.036" size="0.008"/>
           <body name="t_end" pos="0 0 0.045">
             <inertial pos="0 0 0.017" mass="0.015" diaginertia="4e-6 4e-6 2e-6"/>
             <joint name="t_bend" axis="0 1 0" range="0 1.6"/>
