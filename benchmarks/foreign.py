@@ -1,12 +1,13 @@
 """`diagnose` on a plant that others wrote: generate its cases on a seed, diagnose each, score with its own scorer.
 
-    python -m benchmarks.foreign [seed=source] [nulls=40] [cases=0,5,49] [jobs=1] [limit=300] [plant=../shared/foreign] [out=out/foreign]
+    python -m benchmarks.foreign [seed=source] [nulls=40] [cases=0,5,49] [jobs=1] [limit=300] [plant=../shared/foreign]
+    [out=out/foreign]
 
-seed: a number, or `source`: read off the sources of dexsim, so that no change can have been made with it in view. nulls: cases with nothing
-missing beside the plant's own set, from the seeds that follow. cases: only these numbers of the set. limit: seconds a diagnosis may take,
-handed to it as `limit=`; half as much again ends it. Resumable: what is finished is not run again. Writes table.md, score.txt and
-results.json to out=/seed_N, prints the score and one JSON line. Needs numba (pip install numba) and the plant; where either is absent
-it says so and skips.
+seed: a number, or `source`: read off the sources of dexsim, so that no change can have been made with it in view.
+nulls: cases with nothing missing beside the plant's own set, from the seeds that follow. cases: only these numbers of
+the set. limit: seconds a diagnosis may take, handed to it as `limit=`; half as much again ends it. Resumable: what is
+finished is not run again. Writes table.md, score.txt and results.json to out=/seed_N, prints the score and one JSON
+line. Needs numba (pip install numba) and the plant; where either is absent it says so and skips.
 """
 
 from __future__ import annotations
@@ -31,7 +32,16 @@ from dexsim.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 NULLS = range(49, 61)  # numbers of the plant's cases with nothing missing
-SETTINGS = {"seed": "source", "nulls": "40", "cases": "", "jobs": "1", "limit": "300", "plant": "../shared/foreign", "out": "out/foreign", "threads": "1"}
+SETTINGS = {
+    "seed": "source",
+    "nulls": "40",
+    "cases": "",
+    "jobs": "1",
+    "limit": "300",
+    "plant": "../shared/foreign",
+    "out": "out/foreign",
+    "threads": "1",
+}
 
 
 def parse(argv: Sequence[str]) -> dict[str, str]:
@@ -63,9 +73,13 @@ def generate(plant: Path, seed: int, only: Sequence[int], out: Path, jobs: int) 
         # a plain loop over processes of its own: what it computes does not depend on how many there are
         argv = [sys.executable, "generate.py", "--seed", str(seed), "--jobs", str(jobs), "--out", scratch]
         argv += ["--only", ",".join(map(str, only))] if only else []
-        done = subprocess.run(argv, cwd=code, env=os.environ | {"NUMBA_CACHE_DIR": f"{scratch}/numba"}, capture_output=True, text=True)
+        done = subprocess.run(
+            argv, cwd=code, env=os.environ | {"NUMBA_CACHE_DIR": f"{scratch}/numba"}, capture_output=True, text=True
+        )
         if done.returncode:
-            raise UserError(f"plant={plant}: its generator ended with {done.returncode}: {done.stderr.strip().splitlines()[-1:]}")
+            raise UserError(
+                f"plant={plant}: its generator ended with {done.returncode}: {done.stderr.strip().splitlines()[-1:]}"
+            )
         for part in ("cases", "truth"):
             (out / part).mkdir(parents=True, exist_ok=True)
             for item in (Path(scratch) / part).iterdir():
@@ -75,7 +89,8 @@ def generate(plant: Path, seed: int, only: Sequence[int], out: Path, jobs: int) 
 
 
 def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
-    """One case as a user would run it: without the recordings that the scorer keeps, from files that tell nothing of the case."""
+    """One case as a user would run it: without the recordings that the scorer keeps, from files that tell nothing of
+    the case."""
     if (out / "run.json").is_file():
         return
     out.mkdir(parents=True, exist_ok=True)
@@ -84,19 +99,36 @@ def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
         for path in [*case.glob("train/*.mcap"), *case.glob("repeat/*.mcap"), case / "rig.xml", case / "servo.yaml"]:
             shutil.copy(path, work)
         names = sorted(p.name for p in work.glob("*.mcap"))
-        argv = [sys.executable, str(ROOT / "diagnose.py"), f"recordings=[{','.join(str(work / n) for n in names)}]",
-                f"model={work / 'rig.xml'}", f"servo={work / 'servo.yaml'}", f"out={work / 'out'}", "next=false", f"limit={limit}"]  # fmt: skip
+        argv = [
+            sys.executable,
+            str(ROOT / "diagnose.py"),
+            f"recordings=[{','.join(str(work / n) for n in names)}]",
+            f"model={work / 'rig.xml'}",
+            f"servo={work / 'servo.yaml'}",
+            f"out={work / 'out'}",
+            "next=false",
+            f"limit={limit}",
+        ]
         start = time.perf_counter()
         with open(out / "log.txt", "w", encoding="utf-8") as log:
             try:
-                code = subprocess.run(argv, cwd=work, env=os.environ | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
-                                      stdout=log, stderr=subprocess.STDOUT, timeout=1.5 * limit).returncode  # fmt: skip
+                code = subprocess.run(
+                    argv,
+                    cwd=work,
+                    env=os.environ
+                    | {"OMP_NUM_THREADS": str(threads), "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    timeout=1.5 * limit,
+                ).returncode
             except subprocess.TimeoutExpired:
                 code = 124
         for name in ("diagnosis.json", "details.json"):
             if (work / "out" / name).is_file():
                 shutil.copy(work / "out" / name, out)
-        (out / "run.json").write_text(json.dumps({"seconds": time.perf_counter() - start, "rc": code, "recordings": names}), encoding="utf-8")
+        (out / "run.json").write_text(
+            json.dumps({"seconds": time.perf_counter() - start, "rc": code, "recordings": names}), encoding="utf-8"
+        )
 
 
 def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:
@@ -105,10 +137,18 @@ def summary(truths: Sequence[dict], answers: dict[str, dict | None]) -> dict:
     for tier in ("easy", "medium"):
         singles = [t for t in truths if t["kind"] == "single" and t["tier"] == tier]
         for least in (0.0, 0.5, 0.8):
-            out[f"{tier}_first_name_at_{least:g}"] = [sum(_first(answers[t["id"]], least) in _names(t) for t in singles), len(singles)]
+            out[f"{tier}_first_name_at_{least:g}"] = [
+                sum(_first(answers[t["id"]], least) in _names(t) for t in singles),
+                len(singles),
+            ]
     nulls = [t for t in truths if t["kind"] == "null"]
     out["false_alarms"] = [sum(_alarm(answers[t["id"]]) for t in nulls), len(nulls)]
-    sure = [(t, f) for t in truths for f in _physics(answers[t["id"]]) if f["confidence"] >= 0.8 and not f["indistinguishable"]]
+    sure = [
+        (t, f)
+        for t in truths
+        for f in _physics(answers[t["id"]])
+        if f["confidence"] >= 0.8 and not f["indistinguishable"]
+    ]
     out["confident_and_wrong"] = [len({t["id"] for t, f in sure if f["effect"] not in _names(t)}), len(truths)]
     return out
 
@@ -129,22 +169,39 @@ def _first(answer: dict | None, least: float) -> str:
 
 def _alarm(answer: dict | None) -> bool:
     """Where nothing is missing: a verdict that explains, a name of 0.5 and more, or no answer."""
-    return answer is None or answer["verdict"] in ("explained", "partly_explained") or any(f["confidence"] >= 0.5 for f in answer["findings"])
+    return (
+        answer is None
+        or answer["verdict"] in ("explained", "partly_explained")
+        or any(f["confidence"] >= 0.5 for f in answer["findings"])
+    )
 
 
 def table(truths: Sequence[dict], answers: dict[str, dict | None], seconds: dict[str, float]) -> str:
     """One line a case: what was hidden, what was said, errors in mrad before / after / floor, seconds."""
-    lines = ["| case | rig | tier | hidden | verdict | said | before / after / floor | s |", "|---|---|---|---|---|---|---|---|"]
+    lines = [
+        "| case | rig | tier | hidden | verdict | said | before / after / floor | s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for t in truths:
         hidden = " + ".join(f"{e['effect']}@{'/'.join(e['joints'])}" for e in t["effects"]) or "nothing"
         a = answers[t["id"]]
         if a is None:
-            lines.append(f"| {t['index']} | {t['rig']} | {t['tier']} | {hidden} | - | no answer | | {seconds[t['id']]:.0f} |")
+            lines.append(
+                f"| {t['index']} | {t['rig']} | {t['tier']} | {hidden} | - | no answer | | {seconds[t['id']]:.0f} |"
+            )
             continue
-        said = ", ".join(f"{f['effect']}@{'/'.join(f['where']['joints'])} {f['confidence']:.2f}" for f in a["findings"]) or "-"
+        said = (
+            ", ".join(f"{f['effect']}@{'/'.join(f['where']['joints'])} {f['confidence']:.2f}" for f in a["findings"])
+            or "-"
+        )
         h = a["held_out"]
-        errors = " / ".join("-" if x is None else f"{1e3 * x:.2f}" for x in (h["before"], h["after"], a["noise_floor"]["position_rad"]))
-        lines.append(f"| {t['index']} | {t['rig']} | {t['tier']} | {hidden} | {a['verdict']} | {said} | {errors} | {seconds[t['id']]:.0f} |")
+        errors = " / ".join(
+            "-" if x is None else f"{1e3 * x:.2f}" for x in (h["before"], h["after"], a["noise_floor"]["position_rad"])
+        )
+        lines.append(
+            f"| {t['index']} | {t['rig']} | {t['tier']} | {hidden} | {a['verdict']} | {said} | {errors} | "
+            f"{seconds[t['id']]:.0f} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -171,7 +228,10 @@ def main(argv: Sequence[str]) -> dict | None:
     np.random.default_rng(seed).shuffle(ids)  # where it is ended early, what was done is a fair sample
     begun = time.perf_counter()
     with ThreadPoolExecutor(max(jobs, 1)) as pool:
-        work = [pool.submit(diagnose, out / "cases" / i, out / "diagnoses" / i, int(s["limit"]), int(s["threads"])) for i in ids]
+        work = [
+            pool.submit(diagnose, out / "cases" / i, out / "diagnoses" / i, int(s["limit"]), int(s["threads"]))
+            for i in ids
+        ]
         for n, done in enumerate(as_completed(work), 1):
             done.result()
             spent = time.perf_counter() - begun
@@ -181,14 +241,30 @@ def main(argv: Sequence[str]) -> dict | None:
 
 def report(plant: Path, out: Path) -> dict:
     """Scores what is in `out`, with the plant's own scorer and by confidence."""
-    truths = sorted((json.loads(p.read_text()) for p in (out / "truth").glob("*.json")), key=lambda t: (t["seed"], t["index"]))
+    truths = sorted(
+        (json.loads(p.read_text()) for p in (out / "truth").glob("*.json")), key=lambda t: (t["seed"], t["index"])
+    )
     truths = [t for t in truths if (out / "diagnoses" / t["id"] / "run.json").is_file()]
     read = lambda i: json.loads(p.read_text()) if (p := out / "diagnoses" / i / "diagnosis.json").is_file() else None  # noqa: E731
     answers = {t["id"]: read(t["id"]) for t in truths}
     seconds = {t["id"]: json.loads((out / "diagnoses" / t["id"] / "run.json").read_text())["seconds"] for t in truths}
     (out / "table.md").write_text(table(truths, answers, seconds), encoding="utf-8")
-    score = subprocess.run([sys.executable, str(plant / "score.py"), str(out / "truth"), str(out / "diagnoses"), "--cases", str(out / "cases"),
-                            "--ids", ",".join(t["id"] for t in truths), "--json", str(out / "score.json")], capture_output=True, text=True)  # fmt: skip
+    score = subprocess.run(
+        [
+            sys.executable,
+            str(plant / "score.py"),
+            str(out / "truth"),
+            str(out / "diagnoses"),
+            "--cases",
+            str(out / "cases"),
+            "--ids",
+            ",".join(t["id"] for t in truths),
+            "--json",
+            str(out / "score.json"),
+        ],
+        capture_output=True,
+        text=True,
+    )
     (out / "score.txt").write_text(score.stdout + score.stderr, encoding="utf-8")
     print(score.stdout)
     line = {"benchmark": "foreign", "seed": truths[0]["seed"] if truths else None, **summary(truths, answers),

@@ -22,9 +22,24 @@ class Page:
 
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
-            [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-             "--disable-dev-shm-usage", "--no-first-run", "--mute-audio", f"--window-size={size[0]},{size[1]}", "--remote-debugging-port=0",
-             f"--user-data-dir={self._folder.name}", "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            [
+                CHROMIUM,
+                "--headless=new",
+                "--no-sandbox",
+                "--disable-gpu-sandbox",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+                "--disable-dev-shm-usage",
+                "--no-first-run",
+                "--mute-audio",
+                f"--window-size={size[0]},{size[1]}",
+                "--remote-debugging-port=0",
+                f"--user-data-dir={self._folder.name}",
+                "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         port_file, end = Path(self._folder.name, "DevToolsActivePort"), time.monotonic() + 60
         while not (port_file.exists() and "\n" in port_file.read_text()):
             assert time.monotonic() < end and self._process.poll() is None, "the browser did not start"
@@ -36,7 +51,9 @@ class Page:
         self._count = 0
         self.log: list[str] = []
         self.call("Runtime.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
         self.call("Page.navigate", url=url)
 
     def call(self, method: str, **params):
@@ -61,7 +78,9 @@ class Page:
         """Wait until the expression is true; returns its value."""
         end = time.monotonic() + seconds
         while not (value := self.js(expression)):
-            assert time.monotonic() < end, f"never true: {expression}\n{self.js('document.body.innerText')[:2000]}\n{self.log}"
+            assert time.monotonic() < end, (
+                f"never true: {expression}\n{self.js('document.body.innerText')[:2000]}\n{self.log}"
+            )
             time.sleep(0.2)
         return value
 
@@ -79,8 +98,13 @@ class Page:
     def press(self, key: str) -> None:
         """A key, e.g. ArrowRight."""
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode={"ArrowRight": 39, "ArrowLeft": 37,
-                      "ArrowDown": 40, "Enter": 13}.get(key, 0))
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode={"ArrowRight": 39, "ArrowLeft": 37, "ArrowDown": 40, "Enter": 13}.get(key, 0),
+            )
 
     def screenshot(self, path: Path) -> Path:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))

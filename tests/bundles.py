@@ -10,14 +10,29 @@ from worlds import task_cfg
 from dexsim.learning import checkpoint
 from dexsim.learning.ppo import agent_config
 
-QUIET = ("task.sensors.joint_noise=0", "task.sensors.torque_noise=0", "task.sensors.tip_noise=0", "task.sensors.vision_z_noise=0",
-         "task.sensors.vision_delay=[0,0]", "randomize.sensors.vision_xy=0", "randomize.sensors.torque_bias=0")
+QUIET = (
+    "task.sensors.joint_noise=0",
+    "task.sensors.torque_noise=0",
+    "task.sensors.tip_noise=0",
+    "task.sensors.vision_z_noise=0",
+    "task.sensors.vision_delay=[0,0]",
+    "randomize.sensors.vision_xy=0",
+    "randomize.sensors.torque_bias=0",
+)
 """Sensors without noise, bias or delay: what a recording of the truth can reproduce."""
 
 
-QUIET_TURN = ("task.sensors.joint_noise=0", "task.sensors.velocity_noise=0", "task.sensors.tip_noise=0", "task.sensors.imu_noise=0",
-              "task.sensors.imu_heading_walk=0", "randomize.sensors.joint_bias=0", "randomize.imu.delay=0", "randomize.imu.heading_rate=0",
-              "randomize.imu.tilt=0")
+QUIET_TURN = (
+    "task.sensors.joint_noise=0",
+    "task.sensors.velocity_noise=0",
+    "task.sensors.tip_noise=0",
+    "task.sensors.imu_noise=0",
+    "task.sensors.imu_heading_walk=0",
+    "randomize.sensors.joint_bias=0",
+    "randomize.imu.delay=0",
+    "randomize.imu.heading_rate=0",
+    "randomize.imu.tilt=0",
+)
 """The same for the rotation."""
 
 

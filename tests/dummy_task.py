@@ -1,4 +1,5 @@
-"""A tiny task for tests of the shell: N points on a line are pushed to a goal. Every part of the env contract, no physics."""
+"""A tiny task for tests of the shell: N points on a line are pushed to a goal. Every part of the env contract, no
+physics."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 NAMES = ("left", "right")
-XML = """<mujoco><worldbody><light pos="0 0 1"/><body><freejoint/><geom size="0.03" rgba=".9 .4 .2 1"/></body></worldbody></mujoco>"""
+XML = """<mujoco><worldbody><light pos="0 0 1"/><body><freejoint/><geom size="0.03" rgba=".9 .4 .2 1"/></body>
+ </worldbody></mujoco>"""
 
 
 class DummyEnv(VecEnv):
@@ -90,10 +92,17 @@ class DummyEnv(VecEnv):
         def progress_plot(axes):
             axes.plot([0, 1], [0, 1])
 
-        return {"metrics": {"episodes": episodes, "mean_return": float(total.mean()), "graph": self._x.requires_grad, "nothing": float("nan")},
-                "tables": [("by world", ("world", "return"), [(0, float(total[0]))])],
-                "frames": {"model": [mujoco.MjModel.from_xml_string(XML)], "qpos": [qpos], "overlay": [overlay]},
-                "plots": [("second", progress_plot), progress_plot]}
+        return {
+            "metrics": {
+                "episodes": episodes,
+                "mean_return": float(total.mean()),
+                "graph": self._x.requires_grad,
+                "nothing": float("nan"),
+            },
+            "tables": [("by world", ("world", "return"), [(0, float(total[0]))])],
+            "frames": {"model": [mujoco.MjModel.from_xml_string(XML)], "qpos": [qpos], "overlay": [overlay]},
+            "plots": [("second", progress_plot), progress_plot],
+        }
 
 
 def make_env(cfg, n_worlds, device, seed, engine):

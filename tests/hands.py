@@ -15,7 +15,8 @@ def _inertial(mass: float, size: tuple[float, float, float], at: tuple[float, fl
     a, b, c = size
     i = [mass / 12 * (b * b + c * c), mass / 12 * (a * a + c * c), mass / 12 * (a * a + b * b)]
     return (
-        f'<inertial><origin xyz="{at[0]} {at[1]} {at[2]}"/><mass value="{mass}"/><inertia ixx="{i[0]:.3e}" iyy="{i[1]:.3e}"'
+        f'<inertial><origin xyz="{at[0]} {at[1]} {at[2]}"/><mass value="{mass}"/><inertia ixx="{i[0]:.3e}" '
+        f'iyy="{i[1]:.3e}"'
         f' izz="{i[2]:.3e}" ixy="0" ixz="0" iyz="0"/></inertial>'
     )
 
@@ -55,9 +56,15 @@ def urdf(mesh: str = "meshes/tip.stl", left: bool = False) -> str:
                + _shape('<sphere radius="0.008"/>', (0, -0.006 * s, 0)) + "</link>")  # fmt: skip
     out.append('<link name="thumb_near">' + _inertial(0.03, (0.016, 0.045, 0.016), (0, -0.022 * s, 0))
                + _shape('<box size="0.015 0.040 0.015"/>', (0, -0.0225 * s, 0)) + "</link>")  # fmt: skip
-    out.append('<link name="thumb_far">' + _inertial(0.02, (0.014, 0.04, 0.014), (0, -0.02 * s, 0))
-               + "".join(f'<{tag}><origin rpy="0 0 {-s * np.pi / 2}"/><geometry><mesh filename="{mesh}"/></geometry></{tag}>'
-                         for tag in ("visual", "collision")) + "</link>")  # fmt: skip
+    out.append(
+        '<link name="thumb_far">'
+        + _inertial(0.02, (0.014, 0.04, 0.014), (0, -0.02 * s, 0))
+        + "".join(
+            f'<{tag}><origin rpy="0 0 {-s * np.pi / 2}"/><geometry><mesh filename="{mesh}"/></geometry></{tag}>'
+            for tag in ("visual", "collision")
+        )
+        + "</link>"
+    )
     out.append(_joint("thumb_turn", "base", "thumb_base", f"0.0 {-0.05 * s} 0.004", f"{-s} 0 0", 0.0, 2.6))
     out.append(_joint("thumb_1", "thumb_base", "thumb_near", f"0 {-0.016 * s} 0", f"0 0 {s}", -0.3, 1.4))
     out.append(_joint("thumb_2", "thumb_near", "thumb_far", f"0 {-0.045 * s} 0", f"0 0 {s}", 0.0, 1.5))

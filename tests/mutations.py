@@ -3,8 +3,8 @@
     python -m tests.mutations            all of them, about ten seconds each; by hand or nightly
     python -m tests.mutations grasp_eval those whose file or words hold all that is typed
 
-Each mutation is applied to a temporary copy of the package, never to this one. Ends with status 1 if one survives, or if a
-test fails without any mutation (its word would then say nothing).
+Each mutation is applied to a temporary copy of the package, never to this one. Ends with status 1 if one survives, or
+if a test fails without any mutation (its word would then say nothing).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SECONDS = 600
 
 @dataclass(frozen=True)
 class Mutation:
-    """file: below the repository's root; old: text that stands in it exactly once; new: what replaces it; test: what must fail then, as
-    pytest names it."""
+    """file: below the repository's root; old: text that stands in it exactly once; new: what replaces it; test: what
+    must fail then, as pytest names it."""
 
     breaks: str
     file: str
@@ -253,7 +253,8 @@ def mutated(m: Mutation, root: Path = ROOT) -> str:
     text = (root / m.file).read_text(encoding="utf-8")
     if text.count(m.old) != 1:
         raise ValueError(
-            f"{m.file} holds {m.old!r} {text.count(m.old)} times, not once: mend the line of '{m.breaks}' in tests/mutations.py"
+            f"{m.file} holds {m.old!r} {text.count(m.old)} times, not once: mend the line of '{m.breaks}' in "
+            "tests/mutations.py"
         )
     return text.replace(m.old, m.new)
 

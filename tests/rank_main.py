@@ -50,8 +50,16 @@ class ReportingRunner(Runner):
         iteration = self.iteration
         done = super().learn(*args)
         after = {k: v.double().sum().item() for k, v in self.alg.actor.state_dict().items()}
-        row = {"before": before, "after": after, "first_x": self.env.first_x.tolist(), "x": self.env._x.tolist(), "from": iteration,
-               "iteration": self.iteration, "steps": self.steps, "rate": self.alg.learning_rate}
+        row = {
+            "before": before,
+            "after": after,
+            "first_x": self.env.first_x.tolist(),
+            "x": self.env._x.tolist(),
+            "from": iteration,
+            "iteration": self.iteration,
+            "steps": self.steps,
+            "rate": self.alg.learning_rate,
+        }
         Path(os.environ["REPORT"]).mkdir(exist_ok=True)
         Path(os.environ["REPORT"], f"{rank}.json").write_text(json.dumps(row))
         return done

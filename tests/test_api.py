@@ -22,11 +22,18 @@ NAMES = [n for n in dexsim.__all__ if n != "__version__"]
 
 def cells(notebook: Path) -> list[str]:
     """The code cells of a notebook."""
-    return ["".join(c["source"]) for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if c["cell_type"] == "code"]
+    return [
+        "".join(c["source"])
+        for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        if c["cell_type"] == "code"
+    ]
 
 
 def test_importing_dexsim_loads_nothing_heavy():
-    look = "import sys, dexsim; print(sorted({'torch', 'mujoco', 'warp', 'numpy', 'hydra', 'scipy'} & set(sys.modules)), len(dir(dexsim)))"
+    look = (
+        "import sys, dexsim; print(sorted({'torch', 'mujoco', 'warp', 'numpy', 'hydra', 'scipy'} & "
+        "set(sys.modules)), len(dir(dexsim)))"
+    )
     done = subprocess.run([sys.executable, "-c", look], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[]", str(len(dexsim.__all__))]
 
@@ -143,5 +150,7 @@ def test_an_environment_a_policy_and_its_episodes(tmp_path, monkeypatch):
     plain = dexsim.make_env("grasp", worlds=2, device="cpu", seed=3, settings=["tactile=raw"])
     _, reward, done, _ = plain.step(torch.zeros(2, plain.num_actions))
     assert reward.shape == done.shape == (2,)
-    metrics = dexsim.play(policy="zero", episodes=2, device="cpu", settings=["worlds=2"], out=tmp_path / "it's here, [played]")
+    metrics = dexsim.play(
+        policy="zero", episodes=2, device="cpu", settings=["worlds=2"], out=tmp_path / "it's here, [played]"
+    )
     assert metrics["episodes"] == 2 and (tmp_path / "it's here, [played]" / "metrics.json").is_file()

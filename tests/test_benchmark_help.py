@@ -22,7 +22,9 @@ def test_commands_are_found():
 @pytest.mark.slow  # a new interpreter each
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_the_command_and_ends_well(name):
-    done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     assert f"benchmarks.{name}" in done.stdout
     assert "train.py [key=value" not in done.stdout  # its own, not that of the command behind it
@@ -31,13 +33,20 @@ def test_help_names_the_command_and_ends_well(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("module", ["benchmarks.loop.worlds", "benchmarks.reproduce.pack", "dexsim.tasks.reality"])
 def test_help_of_what_writes_files(module):
-    done = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0 and module in done.stdout, done.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["planted", "concealed"])
 def test_a_wrong_setting_is_one_line_and_status_2(name):
-    done = subprocess.run([sys.executable, "-m", f"benchmarks.{name}", "case=3"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", "case=3"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 2
-    assert done.stderr.strip().startswith("error: 'case=3' is not a setting") and len(done.stderr.strip().splitlines()) == 1
+    assert (
+        done.stderr.strip().startswith("error: 'case=3' is not a setting")
+        and len(done.stderr.strip().splitlines()) == 1
+    )

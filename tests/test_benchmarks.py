@@ -1,4 +1,5 @@
-"""The benchmarks measure what they say: replayed torques, equal taxels, counted bytes; and they run where there is no GPU."""
+"""The benchmarks measure what they say: replayed torques, equal taxels, counted bytes; and they run where there is no
+GPU."""
 
 from __future__ import annotations
 
@@ -84,7 +85,10 @@ def test_an_edited_scene_is_edited_only_inside():
     with physics.edited(physics._pyramidal):
         env = grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1)
     assert env.engine.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    assert grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1).engine.mjm.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert (
+        grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1).engine.mjm.opt.cone
+        == mujoco.mjtCone.mjCONE_ELLIPTIC
+    )
     with physics.edited(physics._no_self):
         m = grasp_env("task.objects.train=[box]", "task.objects.emphasis={}", worlds=1).engine.mjm
     on_object = m.geom_bodyid == m.body("object").id
@@ -109,7 +113,12 @@ def test_alternatives_feel_the_same_taxels(touch_scene, shape):
     touch.launch()
     ours = touch.raw_clean
     name, size = touch_benchmark.SHAPES[shape]
-    allowed = {"mesh query": 0.015, "wp.Volume": 0.005, "MuJoCo tactile": {"box": 0.3, "sphere": 1e-5, "grid": 0.05}[shape]}  # inside a box,
+    # inside a box,
+    allowed = {
+        "mesh query": 0.015,
+        "wp.Volume": 0.005,
+        "MuJoCo tactile": {"box": 0.3, "sphere": 1e-5, "grid": 0.05}[shape],
+    }
     # MuJoCo's value is no distance (test_depths_are_those_of_mujocos_tactile_sensor)
     for what, make in alternatives(scene, touch, name, np.asarray(size), poses[2]).items():
         way = make()
@@ -134,13 +143,22 @@ def run(*command: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, timeout=600)
 
 
-@pytest.mark.parametrize("name, setting", [
-    ("step", "steps=none"), ("learning", "worlds=0"), ("touch", "wrlds=3"), ("physics", "only=chosn"), ("engines", "worlds=many"),
-    ("trace", "device=cpu"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, setting",
+    [
+        ("step", "steps=none"),
+        ("learning", "worlds=0"),
+        ("touch", "wrlds=3"),
+        ("physics", "only=chosn"),
+        ("engines", "worlds=many"),
+        ("trace", "device=cpu"),
+    ],
+)
 def test_bad_settings_are_one_clear_line(name, setting):
     with pytest.raises(UserError) as error:
-        importlib.import_module(f"benchmarks.{name}").main([setting] + (["device=cpu"] if name in ("learning", "physics") else []))
+        importlib.import_module(f"benchmarks.{name}").main(
+            [setting] + (["device=cpu"] if name in ("learning", "physics") else [])
+        )
     assert setting.split("=")[0].replace("device", "CUDA") in str(error.value) and "\n" not in str(error.value)
 
 

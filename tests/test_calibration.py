@@ -24,7 +24,8 @@ from dexsim.tactile.reference import mooney_rivlin_force
 torch.set_num_threads(1)
 
 
-# -- lines ----------------------------------------------------------------------------------------------------------------------
+# -- lines
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def levels(slope=4.0, offset=0.0, friction=0.0, noise=0.05, n=8, seed=0, top=2.0) -> Levels:
@@ -81,7 +82,8 @@ def test_hysteresis_is_the_width_of_the_loop():
     assert f.hysteresis == pytest.approx(2 * 4.0 * 0.1 / levels(friction=0.1, noise=0.0).force.max(), rel=0.05)
 
 
-# -- presses ----------------------------------------------------------------------------------------------------------------------
+# -- presses
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +94,8 @@ def pressed():
 
 @pytest.mark.parametrize("joint, within", [("mid_joint1", 0.04), ("mid_joint2", 0.12)])
 def test_simulated_force_over_torque_is_one_over_the_lever_arm(pressed, joint, within):
-    """Statics, from the model's own Jacobian: torque = arm * force, whatever the servo does. The contact's own friction and the
-    millimetres by which it lies beside the taxel count more for the short arm."""
+    """Statics, from the model's own Jacobian: torque = arm * force, whatever the servo does. The contact's own friction
+    and the millimetres by which it lies beside the taxel count more for the short arm."""
     import mujoco
 
     found = presses.levels_of(pressed[joint])
@@ -133,7 +135,9 @@ def test_realistic_presses_give_the_current_per_torque_back(pressed, tmp_path):
         assert c["low"] < CURRENT_PER_TORQUE < c["high"] and c["value"] == pytest.approx(CURRENT_PER_TORQUE, rel=0.03)
         assert joints[joint]["real"]["file"] == f"{joint}.mcap", "each joint from the press made for it"
     assert joints["index_joint1"]["real"]["why"] == ["no press of it in the recordings"]
-    assert joints["mid_joint1"]["alpha"]["value"] == pytest.approx(joints["mid_joint1"]["beta"]["value"] / CURRENT_PER_TORQUE, rel=0.05)
+    assert joints["mid_joint1"]["alpha"]["value"] == pytest.approx(
+        joints["mid_joint1"]["beta"]["value"] / CURRENT_PER_TORQUE, rel=0.05
+    )
 
 
 def test_a_lost_sign_is_refused_and_the_wrong_kind_named(pressed, tmp_path):
@@ -159,24 +163,33 @@ def pushed(alpha=3.0, seed=0) -> Recording:
     touch = np.zeros((len(t), 5, 120, 3))
     touch[:, 3, 60:70, 2] = force[:, None] / 10 + 0.002 * rng.standard_normal((len(t), 10))
     q = np.full((len(t), 12), 0.3)
-    meta = DEFAULTS | {"joint_names": ",".join(xhand.JOINTS), "effort_is": "current_A", "effort_sign": "-1", "tactile_unit": "N", "tactile_lsb": "1"}
+    meta = DEFAULTS | {
+        "joint_names": ",".join(xhand.JOINTS),
+        "effort_is": "current_A",
+        "effort_sign": "-1",
+        "tactile_unit": "N",
+        "tactile_lsb": "1",
+    }
     return Recording(Path("pushed.mcap"), meta, xhand.JOINTS, Series(t, q, COMMANDS),
                      States(Series(t, q, STATES), None, Series(t, -effort, STATES)), tactile=Series(t, touch, TACTILE))
 
 
 def test_presses_from_outside_are_found_without_commands():
     found = presses.levels_of(pushed())
-    assert {"ring_joint1", "ring_joint2"} <= set(found) and "mid_joint1" not in found and "thumb_bend_joint" not in found
+    assert (
+        {"ring_joint1", "ring_joint2"} <= set(found) and "mid_joint1" not in found and "thumb_bend_joint" not in found
+    )
     first, second = (line.fit(found[j], "A") for j in ("ring_joint1", "ring_joint2"))
     assert first.ratio == pytest.approx(3.0, rel=0.02) and second.ratio == pytest.approx(7.5, rel=0.03) and first.linear
 
 
-# -- rubber -----------------------------------------------------------------------------------------------------------------------
+# -- rubber
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_treloars_rubber_up_to_stretch_three():
-    """Treloar (1944), simple elongation: Mooney-Rivlin holds within 5 % there, with his rubber's shear modulus (about 0.39 MPa,
-    4 kg/cm2 as he fits), and fails beyond."""
+    """Treloar (1944), simple elongation: Mooney-Rivlin holds within 5 % there, with his rubber's shear modulus (about
+    0.39 MPa, 4 kg/cm2 as he fits), and fails beyond."""
     table = rubber.TRELOAR_1944
     low = table[table[:, 0] <= 3.0]
     fit = rubber.fit_mooney_rivlin(*low.T)
@@ -219,7 +232,8 @@ def test_linear_stiffness_and_its_loop():
     assert k.hysteresis == pytest.approx(0.10 * 7000 * 0.5e-3 / (1.05 * 7000 * 1e-3), rel=0.1)
 
 
-# -- taxels -----------------------------------------------------------------------------------------------------------------------
+# -- taxels
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def rolled(n=150, seed=0, gains=None, dead=(), swapped=(), lsb=0.1, noise=0.3):
@@ -269,7 +283,8 @@ def test_gains_are_found_and_tell_held_out_loads_better():
 
 @pytest.fixture(scope="module")
 def pads():
-    """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp edges."""
+    """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp
+    edges."""
     return simulate.delivered(simulate.rolled_recording(160, seed=3, frames=12), 3)
 
 
@@ -297,7 +312,9 @@ def test_faults_of_a_simulated_pad_are_found(pads):
     x[:, [20, 90]] = x[:, [90, 20]]
     x[:, [53, 54, 77]] = 0
     p = taxels.inspect(x, load)
-    assert set(p.dead) <= {53, 54, 77} and set(p.dead) | set(p.unseen) >= {53, 54, 77} and len(p.dead) >= 2, "silent, and nothing else is dead"
+    assert set(p.dead) <= {53, 54, 77} and set(p.dead) | set(p.unseen) >= {53, 54, 77} and len(p.dead) >= 2, (
+        "silent, and nothing else is dead"
+    )
     assert p.swapped == [(20, 90)] and p.held_out < 0.95 * p.held_out_equal
     x, load = of_pad(pads, 2)  # a pad without dead taxels, whose neighbours make up for what they miss
     p = taxels.inspect(np.round(x / gains), load)
@@ -317,13 +334,23 @@ def test_hysteresis_of_a_pad_that_lags():
     assert taxels.inspect(shifted, load).hysteresis > 0.06 > taxels.inspect(x, load).hysteresis
 
 
-# -- the file -----------------------------------------------------------------------------------------------------------------------
+# -- the file
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_file_round_trip_and_meaning(tmp_path):
-    content = {"schema": 1, "joints": {"mid_joint1": {"current_per_torque": {"value": 2.0, "low": 1.9, "high": 2.1}, "current_max": 1.5}},
-               "touch": {"lsb": 0.05, "threshold": 0.12, "gain": {"ring": [2.0] * 120}, "dead": {"ring": [7]}, "swapped": {"thumb": [[3, 4]]},
-                         "bias": {"thumb": [1.0] * 120}}}  # fmt: skip
+    content = {
+        "schema": 1,
+        "joints": {"mid_joint1": {"current_per_torque": {"value": 2.0, "low": 1.9, "high": 2.1}, "current_max": 1.5}},
+        "touch": {
+            "lsb": 0.05,
+            "threshold": 0.12,
+            "gain": {"ring": [2.0] * 120},
+            "dead": {"ring": [7]},
+            "swapped": {"thumb": [[3, 4]]},
+            "bias": {"thumb": [1.0] * 120},
+        },
+    }
     save(tmp_path / "c.yaml", content)
     c = Calibration.load(tmp_path / "c.yaml")
     amps = np.zeros(12)
@@ -343,11 +370,20 @@ def test_file_round_trip_and_meaning(tmp_path):
     np.testing.assert_allclose(again.torque_norm(amps), c.torque_norm(amps))
 
 
-@pytest.mark.parametrize("change, says", [
-    ({"jonts": {}}, "jonts"), ({"joints": {"elbow": {}}}, "elbow"), ({"joints": {"mid_joint1": {"current_max": -1}}}, "current_max"),
-    ({"normalization": "x"}, "matched, paper"), ({"touch": {"gain": {"mid": [1, 2]}}}, "120"), ({"touch": {"dead": {"mid": [120]}}}, "mid.*<= 119"),
-    ({"touch": {"axis_sign": [1, 2, 3]}}, "axis_sign"), ({"current_sign": 0}, "current_sign"), ({"schema": 2}, "schema"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"jonts": {}}, "jonts"),
+        ({"joints": {"elbow": {}}}, "elbow"),
+        ({"joints": {"mid_joint1": {"current_max": -1}}}, "current_max"),
+        ({"normalization": "x"}, "matched, paper"),
+        ({"touch": {"gain": {"mid": [1, 2]}}}, "120"),
+        ({"touch": {"dead": {"mid": [120]}}}, "mid.*<= 119"),
+        ({"touch": {"axis_sign": [1, 2, 3]}}, "axis_sign"),
+        ({"current_sign": 0}, "current_sign"),
+        ({"schema": 2}, "schema"),
+    ],
+)
 def test_bad_files_are_named(change, says):
     with pytest.raises(UserError, match=says):
         Calibration.from_dict({"schema": 1} | change, "c.yaml")
@@ -359,7 +395,8 @@ def test_what_is_assumed_is_said():
     assert (Calibration.default().current_per_torque == CURRENT_PER_TORQUE).all(), "one figure in the whole package"
 
 
-# -- the command --------------------------------------------------------------------------------------------------------------------
+# -- the command
+# --------------------------------------------------------------------------------------------------------------------
 
 
 def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
@@ -375,31 +412,64 @@ def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
     force[:, 2] = load
     meta = DEFAULTS | {"joint_names": ",".join(xhand.JOINTS), "effort_is": "none"}
     q = np.zeros((len(x), 12))
-    r = Recording(Path("t.mcap"), meta, xhand.JOINTS, Series(t, q, COMMANDS), States(Series(t, q, STATES)), tactile=Series(t, touch, TACTILE),
-                  external_force=Series(t, force, EXTERNAL_FORCE))  # fmt: skip
+    r = Recording(
+        Path("t.mcap"),
+        meta,
+        xhand.JOINTS,
+        Series(t, q, COMMANDS),
+        States(Series(t, q, STATES)),
+        tactile=Series(t, touch, TACTILE),
+        external_force=Series(t, force, EXTERNAL_FORCE),
+    )
     write(tmp_path / "touch.mcap", r)
     curve = tmp_path / "curve.csv"
     curve.write_text("stretch,stress_Pa\n" + "\n".join(f"{a},{b}" for a, b in rubber.TRELOAR_1944))
     out = tmp_path / "out"
-    status = command.main([f"real={tmp_path / 'real'}", f"sim={tmp_path / 'sim'}", f"touch={tmp_path / 'touch.mcap'}", f"curve={curve}", f"out={out}"], CONFIGS)
+    status = command.main(
+        [
+            f"real={tmp_path / 'real'}",
+            f"sim={tmp_path / 'sim'}",
+            f"touch={tmp_path / 'touch.mcap'}",
+            f"curve={curve}",
+            f"out={out}",
+        ],
+        CONFIGS,
+    )
     said = capsys.readouterr().out
-    assert status == 0 and "linear" in said and "dead: [40]" in said and "Mooney-Rivlin" in said and "no press of it" in said
+    assert (
+        status == 0
+        and "linear" in said
+        and "dead: [40]" in said
+        and "Mooney-Rivlin" in said
+        and "no press of it" in said
+    )
     for name in ("real.png", "sim.png", "taxels.png", "rubber.png"):
         assert (out / name).stat().st_size > 10_000
     content = yaml.safe_load((out / "calibration.yaml").read_text())
-    assert content["touch"]["dead"] == {"index": [40]} and content["touch"]["rubber"]["c10"] == pytest.approx(1.04e5, rel=0.02)
+    assert content["touch"]["dead"] == {"index": [40]} and content["touch"]["rubber"]["c10"] == pytest.approx(
+        1.04e5, rel=0.02
+    )
     assert content["touch"]["lsb"] == pytest.approx(0.1, rel=0.06)
     c = Calibration.load(out / "calibration.yaml")
     assert c.current_per_torque[6] == pytest.approx(2.7, rel=0.03)
 
 
-@pytest.mark.parametrize("arguments, says", [
-    (["rael=x"], "did you mean real"), (["real=nowhere"], "real=nowhere"), (["simulate=maybe"], "true or false"), (["levels=2", "simulate=true"], "levels=2"),
-    (["out=x"], "say what to calibrate"), (["normalization=z"], "matched, paper"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["rael=x"], "did you mean real"),
+        (["real=nowhere"], "real=nowhere"),
+        (["simulate=maybe"], "true or false"),
+        (["levels=2", "simulate=true"], "levels=2"),
+        (["out=x"], "say what to calibrate"),
+        (["normalization=z"], "matched, paper"),
+    ],
+)
 def test_command_errors_are_one_line(arguments, says, tmp_path):
     with pytest.raises(UserError, match=says) as caught:
-        command.main([*arguments, *([] if any(a.startswith("out=") for a in arguments) else [f"out={tmp_path}"])], CONFIGS)
+        command.main(
+            [*arguments, *([] if any(a.startswith("out=") for a in arguments) else [f"out={tmp_path}"])], CONFIGS
+        )
     assert "\n" not in str(caught.value)
 
 

@@ -15,7 +15,9 @@ from dexsim.tasks import make_env
 @pytest.fixture(scope="module")
 def env():
     torch.set_num_threads(1)
-    cfg = start.for_train(["task=grasp", "worlds=12", "device=cpu", "task.objects.train=[box,sphere,rock]"], CONFIGS).cfg
+    cfg = start.for_train(
+        ["task=grasp", "worlds=12", "device=cpu", "task.objects.train=[box,sphere,rock]"], CONFIGS
+    ).cfg
     return make_env(cfg, 12, "cpu", 0, "mujoco")
 
 

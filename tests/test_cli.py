@@ -62,10 +62,24 @@ def test_a_run_from_start_to_play_command(configs, place, capfd):
     assert shell.call("train", configs, *QUICK, "run=first", "save_interval=1") == 0
     out = capfd.readouterr().out
     where = place / "runs" / "dummy" / "first"
-    for part in ("dexsim 0.1.0", "torch ", "warp-lang 1.19", "mujoco 4.0", "rsl-rl-lib 5.5", "device", "memory", "4 worlds",
-                 "compiling kernels (first run only; cached afterwards)", "observations of the actor (2)", "rewards (1)",
-                 "randomization (1)", "2/2", "steps/s", " left",
-                 "play it:  dexsim play checkpoint=runs/dummy/first/policy.pt"):
+    for part in (
+        "dexsim 0.1.0",
+        "torch ",
+        "warp-lang 1.19",
+        "mujoco 4.0",
+        "rsl-rl-lib 5.5",
+        "device",
+        "memory",
+        "4 worlds",
+        "compiling kernels (first run only; cached afterwards)",
+        "observations of the actor (2)",
+        "rewards (1)",
+        "randomization (1)",
+        "2/2",
+        "steps/s",
+        " left",
+        "play it:  dexsim play checkpoint=runs/dummy/first/policy.pt",
+    ):
         assert part in out, part
     assert "Actor Model" not in out and "Learning iteration" not in out  # rsl-rl's own printing
     names = {p.name for p in where.iterdir()}
@@ -233,8 +247,18 @@ def test_bad_play_argument_is_one_line(configs, place, capfd, argv, words):
 def test_values_that_may_take_another_shape(configs):
     from dexsim.cli.start import for_train
 
-    cfg = for_train(["task=dummy", "device=cpu", "task.sizes=[3.0]", "task.mass=[0.1,0.2]", "task.steps=30", "+task.new=1",
-                     "~task.flag"], configs).cfg["task"]
+    cfg = for_train(
+        [
+            "task=dummy",
+            "device=cpu",
+            "task.sizes=[3.0]",
+            "task.mass=[0.1,0.2]",
+            "task.steps=30",
+            "+task.new=1",
+            "~task.flag",
+        ],
+        configs,
+    ).cfg["task"]
     assert (cfg["sizes"], cfg["mass"], cfg["steps"], cfg["new"]) == ([3.0], [0.1, 0.2], 30, 1) and "flag" not in cfg
 
 

@@ -1,4 +1,5 @@
-"""The narrow phase of hulls: against C MuJoCo on random poses, warm starts, what it refuses, and its place in a physics step."""
+"""The narrow phase of hulls: against C MuJoCo on random poses, warm starts, what it refuses, and its place in a physics
+step."""
 
 from __future__ import annotations
 
@@ -20,12 +21,14 @@ POSES = 768
 
 @pytest.mark.parametrize("kind", bench.KINDS)
 def test_contacts_of_random_poses_are_those_of_c_mujoco(kind):
-    """Surfaces from 2 mm deep to the margin apart, a tenth with faces parallel: all contacts, none too many, to 1e-7 m."""
+    """Surfaces from 2 mm deep to the margin apart, a tenth with faces parallel: all contacts, none too many, to 1e-7
+    m."""
     got = bench.kind_of_pair(kind, POSES, "cpu", POSES, seed=3)["hand"]
     assert got["contacts"] > POSES / 6 and got["missed"] == got["extra"] == 0
     assert got["dist_m"]["median"] < 5e-9 and got["dist_m"]["worst"] < 1e-7, got["dist_m"]
     assert got["normal_rad"]["p99"] < 1e-5, got["normal_rad"]
-    assert got["point_m"]["p99"] < 1e-7 and got["point_m"]["worst"] < 1e-5, got["point_m"]  # worst: a core only 10 um away
+    # worst: a core only 10 um away
+    assert got["point_m"]["p99"] < 1e-7 and got["point_m"]["worst"] < 1e-5, got["point_m"]
 
 
 @pytest.fixture(scope="module", params=["capsule", "box", "hull"])
@@ -63,7 +66,8 @@ def test_what_was_nearest_before_does_not_decide_what_is_nearest_now(two_poses):
         dist, normal, _ = found[start]
         with np.errstate(invalid="ignore"):
             error = np.abs(dist - cold[0])
-        edge = np.abs(np.where(np.isfinite(cold[0]), cold[0], dist) - bench.MARGIN) < 1e-7  # a contact or not, by rounding
+        # a contact or not, by rounding
+        edge = np.abs(np.where(np.isfinite(cold[0]), cold[0], dist) - bench.MARGIN) < 1e-7
         assert ((np.isfinite(dist) == np.isfinite(cold[0])) | edge).all(), start
         both = np.isfinite(dist) & np.isfinite(cold[0])
         assert error[both].max() < 1e-7, start
@@ -75,7 +79,8 @@ def test_corners_of_another_mesh_are_forgotten(two_poses):
     worlds.put(before)
     worlds.collide()
     want = worlds.found()[0]
-    worlds.narrow.simplex.fill_(wp.vec3i(60 | (60 << 16), 61 | (61 << 16), 62 | (62 << 16)))  # no hull of the library has so many
+    # no hull of the library has so many
+    worlds.narrow.simplex.fill_(wp.vec3i(60 | (60 << 16), 61 | (61 << 16), 62 | (62 << 16)))
     worlds.collide()
     got = worlds.found()[0]
     near = np.isfinite(want) & np.isfinite(got)
@@ -85,7 +90,10 @@ def test_corners_of_another_mesh_are_forgotten(two_poses):
 @pytest.fixture(scope="module")
 def grasping():
     """A closing hand of each setting, the same worlds: (hand, mujoco)."""
-    return tuple(grasp_env("task.objects.baked_scales=[1.25]", f"sim.collision={c}", worlds=9, engine="warp") for c in ("hand", "mujoco"))
+    return tuple(
+        grasp_env("task.objects.baked_scales=[1.25]", f"sim.collision={c}", worlds=9, engine="warp")
+        for c in ("hand", "mujoco")
+    )
 
 
 def test_both_settings_make_the_same_contacts_of_a_hand(grasping):
@@ -107,7 +115,21 @@ def test_both_settings_make_the_same_contacts_of_a_hand(grasping):
         n, c = int(e.d.nacon.numpy()[0]), e.d.contact
         geom, world, pos = c.geom.numpy()[:n], c.worldid.numpy()[:n], c.pos.numpy()[:n]
         order = np.lexsort((pos[:, 0].round(4), geom[:, 1], geom[:, 0], world))
-        names = ("worldid", "geom", "dim", "includemargin", "friction", "solref", "solreffriction", "solimp", "type", "geomcollisionid", "dist", "pos", "frame")
+        names = (
+            "worldid",
+            "geom",
+            "dim",
+            "includemargin",
+            "friction",
+            "solref",
+            "solreffriction",
+            "solimp",
+            "type",
+            "geomcollisionid",
+            "dist",
+            "pos",
+            "frame",
+        )
         tables.append({f: getattr(c, f).numpy()[:n][order] for f in names})
     a, b = tables
     assert len(a["dist"]) == len(b["dist"]) > 30
@@ -153,7 +175,8 @@ def _launched(program) -> list:
     return [(k, d) for k, d in seen if np.prod(d) and not k.is_generic]
 
 
-# -- what it refuses --------------------------------------------------------------------------------------------------------------
+# -- what it refuses
+# --------------------------------------------------------------------------------------------------------------
 
 
 def test_settings_that_do_not_exist_or_cannot_be_served():
@@ -164,12 +187,24 @@ def test_settings_that_do_not_exist_or_cannot_be_served():
     assert make_engine(pendulum_spec(), 1, "cpu", "warp").narrow is None
 
 
-@pytest.mark.parametrize("edit, word", [
-    (lambda s: None, None),
-    (lambda s: s.add_sensor(type=mujoco.mjtSensor.mjSENS_GEOMDIST, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname="a", reftype=mujoco.mjtObj.mjOBJ_GEOM,
-                            refname="b", cutoff=1.0), "sensor"),
-    (lambda s: setattr(s.option, "disableflags", 0), "multiccd"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "edit, word",
+    [
+        (lambda s: None, None),
+        (
+            lambda s: s.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_GEOMDIST,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname="a",
+                reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                refname="b",
+                cutoff=1.0,
+            ),
+            "sensor",
+        ),
+        (lambda s: setattr(s.option, "disableflags", 0), "multiccd"),
+    ],
+)
 def test_what_a_model_asks_for_is_served_or_the_reason_said(edit, word):
     spec = mujoco.MjSpec()
     for name in ("a", "b"):

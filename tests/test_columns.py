@@ -15,7 +15,9 @@ Q = {"elbow": 0.3 * np.sin(3 * T), "wrist": 0.2 * np.cos(2 * T)}
 
 
 def csv(path, table, separator=","):
-    rows = [separator.join(table)] + [separator.join("" if np.isnan(x) else f"{x:.17g}" for x in row) for row in zip(*table.values(), strict=True)]
+    rows = [separator.join(table)] + [
+        separator.join("" if np.isnan(x) else f"{x:.17g}" for x in row) for row in zip(*table.values(), strict=True)
+    ]
     path.write_text("\n".join(rows) + "\n")
     return path
 
@@ -27,11 +29,23 @@ def plain(scale=1.0, start=0.0):
     return out
 
 
-@pytest.mark.parametrize(("name", "role"), [
-    ("position.elbow", ("position", "elbow", "")), ("Elbow Position (deg)", ("position", "Elbow", "deg")), ("goal_position.a", ("command", "a", "")),
-    ("time_ms", ("time", "", "ms")), ("time.command", ("time", "command", "")), ("left_elbow_pitch_velocity_rpm", ("velocity", "left_elbow_pitch", "rpm")),
-    ("/joint_commands/elbow/position", ("command", "elbow", "")), ("position[3]", ("position", "3", "")), ("current_2 (mA)", ("effort", "2", "ma")),
-    ("quality", None), ("index", None), ("q.elbow", ("position", "elbow", ""))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("position.elbow", ("position", "elbow", "")),
+        ("Elbow Position (deg)", ("position", "Elbow", "deg")),
+        ("goal_position.a", ("command", "a", "")),
+        ("time_ms", ("time", "", "ms")),
+        ("time.command", ("time", "command", "")),
+        ("left_elbow_pitch_velocity_rpm", ("velocity", "left_elbow_pitch", "rpm")),
+        ("/joint_commands/elbow/position", ("command", "elbow", "")),
+        ("position[3]", ("position", "3", "")),
+        ("current_2 (mA)", ("effort", "2", "ma")),
+        ("quality", None),
+        ("index", None),
+        ("q.elbow", ("position", "elbow", "")),
+    ],
+)
 def test_what_a_column_is(name, role):
     found = _role(name)
     assert (found and found[:3]) == role
@@ -41,7 +55,9 @@ def test_what_a_column_is(name, role):
 def test_a_csv_is_a_recording(tmp_path, separator):
     r = read(csv(tmp_path / "a.csv", plain(), separator), audit=False)
     assert r.joints == ("elbow", "wrist") and r.effort_is == "torque_Nm" and r.start_ns == 0
-    assert np.allclose(r.commands.value, np.stack(list(Q.values()), 1), atol=1e-8) and np.allclose(r.states.position.t, T)
+    assert np.allclose(r.commands.value, np.stack(list(Q.values()), 1), atol=1e-8) and np.allclose(
+        r.states.position.t, T
+    )
     assert np.allclose(r.states.effort.value[:, 0], Q["elbow"], atol=1e-8) and r.states.velocity is None
 
 
@@ -62,9 +78,22 @@ def test_units_stand_in_a_name_or_in_meta_and_are_converted_once(tmp_path):
 def test_an_npz_with_arrays_is_the_same_recording(tmp_path):
     joints = list(Q)
     stack = np.stack(list(Q.values()), 1)
-    np.savez(tmp_path / "a.npz", time=T, command_time=T[::2], command=stack[::2], position=stack, joint_names=joints, temperature=np.full((200, 2), 30.0))
+    np.savez(
+        tmp_path / "a.npz",
+        time=T,
+        command_time=T[::2],
+        command=stack[::2],
+        position=stack,
+        joint_names=joints,
+        temperature=np.full((200, 2), 30.0),
+    )
     r = read(tmp_path / "a.npz", audit=False)
-    assert r.joints == tuple(joints) and len(r.commands) == 100 and len(r.states.position) == 200 and r.temperature.value.shape == (200, 2)
+    assert (
+        r.joints == tuple(joints)
+        and len(r.commands) == 100
+        and len(r.states.position) == 200
+        and r.temperature.value.shape == (200, 2)
+    )
 
 
 def test_columns_and_joints_called_otherwise_are_named(tmp_path):
@@ -88,12 +117,22 @@ def test_missing_cells_are_missing_samples(tmp_path):
     assert len(r.commands) == 20 and len(r.states.position) == 200
 
 
-@pytest.mark.parametrize(("text", "why"), [
-    ("", "no line of column names"), ("1,2\n3,4\n", "no line of column names"), ("time,position.a,position_a\n0,1,2\n", "are both position of a"),
-    ("time,time\n0,1\n", "two columns"), ("position.a\n1\n", "comma"), ("x,position.a\n0,1\n0,1\n", "no column of time"),
-    ("time,position,position.a,command.b\n" + "0,1,1,1\n" * 9, "names no joint"), ("time,position.a [furlong]\n0,1\n", None),
-    ("time,position.a\n" + "".join(f"{10 * i},1\n" for i in range(30)), "meta.time_unit"), ("time,torque.a,current.b,position.a\n0,1,1,1\n", "current in one"),
-    ("time,position.a [rpm]\n0,1\n", "not read")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "no line of column names"),
+        ("1,2\n3,4\n", "no line of column names"),
+        ("time,position.a,position_a\n0,1,2\n", "are both position of a"),
+        ("time,time\n0,1\n", "two columns"),
+        ("position.a\n1\n", "comma"),
+        ("x,position.a\n0,1\n0,1\n", "no column of time"),
+        ("time,position,position.a,command.b\n" + "0,1,1,1\n" * 9, "names no joint"),
+        ("time,position.a [furlong]\n0,1\n", None),
+        ("time,position.a\n" + "".join(f"{10 * i},1\n" for i in range(30)), "meta.time_unit"),
+        ("time,torque.a,current.b,position.a\n0,1,1,1\n", "current in one"),
+        ("time,position.a [rpm]\n0,1\n", "not read"),
+    ],
+)
 def test_bad_files_get_one_line(tmp_path, text, why):
     path = tmp_path / "a.csv"
     path.write_text(text)
@@ -124,6 +163,10 @@ def test_convert_writes_what_is_read(tmp_path):
     path = csv(tmp_path / "a.csv", plain())
     convert(path, tmp_path / "a.mcap", {}, {"gravity": "0 0 0"})
     a, b = read(path, audit=False), read(tmp_path / "a.mcap", audit=False)
-    assert np.allclose(a.states.position.value, b.states.position.value) and b.meta["gravity"] == "0 0 0" and b.joints == a.joints
+    assert (
+        np.allclose(a.states.position.value, b.states.position.value)
+        and b.meta["gravity"] == "0 0 0"
+        and b.joints == a.joints
+    )
     with pytest.raises(UserError, match="exists"):
         convert(path, tmp_path / "a.mcap", {}, {})

@@ -1,4 +1,5 @@
-"""The concealed benchmark itself: its plant against the pendulum's own formulas, and that nothing but the motion tells."""
+"""The concealed benchmark itself: its plant against the pendulum's own formulas, and that nothing but the motion
+tells."""
 
 from __future__ import annotations
 
@@ -20,11 +21,18 @@ SMOOTH = {"coulomb": 0.0, "viscous": 0.0, "kp": 0.0, "kd": 0.0}
 BOB = plant.pendulum(0.1)
 
 
-def run(rows: int, steps: int, command: float | np.ndarray = 0.0, rig=BOB, q0=0.0, driven: bool = True, **values) -> dict[str, np.ndarray]:
+def run(
+    rows: int, steps: int, command: float | np.ndarray = 0.0, rig=BOB, q0=0.0, driven: bool = True, **values
+) -> dict[str, np.ndarray]:
     """One-joint rows of the plant; outputs [rows, steps]."""
     c = np.broadcast_to(np.asarray(command, float), (rows, 1, steps))
     p = plant.rows(rows, len(rig.names), **values)
-    return {k: v[:, 0] for k, v in plant.simulate(rig, p, np.repeat(c, len(rig.names), 1), q0=np.asarray(q0, float).reshape(-1, 1), driven=driven).items()}
+    return {
+        k: v[:, 0]
+        for k, v in plant.simulate(
+            rig, p, np.repeat(c, len(rig.names), 1), q0=np.asarray(q0, float).reshape(-1, 1), driven=driven
+        ).items()
+    }
 
 
 def crossings(x: np.ndarray) -> np.ndarray:
@@ -49,17 +57,31 @@ def test_pendulum_swings_at_its_own_frequency():
     """Both inertias count, and the period grows with the amplitude: T = T0 (1 + a^2/16 + 11 a^4/3072)."""
     amplitude = np.array([0.05, 0.9])
     q = run(2, 3000, q0=amplitude, driven=False, **SMOOTH)["position"]
-    expected = 2 * np.pi * np.sqrt((0.15 * 0.1**2 + 4e-4) / (0.15 * 9.81 * 0.1)) * (1 + amplitude**2 / 16 + 11 * amplitude**4 / 3072)
+    expected = (
+        2
+        * np.pi
+        * np.sqrt((0.15 * 0.1**2 + 4e-4) / (0.15 * 9.81 * 0.1))
+        * (1 + amplitude**2 / 16 + 11 * amplitude**4 / 3072)
+    )
     for row in range(2):
         assert np.diff(crossings(q[row])).mean() == pytest.approx(expected[row], rel=0.003)
     assert np.abs(q[:, -800:]).max(1) == pytest.approx(amplitude, rel=0.02)  # the step itself takes no energy
 
 
 def test_links_of_an_arm_move_as_lagrange_says():
-    """Two-link planar arm: mass matrix, gravity and Coriolis torques against the formulas of a textbook (point masses)."""
+    """Two-link planar arm: mass matrix, gravity and Coriolis torques against the formulas of a textbook (point
+    masses)."""
     l1, c1, c2, m1, m2 = 0.1, 0.07, 0.06, 0.2, 0.12
-    rig = plant.Rig(("a", "b"), np.array([[0, 0], [0, 1]]), np.tile(np.eye(3), (1, 2, 1, 1)), np.array([[[0, 0, 0], [0, 0, -l1]]]), np.array([[[0, 1.0, 0]] * 2]),
-                    np.array([[[0, 0, -c1], [0, 0, -c2]]]), np.zeros((1, 2, 3, 3)), np.array([0, 0, -9.81]))  # fmt: skip
+    rig = plant.Rig(
+        ("a", "b"),
+        np.array([[0, 0], [0, 1]]),
+        np.tile(np.eye(3), (1, 2, 1, 1)),
+        np.array([[[0, 0, 0], [0, 0, -l1]]]),
+        np.array([[[0, 1.0, 0]] * 2]),
+        np.array([[[0, 0, -c1], [0, 0, -c2]]]),
+        np.zeros((1, 2, 3, 3)),
+        np.array([0, 0, -9.81]),
+    )
     rng = np.random.default_rng(0)
     q, v = rng.uniform(-1, 1, (5, 1, 2)), rng.uniform(-4, 4, (5, 1, 2))
     mass = np.tile([m1, m2], (5, 1, 1))
@@ -67,14 +89,17 @@ def test_links_of_an_arm_move_as_lagrange_says():
     a, b, va, vb = q[:, 0, 0], q[:, 0, 1], v[:, 0, 0], v[:, 0, 1]
     s = m2 * l1 * c2 * np.sin(b)
     assert M[:, 0, 0, 0] == pytest.approx(m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * np.cos(b)))
-    assert M[:, 0, 0, 1] == pytest.approx(m2 * (c2**2 + l1 * c2 * np.cos(b))) and M[:, 0, 1, 1] == pytest.approx(m2 * c2**2)
+    assert M[:, 0, 0, 1] == pytest.approx(m2 * (c2**2 + l1 * c2 * np.cos(b))) and M[:, 0, 1, 1] == pytest.approx(
+        m2 * c2**2
+    )
     lower = m2 * 9.81 * c2 * np.sin(a + b)
     assert h[:, 0, 0] == pytest.approx(-s * (2 * va * vb + vb**2) + (m1 * c1 + m2 * l1) * 9.81 * np.sin(a) + lower)
     assert h[:, 0, 1] == pytest.approx(s * va**2 + lower)
 
 
 def test_friction_holds_below_its_level_and_play_is_as_wide_as_said():
-    q = run(2, 3000, q0=[0.9, 0.9], driven=False, **(SMOOTH | {"coulomb": np.array([0.05, 0.2])}))["position"]  # the weight asks for 0.115 N.m
+    # the weight asks for 0.115 N.m
+    q = run(2, 3000, q0=[0.9, 0.9], driven=False, **(SMOOTH | {"coulomb": np.array([0.05, 0.2])}))["position"]
     assert abs(q[0, -1]) < 0.6 and abs(q[1, -1] - 0.9) < 0.02
     # a motor held in place: the link hangs on one flank, and pulled up by a spring on the other
     for play in (0.02, 0.06):
@@ -92,14 +117,25 @@ def test_delay_is_felt_after_its_time():
 
 
 def test_other_joints_matter_where_they_should():
-    """Coupling moves a joint by its share of another's motion; a sagging supply takes torque only while the other one works."""
+    """Coupling moves a joint by its share of another's motion; a sagging supply takes torque only while the other one
+    works."""
     rig = plant.pendulum(names=("a", "b"), lengths=(0.1, 0.1))
     p = plant.rows(2, 2, kp=8.0, kd=0.2, torque_limit=5.0, couple=np.array([[0.0, 0.0], [0.0, 0.1]]), motor_side=1.0)
     c = np.zeros((2, 2, 1500))
     c[:, 0] = 0.5
     q = plant.simulate(rig, p, c)["position"]
     assert q[0, 1, -1] == pytest.approx(0.0, abs=2e-3) and q[1, 1, -1] == pytest.approx(0.1 * q[1, 0, -1], rel=0.15)
-    p = plant.rows(1, 2, voltage=1.0, kp=2.0, kd=0.0, torque_limit=1.0, no_load_speed=10.0, coulomb=1e-3, sag=np.array([[0.0, 3.0]]))
+    p = plant.rows(
+        1,
+        2,
+        voltage=1.0,
+        kp=2.0,
+        kd=0.0,
+        torque_limit=1.0,
+        no_load_speed=10.0,
+        coulomb=1e-3,
+        sag=np.array([[0.0, 3.0]]),
+    )
     hold = np.zeros((1, 2, 1200))
     hold[0, 1] = 0.6
     alone = plant.simulate(rig, p, hold, q0=np.array([[0.0, 0.5]]))["position"][0, 1, -1]
@@ -109,32 +145,56 @@ def test_other_joints_matter_where_they_should():
 
 
 def test_ball_on_a_flat_pad():
-    """A ball pressed on a square of two triangles: depth by hand, force by its law, all of it on the taxels, read late and with its gain."""
+    """A ball pressed on a square of two triangles: depth by hand, force by its law, all of it on the taxels, read late
+    and with its gain."""
     square = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]]) * 0.02
     xy = np.stack(np.meshgrid(np.arange(-6, 7) * 2e-3, np.arange(-6, 7) * 2e-3), -1).reshape(-1, 2)
     points = np.c_[xy, np.zeros(len(xy))]
-    pad = touch.Pad(square, 1e-4, points, np.tile([0, 0, 1.0], (len(xy), 1)), np.full(len(xy), 4e-6), np.array([0, 0, 0.0141]), np.array([0, 0, -1.0]),
-                    np.array([1.0, 0, 0]), 0.012, np.zeros(3))  # fmt: skip
+    pad = touch.Pad(
+        square,
+        1e-4,
+        points,
+        np.tile([0, 0, 1.0], (len(xy), 1)),
+        np.full(len(xy), 4e-6),
+        np.array([0, 0, 0.0141]),
+        np.array([0, 0, -1.0]),
+        np.array([1.0, 0, 0]),
+        0.012,
+        np.zeros(3),
+    )
     assert pad.depth(np.array([0.0, 3e-3]), np.array([0.0, 1e-3])) == pytest.approx([-2e-3, 1e-3], abs=2e-5)
     command = np.zeros((2, 400))
     command[1] = np.where(np.arange(400) > 100, 4e-3, 0.0)
     p = touch.DEFAULTS | {"gain": 0.5, "delay": 0.05}
     q, force = touch.move(pad, p, command)
-    assert force[-1] == pytest.approx(7000 * (q[1, -1] - 2e-3), rel=0.01) and force[-1] == pytest.approx(4000 * (4e-3 - q[1, -1]), rel=0.01)
+    assert force[-1] == pytest.approx(7000 * (q[1, -1] - 2e-3), rel=0.01) and force[-1] == pytest.approx(
+        4000 * (4e-3 - q[1, -1]), rel=0.01
+    )
     z = touch.readings(pad, p, q, force)
-    assert z[-1].sum() == pytest.approx(0.5 * force[-1], rel=1e-3) and points[z[-1].argmax()] == pytest.approx([0, 0, 0])
+    assert z[-1].sum() == pytest.approx(0.5 * force[-1], rel=1e-3) and points[z[-1].argmax()] == pytest.approx(
+        [0, 0, 0]
+    )
     first = [int(np.flatnonzero(x > 0.05 * x.max())[0]) for x in (force, z.sum(1))]
     assert first[1] - first[0] == 50
     held = touch.readings(pad, p | {"delay": 0.0, "fraction": 0.4, "time_constant": 0.02}, q, force).sum(1)
-    assert held.max() > 1.1 * 0.5 * force.max() and held[-1] == pytest.approx(0.5 * force[-1], rel=0.01)  # stiffer while fast, then relaxed
+    # stiffer while fast, then relaxed
+    assert held.max() > 1.1 * 0.5 * force.max() and held[-1] == pytest.approx(0.5 * force[-1], rel=0.01)
     spread = touch.readings(pad, p | {"delay": 0.0, "crosstalk": 0.3}, q, force)[-1]
     assert (spread > 0.01).sum() > (z[-1] > 0.01).sum() and spread.sum() == pytest.approx(z[-1].sum(), rel=0.02)
 
 
 def entries(*kinds: str, shape: str = "one", tier: str = "easy") -> list[dict]:
     """Plan entries of given kinds ("none": nothing missing)."""
-    return [{"group": "none" if k == "none" else "outside" if k in effects.OUTSIDE else "effect", "kinds": [] if k == "none" else [k], "tier": tier, "shape": shape, "joints": []}
-            for k in kinds]  # fmt: skip
+    return [
+        {
+            "group": "none" if k == "none" else "outside" if k in effects.OUTSIDE else "effect",
+            "kinds": [] if k == "none" else [k],
+            "tier": tier,
+            "shape": shape,
+            "joints": [],
+        }
+        for k in kinds
+    ]
 
 
 @pytest.fixture
@@ -175,7 +235,8 @@ def test_names_and_metadata_tell_nothing(some):
 
 @pytest.mark.slow
 def test_metadata_classifier_is_at_chance(quick, tmp_path):
-    """Everything that is not motion, of thirty cases in two classes, through a leave-one-out nearest-neighbour classifier."""
+    """Everything that is not motion, of thirty cases in two classes, through a leave-one-out nearest-neighbour
+    classifier."""
     features, labels = [], []
     for n in range(30):
         kind = ("none", "stribeck")[n % 2]
@@ -183,8 +244,16 @@ def test_metadata_classifier_is_at_chance(quick, tmp_path):
         folder = tmp_path / "cases" / made["name"]
         r = read(folder / "a.mcap")
         servo = yaml.safe_load((folder / "servo.yaml").read_text(encoding="utf-8"))
-        row = [int(made["name"], 16) / 2**32, servo["drive"] == "voltage", servo["loop_encoder"] == "motor", r.meta["effort_is"] == "none",
-               (folder / "rig.xml").stat().st_size, len(r.states.position), float(r.states.position.t[0]), len(r.temperature)]  # fmt: skip
+        row = [
+            int(made["name"], 16) / 2**32,
+            servo["drive"] == "voltage",
+            servo["loop_encoder"] == "motor",
+            r.meta["effort_is"] == "none",
+            (folder / "rig.xml").stat().st_size,
+            len(r.states.position),
+            float(r.states.position.t[0]),
+            len(r.temperature),
+        ]
         features.append(np.array(row + list(servo["joints"]["joint0"].values()), float))
         labels.append(n % 2)
     x, y = np.array(features), np.array(labels)
@@ -201,8 +270,16 @@ def test_what_is_believed_does_not_depend_on_the_effect(quick, tmp_path):
         made = generate.build(entries(kind, tier="hard")[0], 5, 3, tmp_path / kind, tmp_path / "truth" / kind)
         folder = tmp_path / kind / made["name"]
         r = read(folder / "a.mcap")
-        texts.add(((folder / "rig.xml").read_text(), (folder / "servo.yaml").read_text(), json.dumps(r.meta, sort_keys=True), made["name"],
-                   r.commands.value.tobytes(), r.states.position.t.tobytes()))  # fmt: skip
+        texts.add(
+            (
+                (folder / "rig.xml").read_text(),
+                (folder / "servo.yaml").read_text(),
+                json.dumps(r.meta, sort_keys=True),
+                made["name"],
+                r.commands.value.tobytes(),
+                r.states.position.t.tobytes(),
+            )
+        )
     assert len(texts) == 1
 
 
@@ -222,7 +299,16 @@ def test_hash_binds_the_truth_and_the_salt_hides_it(some, tmp_path):
 
 
 def test_plan_is_fixed_by_its_seed_and_takes_every_effect_in_turn():
-    mix = {"effect": 3 * len(effects.BY_EFFECT), "none": 4, "noise": 2, "pair": 3, "outside": 2, "decoy": 5, "hand": 3, "touch": 4}
+    mix = {
+        "effect": 3 * len(effects.BY_EFFECT),
+        "none": 4,
+        "noise": 2,
+        "pair": 3,
+        "outside": 2,
+        "decoy": 5,
+        "hand": 3,
+        "touch": 4,
+    }
     assert generate.plan(mix, 7) == generate.plan(mix, 7) != generate.plan(mix, 8)
     plan = generate.plan(mix, 7)
     hidden = [(effects.KINDS[p["kinds"][0]].effect, p["tier"]) for p in plan if p["group"] == "effect"]
@@ -246,38 +332,88 @@ def test_size_is_what_was_asked(tmp_path, monkeypatch):
 
 def test_scores_by_hand():
     def finding(effect, confidence=0.9, group=(), joint="joint0", **parameters):
-        return {"effect": effect, "confidence": confidence, "indistinguishable": list(group), "where": {"joints": [joint], "taxels": [], "topics": []},
-                "when": [{"recording": "a.mcap", "start": 1.0, "end": 2.0}], "held_out": {"before": 11.0, "after": 3.0},
-                "parameters": {k: dict(zip(("value", "low", "high"), v, strict=True)) for k, v in parameters.items()}}  # fmt: skip
+        return {
+            "effect": effect,
+            "confidence": confidence,
+            "indistinguishable": list(group),
+            "where": {"joints": [joint], "taxels": [], "topics": []},
+            "when": [{"recording": "a.mcap", "start": 1.0, "end": 2.0}],
+            "held_out": {"before": 11.0, "after": 3.0},
+            "parameters": {k: dict(zip(("value", "low", "high"), v, strict=True)) for k, v in parameters.items()},
+        }
 
-    hidden = {"effect": "backlash", "kind": "backlash", "joint": "joint0", "parameters": {"gap": 0.02}, "facts": {"floor": 1.0, "before": 11.0, "ratio": 11.0},
-              "when": [["a", 1.0, 2.5]], "also": []}  # fmt: skip
-    truth = {"name": "x", "group": "effect", "decoy": "", "tier": "easy", "shape": "one", "joints": 1, "effects": [hidden]}
+    hidden = {
+        "effect": "backlash",
+        "kind": "backlash",
+        "joint": "joint0",
+        "parameters": {"gap": 0.02},
+        "facts": {"floor": 1.0, "before": 11.0, "ratio": 11.0},
+        "when": [["a", 1.0, 2.5]],
+        "also": [],
+    }
+    truth = {
+        "name": "x",
+        "group": "effect",
+        "decoy": "",
+        "tier": "easy",
+        "shape": "one",
+        "joints": 1,
+        "effects": [hidden],
+    }
     held = {"before": 11.0, "after": 3.0}
     right = {"verdict": "explained", "held_out": held, "findings": [finding("backlash", gap=(0.022, 0.019, 0.025))]}
     r = score.one(truth, right)
-    assert r["right"] and r["alone"] and not r["wrong_sure"] and r["parameter_errors"] == pytest.approx([0.1]) and r["covered"] == [True]
+    assert (
+        r["right"]
+        and r["alone"]
+        and not r["wrong_sure"]
+        and r["parameter_errors"] == pytest.approx([0.1])
+        and r["covered"] == [True]
+    )
     assert r["removed"] == pytest.approx(0.8) and r["overlap"] == pytest.approx(2 / 3, abs=0.01)
     named = {"verdict": "explained", "held_out": held, "findings": [finding("coulomb_friction")]}
     assert not score.one(truth, named)["right"] and score.one(truth, named)["wrong_sure"]
     elsewhere = {"verdict": "explained", "held_out": held, "findings": [finding("backlash", joint="joint1")]}
     assert score.one(truth, elsewhere)["wrong_sure"]  # the right name on the wrong joint
-    as_set = {"verdict": "explained", "held_out": held, "findings": [finding("coulomb_friction", group=("backlash", "coulomb_friction"))]}
-    assert score.one(truth, as_set)["right"] and not score.one(truth, as_set)["alone"] and not score.one(truth, as_set)["wrong_sure"]
+    as_set = {
+        "verdict": "explained",
+        "held_out": held,
+        "findings": [finding("coulomb_friction", group=("backlash", "coulomb_friction"))],
+    }
+    assert (
+        score.one(truth, as_set)["right"]
+        and not score.one(truth, as_set)["alone"]
+        and not score.one(truth, as_set)["wrong_sure"]
+    )
     foreign = {"verdict": "explained", "held_out": held, "findings": [finding("lag", group=("backlash", "lag"))]}
     assert not score.one(truth, foreign)["right"]  # a set of no class is no answer
-    pair = {**truth, "group": "pair", "joints": 2, "effects": [hidden, {**hidden, "effect": "lag", "kind": "lag", "joint": "joint1"}]}
+    pair = {
+        **truth,
+        "group": "pair",
+        "joints": 2,
+        "effects": [hidden, {**hidden, "effect": "lag", "kind": "lag", "joint": "joint1"}],
+    }
     p = score.one(pair, {**right, "findings": [finding("backlash"), finding("lag")]})
     assert p["f1"] == [1, 2, 2] and p["joint_f1"] == [1, 1, 2]  # lag is named on the wrong joint
     linked = {**truth, "joints": 2, "effects": [{**hidden, "effect": "joint_coupling", "also": ["joint1"]}]}
     other_end = score.one(linked, {**right, "findings": [finding("joint_coupling", joint="joint1")]})
-    assert other_end["right"] and not other_end["wrong_sure"] and other_end["joint_f1"] == [1, 1, 1]  # a linkage has two ends
+    # a linkage has two ends
+    assert other_end["right"] and not other_end["wrong_sure"] and other_end["joint_f1"] == [1, 1, 1]
     nothing = {**truth, "group": "none", "effects": []}
-    assert score.one(nothing, right)["false_alarm"] and not score.one(nothing, {**right, "findings": [], "verdict": "none"})["false_alarm"]
+    assert (
+        score.one(nothing, right)["false_alarm"]
+        and not score.one(nothing, {**right, "findings": [], "verdict": "none"})["false_alarm"]
+    )
     outside = {**truth, "group": "outside", "effects": [{**hidden, "effect": "", "kind": "cable_spring"}]}
-    assert not score.one(outside, right)["humble"] and score.one(outside, {**right, "verdict": "unknown", "findings": []})["humble"]
+    assert (
+        not score.one(outside, right)["humble"]
+        and score.one(outside, {**right, "verdict": "unknown", "findings": []})["humble"]
+    )
     bad = {**nothing, "group": "decoy", "decoy": "bad_channel"}
-    assert score.one(bad, {**right, "findings": [finding("bad_channel")]})["caught"] and not score.one(bad, right)["caught"]
+    assert (
+        score.one(bad, {**right, "findings": [finding("bad_channel")]})["caught"]
+        and not score.one(bad, right)["caught"]
+    )
     lines = score.table([r, score.one(nothing, right)])
     assert lines["right effect first, easy"]["value"] == 1.0 and lines["confident and wrong, all cases"]["value"] == 0.5
 
@@ -285,7 +421,8 @@ def test_scores_by_hand():
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_twelve_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
-    """Effects, nothing missing, a pair, decoys, one outside the catalogue: diagnosed by the command; then again from the disk."""
+    """Effects, nothing missing, a pair, decoys, one outside the catalogue: diagnosed by the command; then again from
+    the disk."""
     line = command.main(["ci=true", "seed=2", "jobs=2", "limit=600", f"out={tmp_path}"])
     assert line["cases"] == sum(command.CI.values()) == 12 and line["failed"] == line["left_out"] == 0
     assert line["lines"]["confident and wrong, all cases"]["value"] <= 0.34
@@ -299,7 +436,14 @@ def test_twelve_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
 
 def test_baselines_recover_what_they_can(tmp_path, monkeypatch):
     """CMA-ES finds a minimum; the plain simulation agrees with the plant where nothing but a known delay is wrong."""
-    best = baselines.cma(lambda x: ((x - [0.3, -0.2]) ** 2 * [1.0, 25.0]).sum(1), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), np.array([0.8, 0.8]), 40, 0)
+    best = baselines.cma(
+        lambda x: ((x - [0.3, -0.2]) ** 2 * [1.0, 25.0]).sum(1),
+        np.array([-1.0, -1.0]),
+        np.array([1.0, 1.0]),
+        np.array([0.8, 0.8]),
+        40,
+        0,
+    )
     assert best == pytest.approx([0.3, -0.2], abs=0.01)
     monkeypatch.setattr(generate, "SECONDS", 1.5)
     monkeypatch.setattr(generate, "SIZES", 2)
@@ -310,24 +454,37 @@ def test_baselines_recover_what_they_can(tmp_path, monkeypatch):
 
 
 def test_the_hidden_number_is_compared_where_both_have_it(tmp_path):
-    """mujoco.sysid's armature is of the rotor, the truth's is beyond what is believed; an effect that is not named is 100 % off."""
+    """mujoco.sysid's armature is of the rotor, the truth's is beyond what is believed; an effect that is not named is
+    100 % off."""
     said = tmp_path / "diagnosis.json"
-    said.write_text(json.dumps({"findings": [{"effect": "inertia", "parameters": {"armature": {"value": 1.1e-3, "low": 0, "high": 2e-3}}}]}))
+    said.write_text(
+        json.dumps(
+            {"findings": [{"effect": "inertia", "parameters": {"armature": {"value": 1.1e-3, "low": 0, "high": 2e-3}}}]}
+        )
+    )
     effect = {"kind": "inertia", "effect": "inertia", "parameters": {"armature": 1e-3}}
     found = {"sysid_values": {"armature": 1.8e-3}, "meant": {"armature": 6e-4, "mass": 0.1, "kp": 1.0}}
     assert baselines._parameter(effect, said, found) == pytest.approx({"sysid": 0.2, "diagnose": 0.1})
     said.write_text(json.dumps({"findings": []}))
     assert baselines._parameter(effect, said, found)["diagnose"] == 1.0
-    assert baselines._parameter(effect, said, {}) is None and baselines._parameter({**effect, "kind": "backlash"}, said, found) is None
+    assert (
+        baselines._parameter(effect, said, {}) is None
+        and baselines._parameter({**effect, "kind": "backlash"}, said, found) is None
+    )
 
 
 def test_a_run_ends_when_it_must_and_leaves_out_what_was_under_way(tmp_path, monkeypatch):
-    """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong answer; other methods' cases come among them."""
+    """A diagnosis that the run's end stops is left out, one that took too long by itself is a wrong answer; other
+    methods' cases come among them."""
     made = [{"name": "late", "digest": ""}, {"name": "slow", "digest": ""}]
     monkeypatch.setattr(sys, "executable", "/bin/false")
     begun = command.time.perf_counter()
     s = {"budget": 0, "until": 2, "limit": 100}
-    monkeypatch.setattr(command.subprocess, "run", lambda *a, timeout, **k: (_ for _ in ()).throw(command.subprocess.TimeoutExpired("", timeout)))
+    monkeypatch.setattr(
+        command.subprocess,
+        "run",
+        lambda *a, timeout, **k: (_ for _ in ()).throw(command.subprocess.TimeoutExpired("", timeout)),
+    )
     command._diagnose(made[0], s, tmp_path, begun)
     command._diagnose(made[1], s | {"limit": 1}, tmp_path, begun)
     assert not (tmp_path / "diagnoses" / "late" / "seconds").exists()
@@ -346,8 +503,18 @@ def test_the_others_are_asked_about_what_stands_out(some):
 
 
 def test_right_by_size_and_by_confidence_are_counted():
-    r = {"group": "effect", "decoy": "", "right": True, "ratio": 3.0, "hidden": [("lag", "j")], "said": [("lag", "j", 0.99, []), ("payload", "j", 0.7, [])]}
-    silent, as_set = {**r, "right": False, "said": [], "ratio": 39.0}, {**r, "said": [("lag", "j", 0.9, ["command_delay", "lag"])]}
+    r = {
+        "group": "effect",
+        "decoy": "",
+        "right": True,
+        "ratio": 3.0,
+        "hidden": [("lag", "j")],
+        "said": [("lag", "j", 0.99, []), ("payload", "j", 0.7, [])],
+    }
+    silent, as_set = (
+        {**r, "right": False, "said": [], "ratio": 39.0},
+        {**r, "said": [("lag", "j", 0.9, ["command_delay", "lag"])]},
+    )
     sizes = {a: x for a, _, *x in page.by_size([r, silent, as_set])}
     assert sizes[2.2] == [2, 2, 0] and sizes[6.0] == [1, 0, 1] and sizes[1.25] == [0, 0, 0]
     sure = {a: x for a, _, *x in page.by_confidence([r, silent, as_set, {**r, "decoy": "bad_channel"}])}

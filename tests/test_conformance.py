@@ -3,13 +3,16 @@
 Free trajectories diverge (contact is chaotic), so after each step the second engine takes over the first one's whole
 state: positions, velocities, warm start, servo queues, random numbers. What is left is one control step of difference:
 
-- C MuJoCo works in float64 and MuJoCo-Warp in float32: a position of 0.1 m resolves to 7e-9 m, 0.02 um of contact depth at
+- C MuJoCo works in float64 and MuJoCo-Warp in float32: a position of 0.1 m resolves to 7e-9 m, 0.02 um of contact depth
+at
   7 kN/m are 1e-4 N, and Newton stops at 1e-6 instead of 1e-8 of its scale. Without contact the engines agree to that.
-- In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so the worst
+- In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so the
+worst
   is compared only loosely.
-- Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact. MuJoCo-Warp stops at
-  8 and 20 in training (configs/config.yaml), and where a solver is cut off depends on rounding: 5 % of impacts then differ by
-  0.3 mm and more. Here both solvers may finish.
+- Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact.
+MuJoCo-Warp stops at
+  8 and 20 in training (configs/config.yaml), and where a solver is cut off depends on rounding: 5 % of impacts then
+  differ by 0.3 mm and more. Here both solvers may finish.
 - C MuJoCo must not be cut off there: at 8 iterations it throws an object out of a firm grasp now and then (last tests).
 Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 8e-8, 2e-7, 2e-6 rad; object 7e-9, 7e-8, 2e-7 m; contact
 forces 1e-5, 8e-4, 2e-3 N; reward 1e-7, 2e-6, 1e-5.
@@ -31,7 +34,8 @@ class Twin:
     """A step of each engine from the same state; `collision` as sim.collision of MuJoCo-Warp's."""
 
     def __init__(self, collision: str):
-        settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}",  # all shapes alike
+        # all shapes alike
+        settings = ("task.objects.baked_scales=[1.25]", "task.objects.emphasis={wedge:1,tee:1,box:1}",
                     "sim.iterations=30", "sim.ls_iterations=50")  # solvers that finish
         self.c = grasp_env(*settings, worlds=N, engine="mujoco")
         self.w = grasp_env(*settings, f"sim.collision={collision}", worlds=N, engine="warp")
@@ -61,7 +65,11 @@ class Twin:
             if isinstance(value, torch.Tensor):
                 getattr(w.objects, name).copy_(value)
         for name, value in vars(c).items():
-            if isinstance(value, torch.Tensor) and isinstance(getattr(w, name), torch.Tensor) and not name.startswith("_"):
+            if (
+                isinstance(value, torch.Tensor)
+                and isinstance(getattr(w, name), torch.Tensor)
+                and not name.startswith("_")
+            ):
                 getattr(w, name).copy_(value)
         w._episode_length.copy_(c._episode_length)
         w.rng.set_state(c.rng.get_state())
@@ -77,13 +85,24 @@ class Twin:
             def keep(env=env, into=seen[name], base=type(env)._after):
                 base(env)
                 e = env.engine
-                into.update({
-                    "hand": e.t.qpos[:, env.joint_q], "hand_v": e.t.qvel[:, env.joint_v], "object": e.t.qpos[:, env.object_q[:3]],
-                    "turn": e.t.qpos[:, env.object_q[3:]], "object_v": e.t.qvel[:, env.object_v[:3]], "spin": e.t.qvel[:, env.object_v[3:]],
-                    "normal": e.t.pair_normal, "force": e.t.pair_force.reshape(N, -1), "xpos": e.t.xpos.reshape(N, -1),
-                    "touch": env.touch.force_clean, "centre": env.touch.centre_clean.reshape(N, -1), "torque": env.servo.torque,
-                    "reward": env.reward[:, None], "done": env.done[:, None],
-                })
+                into.update(
+                    {
+                        "hand": e.t.qpos[:, env.joint_q],
+                        "hand_v": e.t.qvel[:, env.joint_v],
+                        "object": e.t.qpos[:, env.object_q[:3]],
+                        "turn": e.t.qpos[:, env.object_q[3:]],
+                        "object_v": e.t.qvel[:, env.object_v[:3]],
+                        "spin": e.t.qvel[:, env.object_v[3:]],
+                        "normal": e.t.pair_normal,
+                        "force": e.t.pair_force.reshape(N, -1),
+                        "xpos": e.t.xpos.reshape(N, -1),
+                        "touch": env.touch.force_clean,
+                        "centre": env.touch.centre_clean.reshape(N, -1),
+                        "torque": env.servo.torque,
+                        "reward": env.reward[:, None],
+                        "done": env.done[:, None],
+                    }
+                )
                 for k, v in env.rewards().items():
                     into[f"reward_{k}"] = v[:, None]
                 into.update({k: v.clone().double() for k, v in into.items()})
@@ -91,7 +110,9 @@ class Twin:
             env._after = keep
             obs, reward, done, extras = env.step(action)
             del env._after
-            seen[name] |= {"obs_" + g: v.double() for g, v in obs.items()} | {"time_outs": extras["time_outs"].double()[:, None]}
+            seen[name] |= {"obs_" + g: v.double() for g, v in obs.items()} | {
+                "time_outs": extras["time_outs"].double()[:, None]
+            }
         return {k: (seen["c"][k], seen["w"][k]) for k in seen["c"]}
 
 
@@ -139,10 +160,19 @@ def test_there_is_something_to_compare(record):
     record["same_after_reset"].w.check()
 
 
-TOLERANCE = {  # median, 95 % and worst over worlds and steps: 10 and 20 times what was measured; the worst, a flip, loosely
-    "hand": (1e-6, 4e-6, 3e-3), "hand_v": (3e-5, 5e-4, 0.3), "object": (1e-7, 1.5e-6, 1e-3), "turn": (2e-6, 4e-5, 2e-2),
-    "object_v": (5e-6, 1e-4, 0.15), "spin": (2e-4, 6e-3, 5.0), "xpos": (3e-7, 1.5e-6, 1e-3), "torque": (5e-6, 6e-5, 5e-2),
-    "normal": (1e-4, 1.6e-2, 3.0), "touch": (1e-4, 4e-4, 1.0), "reward": (1.2e-6, 3e-5, 0.03),
+# median, 95 % and worst over worlds and steps: 10 and 20 times what was measured; the worst, a flip, loosely
+TOLERANCE = {
+    "hand": (1e-6, 4e-6, 3e-3),
+    "hand_v": (3e-5, 5e-4, 0.3),
+    "object": (1e-7, 1.5e-6, 1e-3),
+    "turn": (2e-6, 4e-5, 2e-2),
+    "object_v": (5e-6, 1e-4, 0.15),
+    "spin": (2e-4, 6e-3, 5.0),
+    "xpos": (3e-7, 1.5e-6, 1e-3),
+    "torque": (5e-6, 6e-5, 5e-2),
+    "normal": (1e-4, 1.6e-2, 3.0),
+    "touch": (1e-4, 4e-4, 1.0),
+    "reward": (1.2e-6, 3e-5, 0.03),
 }  # rad, rad/s, m, 1, m/s, rad/s, m, N.m, N, N, a step
 
 
@@ -152,7 +182,10 @@ def test_one_step_maps_agree(record, name):
     assert all(x <= limit for x, limit in zip(got, TOLERANCE[name], strict=True)), (name, got)
 
 
-@pytest.mark.parametrize("name, limit", [("hand", 2e-6), ("hand_v", 2e-4), ("object", 1e-6), ("object_v", 5e-5), ("spin", 2e-3), ("torque", 2e-5)])
+@pytest.mark.parametrize(
+    "name, limit",
+    [("hand", 2e-6), ("hand_v", 2e-4), ("object", 1e-6), ("object_v", 5e-5), ("spin", 2e-3), ("torque", 2e-5)],
+)
 def test_free_of_contact_they_agree_to_float32(record, name, limit):
     pressed = (record["normal"][0].amax(-1) > 0) | (record["normal"][1].amax(-1) > 0)
     near = pressed.clone()  # forces are those of a step's end: it may have touched on the way from or to a free step
@@ -186,7 +219,8 @@ def test_smooth_reward_terms_agree(record, name):
 
 
 def test_contact_sums_agree_more_than_single_contacts(record):
-    """The object's whole momentum change is the sum over pairs: of what presses it, engines agree to 0.03 % in the median."""
+    """The object's whole momentum change is the sum over pairs: of what presses it, engines agree to 0.03 % in the
+    median."""
     c, w = (record["normal"][i][..., 5:11].sum(-1).flatten() for i in (0, 1))
     firm = c > 1.0
     ratio = (w[firm] / c[firm] - 1).abs()
@@ -195,12 +229,13 @@ def test_contact_sums_agree_more_than_single_contacts(record):
     assert got[0] < 3e-4 and got[1] < 1e-2, got
 
 
-# -- where C MuJoCo's solver is cut off ------------------------------------------------------------------------------------------
+# -- where C MuJoCo's solver is cut off
+# ------------------------------------------------------------------------------------------
 
 
 def thrown(steps: int, *settings: str) -> set[int]:
-    """Worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than 1.5 m/s in one control
-    step: gravity adds 0.2 m/s, a firm catch takes 0.6."""
+    """Worlds of 64, played by the included policy on C MuJoCo, whose object's velocity changes by more than 1.5 m/s in
+    one control step: gravity adds 0.2 m/s, a firm catch takes 0.6."""
     env, policy = play_env("grasp", 64, *settings)
     env.reset_all()
     obs, found = env.get_observations(), set()

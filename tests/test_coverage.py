@@ -26,14 +26,16 @@ def test_what_lies_within_is_covered_and_what_does_not_is_not():
     assert inside["force_covered"] == inside["centre_covered"] == 1.0 and inside["region_visited"] < 0.3
     half = coverage.envelope(ours, samples(5000, (4.0, 12.0), (0.0, 0.02), 1))
     assert half["force_covered"] == pytest.approx(0.5, abs=0.03)
-    assert half["centre_covered"] == pytest.approx((0.006 / 0.02) ** 2, abs=0.03)  # a cell of 2 mm reaches over the edge
+    # a cell of 2 mm reaches over the edge
+    assert half["centre_covered"] == pytest.approx((0.006 / 0.02) ** 2, abs=0.03)
     assert half["force_interval"][0] < 0.5 < half["force_interval"][1] and np.diff(half["force_interval"])[0] < 0.06
     assert same["centre_training_halves"] > 0.99 and same["force_training_halves"] > 0.99
     assert coverage.envelope(ours, samples(3, (1, 2), (0, 1)))["force_covered"] is None
 
 
 def test_samples_of_one_world_count_as_one():
-    """Ten worlds, five of them wholly inside and five wholly outside: the interval is that of ten draws, not of 10,000."""
+    """Ten worlds, five of them wholly inside and five wholly outside: the interval is that of ten draws, not of
+    10,000."""
     block = np.repeat(np.arange(10), 1000)
     low, high = coverage.interval(block < 5, block, np.random.default_rng(0))
     assert low == pytest.approx(0.2, abs=0.05) and high == pytest.approx(0.8, abs=0.05)
@@ -52,7 +54,8 @@ def test_contact_centres_lie_on_the_pad():
     layout = xhand_layout()
     force, local = np.array([[0.0, 2.0, 0.05, 0.0, 3.0]]), layout.point[None, :, 7]
     out = coverage.of_contact(force, local, np.array([3]))
-    assert [len(c.force) for c in out] == [0, 1, 0, 0, 1] and out[1].block.tolist() == [3]  # a force at rest is no contact
+    # a force at rest is no contact
+    assert [len(c.force) for c in out] == [0, 1, 0, 0, 1] and out[1].block.tolist() == [3]
     for f in (1, 4):
         plane = coverage.planes()[f]
         back = plane.middle + out[f][1][0] @ plane.axes
@@ -93,9 +96,22 @@ def test_against_the_other_world_and_a_recording(tmp_path):
     common = ["checkpoint=checkpoints/rotate.pt", "worlds=4", "seconds=1", "device=cpu"]
     assert coverage.main([*common, "reality=bench", f"out={tmp_path}"]) == 0
     found = json.loads((tmp_path / "coverage.json").read_text())["fingers"]
-    assert set(found) == {"thumb", "index", "mid", "ring", "pinky"} and (tmp_path / "coverage.png").stat().st_size > 1000
-    begun = start.for_play(["checkpoint=checkpoints/rotate.pt", "episodes=1", "video=false", f"record={tmp_path}/a.mcap", "device=cpu",
-                            "task.evaluation.cap_s=2", "tactile=raw", f"out={tmp_path}/play"], CONFIGS)
+    assert (
+        set(found) == {"thumb", "index", "mid", "ring", "pinky"} and (tmp_path / "coverage.png").stat().st_size > 1000
+    )
+    begun = start.for_play(
+        [
+            "checkpoint=checkpoints/rotate.pt",
+            "episodes=1",
+            "video=false",
+            f"record={tmp_path}/a.mcap",
+            "device=cpu",
+            "task.evaluation.cap_s=2",
+            "tactile=raw",
+            f"out={tmp_path}/play",
+        ],
+        CONFIGS,
+    )
     assert play.run(begun) == 0
     touch = coverage.recorded(str(tmp_path / "a.mcap"), {})
     assert sum(len(c.force) for c in touch) > 5 and set(np.concatenate([c.block for c in touch])) <= {0, 1, 2}

@@ -34,7 +34,9 @@ torch.set_num_threads(1)
 def made(tmp_path_factory):
     """A bundle whose training had quiet sensors and kept every taxel."""
     folder = tmp_path_factory.mktemp("deploy")
-    source = make_checkpoint(folder / "policy.pt", *QUIET, "tactile.raw=true", "task.command.low=0.6", "task.command.high=0.6")
+    source = make_checkpoint(
+        folder / "policy.pt", *QUIET, "tactile.raw=true", "task.command.low=0.6", "task.command.high=0.6"
+    )
     return export.export(str(source), folder / "out", steps=4), source
 
 
@@ -56,7 +58,8 @@ def episode(made, tmp_path_factory):
         with torch.no_grad():
             for k in range(80):
                 obs = env.get_observations()
-                action = policy(obs) if k < 40 else torch.where(torch.arange(12) > 3, 1.0, policy(obs))  # then close, to press
+                # then close, to press
+                action = policy(obs) if k < 40 else torch.where(torch.arange(12) > 3, 1.0, policy(obs))
                 env.step(action)
                 if bool(env.done[0]):
                     break
@@ -73,7 +76,9 @@ def test_a_recorded_episode_gives_the_same_observations_and_actions(made, episod
     b, c = bundle.load(made[0]), Calibration.default()
     clock = VirtualClock()
     hand = ReplayHand(recording, c, clock)
-    settings = LoopSettings(seconds=len(observations) * 0.021 - 1e-3, command=0.6, home=False, speed=100.0, tor_max=32767)
+    settings = LoopSettings(
+        seconds=len(observations) * 0.021 - 1e-3, command=0.6, home=False, speed=100.0, tor_max=32767
+    )
 
     class Taught(Loop):
         """The recorded targets stand for the sent ones, so that one difference cannot grow into the next."""
@@ -95,19 +100,23 @@ def test_a_recorded_episode_gives_the_same_observations_and_actions(made, episod
 
 
 def test_a_replay_with_wrong_calibration_is_seen(made, episode):
-    """The same replay, with currents read by another calibration: observations differ where torque is, and only there."""
+    """The same replay, with currents read by another calibration: observations differ where torque is, and only
+    there."""
     recording, observations, *_ = episode
     other = Calibration.from_dict({"joints": {j: {"current_per_torque": 5.4} for j in xhand.JOINTS}})
     clock = VirtualClock()
     hand = ReplayHand(recording, Calibration.default(), clock)
-    loop = Loop(bundle.load(made[0]), hand, hand, other, LoopSettings(seconds=0.4, command=0.6, home=False), clock, keep=True)
+    loop = Loop(
+        bundle.load(made[0]), hand, hand, other, LoopSettings(seconds=0.4, command=0.6, home=False), clock, keep=True
+    )
     got = np.stack(loop.run().observations)
     want = observations[: len(got)]
     np.testing.assert_allclose(got[:, 12:24], want[:, 12:24] / 2, atol=1e-5)
     np.testing.assert_allclose(np.delete(got, np.s_[12:24], 1), np.delete(want, np.s_[12:24], 1), atol=1e-5)
 
 
-# -- limits ---------------------------------------------------------------------------------------------------------------------
+# -- limits
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def guard(**changes) -> Guard:
@@ -123,7 +132,12 @@ def test_targets_keep_position_and_speed_limits():
         target = rng.normal(0, 3, 12)
         target[rng.integers(12)] = rng.choice([np.nan, np.inf, -np.inf])
         now = g.apply(target, before, q, np.zeros(12), 0.02)
-        assert np.isfinite(now).all() and (np.abs(now - before) <= 0.04 + 1e-9).all() and (now >= -0.5).all() and (now <= 1.5).all()
+        assert (
+            np.isfinite(now).all()
+            and (np.abs(now - before) <= 0.04 + 1e-9).all()
+            and (now >= -0.5).all()
+            and (now <= 1.5).all()
+        )
         before = now
     assert g.counts["not_finite"] == 300 and g.counts["speed"] > 1000 and g.counts["position"] > 10
     quiet = guard()
@@ -158,7 +172,8 @@ def test_sustained_current_and_heat_name_the_joint():
     assert "ring_joint2 is at 90" in guard().must_relax(np.zeros(12), hot, 0.01)
 
 
-# -- phases and watchdogs -----------------------------------------------------------------------------------------------------------
+# -- phases and watchdogs
+# -----------------------------------------------------------------------------------------------------------
 
 
 class FakeHand:
@@ -186,7 +201,9 @@ class FakeHand:
             self.q = self.q + (self.target - self.q) * (1 - np.exp(-(now - self.last) / 0.03))
         self.last = now
         self.sequence += 1
-        return HandState(now, self.sequence, self.q.astype(np.float32), self.current, tactile=np.zeros((5, 120, 3), np.int16))
+        return HandState(
+            now, self.sequence, self.q.astype(np.float32), self.current, tactile=np.zeros((5, 120, 3), np.int16)
+        )
 
     def send(self, command):
         self.sent.append((self.clock.now(), command.position.copy(), command.tor_max.copy(), command.mode))
@@ -206,7 +223,9 @@ def play(made, fault=None, clock=None, start=0.05, recorder=None, **changes):
     clock = clock or VirtualClock(100.0)
     hand = FakeHand(clock, fault, start)
     settings = LoopSettings(**{"seconds": 1.0, "tor_max": 300.0} | changes)
-    loop = Loop(bundle.load(made[0]), hand, FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings, clock, recorder)
+    loop = Loop(
+        bundle.load(made[0]), hand, FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings, clock, recorder
+    )
     return hand, loop
 
 
@@ -264,7 +283,9 @@ def test_recover_homes_again(made):
 
 def test_over_current_relaxes(made):
     def press(hand, now):
-        hand.current = np.where(np.arange(12) == 4, -500.0, 0.0) if hand.begun and now > hand.begun + 0.1 else np.zeros(12)
+        hand.current = (
+            np.where(np.arange(12) == 4, -500.0, 0.0) if hand.begun and now > hand.begun + 0.1 else np.zeros(12)
+        )
 
     hand, loop = play(made, press, seconds=4.0)
     report = loop.run()
@@ -296,7 +317,19 @@ def test_a_hanging_driver_is_relaxed_by_the_watchdogs_thread(made):
             time.sleep(0.8)
             held.append((now, hand.clock.now()))
 
-    hand, loop = play(made, hang, Clock(), start=0.45, hang=0.2, late=5.0, stale=5.0, settle=0.1, home_speed=5.0, home_error=2.0, seconds=3.0)
+    hand, loop = play(
+        made,
+        hang,
+        Clock(),
+        start=0.45,
+        hang=0.2,
+        late=5.0,
+        stale=5.0,
+        settle=0.1,
+        home_speed=5.0,
+        home_error=2.0,
+        seconds=3.0,
+    )
     report = loop.run()
     assert report.counts["watchdog"] == 1 and "did not turn" in report.ended
     start, end = held[0]
@@ -309,7 +342,9 @@ def test_turns_that_take_too_long_relax(made):
         if hand.begun and now > hand.begun + 0.1:
             time.sleep(0.03)
 
-    hand, loop = play(made, slow, Clock(), start=0.45, settle=0.1, home_speed=5.0, home_error=2.0, late=5.0, stale=5.0, overruns=8)
+    hand, loop = play(
+        made, slow, Clock(), start=0.45, settle=0.1, home_speed=5.0, home_error=2.0, late=5.0, stale=5.0, overruns=8
+    )
     report = loop.run()
     assert "8 turns in a row" in report.ended and report.timing.overruns >= 8
 
@@ -323,11 +358,19 @@ def test_a_nan_policy_holds_the_hand_and_lets_go(made):
     assert hand.relaxed_at[0] - hand.begun < 0.15
 
 
-# -- recording --------------------------------------------------------------------------------------------------------------------
+# -- recording
+# --------------------------------------------------------------------------------------------------------------------
 
 
 def recorder_at(path, **kw):
-    return Recorder(path, xhand.JOINTS, {"source": "sim", "effort_is": "current_A", "effort_sign": "-1", "tactile_unit": "count"}, None, 100.0, **kw)
+    return Recorder(
+        path,
+        xhand.JOINTS,
+        {"source": "sim", "effort_is": "current_A", "effort_sign": "-1", "tactile_unit": "count"},
+        None,
+        100.0,
+        **kw,
+    )
 
 
 def test_what_is_seen_and_sent_is_recorded(made, tmp_path):
@@ -396,7 +439,8 @@ def test_a_killed_loop_leaves_its_finished_chunks(tmp_path):
     assert any(f.kind == "damage" for f in r.findings), "and it says that the end is missing"
 
 
-# -- the simulated hand, vision, the vendor's adapter ----------------------------------------------------------------------------------
+# -- the simulated hand, vision, the vendor's adapter
+# ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -567,7 +611,9 @@ class FakePackage:
         time.sleep(0.005)
         taxel = [SimpleNamespace(fx=-k % 100, fy=1, fz=k) for k in range(120)]
         sensors = [SimpleNamespace(raw_force=taxel) for _ in range(5)]
-        return SimpleNamespace(error_code=0), SimpleNamespace(finger_state=[self._Joint(i) for i in range(12)], sensor_data=sensors)
+        return SimpleNamespace(error_code=0), SimpleNamespace(
+            finger_state=[self._Joint(i) for i in range(12)], sensor_data=sensors
+        )
 
     def close_device(self):
         self.closed = True
@@ -601,13 +647,23 @@ def test_timing_percentiles():
     t._rows[1000:1002, 0] = 9e-3
     t.turns = 1002
     s = t.summary()
-    assert s["cpu_median_ms"] == pytest.approx(1) and s["cpu_p999_ms"] == pytest.approx(9, rel=0.01) and s["cpu_max_ms"] == pytest.approx(9)
+    assert (
+        s["cpu_median_ms"] == pytest.approx(1)
+        and s["cpu_p999_ms"] == pytest.approx(9, rel=0.01)
+        and s["cpu_max_ms"] == pytest.approx(9)
+    )
 
 
 def test_command_line(made, capsys):
-    for arguments, says in ((["bundle=nowhere"], "manifest"), ([f"bundle={made[0]}", "driver=xhand"], "port="), (["sedonds=3"], "sedonds"),
-                            ([f"bundle={made[0]}", "seconds=abc"], "seconds=abc"), ([f"bundle={made[0]}", "driver=x"], "driver=x"),
-                            ([f"bundle={made[0]}", "shape=blob"], "shape=blob"), ([f"bundle={made[0]}", "place=1,2"], "place=1,2: must be x y z")):  # fmt: skip
+    for arguments, says in (
+        (["bundle=nowhere"], "manifest"),
+        ([f"bundle={made[0]}", "driver=xhand"], "port="),
+        (["sedonds=3"], "sedonds"),
+        ([f"bundle={made[0]}", "seconds=abc"], "seconds=abc"),
+        ([f"bundle={made[0]}", "driver=x"], "driver=x"),
+        ([f"bundle={made[0]}", "shape=blob"], "shape=blob"),
+        ([f"bundle={made[0]}", "place=1,2"], "place=1,2: must be x y z"),
+    ):
         with pytest.raises(UserError, match=says) as caught:
             command(arguments)
         assert "\n" not in str(caught.value)
@@ -620,8 +676,23 @@ def test_real_time_on_the_simulated_hand(made, tmp_path):
     import sys
 
     done = subprocess.run(
-        [sys.executable, "-m", "dexsim.deploy", f"bundle={made[0]}", "seconds=2", "home_speed=2", "late=1", "stale=1", "hang=2", "overruns=200",
-         f"record={tmp_path / 'run.mcap'}"], capture_output=True, text=True, timeout=300)  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "dexsim.deploy",
+            f"bundle={made[0]}",
+            "seconds=2",
+            "home_speed=2",
+            "late=1",
+            "stale=1",
+            "hang=2",
+            "overruns=200",
+            f"record={tmp_path / 'run.mcap'}",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     assert "99.9 %" in done.stdout and "overruns" in done.stdout and "relaxed" in done.stdout
     assert len(read(tmp_path / "run.mcap", audit=False).commands) > 100
@@ -638,8 +709,23 @@ def test_interrupting_the_command(made, tmp_path, how):
 
     path = tmp_path / "run.mcap"
     p = subprocess.Popen(
-        [sys.executable, "-m", "dexsim.deploy", f"bundle={made[0]}", "seconds=60", "home_speed=2", "late=2", "stale=2", "hang=3", "overruns=500",
-         f"record={path}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "dexsim.deploy",
+            f"bundle={made[0]}",
+            "seconds=60",
+            "home_speed=2",
+            "late=2",
+            "stale=2",
+            "hang=3",
+            "overruns=500",
+            f"record={path}",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     limit = time.monotonic() + 120
     while not (path.exists() and path.stat().st_size > 40_000) and time.monotonic() < limit:
         time.sleep(0.1)
@@ -655,6 +741,8 @@ def test_interrupting_the_command(made, tmp_path, how):
     alive = children
     while alive and time.monotonic() < limit:  # what is left of a process that nobody waited for does not count
         time.sleep(0.2)
-        rows = subprocess.run(["ps", "-o", "pid=,stat=", "-p", ",".join(children)], capture_output=True, text=True).stdout.splitlines()
+        rows = subprocess.run(
+            ["ps", "-o", "pid=,stat=", "-p", ",".join(children)], capture_output=True, text=True
+        ).stdout.splitlines()
         alive = [row for row in rows if "Z" not in row.split()[1]]
     assert children and not alive

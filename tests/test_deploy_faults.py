@@ -1,5 +1,6 @@
-"""The real-time loop lets go: whatever the hand, the object's eye, the disk, the settings or the terminal do, the hand is relaxed
-within 0.15 s, no target leaves that is not finite or lies outside the limits, and the recording and the report are there."""
+"""The real-time loop lets go: whatever the hand, the object's eye, the disk, the settings or the terminal do, the hand
+is relaxed within 0.15 s, no target leaves that is not finite or lies outside the limits, and the recording and the
+report are there."""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ def b(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """One hand model for all loops here, and no collection of torch's whole heap before each: a run is then a tenth of a second."""
+    """One hand model for all loops here, and no collection of torch's whole heap before each: a run is then a tenth of
+    a second."""
     from dexsim.deploy import loop, measure
 
     with pytest.MonkeyPatch.context() as patch:
@@ -57,7 +59,8 @@ def quick():
 
 
 class Spoiled(FakeHand):
-    """A hand whose readings are changed by `spoil(state, now)` from `at` s after the policy's begin on (None: always)."""
+    """A hand whose readings are changed by `spoil(state, now)` from `at` s after the policy's begin on (None:
+    always)."""
 
     def __init__(self, clock, spoil=None, at=0.3):
         super().__init__(clock, start=0.05)
@@ -85,8 +88,15 @@ class Eye:
 
 
 def run(b, hand, eye=None, recorder=None, **changes):
-    loop = Loop(b, hand, eye or FixedPlace(PLACE), Calibration.default(), LoopSettings(**{"seconds": 1.0, "tor_max": 300.0, "home_speed": 3.0} | changes),
-                hand.clock, recorder)  # fmt: skip
+    loop = Loop(
+        b,
+        hand,
+        eye or FixedPlace(PLACE),
+        Calibration.default(),
+        LoopSettings(**{"seconds": 1.0, "tor_max": 300.0, "home_speed": 3.0} | changes),
+        hand.clock,
+        recorder,
+    )
     try:
         loop.run()
     finally:
@@ -140,20 +150,37 @@ def taxel(value):
 
 HAND = {
     "stamps an hour ahead, frozen": frozen(time=lambda old, now: now + 3600),
-    "stamps an hour ahead, frozen, counted on": frozen(time=lambda old, now: now + 3600, sequence=lambda old, now: int(1e6 * now)),
+    "stamps an hour ahead, frozen, counted on": frozen(
+        time=lambda old, now: now + 3600, sequence=lambda old, now: int(1e6 * now)
+    ),
     "stamps of NaN, frozen": frozen(time=NAN),
     "stamps of now, frozen": frozen(time=lambda old, now: now),
-    "stamps ahead": change(time=lambda old, now: now + 1.0), "stamps of NaN": change(time=NAN), "stamps of inf": change(time=INF),
-    "stamps of None": change(time=None), "stamps an hour old": change(time=lambda old, now: now - 3600),
+    "stamps ahead": change(time=lambda old, now: now + 1.0),
+    "stamps of NaN": change(time=NAN),
+    "stamps of inf": change(time=INF),
+    "stamps of None": change(time=None),
+    "stamps an hour old": change(time=lambda old, now: now - 3600),
     "stamps that run backwards": change(time=lambda old, now: 200 - now),
-    "no reading any more": frozen(), "a position of NaN": change(position=one(NAN)), "positions of NaN": change(position=np.full(12, NAN)),
-    "a position of 1e9": change(position=one(1e9)), "a position of -inf": change(position=one(-INF)), "11 positions": change(position=np.zeros(11)),
-    "positions of text": change(position=["x"] * 12), "a current of NaN": change(current=one(NAN)), "currents of NaN": change(current=np.full(12, NAN)),
-    "a current of 1e9": change(current=one(1e9)), "a temperature of NaN": change(temperature=one(NAN)), "a temperature of inf": change(temperature=one(INF)),
-    "90 degC": change(temperature=one(90.0)), "a taxel of NaN": change(tactile=taxel(NAN)), "a taxel of 1e9": change(tactile=taxel(1e9)),
-    "taxels of another shape": change(tactile=np.zeros((5, 12, 3))), "a velocity of 1e9": change(velocity=one(1e9)),
-    "error codes": change(error=one(7)), "an error of NaN": change(error=np.full(12, NAN)),
-}  # fmt: skip
+    "no reading any more": frozen(),
+    "a position of NaN": change(position=one(NAN)),
+    "positions of NaN": change(position=np.full(12, NAN)),
+    "a position of 1e9": change(position=one(1e9)),
+    "a position of -inf": change(position=one(-INF)),
+    "11 positions": change(position=np.zeros(11)),
+    "positions of text": change(position=["x"] * 12),
+    "a current of NaN": change(current=one(NAN)),
+    "currents of NaN": change(current=np.full(12, NAN)),
+    "a current of 1e9": change(current=one(1e9)),
+    "a temperature of NaN": change(temperature=one(NAN)),
+    "a temperature of inf": change(temperature=one(INF)),
+    "90 degC": change(temperature=one(90.0)),
+    "a taxel of NaN": change(tactile=taxel(NAN)),
+    "a taxel of 1e9": change(tactile=taxel(1e9)),
+    "taxels of another shape": change(tactile=np.zeros((5, 12, 3))),
+    "a velocity of 1e9": change(velocity=one(1e9)),
+    "error codes": change(error=one(7)),
+    "an error of NaN": change(error=np.full(12, NAN)),
+}
 
 
 @pytest.mark.parametrize("fault", HAND)
@@ -179,16 +206,25 @@ def test_a_fault_from_the_start_moves_nothing(b, fault):
 
 
 def test_one_bad_reading_in_ten_is_left_out_and_counted(b):
-    hand = Spoiled(VirtualClock(100.0), lambda state, now, kept: change(position=one(1e9))(state, now) if state.sequence % 10 == 0 else None, at=None)
+    hand = Spoiled(
+        VirtualClock(100.0),
+        lambda state, now, kept: change(position=one(1e9))(state, now) if state.sequence % 10 == 0 else None,
+        at=None,
+    )
     report = run(b, hand)
     assert report.ended == "done" and 10 < report.counts["bad_readings"] < 60
 
 
 EYE = {
-    "an hour old": lambda now, since: (PLACE, now - 3600), "never": lambda now, since: None, "a stamp of NaN": lambda now, since: (PLACE, NAN),
-    "an hour ahead": lambda now, since: (PLACE, now + 3600), "a place of NaN": lambda now, since: (PLACE * NAN, now),
-    "a place of 1e9": lambda now, since: (PLACE * 1e10, now), "two numbers": lambda now, since: (PLACE[:2], now), "frozen": lambda now, since: (PLACE, since),
-}  # fmt: skip
+    "an hour old": lambda now, since: (PLACE, now - 3600),
+    "never": lambda now, since: None,
+    "a stamp of NaN": lambda now, since: (PLACE, NAN),
+    "an hour ahead": lambda now, since: (PLACE, now + 3600),
+    "a place of NaN": lambda now, since: (PLACE * NAN, now),
+    "a place of 1e9": lambda now, since: (PLACE * 1e10, now),
+    "two numbers": lambda now, since: (PLACE[:2], now),
+    "frozen": lambda now, since: (PLACE, since),
+}
 
 
 @pytest.mark.parametrize("at", [0.0, 0.3])
@@ -205,7 +241,8 @@ def test_an_object_that_is_not_seen_relaxes_the_hand(b, fault, at):
         assert "object" in run(b, hand, eye).ended and hand.relaxed_at[0] - eye.since < 0.15
 
 
-# -- settings ---------------------------------------------------------------------------------------------------------------------
+# -- settings
+# ---------------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", LIMITS)
 def test_settings_outside_their_range_are_refused_before_anything_moves(b, name):
     low, high, _ = LIMITS[name]
@@ -242,7 +279,8 @@ def test_the_guard_gives_finite_targets_inside_the_limits_whatever_comes_in():
         assert np.isfinite(out).all() and (out >= low).all() and (out <= high).all()
 
 
-# -- relaxing that fails, disks, signals ----------------------------------------------------------------------------------------------
+# -- relaxing that fails, disks, signals
+# ----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("error", [RuntimeError("bus"), OSError(5, "I/O"), KeyboardInterrupt()])
 def test_relaxing_is_tried_again_until_it_works(b, error):
     hand = Spoiled(VirtualClock(100.0), HAND["a position of 1e9"])
@@ -258,7 +296,9 @@ def test_relaxing_is_tried_again_until_it_works(b, error):
     report = run(b, hand)
     assert len(tries) >= 4 and report.counts["relax_failed"] == 3 and not report.not_relaxed
     assert hand.relaxed_at[0] - hand.since < 0.15
-    assert [mode for t, _, _, mode in hand.sent if t >= tries[0]] == [PASSIVE] * 3, "and the passive mode is sent meanwhile"
+    assert [mode for t, _, _, mode in hand.sent if t >= tries[0]] == [PASSIVE] * 3, (
+        "and the passive mode is sent meanwhile"
+    )
 
 
 def test_a_hand_that_never_relaxes_is_said(b, capsys):
@@ -288,7 +328,9 @@ def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_pat
     def odd(*_, **__):
         raise ValueError("what nobody thought of")
 
-    setattr(rec.writer, {"write": "add_state", "close": "close", "thread": "_array"}[at], odd if at == "thread" else full)
+    setattr(
+        rec.writer, {"write": "add_state", "close": "close", "thread": "_array"}[at], odd if at == "thread" else full
+    )
     report = run(b, hand, recorder=rec)
     assert report.ended == "done" and report.acts == 48 and hand.relaxed_at
     assert ("nobody thought" if at == "thread" else "No space left") in rec.error and rec.writer._file.closed
@@ -323,8 +365,24 @@ def test_a_signal_relaxes_and_those_after_it_change_nothing(b, number, tmp_path)
 @pytest.mark.slow
 def test_a_terminal_that_goes_away_leaves_a_relaxed_hand_and_a_whole_recording(b, tmp_path):
     path = tmp_path / "run.mcap"
-    p = subprocess.Popen([sys.executable, "-m", "dexsim.deploy", f"bundle={b.path}", "seconds=60", "home_speed=2", "late=2", "stale=2", "hang=3",
-                          "overruns=500", f"record={path}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
+    p = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "dexsim.deploy",
+            f"bundle={b.path}",
+            "seconds=60",
+            "home_speed=2",
+            "late=2",
+            "stale=2",
+            "hang=3",
+            "overruns=500",
+            f"record={path}",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     limit = time.monotonic() + 120
     while not (path.exists() and path.stat().st_size > 40_000) and time.monotonic() < limit:
         time.sleep(0.1)
@@ -334,7 +392,8 @@ def test_a_terminal_that_goes_away_leaves_a_relaxed_hand_and_a_whole_recording(b
     assert not [f for f in read(path, audit=False).findings if f.kind == "damage"]
 
 
-# -- the vendor's bus -------------------------------------------------------------------------------------------------------------
+# -- the vendor's bus
+# -------------------------------------------------------------------------------------------------------------
 def test_a_bus_that_fails_for_a_while_still_carries_the_command_to_relax():
     package = FakePackage()
     send, failing = package.send_command, threading.Event()
@@ -373,7 +432,8 @@ def test_a_bus_that_never_carries_it_is_said(monkeypatch):
     assert package.closed
 
 
-# -- the IMU's port ----------------------------------------------------------------------------------------------------------------
+# -- the IMU's port
+# ----------------------------------------------------------------------------------------------------------------
 def udp():
     return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 

@@ -1,4 +1,5 @@
-"""The rotation outside the simulator: bundles of both perceptions, the same observations and actions, goals, IMU, closing the hand."""
+"""The rotation outside the simulator: bundles of both perceptions, the same observations and actions, goals, IMU,
+closing the hand."""
 
 from __future__ import annotations
 
@@ -29,7 +30,12 @@ torch.set_num_threads(1)
 SETTINGS = {
     "imu": ("task.perception=imu",),
     "proprioception": ("task.perception=proprioception", "task.history=3"),
-    "plain": ("task.perception=imu", "task.observe.orientation=quaternion", "task.observe.force_weighted=false", "task.observe.last_action=step"),
+    "plain": (
+        "task.perception=imu",
+        "task.observe.orientation=quaternion",
+        "task.observe.force_weighted=false",
+        "task.observe.last_action=step",
+    ),
 }
 
 
@@ -37,7 +43,9 @@ SETTINGS = {
 def made(request, tmp_path_factory):
     """(bundle folder, checkpoint, name) of quiet sensors."""
     folder = tmp_path_factory.mktemp(request.param)
-    source = make_checkpoint(folder / "policy.pt", *QUIET_TURN, "tactile.raw=true", *SETTINGS[request.param], task="rotate")
+    source = make_checkpoint(
+        folder / "policy.pt", *QUIET_TURN, "tactile.raw=true", *SETTINGS[request.param], task="rotate"
+    )
     return export.export(str(source), folder / "out", steps=6), source, request.param
 
 
@@ -53,7 +61,9 @@ def test_golden_rows_and_manifest(made, capsys):
     low, high, g = np.array(m["action"]["low"]), np.array(m["action"]["high"]), m["grip"]
     for pose in (g["hand"], g["target"]):
         assert (np.array(pose) >= low - 1e-6).all() and (np.array(pose) <= high + 1e-6).all()
-    assert m["initial_pose"] == g["hand"] and 0.04 < g["object_edge_m"] < 0.07 and "force_max_N" not in m["normalization"]
+    assert (
+        m["initial_pose"] == g["hand"] and 0.04 < g["object_edge_m"] < 0.07 and "force_max_N" not in m["normalization"]
+    )
 
 
 def test_check_notices_a_changed_orientation_or_history(made, tmp_path):
@@ -87,7 +97,9 @@ def episode(made, tmp_path_factory):
             env.step(action)
             if bool(env.done[1]):
                 break
-            rows.append((obs["actor"][1].numpy().copy(), policy(obs)[1].numpy().copy(), before, env.target[1].numpy().copy()))
+            rows.append(
+                (obs["actor"][1].numpy().copy(), policy(obs)[1].numpy().copy(), before, env.target[1].numpy().copy())
+            )
     path = tap.save(tmp_path_factory.mktemp("mcap") / "episode.mcap")[0]
     return read(path, audit=False), *(np.stack(x) for x in zip(*rows, strict=True))
 
@@ -103,7 +115,8 @@ def test_a_recorded_episode_gives_the_same_observations_and_actions(made, episod
     settings = LoopSettings(seconds=len(observed) * 0.021 - 1e-3, home=False, speed=100.0, tor_max=32767)
 
     class Taught(Loop):
-        """The recorded targets stand for the sent ones, and half the policy's action for its own, as in the recording."""
+        """The recorded targets stand for the sent ones, and half the policy's action for its own, as in the
+        recording."""
 
         def _begin_run(self, now):
             super()._begin_run(now)
@@ -175,8 +188,25 @@ def test_the_whole_loop_on_the_simulated_hand(made, tmp_path):
 
     clock, b, c, said = VirtualClock(), bundle.load(made[0]), Calibration.default(), []
     hand = SimulatedXHand(b.config, c, clock, seed=2, grip=b.manifest["grip"])
-    rec = Recorder(tmp_path / "run.mcap", b.manifest["joints"], {"source": "sim", "effort_is": "current_A", "tactile_unit": "count"}, None, 0.0, most=10**6)
-    loop = Loop(b, hand, hand, c, LoopSettings(seconds=1.0, home_speed=2.0, wait=0.5, grip=0.5), clock, rec, keep=True, say=said.append)
+    rec = Recorder(
+        tmp_path / "run.mcap",
+        b.manifest["joints"],
+        {"source": "sim", "effort_is": "current_A", "tactile_unit": "count"},
+        None,
+        0.0,
+        most=10**6,
+    )
+    loop = Loop(
+        b,
+        hand,
+        hand,
+        c,
+        LoopSettings(seconds=1.0, home_speed=2.0, wait=0.5, grip=0.5),
+        clock,
+        rec,
+        keep=True,
+        say=said.append,
+    )
     loop.bundle.act = lambda observation: np.zeros((1, 12), np.float32)  # hold still
     report = loop.run()
     assert report.ended == "done" and report.acts == 47 and np.isfinite(np.stack(report.observations)).all()
@@ -200,9 +230,17 @@ def test_the_loop_says_what_it_lacks(made):
 
 
 def test_command_line(made):
-    wrong = [(["command=0.5"], "takes no commanded force"), (["vision=camera"], "vision=camera"), (["shape=box"], "shape=box")]
+    wrong = [
+        (["command=0.5"], "takes no commanded force"),
+        (["vision=camera"], "vision=camera"),
+        (["shape=box"], "shape=box"),
+    ]
     if made[2] == "imu":
-        wrong += [(["driver=xhand", "port=x"], "imu=udp:PORT"), (["driver=xhand", "port=x", "imu=udp:x"], "imu=udp:x"), (["imu=udp:1"], "imu=")]
+        wrong += [
+            (["driver=xhand", "port=x"], "imu=udp:PORT"),
+            (["driver=xhand", "port=x", "imu=udp:x"], "imu=udp:x"),
+            (["imu=udp:1"], "imu="),
+        ]
     for arguments, says in wrong:
         with pytest.raises(UserError, match=says) as caught:
             command([f"bundle={made[0]}", *arguments])

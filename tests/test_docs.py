@@ -208,7 +208,9 @@ def test_files_that_the_pages_name_exist():
 
 def test_every_benchmark_stands_where_figures_are_reproduced():
     text = (DOCS / "howto" / "reproducing.md").read_text(encoding="utf-8")
-    jobs = [p.stem for p in (ROOT / "benchmarks").glob("*.py") if f"python -m benchmarks.{p.stem}" in p.read_text("utf-8")]
+    jobs = [
+        p.stem for p in (ROOT / "benchmarks").glob("*.py") if f"python -m benchmarks.{p.stem}" in p.read_text("utf-8")
+    ]
     jobs += [p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")]
     assert len(jobs) > 15
     assert [job for job in sorted(jobs) if not re.search(rf"\b{job}\b", text)] == []

@@ -1,4 +1,5 @@
-"""What the randomization of a task names is drawn: every range reaches what it is for, over its whole width, in every episode."""
+"""What the randomization of a task names is drawn: every range reaches what it is for, over its whole width, in every
+episode."""
 
 from __future__ import annotations
 
@@ -160,7 +161,9 @@ def test_every_range_is_drawn_over_its_whole_width(drawn):
         try:
             covers(x, low, high, STEPS.get(name, 0.0) * env.dt)
         except AssertionError as error:
-            raise AssertionError(f"{task}: {name} in [{low:g}, {high:g}]: {float(x.min()):g} to {float(x.max()):g}") from error
+            raise AssertionError(
+                f"{task}: {name} in [{low:g}, {high:g}]: {float(x.min()):g} to {float(x.max()):g}"
+            ) from error
 
 
 def test_worlds_do_not_share_their_draws(drawn):

@@ -1,4 +1,5 @@
-"""Policy bundles: the exported network is the trained one, the manifest says what its inputs are, and changes are noticed."""
+"""Policy bundles: the exported network is the trained one, the manifest says what its inputs are, and changes are
+noticed."""
 
 from __future__ import annotations
 
@@ -111,16 +112,22 @@ def test_another_observation_table_is_refused(copy):
 
 
 def test_calibration_is_carried(made, tmp_path):
-    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"joints": {"mid_joint1": {"current_per_torque": 1.9}}, "touch": {"lsb": 0.08}}))
+    (tmp_path / "calibration.yaml").write_text(
+        yaml.safe_dump({"joints": {"mid_joint1": {"current_per_torque": 1.9}}, "touch": {"lsb": 0.08}})
+    )
     out = export.export(str(made[0]), tmp_path / "out", str(tmp_path / "calibration.yaml"), steps=4)
     c = bundle.load(out).manifest["calibration"]
     assert c["joints"]["mid_joint1"]["current_per_torque"] == 1.9 and c["touch"]["lsb"] == 0.08
 
 
 def test_command_line_errors_are_one_line(made, tmp_path):
-    for arguments, says in ((["checkpoint=nowhere.pt", f"out={tmp_path / 'x'}"], "nowhere.pt"), (["check=nowhere"], "manifest.yaml"),
-                            (["chekpoint=a"], "chekpoint"), ([f"checkpoint={made[0]}"], "out="),
-                            ([f"checkpoint={made[0]}", f"out={made[1]}"], "already holds")):  # fmt: skip
+    for arguments, says in (
+        (["checkpoint=nowhere.pt", f"out={tmp_path / 'x'}"], "nowhere.pt"),
+        (["check=nowhere"], "manifest.yaml"),
+        (["chekpoint=a"], "chekpoint"),
+        ([f"checkpoint={made[0]}"], "out="),
+        ([f"checkpoint={made[0]}", f"out={made[1]}"], "already holds"),
+    ):
         with pytest.raises(UserError, match=says) as caught:
             export.main(arguments)
         assert "\n" not in str(caught.value)
@@ -135,7 +142,9 @@ def test_module_checks_in_its_own_process(made):
 def test_builder_places_every_signal():
     """Each signal set to a value of its own lands in its own slice, scaled as the table says."""
     one = lambda k, *shape: torch.full((2, *shape), float(k))  # noqa: E731
-    s = observations.Signals(one(1, 12), one(2, 12), one(3, 2), one(4), one(5), one(6, 5), one(7, 5, 3), one(8, 5, 3), one(9))
+    s = observations.Signals(
+        one(1, 12), one(2, 12), one(3, 2), one(4), one(5), one(6, 5), one(7, 5, 3), one(8, 5, 3), one(9)
+    )
     out = observations.build(s, 2.0)
     at = observations.slices(observations.rows(12, 5, 5))
     assert out.shape == (2, 66)

@@ -1,4 +1,5 @@
-"""A scripted pinch holds a 50 g box by the fingertips alone, palm vertical, without it sinking: friction, rubber and drives agree."""
+"""A scripted pinch holds a 50 g box by the fingertips alone, palm vertical, without it sinking: friction, rubber and
+drives agree."""
 
 from __future__ import annotations
 
@@ -20,9 +21,20 @@ FINGERS_UP = (-9.81, 0.0, 0.0)  # m/s2, gravity in the palm frame: the palm is v
 
 
 def pinch(engine: str, gravity: tuple, friction: float = FRICTION, seconds: float = 5.0) -> dict[str, torch.Tensor]:
-    """Close on the weightless box, turn gravity on, wait. Two worlds that differ by a millimetre in where the box begins."""
-    cfg = start.for_train(["task=rotate", "device=cpu", "randomize=rotate_fixed", f"randomize.object.mass={MASS}",
-                           f"randomize.object.friction={friction}", "sim.control_period=0.021", "worlds=2"], CONFIGS).cfg
+    """Close on the weightless box, turn gravity on, wait. Two worlds that differ by a millimetre in where the box
+    begins."""
+    cfg = start.for_train(
+        [
+            "task=rotate",
+            "device=cpu",
+            "randomize=rotate_fixed",
+            f"randomize.object.mass={MASS}",
+            f"randomize.object.friction={friction}",
+            "sim.control_period=0.021",
+            "worlds=2",
+        ],
+        CONFIGS,
+    ).cfg
     torch.set_num_threads(1)
     hand, pose = torch.tensor([OPEN, OPEN]), torch.tensor([POSE, POSE])
     pose[1, 2] += 0.001
@@ -52,9 +64,11 @@ def pinch(engine: str, gravity: tuple, friction: float = FRICTION, seconds: floa
     before = env.object_pose.clone()
     play(seconds, False)
     return {
-        "sunk": ((env.object_pose[:, :3] - before[:, :3]) @ down) / down.norm(), "moved": (env.object_pose - before)[:, :3].norm(dim=1),
-        "tips": env.tip_force.clone(), "other": (env.finger_force - env.tip_force).abs().amax(1) + env.palm_force,
-    }  # fmt: skip
+        "sunk": ((env.object_pose[:, :3] - before[:, :3]) @ down) / down.norm(),
+        "moved": (env.object_pose - before)[:, :3].norm(dim=1),
+        "tips": env.tip_force.clone(),
+        "other": (env.finger_force - env.tip_force).abs().amax(1) + env.palm_force,
+    }
 
 
 def check(r: dict[str, torch.Tensor]) -> None:

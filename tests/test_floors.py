@@ -1,7 +1,8 @@
-"""Imports run down the floors, and no files import each other in a circle. Read off the source with `ast`, nothing is imported.
+"""Imports run down the floors, and no files import each other in a circle. Read off the source with `ast`, nothing is
+imported.
 
-What stands under `if __name__ == "__main__":`, and a `__main__.py`, is a door: it runs only as a program and may lead to any floor.
-Imports inside functions count like those at the top; what stands under `if TYPE_CHECKING:` does not.
+What stands under `if __name__ == "__main__":`, and a `__main__.py`, is a door: it runs only as a program and may lead
+to any floor. Imports inside functions count like those at the top; what stands under `if TYPE_CHECKING:` does not.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ CIRCLES: dict[frozenset[str], str] = {}
 def door(node: ast.AST) -> bool:
     """Whether a statement is `if __name__ == "__main__":` or `if TYPE_CHECKING:`."""
     return isinstance(node, ast.If) and (
-        "TYPE_CHECKING" in ast.unparse(node.test) or ast.unparse(node.test).replace('"', "'") == "__name__ == '__main__'"
+        "TYPE_CHECKING" in ast.unparse(node.test)
+        or ast.unparse(node.test).replace('"', "'") == "__name__ == '__main__'"
     )
 
 
@@ -67,7 +69,9 @@ def imported(path: Path, known: dict[str, Path], package: str = "dexsim") -> set
             names = [a.name for a in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: imports are absolute in dexsim"
-            names = [f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in known else node.module for a in node.names]
+            names = [
+                f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in known else node.module for a in node.names
+            ]
         else:
             names = []
         for name in names:
@@ -139,7 +143,9 @@ def test_the_check_sees_what_it_must(tmp_path):
     (house / "a.py").write_text("import dexsim.b\n")
     (house / "b.py").write_text("def f():\n    from dexsim import c\n")
     (house / "c.py").write_text("class C:\n    def g(self):\n        from dexsim.a import x\n")
-    (house / "d.py").write_text("from typing import TYPE_CHECKING\nimport dexsim.a\nif TYPE_CHECKING:\n    import dexsim.e\n")
+    (house / "d.py").write_text(
+        "from typing import TYPE_CHECKING\nimport dexsim.a\nif TYPE_CHECKING:\n    import dexsim.e\n"
+    )
     (house / "e.py").write_text("import dexsim.d\nif __name__ == '__main__':\n    from dexsim.e import d\n")
     known = modules(tmp_path)
     graph = {name: imported(path, known) - {name} for name, path in known.items()}

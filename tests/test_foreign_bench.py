@@ -15,9 +15,20 @@ def case(id_: str, kind: str, *effects: str, tier: str = "easy") -> dict:
 
 
 def test_counts_by_confidence():
-    truths = [case("1", "single", "lag"), case("2", "single", "backlash"), case("3", "null"), case("4", "null"), case("5", "null")]
-    answers = {"1": answer("explained", ("lag", 0.9)), "2": answer("explained", ("lag", 0.85), ("backlash", 0.6)), "3": answer("none", ("lag", 0.4)),
-               "4": answer("unknown", ("lag", 0.55)), "5": None}  # fmt: skip
+    truths = [
+        case("1", "single", "lag"),
+        case("2", "single", "backlash"),
+        case("3", "null"),
+        case("4", "null"),
+        case("5", "null"),
+    ]
+    answers = {
+        "1": answer("explained", ("lag", 0.9)),
+        "2": answer("explained", ("lag", 0.85), ("backlash", 0.6)),
+        "3": answer("none", ("lag", 0.4)),
+        "4": answer("unknown", ("lag", 0.55)),
+        "5": None,
+    }
     s = foreign.summary(truths, answers)
     assert s["easy_first_name_at_0"] == [1, 2] and s["easy_first_name_at_0.8"] == [1, 2]
     assert s["false_alarms"] == [2, 3]  # a name of 0.55, and no answer

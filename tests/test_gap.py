@@ -1,4 +1,5 @@
-"""The diagnosis: its plant against the servo's reference and MuJoCo, planted effects, nothing planted, bad input, the page."""
+"""The diagnosis: its plant against the servo's reference and MuJoCo, planted effects, nothing planted, bad input, the
+page."""
 
 from __future__ import annotations
 
@@ -29,7 +30,14 @@ from dexsim.gap.touch import constant_taxels
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import drive
 
-SERVO = {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}
+SERVO = {
+    "kp": 2.0,
+    "kd": 0.04,
+    "torque_limit": 0.8,
+    "no_load_speed": 12.0,
+    "coulomb_friction": 0.015,
+    "viscous_friction": 0.004,
+}
 
 
 def model() -> mujoco.MjModel:
@@ -40,16 +48,31 @@ def motion(kind: int, seconds: float, seed: int = 0):
     return demo.commands(kind, seconds, np.random.default_rng(seed))
 
 
-def plant_run(name: str, kind: int, seconds: float, changes: dict[str, float], seed: int = 0, noisy: bool = True, servo: dict | None = None,
-              temperature: bool = False) -> Run:
-    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name').
-    servo: believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than the one before."""
+def plant_run(
+    name: str,
+    kind: int,
+    seconds: float,
+    changes: dict[str, float],
+    seed: int = 0,
+    noisy: bool = True,
+    servo: dict | None = None,
+    temperature: bool = False,
+) -> Run:
+    """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name'). servo:
+    believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than the one
+    before."""
     t_cmd, cmd = motion(kind, seconds, seed)
-    t = np.arange(0.0, seconds - 0.02, 0.01) + (np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01))))
+    t = np.arange(0.0, seconds - 0.02, 0.01) + (
+        np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01)))
+    )
     other = servo or {}
     sides = {k: v for k, v in other.items() if k.endswith("_encoder")}
-    table = ServoTable.from_dict({"joints": {"*": SERVO | {k: v for k, v in other.items() if k not in sides}}, "loop_rate": 1000} | sides)
-    rough = Run(name, ("joint",), t_cmd, cmd[:, None], t, np.interp(t, t_cmd, cmd)[:, None], table, np.array([0, 0, -9.81]))
+    table = ServoTable.from_dict(
+        {"joints": {"*": SERVO | {k: v for k, v in other.items() if k not in sides}}, "loop_rate": 1000} | sides
+    )
+    rough = Run(
+        name, ("joint",), t_cmd, cmd[:, None], t, np.interp(t, t_cmd, cmd)[:, None], table, np.array([0, 0, -9.81])
+    )
     if temperature:
         rough.temperature = (20.0 + 7.0 * kind + 9.0 * t / seconds)[:, None]
     for _ in range(3):  # the series are those of the motion itself
@@ -78,7 +101,8 @@ def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds
     return JointSearch(case, list(range(len(runs))), None, conditions(runs)).run()
 
 
-# -- the plant ------------------------------------------------------------------------------------------------------------
+# -- the plant
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_plant_columns_begin_with_the_servos():
@@ -103,8 +127,16 @@ def test_a_stuck_drive_rests_where_the_servo_law_balances_gravity():
     assert law == pytest.approx(0.15 * 9.81 * 0.1 * np.sin(rest), rel=2e-3)
 
 
-@pytest.mark.parametrize("change", [{}, {"deadband": 0.03}, {"load_friction": 0.2, "load_friction_backdriven": 0.3}, {"delay": 0.02},
-                                    {"speed_feedforward": 0.04, "acceleration_feedforward": 1e-3, "braking_slope": 0.0}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"deadband": 0.03},
+        {"load_friction": 0.2, "load_friction_backdriven": 0.3},
+        {"delay": 0.02},
+        {"speed_feedforward": 0.04, "acceleration_feedforward": 1e-3, "braking_slope": 0.0},
+    ],
+)
 def test_plant_follows_the_full_simulation(change):
     """C MuJoCo with the servo kernel and the gap's own one-joint plant, the same columns: the same motion."""
     t_cmd, cmd = motion(0, 3.0)
@@ -114,14 +146,18 @@ def test_plant_follows_the_full_simulation(change):
     m = mechanism_of(table)
     full = drive(m, Series(t_cmd, cmd[:, None], COMMANDS, t_cmd), ["joint"], 3.0, timestep=5e-4)
     pick = slice(0, None, 20)
-    run = Run("full", ("joint",), t_cmd, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81]))
+    run = Run(
+        "full", ("joint",), t_cmd, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81])
+    )
     run.smooth()
     plant = build(model(), [run])[0].plant
     q, _ = plant.simulate(plant.base()[None], plant.windows(None))
     assert np.sqrt(np.mean((q[0] - plant.q) ** 2)) < 2e-3
     if change:
         plain = plant.base()[None].copy()
-        plain[0, 0, : len(SERVO_INDEX)] = nominal_row(ServoTable.from_dict({"joints": {"*": SERVO}}).nominal(["joint"])[0], 0.0)[: len(SERVO_INDEX)]
+        plain[0, 0, : len(SERVO_INDEX)] = nominal_row(
+            ServoTable.from_dict({"joints": {"*": SERVO}}).nominal(["joint"])[0], 0.0
+        )[: len(SERVO_INDEX)]
         other, _ = plant.simulate(plain, plant.windows(None))
         assert np.sqrt(np.mean((other[0] - plant.q) ** 2)) > 4e-3  # the column matters
 
@@ -199,9 +235,13 @@ def test_map_finds_the_regime_and_controls_false_discoveries():
     speed, other = rng.uniform(0, 1, n), rng.uniform(0, 1, n)
     block = np.arange(n) // 50
     plain = rng.standard_normal(n)
-    found = bins.control(bins.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng))
+    found = bins.control(
+        bins.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng)
+    )
     assert found and found[0].regime == "speed" and found[0].low > 0.7 and found[0].text == found[0].where
-    both = bins.control(bins.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found)
+    both = bins.control(
+        bins.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found
+    )
     assert both[0].of == "position" and both[-1].of == "effort" and both[-1].text.startswith("effort, speed")
     assert not bins.control(bins.spots("j", plain, block, {"speed": speed, "load": other}, rng))
 
@@ -240,10 +280,33 @@ def test_rms_interval_covers():
 
 
 def test_catalogue_is_that_of_the_specification():
-    joint = {"coulomb_friction", "stribeck_friction", "viscous_friction", "load_friction", "backlash", "compliance", "command_delay", "lag",
-             "torque_limit", "torque_speed_limit", "supply_sag", "torque_ripple", "thermal", "joint_coupling", "position_offset", "position_scale",
-             "payload", "inertia", "gain_mismatch", "deadband", "current_sensor", "braking_limit", "controller_term", "presliding",
-             "external_force"}  # fmt: skip
+    joint = {
+        "coulomb_friction",
+        "stribeck_friction",
+        "viscous_friction",
+        "load_friction",
+        "backlash",
+        "compliance",
+        "command_delay",
+        "lag",
+        "torque_limit",
+        "torque_speed_limit",
+        "supply_sag",
+        "torque_ripple",
+        "thermal",
+        "joint_coupling",
+        "position_offset",
+        "position_scale",
+        "payload",
+        "inertia",
+        "gain_mismatch",
+        "deadband",
+        "current_sensor",
+        "braking_limit",
+        "controller_term",
+        "presliding",
+        "external_force",
+    }
     assert joint == set(EFFECTS)
     assert confusable("backlash", "stribeck_friction") and not confusable("backlash", "inertia")
     runs = [plant_run("s", 0, 3.0, {})]
@@ -258,7 +321,8 @@ def test_catalogue_is_that_of_the_specification():
                 assert p.low < p.high
 
 
-# -- planted effects, in our own plant ------------------------------------------------------------------------------------------------------------
+# -- planted effects, in our own plant
+# ------------------------------------------------------------------------------------------------------------
 
 PLANTED = [
     ("coulomb_friction", {"coulomb_friction": 0.06}, "torque", 0.06),
@@ -286,15 +350,18 @@ def check_planted(effect, changes, key, value):
     rivals = [e for e, share in outcome.rivals[first.id] if share > 0.1 and confusable(e, first.id)]
     assert first.id == effect or effect in rivals, f"{outcome.best.ids} {outcome.rivals}"
     if first.id == effect:
-        # gains and mass are refitted within 5 %, and inertia or a load trades against both; so does a share of the load against
+        # gains and mass are refitted within 5 %, and inertia or a load trades against both; so does a share of the load
+        # against
         # the dry friction that was believed
         tolerance = {"inertia": 0.3, "payload": 0.3, "load_friction": 0.2}.get(effect, 0.15)
         assert outcome.best.fit.value(f"{effect}.{key}") == pytest.approx(value, rel=tolerance)
 
 
 # a deadband's fits, begun again from several places, take 45 s; the others 6
-@pytest.mark.parametrize(("effect", "changes", "key", "value"),
-                         [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED])
+@pytest.mark.parametrize(
+    ("effect", "changes", "key", "value"),
+    [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
+)
 def test_planted_effect_is_named_and_sized(effect, changes, key, value):
     check_planted(effect, changes, key, value)
 
@@ -306,11 +373,14 @@ def test_more_planted_effects(effect, changes, key, value):
 
 
 def test_nothing_planted_nothing_found():
-    outcome = search({}, {"*kp": 0.97, "*kd": 1.04, "*inertia_scale": 1.03, "*coulomb_friction": 1.04, "*gravity_scale": 0.98})
+    outcome = search(
+        {}, {"*kp": 0.97, "*kd": 1.04, "*inertia_scale": 1.03, "*coulomb_friction": 1.04, "*gravity_scale": 0.98}
+    )
     assert not outcome.best.members
 
 
-# -- the command ------------------------------------------------------------------------------------------------------------
+# -- the command
+# ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -328,8 +398,29 @@ def answer(rig):
     return d, folder / "out"
 
 
-KEYS = {"schema", "verdict", "noise_floor", "nuisance", "baseline", "held_out", "findings", "unexplained", "next_recording"}
-FINDING = {"effect", "confidence", "alternatives", "indistinguishable", "separating_experiment", "where", "regime", "when", "parameters", "held_out"}
+KEYS = {
+    "schema",
+    "verdict",
+    "noise_floor",
+    "nuisance",
+    "baseline",
+    "held_out",
+    "findings",
+    "unexplained",
+    "next_recording",
+}
+FINDING = {
+    "effect",
+    "confidence",
+    "alternatives",
+    "indistinguishable",
+    "separating_experiment",
+    "where",
+    "regime",
+    "when",
+    "parameters",
+    "held_out",
+}
 
 
 def test_diagnosis_json_has_the_keys_of_the_specification(answer):
@@ -337,18 +428,37 @@ def test_diagnosis_json_has_the_keys_of_the_specification(answer):
     data = json.loads((out / "diagnosis.json").read_text())
     assert set(data) == KEYS and data["schema"] == 1
     assert data["verdict"] in ("explained", "partly_explained")
-    assert set(data["noise_floor"]) == {"position_rad", "how", "joints"} and set(data["noise_floor"]["joints"]) == {"joint"}
+    assert set(data["noise_floor"]) == {"position_rad", "how", "joints"} and set(data["noise_floor"]["joints"]) == {
+        "joint"
+    }
     assert data["noise_floor"]["how"] in ("repeats", "split", "quantum")
-    assert set(data["held_out"]) == {"recordings", "error", "before", "after", "before_low", "before_high", "after_low", "after_high", "not_judged"}
+    assert set(data["held_out"]) == {
+        "recordings",
+        "error",
+        "before",
+        "after",
+        "before_low",
+        "before_high",
+        "after_low",
+        "after_high",
+        "not_judged",
+    }
     assert data["held_out"]["not_judged"] == []
     plain = data["baseline"]
-    assert set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"} and plain["error"] < 0.1 * plain["error_before"]
+    assert (
+        set(plain) == {"error_before", "error", "parameters", "joints", "handed_on"}
+        and plain["error"] < 0.1 * plain["error_before"]
+    )
     assert set(plain["joints"]["joint"]) == {"error_before", "error", "parameters"} and plain["handed_on"] == []
     f = data["findings"][0]
     assert set(f) == FINDING and set(f["where"]) == {"joints", "taxels", "topics"}
     assert f["effect"] == "command_delay" and f["where"]["joints"] == ["joint"]
     p = f["parameters"]["delay"]
-    assert set(p) == {"value", "low", "high", "unit"} and p["value"] == pytest.approx(0.02, abs=0.003) and p["low"] <= p["value"] <= p["high"]
+    assert (
+        set(p) == {"value", "low", "high", "unit"}
+        and p["value"] == pytest.approx(0.02, abs=0.003)
+        and p["low"] <= p["value"] <= p["high"]
+    )
     assert all(w["end"] >= w["start"] and w["recording"].endswith(".mcap") for w in f["when"])
     assert data["held_out"]["after"] < 0.4 * data["held_out"]["before"]
     assert set(data["unexplained"]) == {"fraction_of_gap", "depends_on"}
@@ -400,7 +510,8 @@ def test_terminal_verdict_is_at_most_ten_lines(answer):
     assert len(text) <= 10 and text[0].startswith(("EXPLAINED", "PARTLY EXPLAINED"))
 
 
-# -- bad input ------------------------------------------------------------------------------------------------------------
+# -- bad input
+# ------------------------------------------------------------------------------------------------------------
 
 
 def changed(rig, tmp_path, change, index=0):
@@ -443,7 +554,9 @@ def test_unusable_recordings_are_a_verdict(rig, tmp_path, what):
             r.states.effort = None
 
     d = run(changed(rig, tmp_path, change))
-    assert d.data["verdict"] == "unusable" and d.sentence and not any(f["effect"] in EFFECTS for f in d.data["findings"])
+    assert (
+        d.data["verdict"] == "unusable" and d.sentence and not any(f["effect"] in EFFECTS for f in d.data["findings"])
+    )
 
 
 def test_some_missing_samples_are_said_not_fatal(rig, tmp_path):
@@ -458,7 +571,9 @@ def test_model_range_in_the_wrong_unit_is_said(rig, tmp_path):
     folder, paths, model_path, servo = rig
     wrong = tmp_path / "wrong.xml"
     wrong.write_text(model_path.read_text().replace('angle="radian"', 'angle="degree"'))
-    d = diagnose(Settings(paths[:2], tmp_path / "out", None, str(wrong), str(servo), next_recording=False), say=lambda _: None)
+    d = diagnose(
+        Settings(paths[:2], tmp_path / "out", None, str(wrong), str(servo), next_recording=False), say=lambda _: None
+    )
     assert any("range" in n and "joint" in n for n in d.notes)
 
 
@@ -470,7 +585,12 @@ def test_user_errors_are_one_line(rig, tmp_path):
     broken.write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
     with pytest.raises(UserError, match="broken.xml"):
         diagnose(Settings(paths, tmp_path, None, str(broken), str(servo)), say=lambda _: None)
-    for argv, text in ((["recording=a"], "Did you mean 'recordings'"), (["--out=x"], "Did you mean 'out'"), (["demo=perhaps"], "true, false or one of backlash"), (["out=x"], "recordings")):
+    for argv, text in (
+        (["recording=a"], "Did you mean 'recordings'"),
+        (["--out=x"], "Did you mean 'out'"),
+        (["demo=perhaps"], "true, false or one of backlash"),
+        (["out=x"], "recordings"),
+    ):
         with pytest.raises(UserError, match=text):
             command.main(argv)
     with pytest.raises(UserError, match="does not exist"):
@@ -483,9 +603,12 @@ def test_help_and_columns(capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("demo", "effect", "key", "true"), [("true", "command_delay", "delay", 0.02), ("backlash", "backlash", "gap", 0.06)])
+@pytest.mark.parametrize(
+    ("demo", "effect", "key", "true"), [("true", "command_delay", "delay", 0.02), ("backlash", "backlash", "gap", 0.06)]
+)
 def test_demo_finds_what_it_hid(demo, effect, key, true, tmp_path):
-    """Recorded from the engine and the servo that train, found by the search's own plant, and confirmed by the engine again."""
+    """Recorded from the engine and the servo that train, found by the search's own plant, and confirmed by the engine
+    again."""
     folder = tmp_path / "demo"
     assert command.main([f"demo={demo}", f"out={folder}"]) == 0
     found = json.loads((folder / "diagnosis.json").read_text())["findings"][0]

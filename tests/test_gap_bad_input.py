@@ -30,7 +30,16 @@ def judged(rig, tmp_path, change, keep=(0, 2), **settings):
         change(r)
         out.append(tmp_path / f"{k}.mcap")
         write(out[-1], r)
-    s = Settings(out, tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed=settings.pop("allowed", {"command_delay"}), **settings)
+    s = Settings(
+        out,
+        tmp_path / "out",
+        None,
+        str(model),
+        str(servo),
+        next_recording=False,
+        allowed=settings.pop("allowed", {"command_delay"}),
+        **settings,
+    )
     d = diagnose(s, say=lambda _: None)
     save(d, s.out)
     json.loads((s.out / "diagnosis.json").read_text())
@@ -89,9 +98,22 @@ def stopped(r):
     r.states.position.value[150:] = r.states.position.value[150]
 
 
-STILL = [("wrap", wrapped_effort), ("lost_sign", lost_sign), ("stale", repeated), ("stale", frozen_once), ("clock_skew", drifting_stamp)]
-LOST = [("unit", degrees), ("unit", degrees_everywhere), ("unit", counts), ("wrap", wrapped_position), ("sign", reversed_commands), ("stuck", stopped),
-        ("clock_skew", late_commands)]  # fmt: skip
+STILL = [
+    ("wrap", wrapped_effort),
+    ("lost_sign", lost_sign),
+    ("stale", repeated),
+    ("stale", frozen_once),
+    ("clock_skew", drifting_stamp),
+]
+LOST = [
+    ("unit", degrees),
+    ("unit", degrees_everywhere),
+    ("unit", counts),
+    ("wrap", wrapped_position),
+    ("sign", reversed_commands),
+    ("stuck", stopped),
+    ("clock_skew", late_commands),
+]
 
 
 @pytest.mark.parametrize(("kind", "change"), STILL, ids=[c.__name__ for _, c in STILL])
@@ -99,7 +121,10 @@ def test_a_bad_channel_is_named_and_the_rest_still_judged(rig, tmp_path, kind, c
     d = judged(rig, tmp_path, change)
     bad = [f for f in d.data["findings"] if f["effect"] == "bad_channel"]
     assert [f["regime"].split(":")[0] for f in bad] == [kind] and bad[0]["where"]["topics"] and bad[0]["when"]
-    assert d.data["verdict"] == "explained" and d.data["held_out"]["before"] < (6 if change is repeated else 2) * d.data["noise_floor"]["position_rad"]
+    assert (
+        d.data["verdict"] == "explained"
+        and d.data["held_out"]["before"] < (6 if change is repeated else 2) * d.data["noise_floor"]["position_rad"]
+    )
     assert "not what it says" in d.sentence
 
 
@@ -121,7 +146,15 @@ def test_one_bad_recording_leaves_the_others(rig, tmp_path):
     r = read(paths[3], audit=False)
     degrees(r)
     write(tmp_path / "wrong.mcap", r)
-    s = Settings([*paths[:2], tmp_path / "wrong.mcap"], tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed={"command_delay"})
+    s = Settings(
+        [*paths[:2], tmp_path / "wrong.mcap"],
+        tmp_path / "out",
+        None,
+        str(model),
+        str(servo),
+        next_recording=False,
+        allowed={"command_delay"},
+    )
     d = diagnose(s, say=lambda _: None)
     assert d.data["verdict"] == "explained" and any("wrong.mcap" in n and "left out" in n for n in d.notes)
     assert [f["effect"] for f in d.data["findings"]] == ["bad_channel"]
@@ -129,7 +162,9 @@ def test_one_bad_recording_leaves_the_others(rig, tmp_path):
 
 def test_effects_that_cannot_be_there_are_named(rig, tmp_path):
     d = judged(rig, tmp_path, lambda r: None, allowed={"supply_sag", "tactile_hysteresis"})
-    assert any(n.startswith("supply_sag cannot be seen") for n in d.notes) and any(n.startswith("tactile_hysteresis cannot be seen") for n in d.notes)
+    assert any(n.startswith("supply_sag cannot be seen") for n in d.notes) and any(
+        n.startswith("tactile_hysteresis cannot be seen") for n in d.notes
+    )
     with pytest.raises(UserError, match="Did you mean 'backlash'"):
         command.main(["recordings=" + str(rig[1][0]), "effects=[backlas]", f"model={rig[2]}", f"servo={rig[3]}"])
 
@@ -159,7 +194,8 @@ def test_held_out_copies_are_refused(rig, tmp_path):
 
 
 def test_two_recordings_of_a_dead_encoder_are_no_copies(rig, tmp_path):
-    """Both hold one reading for all their length: that is a fault of the signal, which is named, not one recording given twice."""
+    """Both hold one reading for all their length: that is a fault of the signal, which is named, not one recording
+    given twice."""
     folder, paths, model, servo = rig
     dead = []
     for k in (0, 1):
@@ -167,7 +203,15 @@ def test_two_recordings_of_a_dead_encoder_are_no_copies(rig, tmp_path):
         r.states.position.value[:] = 0.25
         dead.append(tmp_path / f"dead_{k}.mcap")
         write(dead[-1], r)
-    s = Settings([*paths[2:], dead[0]], tmp_path / "out", [paths[0], dead[1]], str(model), str(servo), next_recording=False, allowed={"command_delay"})
+    s = Settings(
+        [*paths[2:], dead[0]],
+        tmp_path / "out",
+        [paths[0], dead[1]],
+        str(model),
+        str(servo),
+        next_recording=False,
+        allowed={"command_delay"},
+    )
     d = diagnose(s, say=lambda _: None)
     assert "bad_channel" in [f["effect"] for f in d.data["findings"]]
 
@@ -176,17 +220,25 @@ def test_a_model_that_does_not_compile_still_says_what_the_recordings_are(rig, t
     folder, paths, model, servo = rig
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
-    with pytest.raises(UserError, match=r"broken.xml.*of the recordings themselves: motion_1.mcap: 4.0 s of 1 joint, no fault") as error:
+    with pytest.raises(
+        UserError, match=r"broken.xml.*of the recordings themselves: motion_1.mcap: 4.0 s of 1 joint, no fault"
+    ) as error:
         diagnose(Settings(paths[:1], tmp_path, None, str(broken), str(servo)), say=lambda _: None)
     assert "\n" not in str(error.value)
 
 
 def test_joints_on_one_side_only_are_said(rig, tmp_path):
-    """The model has a joint that no recording has, the recording one that the model has not: both named, the common one judged."""
+    """The model has a joint that no recording has, the recording one that the model has not: both named, the common one
+    judged."""
     folder, paths, model, servo = rig
     both = tmp_path / "two.xml"
-    both.write_text(model.read_text().replace('<body name="link">', '<body name="other"><joint name="wrist" type="hinge" axis="0 1 0"/>'
-                                              '<geom size="0.01" mass="0.1" pos="0 0 0.05"/></body><body name="link">'))  # fmt: skip
+    both.write_text(
+        model.read_text().replace(
+            '<body name="link">',
+            '<body name="other"><joint name="wrist" type="hinge" axis="0 1 0"/>'
+            '<geom size="0.01" mass="0.1" pos="0 0 0.05"/></body><body name="link">',
+        )
+    )
     out = []
     for k in (0, 2):
         r = read(paths[k], audit=False)

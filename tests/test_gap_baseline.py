@@ -23,7 +23,18 @@ BELIEVED = {"drive": "torque", "loop_rate": 1000, "joints": {"*": {"kp": 3.0, "k
 
 def run(name: str, t, q, cmd, enabled=None, torque=None) -> Run:
     column = lambda x: None if x is None else np.asarray(x, float)[:, None]  # noqa: E731
-    return Run(name, ("joint",), t, column(cmd), t, column(q), ServoTable.from_dict(BELIEVED), np.array([0, 0, -9.81]), enabled=column(enabled), torque=column(torque))
+    return Run(
+        name,
+        ("joint",),
+        t,
+        column(cmd),
+        t,
+        column(q),
+        ServoTable.from_dict(BELIEVED),
+        np.array([0, 0, -9.81]),
+        enabled=column(enabled),
+        torque=column(torque),
+    )
 
 
 def case_of(*runs: Run):
@@ -92,7 +103,13 @@ def test_the_plain_model_follows_what_it_can_state(fitted):
 def test_what_follows_worse_than_the_plain_model_is_not_handed_on(fitted):
     case, true, plain = fitted
     trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
-    given = lambda squares: baseline.refused([plain], {"joint": {"after": float(np.sqrt(squares.mean())), "sigma": 3e-4}}, [(case, trial, squares)], [0], 3e-4)  # noqa: E731
+    given = lambda squares: baseline.refused(  # noqa: E731
+        [plain],
+        {"joint": {"after": float(np.sqrt(squares.mean())), "sigma": 3e-4}},
+        [(case, trial, squares)],
+        [0],
+        3e-4,
+    )
     assert given(1.05 * plain.squares) == {}  # as good, to the noise
     worse = plain.squares + (2e-3) ** 2
     assert "plain least squares" in given(worse)["joint"]
@@ -107,8 +124,17 @@ def test_what_follows_worse_than_the_plain_model_is_not_handed_on(fitted):
 
 def test_the_plain_model_fits_no_friction_that_a_fall_forbids():
     t, q = falls(0.05)
-    case = case_of(run("fall.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))), run("again.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))))
+    case = case_of(
+        run("fall.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))),
+        run("again.mcap", t, q, np.full(len(t), 1.2), enabled=np.zeros(len(t))),
+    )
     friction = next(p for p in baseline.plain_model(case, [0]) if p.key == "coulomb_friction")
     assert friction.high <= room_for_friction(case, [0])[-1]
-    refused = baseline.refused([], {"joint": {"after": 1.0, "sigma": 1e-3}}, [(case, SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS]))), np.ones(3))], [0], 1e-3)
+    refused = baseline.refused(
+        [],
+        {"joint": {"after": 1.0, "sigma": 1e-3}},
+        [(case, SimpleNamespace(fit=SimpleNamespace(params=[friction], x=np.array([2 * HANGS]))), np.ones(3))],
+        [0],
+        1e-3,
+    )
     assert "would hold the joint" in refused["joint"]

@@ -16,11 +16,16 @@ from dexsim.gap.plant.param import Param
 from dexsim.gap.rules import JUDGE
 
 DOUBTED = JUDGE.doubted
-CASE = SimpleNamespace(scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0}))
+CASE = SimpleNamespace(
+    scales=SimpleNamespace(nominal={"viscous_friction": 0.002, "kp": 2.0, "torque_limit": 1.0, "coulomb_friction": 0.0})
+)
 
 
 def evidence(**changes) -> Evidence:
-    given = dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, folds=[], members=1, place=0) | changes
+    given = (
+        dict(effect="lag", joint="j", share=1.0, earned=1.0, left=0.0, left_of_rest=0.0, folds=[], members=1, place=0)
+        | changes
+    )
     return Evidence(**given)
 
 
@@ -28,22 +33,31 @@ def viscous(low=0.0, high=0.1):
     return Param("coefficient", ("viscous_friction",), "set", low, high, 0.002)
 
 
-@pytest.mark.parametrize(("low", "high", "nothing"), [(0.0, 0.004, True), (0.00207, 0.004, True), (0.003, 0.006, False), (0.0, 0.001, False)])
+@pytest.mark.parametrize(
+    ("low", "high", "nothing"), [(0.0, 0.004, True), (0.00207, 0.004, True), (0.003, 0.006, False), (0.0, 0.001, False)]
+)
 def test_an_interval_that_holds_what_is_believed_holds_nothing(low, high, nothing):
     assert confidence.holds_nothing([viscous()], {"coefficient": (low, high)}, CASE) is nothing
 
 
 def test_all_sizes_must_hold_nothing_and_shapes_do_not_count():
-    gains = [Param("kp_factor", ("kp",), "factor", 0.25, 4.0, 1.0), Param("kd_factor", ("kd",), "factor", 0.1, 6.0, 1.0)]
+    gains = [
+        Param("kp_factor", ("kp",), "factor", 0.25, 4.0, 1.0),
+        Param("kd_factor", ("kd",), "factor", 0.1, 6.0, 1.0),
+    ]
     assert confidence.holds_nothing(gains, {"kp_factor": (0.9, 1.2), "kd_factor": (0.8, 1.3)}, CASE)
     assert not confidence.holds_nothing(gains, {"kp_factor": (0.9, 1.2), "kd_factor": (1.4, 2.0)}, CASE)
-    peak = [Param("peak", ("stribeck_peak",), "set", 0.0, 1.0, 0.0), Param("v_s", ("stribeck_speed",), "set", 0.01, 1.0, 0.1)]
+    peak = [
+        Param("peak", ("stribeck_peak",), "set", 0.0, 1.0, 0.0),
+        Param("v_s", ("stribeck_speed",), "set", 0.01, 1.0, 0.1),
+    ]
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"stribeck_peak": 0.0, "stribeck_speed": 0.1}))
     assert not confidence.holds_nothing(peak, {"peak": (0.1, 0.3), "v_s": (0.05, 0.2)}, case)
 
 
 def test_a_size_at_its_bound_is_told_from_one_at_nothing():
-    assert confidence.at_bound([viscous()], {"coefficient": 0.0}, CASE) == "coefficient"  # less than none cannot be, and some is believed
+    # less than none cannot be, and some is believed
+    assert confidence.at_bound([viscous()], {"coefficient": 0.0}, CASE) == "coefficient"
     assert confidence.at_bound([viscous()], {"coefficient": 0.01}, CASE) == ""
     turns = Param("per_turn", ("ripple_per_turn",), "set", 3.92, 4.08, 4.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"ripple_per_turn": 0.0}))
@@ -52,7 +66,12 @@ def test_a_size_at_its_bound_is_told_from_one_at_nothing():
     assert confidence.at_bound([coulomb], {"torque": 0.0}, CASE) == ""
     scale = Param("scale", ("position_scale",), "set", 0.7, 1.4, 1.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0}))
-    assert [confidence.at_bound([scale], {"scale": x}, case) for x in (1.3986, 1.37, 1.0, 0.701)] == ["scale", "", "", "scale"]
+    assert [confidence.at_bound([scale], {"scale": x}, case) for x in (1.3986, 1.37, 1.0, 0.701)] == [
+        "scale",
+        "",
+        "",
+        "scale",
+    ]
     gap = Param("gap", ("backlash",), "set", 0.0015, 0.4, 0.0015)  # begins near nothing: a small one is not at a bound
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"backlash": 0.0}))
     assert confidence.at_bound([gap], {"gap": 0.004}, case) == ""
@@ -66,11 +85,14 @@ def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():
 
 
 def test_what_the_encoder_does_not_resolve_is_doubted():
-    """An error of 1.0 that the effect brings down by 0.3 in squares has been moved by 0.55 of a count, or by 0.27 of one."""
+    """An error of 1.0 that the effect brings down by 0.3 in squares has been moved by 0.55 of a count, or by 0.27 of
+    one."""
     after = np.sqrt(0.7)
     assert confidence.unresolved(1.0, after, 1.0) == ""
     assert "count of the encoder" in confidence.unresolved(1.0, after, 2.0)
-    assert "count of the encoder" in confidence.unresolved(1.0, 1.1, 1.0), "what makes it worse moves nothing for the better"
+    assert "count of the encoder" in confidence.unresolved(1.0, 1.1, 1.0), (
+        "what makes it worse moves nothing for the better"
+    )
 
 
 def test_touch_is_doubted_alike():
@@ -85,7 +107,8 @@ def test_weigh_takes_every_doubt_into_account():
     assert confidence.weigh(evidence(), 10.0, 1.0, 10.0, 1.0) == 0.99
     assert confidence.weigh(evidence(reasons=["x"]), 10.0, 1.0, 10.0, 1.0) == DOUBTED
     assert confidence.weigh(evidence(), 10.0, 7.0, 10.0, 1.0) == pytest.approx(0.5)  # half of the squared error stays
-    assert confidence.weigh(evidence(members=2), 20.0, 4.0, 4.5, 1.0) < 0.6  # next to nothing of what the first one left
+    # next to nothing of what the first one left
+    assert confidence.weigh(evidence(members=2), 20.0, 4.0, 4.5, 1.0) < 0.6
     assert confidence.weigh(evidence(earned=0.0), 10.0, 1.0, 10.0, 1.0) == pytest.approx(0.3)
 
 
@@ -112,7 +135,10 @@ def test_two_torques_of_the_pose_can_be_any():
     case = SimpleNamespace(scales=SimpleNamespace(span=1.5))
     assert EFFECTS["payload"].of_pose({"mass": 0.1}, case) and EFFECTS["torque_ripple"].of_pose({"per_turn": 4.9}, case)
     assert not EFFECTS["torque_ripple"].of_pose({"per_turn": 20}, case) and not EFFECTS["lag"].of_pose({}, case)
-    load, slow, fast = (evidence(effect=e, confidence=0.99, of_pose=o) for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False)))
+    load, slow, fast = (
+        evidence(effect=e, confidence=0.99, of_pose=o)
+        for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False))
+    )
     confidence.together([load, fast])
     assert load.confidence == fast.confidence == 0.99
     confidence.together([load, slow])
@@ -120,7 +146,10 @@ def test_two_torques_of_the_pose_can_be_any():
 
 
 def test_what_hangs_on_a_misread_pose_is_doubted():
-    scale, load, friction = (evidence(effect=e, joint=j, confidence=0.99) for e, j in (("position_scale", "b"), ("payload", "a"), ("coulomb_friction", "a")))
+    scale, load, friction = (
+        evidence(effect=e, joint=j, confidence=0.99)
+        for e, j in (("position_scale", "b"), ("payload", "a"), ("coulomb_friction", "a"))
+    )
     confidence.of_the_whole([load, scale, friction], {}, set())
     assert load.confidence == DOUBTED and "b" in load.reasons[0] and scale.confidence == friction.confidence == 0.99
     own = evidence(effect="payload", joint="b", confidence=0.99)
@@ -128,20 +157,39 @@ def test_what_hangs_on_a_misread_pose_is_doubted():
     assert own.confidence == 0.99
 
 
-@pytest.mark.parametrize(("starts", "gains", "what"), [
-    ((25, 35, 45, 55), (1, 1, 1, 1), "the clock"), ((45, 25, 55, 35), (1, 1, 1, 1), ""), ((55, 45, 35, 25), (1, 1, 1, 1), "the order of the recordings"),
-    ((25, 45, 35, 55), (1, 1, 1, 1), ""), ((25, 45, 35, 55), (8, 32, 16, 64), "the gain")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("starts", "gains", "what"),
+    [
+        ((25, 35, 45, 55), (1, 1, 1, 1), "the clock"),
+        ((45, 25, 55, 35), (1, 1, 1, 1), ""),
+        ((55, 45, 35, 25), (1, 1, 1, 1), "the order of the recordings"),
+        ((25, 45, 35, 55), (1, 1, 1, 1), ""),
+        ((25, 45, 35, 55), (8, 32, 16, 64), "the gain"),
+    ],
+)
 def test_temperature_that_follows_something_else(starts, gains, what):
     n = 50
     rows = lambda r: slice(n * r, n * (r + 1))  # noqa: E731
     warm = np.concatenate([s + np.linspace(0, 1.0, n) for s in starts])
     nominal = [np.where(np.arange(len(INDEX)) == INDEX["kp"], g, 0.0) for g in gains]
-    case = SimpleNamespace(regimes={"temperature": warm}, plant=SimpleNamespace(rows=rows, t=np.tile(np.linspace(0, 7, n), 4), nominal=nominal))
+    case = SimpleNamespace(
+        regimes={"temperature": warm},
+        plant=SimpleNamespace(rows=rows, t=np.tile(np.linspace(0, 7, n), 4), nominal=nominal),
+    )
     assert temperature_follows(case, range(4)) == what
 
 
-@pytest.mark.parametrize(("before", "low", "structured", "word"), [(1.2, 1.1, True, "none"), (4.0, 1.1, True, "none"), (4.0, 3.0, False, "none"),
-                                                                  (4.0, 3.0, True, "unknown"), (12.0, 1.1, True, "unknown"), (12.0, 9.0, False, "unknown")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("before", "low", "structured", "word"),
+    [
+        (1.2, 1.1, True, "none"),
+        (4.0, 1.1, True, "none"),
+        (4.0, 3.0, False, "none"),
+        (4.0, 3.0, True, "unknown"),
+        (12.0, 1.1, True, "unknown"),
+        (12.0, 9.0, False, "unknown"),
+    ],
+)
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
     assert verdict.verdict([], 1.0, before, low, before, structured) == word
@@ -167,7 +215,8 @@ def test_what_is_neutral_is_not_believed_to_a_few_percent():
 
 
 def test_a_size_that_may_lie_beyond_what_is_looked_for_is_doubted():
-    """An interval that ends at the far bound is only as long as the search; one that ends at the bound beside nothing is not cut."""
+    """An interval that ends at the far bound is only as long as the search; one that ends at the bound beside nothing
+    is not cut."""
     p = Param("scale", ("position_scale",), "factor", 0.7, 1.3, 1.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={}))
     assert confidence.beyond([p], {"scale": (0.7, 0.98)}, case) == "scale"

@@ -1,4 +1,5 @@
-"""Where hypotheses are simulated: side by side on a CPU, in one stream a joint on a GPU, and what is said without one."""
+"""Where hypotheses are simulated: side by side on a CPU, in one stream a joint on a GPU, and what is said without
+one."""
 
 from __future__ import annotations
 
@@ -88,7 +89,8 @@ def test_joints_side_by_side_come_back_in_order(monkeypatch):
     assert side_by_side(names, work, "cuda", lambda *x: seen.append(x)) == [0, 1, 4]
     assert seen[-1] == (3, 3, "") and sorted({x[2] for x in seen[:-1]}) == names
     done = [x[0] for x in seen]
-    assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])  # each begins, and is half done
+    # each begins, and is half done
+    assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])
     with pytest.raises(ZeroDivisionError):
         side_by_side(names, lambda k, tell: 1 // 0, "cuda")
     for given, cores in (("1", 1), ("4", 2), ("64", parallel.MOST_CPU), ("12", 6)):
@@ -101,7 +103,11 @@ def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):
     monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 0)
     assert command.available("cuda") == "cpu" and "no such GPU" in capsys.readouterr().out
     monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 2)
-    assert command.available("cuda:1") == "cuda:1" and command.available("cuda") == "cuda:0" and not capsys.readouterr().out
+    assert (
+        command.available("cuda:1") == "cuda:1"
+        and command.available("cuda") == "cuda:0"
+        and not capsys.readouterr().out
+    )
     assert command.available("cuda:2") == "cpu" and "it has 2" in capsys.readouterr().out
     with pytest.raises(UserError, match="cuda:0"):
         command.available("cuda:x")

@@ -31,7 +31,7 @@ def named(rig, folder, change, which):
         else:
             write(paths[-1], copy)
     d = diagnose(Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False, replay="none",
-                          allowed={"command_delay", "viscous_friction", "coulomb_friction", "lag"}), say=lambda _: None)  # fmt: skip
+                          allowed={"command_delay", "viscous_friction", "coulomb_friction", "lag"}), say=lambda _: None)
     return [f for f in d.data["findings"] if f["effect"] != "bad_channel"][0], d
 
 
@@ -53,11 +53,19 @@ def stamps(jump, share):
         late = np.arange(n) > n // 2 if share is None else rng.random(n) < share
         half = float(r.states.position.t[n // 2])
         rows = [(t, 1, i, t + (jump if late[i] else 0.0)) for i, t in enumerate(r.states.position.t)]
-        rows += [(t, 0, i, t + (jump if (t > half if share is None else rng.random() < share) else 0.0)) for i, t in enumerate(r.commands.t)]
+        rows += [
+            (t, 0, i, t + (jump if (t > half if share is None else rng.random() < share) else 0.0))
+            for i, t in enumerate(r.commands.t)
+        ]
         with Writer(path, r.joints, r.meta, r.start_ns + 10**13) as w:
             for _, kind, i, stamp in sorted(rows):
                 if kind:
-                    w.add_state(stamp, r.states.position.value[i], None, None if r.states.effort is None else r.states.effort.value[i])
+                    w.add_state(
+                        stamp,
+                        r.states.position.value[i],
+                        None,
+                        None if r.states.effort is None else r.states.effort.value[i],
+                    )
                 else:
                     w.add_command(stamp, r.commands.value[i])
 
@@ -65,9 +73,20 @@ def stamps(jump, share):
 
 
 @pytest.mark.parametrize("which", [(1,), (0, 1, 2, 3)], ids=["one", "all"])
-@pytest.mark.parametrize("change", [spikes("position", 0.02, 1.5), spikes("position", 0.05, 0.5), spikes("command", 0.05, 1.0), spikes("effort", 0.05, 5.0),
-                                    stamps(-3.0, 0.05), stamps(600.0, 0.05), stamps(1e18 * 1e-9, 0.02), stamps(-1.5, None)],
-                         ids=["position2", "position5", "command5", "effort5", "back", "ahead", "far", "set back"])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        spikes("position", 0.02, 1.5),
+        spikes("position", 0.05, 0.5),
+        spikes("command", 0.05, 1.0),
+        spikes("effort", 0.05, 5.0),
+        stamps(-3.0, 0.05),
+        stamps(600.0, 0.05),
+        stamps(1e18 * 1e-9, 0.02),
+        stamps(-1.5, None),
+    ],
+    ids=["position2", "position5", "command5", "effort5", "back", "ahead", "far", "set back"],
+)
 def test_the_same_name_as_sure(rig, tmp_path, change, which):
     known = rig[3]
     if "clean" not in known:

@@ -30,19 +30,26 @@ COLUMNS = {*NAMES, *SERIES}  # some effects are called as the column that they w
 
 
 def asked_by_name(source: str) -> list[str]:
-    """Ids of effects that a source names: any that is no column's name, and those in comparisons with a finding's or a member's effect."""
+    """Ids of effects that a source names: any that is no column's name, and those in comparisons with a finding's or a
+    member's effect."""
     out = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in IDS - COLUMNS:
             out.append(f"{node.lineno}: {node.value}")
         if isinstance(node, ast.Compare) and re.search(r"\.ids?\b|\beffects?\b", ast.unparse(node)):
-            named = {x.value for x in ast.walk(node) if isinstance(x, ast.Constant) and isinstance(x.value, str)} & IDS & COLUMNS
+            named = (
+                {x.value for x in ast.walk(node) if isinstance(x, ast.Constant) and isinstance(x.value, str)}
+                & IDS
+                & COLUMNS
+            )
             out += [f"{node.lineno}: {x}" for x in sorted(named)]
     return out
 
 
 @pytest.mark.parametrize(("source", "found"), [
-    ('f["effect"] == "supply_sag"', 1), ('m.id in ("payload", "lag")', 2), ('FAST = ("command_delay", "lag")', 1), ('row[INDEX["payload"]]', 0),
+    ('f["effect"] == '
+     '"supply_sag"', 1), ('m.id in ("payload", '
+                          '"lag")', 2), ('FAST = ("command_delay", "lag")', 1), ('row[INDEX["payload"]]', 0),
     ('name in ("kp", "torque_limit")', 0)])  # fmt: skip
 def test_the_search_for_names_finds_them(source, found):
     assert len(asked_by_name(source)) == found
@@ -51,7 +58,9 @@ def test_the_search_for_names_finds_them(source, found):
 def test_no_effect_is_asked_for_by_name_outside_its_class():
     files = [p for p in ROOM.rglob("*.py") if p.parent.name != "effects"]
     assert len(files) > 20
-    assert {str(p.relative_to(ROOM)): said for p in files if (said := asked_by_name(p.read_text(encoding="utf-8")))} == {}
+    assert {
+        str(p.relative_to(ROOM)): said for p in files if (said := asked_by_name(p.read_text(encoding="utf-8")))
+    } == {}
 
 
 def test_every_effect_has_a_file_of_its_own_and_says_what_it_is():
@@ -84,7 +93,11 @@ FAST = {"torque_limit": 0.3, "no_load_speed": 14.0, "braking_slope": 1.0}
 BRAKING = ({"braking_slope": 0.0}, FAST, {"braking_limit", "torque_limit", "torque_speed_limit"})
 LEADING = ({"speed_feedforward": 0.04}, None, {"controller_term"})
 CREEPING = ({"integral_gain": 3.0}, None, {"controller_term", "payload"})
-GIVING = ({"presliding": 0.02, "coulomb_friction": 0.06}, {"coulomb_friction": 0.06}, {"presliding", "backlash", "stribeck_friction"})
+GIVING = (
+    {"presliding": 0.02, "coulomb_friction": 0.06},
+    {"coulomb_friction": 0.06},
+    {"presliding", "backlash", "stribeck_friction"},
+)
 
 
 @pytest.mark.parametrize(("planted", "effect", "key", "value", "jumps"), [
@@ -96,7 +109,9 @@ GIVING = ({"presliding": 0.02, "coulomb_friction": 0.06}, {"coulomb_friction": 0
 def test_a_law_that_is_not_believed_is_named_and_sized(monkeypatch, planted, effect, key, value, jumps):
     monkeypatch.setattr(test_gap, "motion", steps if jumps else test_gap.motion)
     best = found(*planted).best
-    assert best.ids == (effect,) and best.fit.value(f"{effect}.{key}") == pytest.approx(value, rel=0.1, abs=0.05 if jumps else 0)
+    assert best.ids == (effect,) and best.fit.value(f"{effect}.{key}") == pytest.approx(
+        value, rel=0.1, abs=0.05 if jumps else 0
+    )
 
 
 def test_what_is_not_stated_of_braking_is_no_effect(monkeypatch):
@@ -109,7 +124,8 @@ def test_what_is_not_stated_of_braking_is_no_effect(monkeypatch):
 
 @pytest.mark.slow
 def test_an_interval_holds_the_size_by_another_law():
-    """Breakaway friction that falls with the speed itself and not with its square: the law is tried too, and the interval holds the truth."""
+    """Breakaway friction that falls with the speed itself and not with its square: the law is tried too, and the
+    interval holds the truth."""
     off = {"*kp": 1.02, "*inertia_scale": 0.98, "stribeck_peak": 0.06, "stribeck_speed": 0.25, "stribeck_exponent": 1.0}
     runs = [plant_run(f"run{k}", k, 5.0, off, seed=k) for k in (0, 1, 3)]
     for r in runs:
@@ -154,18 +170,32 @@ def cable_pull(stiffness: Any, q: Any):
     """Torque [N.m] of a cable [N.m/rad3] at position q [rad]: -stiffness q^3."""
     return -stiffness * q * q * q
 '''
-ADDED = (  # file, the line before which (none: at its end), what is added: a column, its law in training and search, its reference, an entry
-    ("actuator/columns.py", "    # Torque of nothing that is known", '    Column("cable", "N.m/rad3", 0.0, 0.0, 1e3, "a cable that pulls home"),\n'),
+# file, the line before which (none: at its end), what is added: a column, its law in training and search, its
+# reference, an entry
+ADDED = (
+    (
+        "actuator/columns.py",
+        "    # Torque of nothing that is known",
+        '    Column("cable", "N.m/rad3", 0.0, 0.0, 1e3, "a cable that pulls home"),\n',
+    ),
     ("actuator/laws.py", "", LAW),
     ("actuator/kernel.py", "KP, KD = INDEX", 'from dexsim.actuator.laws import cable_pull\n\nCABLE = INDEX["cable"]\n'),
-    ("actuator/kernel.py", "        # The stand-in for what is not known", "        t.end += cable_pull(d.params[w, j, CABLE], q)\n"),
+    (
+        "actuator/kernel.py",
+        "        # The stand-in for what is not known",
+        "        t.end += cable_pull(d.params[w, j, CABLE], q)\n",
+    ),
     ("actuator/reference.py", "    of_motor, slope_motor, drawn", '    applied = applied - p["cable"] * q**3\n'),
-    ("gap/plant/kernel.py", "f64 = wp.float64", 'from dexsim.actuator.laws import cable_pull\n\nP_CABLE = INDEX["cable"]\n'),
+    (
+        "gap/plant/kernel.py",
+        "f64 = wp.float64",
+        'from dexsim.actuator.laws import cable_pull\n\nP_CABLE = INDEX["cable"]\n',
+    ),
     ("gap/plant/kernel.py", "    applied += p.bias", "    applied += cable_pull(c.params[h, P_CABLE], x.q)\n"),
     ("gap/effects/cable.py", "", CABLE),
     ("gap/effects/catalogue.py", "CATALOGUE: tuple[Effect, ...] = (", "from dexsim.gap.effects.cable import Cable\n\n"),
     ("gap/effects/catalogue.py", "    CoulombFriction(),", "    Cable(),\n"),
-)  # fmt: skip
+)
 TRIED = """
 import json, sys
 from pathlib import Path
@@ -177,18 +207,21 @@ from dexsim.gap.diagnosis import Settings, diagnose, save
 
 out = Path(sys.argv[1])
 paths, model, servo, hidden = demo.make(out, "cable_pull", seconds=5.0)
-d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={"cable_pull", "payload"}), say=lambda _: None)
+d = diagnose(Settings(paths, out, None, str(model), str(servo), next_recording=False, allowed={"cable_pull",
+             "payload"}), say=lambda _: None)
 save(d, out)
 row = ServoTable.from_dict(demo.BELIEVED).nominal(["joint"])[0]
-plain, pulled = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9)["qfrc_applied"] for r in (row, np.where(np.arange(len(row)) == reference.INDEX["cable"], 0.08, row)))
-print(json.dumps({"hidden": hidden, "torque": float(pulled - plain), "row": ServoTable.load(out / "servo.yaml").value("joint", "cable").value}))
+plain, pulled = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9)["qfrc_applied"] for r in (row,
+             np.where(np.arange(len(row)) == reference.INDEX["cable"], 0.08, row)))
+print(json.dumps({"hidden": hidden, "torque": float(pulled - plain),
+             "row": ServoTable.load(out / "servo.yaml").value("joint", "cable").value}))
 """
 
 
 @pytest.mark.slow
 def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
-    """A copy of the package with one effect more, added in the places that CONTRIBUTING names and nowhere else: it is planted by the
-    engine that trains, found, sized, written to servo.yaml and shown on the page."""
+    """A copy of the package with one effect more, added in the places that CONTRIBUTING names and nowhere else: it is
+    planted by the engine that trains, found, sized, written to servo.yaml and shown on the page."""
     package = tmp_path / "dexsim"
     shutil.copytree(Path(dexsim.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     for name, before, text in ADDED:
@@ -198,7 +231,13 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
         path.write_text(old.replace(before, text + before) if before else old + text, encoding="utf-8")
     script, out = tmp_path / "tried.py", tmp_path / "out"
     script.write_text(TRIED, encoding="utf-8")
-    done = subprocess.run([sys.executable, str(script), str(out)], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(script), str(out)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     said = json.loads(done.stdout.splitlines()[-1])
     first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]

@@ -10,7 +10,8 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.read import end_stops
 from dexsim.gap.read.runs import Run
 
-XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/><geom type="capsule" size="0.01" fromto="0 0 0 0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>"""
+XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/>
+ <geom type="capsule" size="0.01" fromto="0 0 0 0.1 0 0" mass="{mass}"/></body></worldbody></mujoco>"""
 
 
 def run_of(stop: float | None, lag: float = 0.02, reach: float = 1.5) -> Run:

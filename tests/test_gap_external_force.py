@@ -1,4 +1,5 @@
-"""A joint that something outside pushes in stretches of time: said with when and how hard, and not taken for physics of its own."""
+"""A joint that something outside pushes in stretches of time: said with when and how hard, and not taken for physics of
+its own."""
 
 from __future__ import annotations
 
@@ -64,9 +65,21 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     assert not push.clear and push.finding()["confidence"] < 0.5
     size = {"torque": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}}
     held = {"before": 0.02, "after": 0.01}
-    of = lambda effect, joint: {"effect": effect, "where": {"joints": [joint]}, "confidence": 0.7, "held_out": held, "parameters": size, "indistinguishable": []}  # noqa: E731
-    data = {"findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")], "verdict": "explained", "noise_floor": {"position_rad": 0.01},
-            "held_out": held | {"error": "position_rmse_rad"}, "unexplained": {"depends_on": []}}  # fmt: skip
+    of = lambda effect, joint: {  # noqa: E731
+        "effect": effect,
+        "where": {"joints": [joint]},
+        "confidence": 0.7,
+        "held_out": held,
+        "parameters": size,
+        "indistinguishable": [],
+    }
+    data = {
+        "findings": [of("torque_ripple", "elbow"), of("coulomb_friction", "shoulder")],
+        "verdict": "explained",
+        "noise_floor": {"position_rad": 0.01},
+        "held_out": held | {"error": "position_rmse_rad"},
+        "unexplained": {"depends_on": []},
+    }
     d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={})
     external_force.claim(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
@@ -81,13 +94,29 @@ def test_a_diagnosis_says_it_first_and_judges_by_the_rest(tmp_path):
 
     model, made = arm(), []
     (tmp_path / "arm.xml").write_text(ARM)
-    believed = {"kp": 80.0, "kd": 3.0, "torque_limit": 40.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}
+    believed = {
+        "kp": 80.0,
+        "kd": 3.0,
+        "torque_limit": 40.0,
+        "coulomb_friction": "unknown",
+        "viscous_friction": "unknown",
+    }
     servo = dump(tmp_path / "arm.yaml", {"drive": "torque", "joints": {"*": believed}})
     for k in range(3):
         r = run(model, k, pushed=shove if k == 1 else None)
         cmd = r.q + (r.torque + 3.0 * np.gradient(r.q, r.t, axis=0)) / 80.0
         made.append(save(tmp_path / f"r{k}.mcap", r.joints, r.t, cmd, r.t, r.q, effort=r.torque, gravity="0 0 -9.81"))
-    asked = Settings(made[:2], tmp_path, made[2:], str(tmp_path / "arm.xml"), str(servo), next_recording=False, replay="none", allowed={"viscous_friction"}, joints={"elbow"})
+    asked = Settings(
+        made[:2],
+        tmp_path,
+        made[2:],
+        str(tmp_path / "arm.xml"),
+        str(servo),
+        next_recording=False,
+        replay="none",
+        allowed={"viscous_friction"},
+        joints={"elbow"},
+    )
     d = diagnose(asked, say=lambda _: None)
     assert d.sentence.startswith("Joint elbow is pushed by something outside")
     first = d.data["findings"][0]

@@ -1,4 +1,5 @@
-"""Fits that do not stop short, and what of a size no recording tells: the plant's step, the fit without any effect begun again, sizes traded with beliefs."""
+"""Fits that do not stop short, and what of a size no recording tells: the plant's step, the fit without any effect
+begun again, sizes traded with beliefs."""
 
 from __future__ import annotations
 
@@ -29,7 +30,10 @@ def test_a_millisecond_is_short_enough_for_a_lag_and_for_braking_at_the_limit(ch
 
 
 def test_no_effect_is_begun_again_from_where_an_effect_ended():
-    runs = [plant_run(name, kind, 5.0, {"delay": 6e-4, "*kp": 0.97}, seed) for name, kind, seed in (("a", 0, 1), ("b", 1, 2), ("c", 2, 3))]
+    runs = [
+        plant_run(name, kind, 5.0, {"delay": 6e-4, "*kp": 0.97}, seed)
+        for name, kind, seed in (("a", 0, 1), ("b", 1, 2), ("c", 2, 3))
+    ]
     s = JointSearch(build(model(), runs)[0], [0, 1, 2], None, [0, 1, 2])
     none = s.start()
     member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in s.scan(none) if m.id == "command_delay")
@@ -50,8 +54,11 @@ def test_an_interval_holds_what_a_size_trades_with_a_belief():
     rng = np.random.default_rng(0)
     a, c = rng.standard_normal((2, 3000))
     # a rotor's inertia, of which a link's 0.002 known to 2.5 % takes the place; and a size of its own
-    params = [Param("armature", ("armature",), "add", -1e-3, 1e-2, 0.0), Param("peak", ("stribeck_peak",), "set", 0.0, 1.0, 0.0),
-              Param("inertia", ("inertia_scale",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025)]  # fmt: skip
+    params = [
+        Param("armature", ("armature",), "add", -1e-3, 1e-2, 0.0),
+        Param("peak", ("stribeck_peak",), "set", 0.0, 1.0, 0.0),
+        Param("inertia", ("inertia_scale",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025),
+    ]
     J = np.stack([1e5 * a, 500 * c, 1e5 * 2e-3 * a], 1)
     f = Fitted(params, np.array([4e-4, 0.3, 1.0]), np.zeros(3000), J, np.zeros(3000, int), 1.0, np.zeros(1))
     half = traded(f)

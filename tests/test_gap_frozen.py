@@ -17,11 +17,16 @@ def goal(kind: int) -> np.ndarray:
     if kind:
         return 0.3 * np.sin(2 * np.pi * (0.2 + 0.15 * T) * T)
     knots = np.arange(0, 8, 0.7)
-    return np.interp(T, np.sort(np.r_[knots[1:], knots[1:] + 0.2]), np.repeat(np.random.default_rng(3).uniform(-0.8, 0.8, len(knots) - 1), 2))
+    return np.interp(
+        T,
+        np.sort(np.r_[knots[1:], knots[1:] + 0.2]),
+        np.repeat(np.random.default_rng(3).uniform(-0.8, 0.8, len(knots) - 1), 2),
+    )
 
 
 def follow(target: np.ndarray, stiction: float = 0.0) -> np.ndarray:
-    """A joint of second order behind its target; it stays where it is until the target is `stiction` away, then it goes all the way."""
+    """A joint of second order behind its target; it stays where it is until the target is `stiction` away, then it goes
+    all the way."""
     q, v, out, stuck = target[0], 0.0, [], False
     for c in np.repeat(target, 10):
         stuck = abs(c - q) < stiction if stuck else stiction > 0 and abs(v) < 0.02 and abs(c - q) < stiction
@@ -33,7 +38,16 @@ def follow(target: np.ndarray, stiction: float = 0.0) -> np.ndarray:
 
 def run(name: str, target: np.ndarray, q: np.ndarray, noise: float = 0.0, quantum: float = QUANTUM) -> Run:
     read = q + noise * np.random.default_rng(len(name)).normal(size=len(q))
-    return Run(name, ("joint",), T, target[:, None], T, (np.round(read / quantum) * quantum)[:, None], None, np.array([0, 0, -9.81]))
+    return Run(
+        name,
+        ("joint",),
+        T,
+        target[:, None],
+        T,
+        (np.round(read / quantum) * quantum)[:, None],
+        None,
+        np.array([0, 0, -9.81]),
+    )
 
 
 def clean(noise: float, quantum: float = QUANTUM, stiction: float = 0.0) -> list[Run]:
@@ -83,7 +97,16 @@ def test_single_readings_sent_twice():
 
 def test_a_run_without_the_joint_and_two_joints():
     runs = clean(0.0)
-    two = Run("2", ("other", "joint"), T, np.stack([goal(0), goal(1)], 1), T, np.concatenate([runs[0].q, runs[1].q], 1), None, np.zeros(3))
+    two = Run(
+        "2",
+        ("other", "joint"),
+        T,
+        np.stack([goal(0), goal(1)], 1),
+        T,
+        np.concatenate([runs[0].q, runs[1].q], 1),
+        None,
+        np.zeros(3),
+    )
     two.q[200:330, 1] = two.q[200, 1]
     assert repeated.stretches([*runs, two], "other") == [[], [], []]
     assert [len(x) for x in repeated.stretches([*runs, two], "joint")] == [0, 0, 1]

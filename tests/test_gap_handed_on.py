@@ -1,4 +1,5 @@
-"""What a diagnosis hands on: servo.yaml as the centre and width of randomization, model.xml as the hand, the stand-in."""
+"""What a diagnosis hands on: servo.yaml as the centre and width of randomization, model.xml as the hand, the
+stand-in."""
 
 from __future__ import annotations
 
@@ -61,9 +62,12 @@ def hand_servo(tmp_path_factory):
 
 @pytest.mark.slow
 def test_fit_becomes_centre_and_width_of_randomization(hand_servo):
-    """Recording -> diagnosis -> `train.py servo_file=`: the fitted column of that joint is drawn from its interval, in every world."""
+    """Recording -> diagnosis -> `train.py servo_file=`: the fitted column of that joint is drawn from its interval, in
+    every world."""
     d, out = hand_servo
-    assert any(f["effect"] == "coulomb_friction" and f["where"]["joints"] == [JOINT] for f in d.data["findings"]), d.data["findings"]
+    assert any(f["effect"] == "coulomb_friction" and f["where"]["joints"] == [JOINT] for f in d.data["findings"]), (
+        d.data["findings"]
+    )
     value = ServoTable.load(out / "servo.yaml").value(JOINT, "coulomb_friction")
     assert value.low < value.value < value.high and value.value == pytest.approx(0.06, rel=0.2)
     env = grasp_env(f"servo_file={out / 'servo.yaml'}", worlds=64)
@@ -71,18 +75,30 @@ def test_fit_becomes_centre_and_width_of_randomization(hand_servo):
     drawn = env.servo.params[:, j, c].double()
     wide = value.high - value.low
     assert float(drawn.min()) >= value.low - 1e-9 and float(drawn.max()) <= value.high + 1e-9
-    assert float(drawn.max() - drawn.min()) > 0.8 * wide and float(drawn.mean()) == pytest.approx(0.5 * (value.low + value.high), abs=0.2 * wide)
+    assert float(drawn.max() - drawn.min()) > 0.8 * wide and float(drawn.mean()) == pytest.approx(
+        0.5 * (value.low + value.high), abs=0.2 * wide
+    )
     first = drawn.clone()
     env.reset_all()
     assert not torch.equal(first, env.servo.params[:, j, c].double())  # anew at each episode
-    other = env.servo.params[:, xhand.JOINTS.index("mid_joint2"), c].double()  # not diagnosed: the configured randomization
+    # not diagnosed: the configured randomization
+    other = env.servo.params[:, xhand.JOINTS.index("mid_joint2"), c].double()
     assert not ((other >= value.low) & (other <= value.high)).all()
 
 
-@pytest.mark.parametrize("fitted, low, high, sure, after", [(0.25, 0.2, 0.3, 0.14, (0.2, 1.09)), (1.5, 1.4, 1.6, 0.5, (1.09, 1.6)), (1.0, 0.9, 1.2, 0.3, (0.9, 1.2)),
-                                                            (0.25, 0.2, 0.3, 0.75, (0.2, 0.67)), (1.0, 0.99, 1.01, 0.999, (0.99, 1.01))])
+@pytest.mark.parametrize(
+    "fitted, low, high, sure, after",
+    [
+        (0.25, 0.2, 0.3, 0.14, (0.2, 1.09)),
+        (1.5, 1.4, 1.6, 0.5, (1.09, 1.6)),
+        (1.0, 0.9, 1.2, 0.3, (0.9, 1.2)),
+        (0.25, 0.2, 0.3, 0.75, (0.2, 0.67)),
+        (1.0, 0.99, 1.01, 0.999, (0.99, 1.01)),
+    ],
+)
 def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fitted, low, high, sure, after):
-    """An effect that is not sure: its range is widened to the belief (1.09), half of the way at 0.75; its fitted value stays, other columns do not move."""
+    """An effect that is not sure: its range is widened to the belief (1.09), half of the way at 0.75; its fitted value
+    stays, other columns do not move."""
     from types import SimpleNamespace
 
     from dexsim.gap.judge.findings import widen
@@ -98,39 +114,54 @@ def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fit
 
 
 def test_what_reproduces_what_was_kept_out_is_handed_on_as_fitted_whatever_its_name_is_worth():
-    """By hand: half of a tenth less error earns 0.5, a rival with 0.4 takes 0.4 of it; at a confidence of 0.5 the way to the belief (1.09) is then
-    1 - 0.3 of 0.84."""
+    """By hand: half of a tenth less error earns 0.5, a rival with 0.4 takes 0.4 of it; at a confidence of 0.5 the way
+    to the belief (1.09) is then 1 - 0.3 of 0.84."""
     from types import SimpleNamespace
 
     from dexsim.gap.judge.findings import earned, widen
 
-    found = lambda after, *others: {"held_out": {"before": 1.0, "after": after}, "alternatives": [{"effect": "lag", "confidence": c} for c in others]}  # noqa: E731
-    assert [earned(found(x)) for x in (1.2, 1.0, 0.95, 0.9, 0.2)] == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0]) and earned({"held_out": None}) == 0.0
+    found = lambda after, *others: {  # noqa: E731
+        "held_out": {"before": 1.0, "after": after},
+        "alternatives": [{"effect": "lag", "confidence": c} for c in others],
+    }
+    assert [earned(found(x)) for x in (1.2, 1.0, 0.95, 0.9, 0.2)] == pytest.approx(
+        [0.0, 0.0, 0.5, 1.0, 1.0]
+    ) and earned({"held_out": None}) == 0.0
     assert earned(found(0.95, 0.3, 0.1)) == pytest.approx(0.3)
     case = SimpleNamespace(joint=JOINT, scales=SimpleNamespace(nominal={"torque_limit": 1.09}))
     member = SimpleNamespace(variant=SimpleNamespace(params=[SimpleNamespace(columns=("torque_limit",))]))
     for worth, high in ((0.0, 1.09), (0.3, 0.25 + 0.7 * 0.84), (1.0, 0.3)):
         table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1.09}}})
         table.set(JOINT, "torque_limit", 0.25, 0.2, 0.3)
-        assert widen(table, case, member, 0.5, worth) == (high > 0.3) and table.value(JOINT, "torque_limit").high == pytest.approx(high)
+        assert widen(table, case, member, 0.5, worth) == (high > 0.3) and table.value(
+            JOINT, "torque_limit"
+        ).high == pytest.approx(high)
 
 
 PLAY = {
-    "backlash": {"value": 0.03, "low": 0.02, "high": 0.04}, "rebound": 0.1, "speed_lag": {"value": 0.01, "low": 0.005, "high": 0.02},
-    "eccentric_sin": {"value": 0.05, "low": 0.04, "high": 0.06}, "sag": {"value": 0.05, "low": 0.02, "high": 0.08},
-    "coupling": {"value": 0.1, "low": 0.05, "high": 0.15}, "coupling_from": 4, "thermal_friction": 0.02, "warmth": {"value": 10.0, "low": 0.0, "high": 25.0},
-}  # fmt: skip
+    "backlash": {"value": 0.03, "low": 0.02, "high": 0.04},
+    "rebound": 0.1,
+    "speed_lag": {"value": 0.01, "low": 0.005, "high": 0.02},
+    "eccentric_sin": {"value": 0.05, "low": 0.04, "high": 0.06},
+    "sag": {"value": 0.05, "low": 0.02, "high": 0.08},
+    "coupling": {"value": 0.1, "low": 0.05, "high": 0.15},
+    "coupling_from": 4,
+    "thermal_friction": 0.02,
+    "warmth": {"value": 10.0, "low": 0.0, "high": 25.0},
+}
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_training_has_the_play_and_the_rest_of_it(engine, tmp_path):
-    """A servo.yaml with all of it trains: drawn inside the intervals at each episode, on that joint alone; the joint hangs in its play;
-    the policy sees what the eccentric encoder reports; no host synchronisation."""
+    """A servo.yaml with all of it trains: drawn inside the intervals at each episode, on that joint alone; the joint
+    hangs in its play; the policy sees what the eccentric encoder reports; no host synchronisation."""
     from test_nosync import NoSync, _strict
 
     table = xhand_table()
     for name, value in PLAY.items():
-        table.set(JOINT, name, *((value["value"], value["low"], value["high"]) if isinstance(value, dict) else (value,)))
+        table.set(
+            JOINT, name, *((value["value"], value["low"], value["high"]) if isinstance(value, dict) else (value,))
+        )
     table.loop_encoder = "motor"
     table.save(tmp_path / "servo.yaml")
     env = grasp_env(f"servo_file={tmp_path / 'servo.yaml'}", worlds=16, engine=engine)
@@ -198,14 +229,18 @@ def test_model_file_is_the_hand_that_trains(tmp_path):
     assert e.mjm.dof_armature[dof] == pytest.approx(base.mjm.dof_armature[base.dof_index([JOINT])[0]] + 3e-4)
     assert e.mjm.body_mass.sum() == pytest.approx(base.mjm.body_mass.sum() + 0.015, rel=1e-6)
     env.step(torch.zeros(2, 12))
-    for text, word in (("nowhere.xml", "no such file"), (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not the xHand")):
+    for text, word in (
+        ("nowhere.xml", "no such file"),
+        (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not the xHand"),
+    ):
         with pytest.raises(UserError, match=word):
             grasp_env(f"model_file={text}", worlds=2)
 
 
 @pytest.mark.parametrize(("kd", "after"), [(0.1, 0.096), (0.002, 0.0), ("unknown", None)])
 def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
-    """kp (q - age v): a loop that acts on where the joint was 1 ms ago has kp * age less damping; where kd is unknown there is none to take it from."""
+    """kp (q - age v): a loop that acts on where the joint was 1 ms ago has kp * age less damping; where kd is unknown
+    there is none to take it from."""
     from types import SimpleNamespace
 
     from dexsim.gap.judge.findings import servo_changes
@@ -213,7 +248,9 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
     age = Param("feedback_delay", ("feedback_delay",), "set", 0.0, 0.003, 0.0, "s", nuisance=True)
-    case = SimpleNamespace(joint=JOINT, ranges={}, constants=SimpleNamespace(armature=1e-4), scales=SimpleNamespace(nominal={}))
+    case = SimpleNamespace(
+        joint=JOINT, ranges={}, constants=SimpleNamespace(armature=1e-4), scales=SimpleNamespace(nominal={})
+    )
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=(age,), x=np.array([0.001])))
     assert servo_changes(table, case, trial, np.array([[0.0, 0.002]]), xhand.JOINTS) == []
     assert table.value(JOINT, "kd").value == (None if after is None else pytest.approx(after))
@@ -229,9 +266,16 @@ def _write(path, text):
 
 
 def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
-    """A drag that the catalogue has not (torque against speed times |speed|): regressed, judged, written, loaded by training."""
+    """A drag that the catalogue has not (torque against speed times |speed|): regressed, judged, written, loaded by
+    training."""
     drag = -3e-2
-    table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.005}}})
+    table = ServoTable.from_dict(
+        {
+            "joints": {
+                "*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.005}
+            }
+        }
+    )
     true = copy.deepcopy(table)
     true.set("joint", "standin_drag", drag)
     spec = mujoco.MjSpec.from_string(demo.MODEL)
@@ -241,9 +285,17 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
     runs = []
     for k in (0, 1, 3):
         t, cmd = motion(k, 6.0, k)
-        full = drive(Mechanism(spec, ("joint",), true, "pendulum"), Series(t, cmd[:, None], COMMANDS, t), ["joint"], 6.0, timestep=1e-3)
+        full = drive(
+            Mechanism(spec, ("joint",), true, "pendulum"),
+            Series(t, cmd[:, None], COMMANDS, t),
+            ["joint"],
+            6.0,
+            timestep=1e-3,
+        )
         pick = slice(0, None, 10)
-        runs.append(Run(f"r{k}", ("joint",), t, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81])))
+        runs.append(
+            Run(f"r{k}", ("joint",), t, cmd[:, None], full.t[pick], full.position[pick], table, np.array([0, 0, -9.81]))
+        )
         runs[-1].smooth()
     case = build(spec.compile(), runs)[0]
     none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
@@ -255,7 +307,11 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
     residual_fit.write(hand, [found], tmp_path / "servo_standin.yaml")
     env = grasp_env(f"servo_file={tmp_path / 'servo_standin.yaml'}", worlds=32)
     drawn = env.servo.params[:, xhand.JOINTS.index(JOINT), INDEX["standin_drag"]]
-    assert float(drawn.min()) >= found.low[3] - 1e-6 and float(drawn.max()) <= found.high[3] + 1e-6 and float(drawn.std()) > 0
+    assert (
+        float(drawn.min()) >= found.low[3] - 1e-6
+        and float(drawn.max()) <= found.high[3] + 1e-6
+        and float(drawn.std()) > 0
+    )
 
 
 def test_no_stand_in_where_nothing_is_left():

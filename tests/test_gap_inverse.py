@@ -13,10 +13,14 @@ from dexsim.gap.search.torque_told import believe
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):
-    """Times, noisy positions and forces of 95 kg, 200 N.s/m, 20 N, -3 N; backward: viscous friction more when it goes back; late: the
-    force acts so much later than it is logged."""
+    """Times, noisy positions and forces of 95 kg, 200 N.s/m, 20 N, -3 N; backward: viscous friction more when it goes
+    back; late: the force acts so much later than it is logged."""
     t = np.arange(0, 12, 2e-3)
-    v = 0.1 * np.sin(2 * np.pi * 0.4 * t) + 0.04 * np.sin(2 * np.pi * 1.3 * t) + (0.01 * np.sin(2 * np.pi * 5.3 * t) if late else 0)
+    v = (
+        0.1 * np.sin(2 * np.pi * 0.4 * t)
+        + 0.04 * np.sin(2 * np.pi * 1.3 * t)
+        + (0.01 * np.sin(2 * np.pi * 5.3 * t) if late else 0)
+    )
     q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * 2e-3)])
     force = 95 * np.gradient(v, 2e-3) + (200 + backward * (v < 0)) * v + 20 * np.sign(v) - 3
     force = np.interp(t + late, t, force)
@@ -58,7 +62,15 @@ def test_nothing_further_is_named_where_nothing_is_missing():
 def test_unknown_friction_is_believed_as_the_torque_tells_it():
     def case(*unknown: str) -> SimpleNamespace:
         scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=94.0)
-        return SimpleNamespace(joint="carriage", unknown=unknown, scales=scales, plant=SimpleNamespace(nominal=np.zeros((2, len(INDEX)))), ranges={}, factors={}, told=False)
+        return SimpleNamespace(
+            joint="carriage",
+            unknown=unknown,
+            scales=scales,
+            plant=SimpleNamespace(nominal=np.zeros((2, len(INDEX)))),
+            ranges={},
+            factors={},
+            told=False,
+        )
 
     x = identify(*carriage())
     open_, known = case("viscous_friction", "coulomb_friction", "kd"), case("kd")

@@ -23,7 +23,10 @@ class Judged(JointAnswer):
             effort_only=False, jitters=False, shows="", parameters=lambda fitted: {}, signal=lambda *_: np.ones(ROWS)
         )
         self.member = SimpleNamespace(id="lag", effect=effect, variant=SimpleNamespace(fixed=(), note=""))
-        self.best, self.none = SimpleNamespace(members=(self.member,), fit=None), SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
+        self.best, self.none = (
+            SimpleNamespace(members=(self.member,), fit=None),
+            SimpleNamespace(fit=SimpleNamespace(params=[], x=[])),
+        )
         self.case = SimpleNamespace(joint="j")
         self.kept = SimpleNamespace(runs=[], train=[], test=[])
         self.outcome = SimpleNamespace(rivals={})

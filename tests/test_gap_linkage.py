@@ -1,4 +1,5 @@
-"""A linkage between two joints in the gap's plant: the rotor that it turns, the friction that it carries along, the pull at its other end."""
+"""A linkage between two joints in the gap's plant: the rotor that it turns, the friction that it carries along, the
+pull at its other end."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from dexsim.gap.read.runs import Run
 ROTOR, BOB = 5e-4, 0.2 * 0.1**2
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody>
 <body><joint name="a" axis="0 1 0" armature="5e-4"/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>
-<body pos="1 0 0"><joint name="b" axis="0 1 0" armature="5e-4"/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>
+<body pos="1 0 0"><joint name="b" axis="0 1 0" armature="5e-4"/>
+ <geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>
 </worldbody></mujoco>"""
 RATE = 3.0  # rad/s2 of joint b
 
@@ -40,7 +42,8 @@ def test_the_other_joint_is_known_by_rate_acceleration_and_pull():
     p = plant()
     inside = slice(200, -200)
     assert p.series[inside, SERIES_INDEX["drag_a0"]] == pytest.approx(RATE, rel=0.02)
-    assert p.series[inside, SERIES_INDEX["pull0"]] == pytest.approx(BOB * RATE, rel=0.02)  # its link alone, without its rotor
+    # its link alone, without its rotor
+    assert p.series[inside, SERIES_INDEX["pull0"]] == pytest.approx(BOB * RATE, rel=0.02)
 
 
 def test_a_linkage_turns_the_rotor():
@@ -72,7 +75,8 @@ def test_a_loop_on_the_motor_turns_the_joint_by_the_ratio():
     t = p.t - p.t[0]
     stiff = moved(p, linkage=0.5, kp=2.0, kd=0.1, torque_limit=10.0)
     assert stiff[-1] == pytest.approx(0.5 * 0.5 * RATE * t[-1] ** 2, rel=0.05)
-    assert abs(moved(plant(), linkage=0.5, kp=2.0, kd=0.1, torque_limit=10.0)[-1]) < 0.01  # on the joint it holds against it
+    # on the joint it holds against it
+    assert abs(moved(plant(), linkage=0.5, kp=2.0, kd=0.1, torque_limit=10.0)[-1]) < 0.01
 
 
 def test_the_catalogue_offers_both_ends_of_a_linkage():
@@ -91,14 +95,28 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
     from dexsim.gap.judge import conclude
 
     def end(joint: str, other: str, sure: float) -> dict:
-        return {"effect": "joint_coupling", "confidence": sure, "where": {"joints": [joint], "taxels": [], "topics": []}, "parameters": {"from_joint": {"value": other}}}
+        return {
+            "effect": "joint_coupling",
+            "confidence": sure,
+            "where": {"joints": [joint], "taxels": [], "topics": []},
+            "parameters": {"from_joint": {"value": other}},
+        }
 
     def answer(joint: str, column: str):
-        member = SimpleNamespace(effect=EFFECTS["joint_coupling"], variant=SimpleNamespace(params=[SimpleNamespace(columns=(column,))]))
-        return SimpleNamespace(case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member])))
+        member = SimpleNamespace(
+            effect=EFFECTS["joint_coupling"], variant=SimpleNamespace(params=[SimpleNamespace(columns=(column,))])
+        )
+        return SimpleNamespace(
+            case=SimpleNamespace(joint=joint), outcome=SimpleNamespace(best=SimpleNamespace(members=[member]))
+        )
 
     lag = {"effect": "lag", "confidence": 0.9, "where": {"joints": ["b"], "taxels": [], "topics": []}, "parameters": {}}
-    found = conclude._linkages([end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")])
-    assert [(f["effect"], f["where"]["joints"], f["confidence"]) for f in found] == [("joint_coupling", ["b", "a"], 0.99), ("lag", ["b"], 0.9)]
+    found = conclude._linkages(
+        [end("a", "b", 0.99), lag, end("b", "a", 0.7)], [answer("a", "reaction"), answer("b", "linkage")]
+    )
+    assert [(f["effect"], f["where"]["joints"], f["confidence"]) for f in found] == [
+        ("joint_coupling", ["b", "a"], 0.99),
+        ("lag", ["b"], 0.9),
+    ]
     chain = [end("a", "b", 0.9), end("b", "c", 0.9)]
     assert conclude._linkages(chain, []) == chain

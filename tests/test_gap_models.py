@@ -1,4 +1,5 @@
-"""Physics that the plant and the handed-on model have beyond one number: a load off its link's centre, elasticity that hardens, jitter."""
+"""Physics that the plant and the handed-on model have beyond one number: a load off its link's centre, elasticity that
+hardens, jitter."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 
 
 def found(changes: dict[str, float], effect: str) -> tuple[dict, str]:
-    """(parameters as reported, variant's label) of the search for one effect on recordings with figures a few percent off."""
+    """(parameters as reported, variant's label) of the search for one effect on recordings with figures a few percent
+    off."""
     runs = [plant_run(f"run{k}", k, 6.0, OFF | changes, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
@@ -35,8 +37,13 @@ def found(changes: dict[str, float], effect: str) -> tuple[dict, str]:
     bounds = search.widen(best, intervals(best.fit, search.blocks, knee=search.r.knee))
     keys, member = [p.key for p in best.fit.params], best.members[0]
     at = {p.key: keys.index(f"{effect}.{p.key}") for p in member.variant.params}
-    raw, spread = {k: float(best.fit.x[i]) for k, i in at.items()}, {k: (float(bounds[i][0]), float(bounds[i][1])) for k, i in at.items()}
-    return member.effect.parameters(FittedEffect(member.variant, raw, spread, case, runs[0].servo)), member.variant.label
+    raw, spread = (
+        {k: float(best.fit.x[i]) for k, i in at.items()},
+        {k: (float(bounds[i][0]), float(bounds[i][1])) for k, i in at.items()},
+    )
+    return member.effect.parameters(
+        FittedEffect(member.variant, raw, spread, case, runs[0].servo)
+    ), member.variant.label
 
 
 def mass_matrix(m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +76,9 @@ def test_an_added_mass_is_a_point_mass_on_the_last_link(joint, mass):
 
 def test_more_mass_cannot_be_taken_away_than_there_is():
     spec = mujoco.MjSpec.from_string(demo.MODEL)
-    assert "less than the model's links" in add_mass(spec, "joint", -1.0, None) and spec.compile().body_mass[1] == pytest.approx(0.15)
+    assert "less than the model's links" in add_mass(spec, "joint", -1.0, None) and spec.compile().body_mass[
+        1
+    ] == pytest.approx(0.15)
 
 
 def test_the_plants_load_off_centre_is_that_of_the_model():
@@ -94,14 +103,17 @@ def test_the_plants_load_off_centre_is_that_of_the_model():
             full = np.zeros((1, 1))
             mujoco.mj_fullM(m, d, full)
             torques.append((full[0, 0], d.qfrc_bias[0]))
-        inertia = mass * (x["load_inertia"] + out * x["com_out_inertia"] + across * x["com_across_inertia"] + out**2 + across**2)
+        inertia = mass * (
+            x["load_inertia"] + out * x["com_out_inertia"] + across * x["com_across_inertia"] + out**2 + across**2
+        )
         gravity = mass * (x["load_cos"] + out * x["com_out_cos"] + across * x["com_across_cos"])
         assert inertia == pytest.approx(torques[0][0] - torques[1][0], rel=1e-6)
         assert gravity == pytest.approx(torques[0][1] - torques[1][1], abs=1e-5)
 
 
 CHAIN = """<mujoco><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0" armature="1e-4"/>
-<geom type="sphere" size="0.01" mass="0.1" pos="0 0 -0.08"/><body pos="0 0 -0.1"><joint name="b" axis="1 0 0" armature="1e-4"/>
+<geom type="sphere" size="0.01" mass="0.1" pos="0 0 -0.08"/><body pos="0 0 -0.1">
+ <joint name="b" axis="1 0 0" armature="1e-4"/>
 <geom type="sphere" size="0.01" mass="0.1" pos="0.01 0 -0.06"/></body></body></worldbody></mujoco>"""
 
 
@@ -109,7 +121,9 @@ def chain_case(spec: mujoco.MjSpec):
     """Joint a's case along motions of both joints."""
     t = np.arange(0.0, 3.0, 0.01)
     q = np.stack([0.6 * np.sin(4 * t), 0.5 * np.sin(3 * t + 1)], 1)
-    servo = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.02, "torque_limit": 1.0, "coulomb_friction": 0.002}}})
+    servo = ServoTable.from_dict(
+        {"joints": {"*": {"kp": 1.0, "kd": 0.02, "torque_limit": 1.0, "coulomb_friction": 0.002}}}
+    )
     return build(spec.compile(), [Run("x", ("a", "b"), t, q.copy(), t, q, servo, np.array([0, 0, -9.81]))])[0]
 
 
@@ -121,7 +135,12 @@ def test_a_mass_on_the_joints_own_link_is_that_of_the_model():
     assert variants["mass on its own link"].params[0].columns == ("own_payload",)
     assert "kg" in add_mass(spec, "a", 0.05, None, own=True) and spec.compile().body_mass[1] == pytest.approx(0.15)
     paths = {}
-    for name, case, column in (("model", chain_case(spec), None), ("own", light, "own_payload"), ("last", light, "payload"), ("none", light, None)):
+    for name, case, column in (
+        ("model", chain_case(spec), None),
+        ("own", light, "own_payload"),
+        ("last", light, "payload"),
+        ("none", light, None),
+    ):
         params = case.plant.base()[None].copy()
         if column:
             params[..., INDEX[column]] = 0.05
@@ -134,7 +153,9 @@ def test_a_mass_on_the_joints_own_link_is_that_of_the_model():
 
 def test_a_last_link_has_no_own_load_beside_it():
     case = build(model(), [plant_run("a", 0, 2.0, {}, noisy=False)])[0]
-    assert case.scales.own_torque == 0 and "mass on its own link" not in {v.label for v in EFFECTS["payload"].variants(case.scales)}
+    assert case.scales.own_torque == 0 and "mass on its own link" not in {
+        v.label for v in EFFECTS["payload"].variants(case.scales)
+    }
 
 
 def test_hardening_is_the_cubic_spring_it_says():
@@ -161,7 +182,11 @@ def test_a_load_off_its_links_centre_is_weighed_and_placed():
     assert label == "mass and its centre"
     assert p["mass"]["low"] <= 0.08 <= p["mass"]["high"] and p["mass"]["value"] == pytest.approx(0.08, rel=0.25)
     com = p["com"]
-    assert com["unit"] == "m" and com["value"][0] == pytest.approx(-0.05, abs=0.012) and com["value"][2] == pytest.approx(-0.1, abs=0.02)
+    assert (
+        com["unit"] == "m"
+        and com["value"][0] == pytest.approx(-0.05, abs=0.012)
+        and com["value"][2] == pytest.approx(-0.1, abs=0.02)
+    )
     assert com["low"][0] < com["value"][0] < com["high"][0] and com["value"][1] == 0.0
 
 
@@ -174,7 +199,9 @@ def test_a_load_at_its_links_centre_has_no_place_fitted():
 def test_elasticity_that_hardens_is_told_from_one_that_does_not():
     p, _ = found({"softness": 0.25, "hardening": 8.0}, "compliance")
     assert p["stiffness"]["value"] == pytest.approx(4.0, rel=0.05)
-    assert p["hardening"]["low"] <= 128.0 <= p["hardening"]["high"] and p["hardening"]["value"] == pytest.approx(128.0, rel=0.3)
+    assert p["hardening"]["low"] <= 128.0 <= p["hardening"]["high"] and p["hardening"]["value"] == pytest.approx(
+        128.0, rel=0.3
+    )
     p, _ = found({"softness": 0.25}, "compliance")
     assert "hardening" not in p and p["stiffness"]["value"] == pytest.approx(4.0, rel=0.05)
 
@@ -220,7 +247,12 @@ def test_jitter_of_a_delay_is_found_and_sized(sd):
     if not sd:
         assert found is None
     else:
-        assert found.value == pytest.approx(sd, rel=0.15) and found.low < found.value < found.high and found.low < 1.05 * sd and found.high > 0.95 * sd
+        assert (
+            found.value == pytest.approx(sd, rel=0.15)
+            and found.low < found.value < found.high
+            and found.low < 1.05 * sd
+            and found.high > 0.95 * sd
+        )
         assert set(found.entry()) == {"value", "low", "high", "unit"}
 
 

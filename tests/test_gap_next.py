@@ -21,8 +21,8 @@ from dexsim.recording.mechanism import Mechanism
 
 @pytest.fixture(scope="module")
 def hypotheses():
-    """A search whose recordings are one slow motion, with two hypotheses fitted to it: dry friction, and friction that grows with
-    speed."""
+    """A search whose recordings are one slow motion, with two hypotheses fitted to it: dry friction, and friction that
+    grows with speed."""
     import mujoco
 
     runs = [plant_run(f"r{k}", 0, 5.0, {"coulomb_friction": 0.05}, seed=k) for k in range(2)]
@@ -36,24 +36,49 @@ def hypotheses():
     for e in ("coulomb_friction", "viscous_friction", "command_delay"):
         v = EFFECTS[e].variants(case.scales)[0]
         trials[e] = search.fit((Member(EFFECTS[e], v),), np.array(v.starts[1]), none, quick=True)
-    servo = {"joints": {"*": {"kp": 2.0, "kd": 0.04, "torque_limit": 0.8, "no_load_speed": 12.0, "coulomb_friction": 0.015, "viscous_friction": 0.004}}}
-    return Mechanism(mujoco.MjSpec.from_string(demo.MODEL), ("joint",), ServoTable.from_dict(servo), "pendulum"), search, none, trials
+    servo = {
+        "joints": {
+            "*": {
+                "kp": 2.0,
+                "kd": 0.04,
+                "torque_limit": 0.8,
+                "no_load_speed": 12.0,
+                "coulomb_friction": 0.015,
+                "viscous_friction": 0.004,
+            }
+        }
+    }
+    return (
+        Mechanism(mujoco.MjSpec.from_string(demo.MODEL), ("joint",), ServoTable.from_dict(servo), "pendulum"),
+        search,
+        none,
+        trials,
+    )
 
 
 def test_the_same_hypothesis_disagrees_nowhere_and_others_do(hypotheses):
     m, search, none, trials = hypotheses
-    same = next_experiment.choose(m, search, trials["coulomb_friction"], trials["coulomb_friction"], kinds=("steps", "triangles"))
+    same = next_experiment.choose(
+        m, search, trials["coulomb_friction"], trials["coulomb_friction"], kinds=("steps", "triangles")
+    )
     assert max(same.scores.values()) < 1e-9
     assert not same.settles and same.text.startswith("none settles it")
-    other = next_experiment.choose(m, search, trials["coulomb_friction"], trials["viscous_friction"], kinds=("steps", "triangles"))
+    other = next_experiment.choose(
+        m, search, trials["coulomb_friction"], trials["viscous_friction"], kinds=("steps", "triangles")
+    )
     assert other.scores[other.chosen[0]] == max(other.scores.values()) > 1.0
     assert other.settles and f"{max(other.scores.values()):.1f} times the noise" in other.text
 
 
 def test_every_class_has_the_experiment_that_separates_it():
     assert all(len(members(c)) > 1 and separating(sorted(members(c))) == said for c, said in CLASSES.items())
-    assert {c for e in EFFECTS.values() for c in e.classes} == set(CLASSES) and "turned over" in separating(["payload", "position_offset"])
-    assert separating(["lag", "command_delay"]) != EFFECTS["lag"].experiment and separating(["lag", "backlash"]) == EFFECTS["lag"].experiment
+    assert {c for e in EFFECTS.values() for c in e.classes} == set(CLASSES) and "turned over" in separating(
+        ["payload", "position_offset"]
+    )
+    assert (
+        separating(["lag", "command_delay"]) != EFFECTS["lag"].experiment
+        and separating(["lag", "backlash"]) == EFFECTS["lag"].experiment
+    )
 
 
 def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
@@ -66,7 +91,9 @@ def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
     moved.fit.x[k] = np.clip(moved.fit.x[k] - 0.03, 0.95, 1.05)
     p = next_experiment.plan(m, ["joint"], ["steps"], repeats=0)
     gain = next_experiment.disagreement(m, search.case, search, none, moved, p)["steps"]
-    real = next_experiment.disagreement(m, search.case, search, trials["coulomb_friction"], trials["viscous_friction"], p)["steps"]
+    real = next_experiment.disagreement(
+        m, search.case, search, trials["coulomb_friction"], trials["viscous_friction"], p
+    )["steps"]
     assert gain < 0.3 * real
 
 
@@ -78,4 +105,7 @@ def test_touch_asks_for_the_same_presses_with_a_load_cell(tmp_path):
     assert n and "load cell" in n["why"] and tmp_path / "out" / "next_recording.mcap" in written
     sent = read(tmp_path / "out" / n["commands"], audit=False)
     first = [read(p, audit=False) for p in paths]
-    assert sent.joints == first[0].joints and any(sent.commands.value.shape == r.commands.value.shape and np.allclose(sent.commands.value, r.commands.value) for r in first)
+    assert sent.joints == first[0].joints and any(
+        sent.commands.value.shape == r.commands.value.shape and np.allclose(sent.commands.value, r.commands.value)
+        for r in first
+    )

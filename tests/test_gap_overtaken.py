@@ -20,7 +20,10 @@ def search(*known):
 
 def test_a_rival_takes_the_place_of_the_member_that_it_beats():
     now, better = hypothesis("payload", "torque_ripple"), hypothesis("position_scale", "torque_ripple")
-    final = {"payload": ([("position_scale", 0.93)], 0.06, 0.1), "torque_ripple": ([("position_scale", 0.01)], 0.98, 0.3)}
+    final = {
+        "payload": ([("position_scale", 0.93)], 0.06, 0.1),
+        "torque_ripple": ([("position_scale", 0.01)], 0.98, 0.3),
+    }
     assert search(now, better)(now, final) is better
     assert search(now)(now, final) is None  # never fitted beside the rest
 
@@ -40,5 +43,6 @@ def test_one_alone_is_overtaken_as_well():
 def test_draws_that_an_effects_like_wins_are_not_lost_to_a_rival():
     now, better = hypothesis("payload"), hypothesis("coulomb_friction")
     shares = lambda like: {"payload": ([("coulomb_friction", 0.48), (like, 0.26)], 0.26, 0.5)}  # noqa: E731
-    assert search(now, better)(now, shares("position_offset")) is None  # a tilt of gravity and an encoder's zero: half of the draws together
+    # a tilt of gravity and an encoder's zero: half of the draws together
+    assert search(now, better)(now, shares("position_offset")) is None
     assert search(now, better)(now, shares("torque_ripple")) is better

@@ -15,12 +15,17 @@ from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.report.files import grouped
 from dexsim.gap.touch import press_rig
 
-CHROMIUM = next((p for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (p := shutil.which(name))), None)
+CHROMIUM = next(
+    (p for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (p := shutil.which(name))), None
+)
 PROBE = """<script>
 window.onload = function () {
-  var out = {width: document.documentElement.scrollWidth, height: document.documentElement.scrollHeight, inner: window.innerWidth, figures: [],
-             first: document.querySelector('h1').getBoundingClientRect().bottom, fetched: performance.getEntriesByType('resource').length, long: []};
-  document.querySelectorAll('svg').forEach(function (s) { var b = s.getBoundingClientRect(); out.figures.push([b.width, b.height, s.querySelectorAll('*').length]); });
+  var out = {width: document.documentElement.scrollWidth, height: document.documentElement.scrollHeight,
+             inner: window.innerWidth, figures: [],
+             first: document.querySelector('h1').getBoundingClientRect().bottom,
+             fetched: performance.getEntriesByType('resource').length, long: []};
+  document.querySelectorAll('svg').forEach(function (s) { var b = s.getBoundingClientRect();
+             out.figures.push([b.width, b.height, s.querySelectorAll('*').length]); });
   document.querySelectorAll('svg text').forEach(function (t) {
     var b = t.getBoundingClientRect(), s = t.ownerSVGElement.getBoundingClientRect();
     if (b.right > s.right + 2 || b.left < s.left - 2) out.long.push(t.textContent);
@@ -36,10 +41,22 @@ def opened(page: Path, width: int = 1120) -> dict:
     probed = page.with_name("probed.html")
     probed.write_text(text.replace("</body>", PROBE + "</body>"), encoding="utf-8")
     done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={page.parent / 'profile'}", f"--window-size={width},1400",
-         "--virtual-time-budget=3000", "--dump-dom", probed.as_uri()],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        [
+            CHROMIUM,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={page.parent / 'profile'}",
+            f"--window-size={width},1400",
+            "--virtual-time-budget=3000",
+            "--dump-dom",
+            probed.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     start = done.stdout.index('data-probe="') + len('data-probe="')
     return json.loads(done.stdout[start : done.stdout.index('"', start)].replace("&quot;", '"'))
@@ -61,7 +78,9 @@ def pages(tmp_path_factory):
     r.commands.value[:] = 0
     r.states.position.value[:] = 0
     write(folder / "still.mcap", r)
-    out["unusable"] = Settings([folder / "still.mcap"], folder / "still_out", None, str(model), str(servo), next_recording=False)
+    out["unusable"] = Settings(
+        [folder / "still.mcap"], folder / "still_out", None, str(model), str(servo), next_recording=False
+    )
     for s in out.values():
         save(diagnose(s, say=lambda _: None), s.out)
     return {name: s.out / "report.html" for name, s in out.items()}
@@ -85,8 +104,22 @@ def test_page_is_not_blank(pages, tmp_path):
     from PIL import Image
 
     shot = tmp_path / "page.png"
-    subprocess.run([CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--user-data-dir={tmp_path / 'p'}", "--window-size=1120,1600",
-                    f"--screenshot={shot}", pages["joint"].as_uri()], check=True, capture_output=True, timeout=120)  # fmt: skip
+    subprocess.run(
+        [
+            CHROMIUM,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--hide-scrollbars",
+            f"--user-data-dir={tmp_path / 'p'}",
+            "--window-size=1120,1600",
+            f"--screenshot={shot}",
+            pages["joint"].as_uri(),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
     image = np.asarray(Image.open(shot).convert("RGB")).astype(int)
     red, blue = np.array([209, 73, 91]), np.array([23, 104, 172])
     for colour in (red, blue):  # both curves and bars are there
@@ -94,7 +127,11 @@ def test_page_is_not_blank(pages, tmp_path):
 
 
 def test_notes_that_recordings_share_are_said_once():
-    assert grouped(["a.mcap: x", "b.mcap: x", "c.mcap: y", "plain: note"]) == ["a.mcap, b.mcap: x", "c.mcap: y", "plain: note"]
+    assert grouped(["a.mcap: x", "b.mcap: x", "c.mcap: y", "plain: note"]) == [
+        "a.mcap, b.mcap: x",
+        "c.mcap: y",
+        "plain: note",
+    ]
 
 
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
@@ -104,9 +141,18 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     from dexsim.gap.result import Diagnosis, empty
 
     def found(effect: str, confidence: float, key: str) -> dict:
-        return {"effect": effect, "confidence": confidence, "where": {"joints": ["knee"], "taxels": [], "topics": []}, "regime": "somewhere", "when": [],
-                "alternatives": [], "indistinguishable": [], "separating_experiment": None, "held_out": {"before": 0.02, "after": 0.01},
-                "parameters": {key: {"value": 0.01, "low": 0.005, "high": 0.02, "unit": "s"}}} | ({"hint": True} if confidence < 0.5 else {})  # fmt: skip
+        return {
+            "effect": effect,
+            "confidence": confidence,
+            "where": {"joints": ["knee"], "taxels": [], "topics": []},
+            "regime": "somewhere",
+            "when": [],
+            "alternatives": [],
+            "indistinguishable": [],
+            "separating_experiment": None,
+            "held_out": {"before": 0.02, "after": 0.01},
+            "parameters": {key: {"value": 0.01, "low": 0.005, "high": 0.02, "unit": "s"}},
+        } | ({"hint": True} if confidence < 0.5 else {})
 
     data = empty("partly_explained")
     data["held_out"] |= {"before": 0.02, "after": 0.01}
@@ -119,7 +165,9 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
     assert "later than believed" in said and "more" not in said
     data["findings"] = data["findings"][1:]
     data["verdict"] = "unknown"
-    assert "What is missing" not in render(Findings(d)) and "no effect of the catalogue explains" in sentence(data, d, 0.001)
+    assert "What is missing" not in render(Findings(d)) and "no effect of the catalogue explains" in sentence(
+        data, d, 0.001
+    )
 
 
 def test_what_recordings_say_is_text_and_no_markup():

@@ -16,8 +16,10 @@ from dexsim.gap.read import channels, inputs
 from dexsim.gap.read.runs import Run
 from dexsim.recording import read, write
 
-TWO = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".1"/>
-<body name="lower" pos="0 0 -.1"><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".05"/></body></body>
+TWO = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0"/>
+ <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".1"/>
+<body name="lower" pos="0 0 -.1"><joint name="b" axis="0 1 0"/>
+ <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".05"/></body></body>
 </worldbody></mujoco>"""
 SERVO = {"joints": {"*": {"kp": 2.0, "kd": 0.1, "torque_limit": 2.0}}}
 
@@ -39,7 +41,11 @@ def test_a_joint_that_stops_in_one_recording_is_judged_by_the_others():
     assert list(out) == [("1.mcap", "b")] and found[0]["regime"].startswith("stuck")
     notes: list[str] = []
     runs = channels.drop(runs, out, notes, model)
-    assert [sorted(r.left_out) for r in runs] == [[], ["b"], []] and all(r.joints == ("a", "b") for r in runs) and len(notes) == 1
+    assert (
+        [sorted(r.left_out) for r in runs] == [[], ["b"], []]
+        and all(r.joints == ("a", "b") for r in runs)
+        and len(notes) == 1
+    )
     assert np.abs(runs[1].q[:, 1] - runs[1].cmd[:, 1]).max() < 0.3, "it is taken to follow its target"
     runs = inputs.common_joints(runs, [])
     for r in runs:
@@ -91,7 +97,9 @@ def test_a_lead_is_that_of_the_plain_correlation(lead):
     run = run_of("r", 0, 20.0)
     steps = np.repeat(np.random.default_rng(3).uniform(-1, 1, 40), 50)[: len(run.t)]
     run.cmd[:, 0] = steps
-    run.q[:, 0] = np.interp(run.t - 0.02 + lead, run.t, np.convolve(np.pad(steps, 8, mode="edge"), np.ones(9) / 9, "same")[8:-8])
+    run.q[:, 0] = np.interp(
+        run.t - 0.02 + lead, run.t, np.convolve(np.pad(steps, 8, mode="edge"), np.ones(9) / 9, "same")[8:-8]
+    )
     assert channels._lead(run, 0) == pytest.approx(plain_lead(run), abs=0.0051)
     assert (channels._lead(run, 0) > channels.EARLY) == (lead > 0)
 
@@ -117,7 +125,16 @@ def test_enabled_acts_in_the_recording_that_has_it_and_a_second_is_enough(tmp_pa
     m = mechanism(str(model), str(servo))
     runs = inputs.common_joints([inputs.to_run(read(p, joints=m.joints), m, []) for p in clips], [])
     assert [r.enabled is not None for r in runs] == [False, True, False]
-    s = Settings(clips, tmp_path / "out", None, str(model), str(servo), next_recording=False, allowed={"command_delay"}, replay="none")
+    s = Settings(
+        clips,
+        tmp_path / "out",
+        None,
+        str(model),
+        str(servo),
+        next_recording=False,
+        allowed={"command_delay"},
+        replay="none",
+    )
     d = diagnose(s, say=lambda _: None)
     save(d, s.out)
     answer = json.loads((s.out / "diagnosis.json").read_text())

@@ -33,7 +33,8 @@ def test_a_readout_is_shifted_and_stretched_and_the_motion_stays():
     assert np.allclose(q[2][late], 1.05 * q[0][late], atol=1e-4)
     assert np.allclose(torque[1][late], torque[0][late], atol=2e-3) and np.ptp(torque[0]) > 0.1
     both = case.plant.base()[None].copy()
-    both[..., INDEX["position_offset"]] = 0.01  # of the loop's encoder too: it holds what it reads, the joint stands elsewhere
+    # of the loop's encoder too: it holds what it reads, the joint stands elsewhere
+    both[..., INDEX["position_offset"]] = 0.01
     assert np.abs(case.plant.simulate(both, windows)[0][0][late] - q[0][late]).max() < 5e-3
 
 

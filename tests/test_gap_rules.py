@@ -103,12 +103,17 @@ def test_the_short_list_asks_a_price():
 
 def test_within_the_noise_nothing_is_looked_for_nearby():
     search = Made()
-    assert search._shaken([], SimpleNamespace(loss=1.3)) == "shaken" and search._shaken([], SimpleNamespace(loss=1.1)) != "shaken"
+    assert (
+        search._shaken([], SimpleNamespace(loss=1.3)) == "shaken"
+        and search._shaken([], SimpleNamespace(loss=1.1)) != "shaken"
+    )
 
 
 def test_intervals_hold_the_laws_that_do_as_well():
     search, p = Made(), param("peak", "stribeck_peak", "set", 0.0, 1.0)
-    fitted = lambda x, loss: SimpleNamespace(fit=SimpleNamespace(params=[p], x=np.array([x])), loss=np.full(40, loss), ids=("s",))  # noqa: E731
+    fitted = lambda x, loss: SimpleNamespace(  # noqa: E731
+        fit=SimpleNamespace(params=[p], x=np.array([x])), loss=np.full(40, loss), ids=("s",)
+    )
     best = fitted(0.06, 1.0)
     search.by_law = {"s": [best, fitted(0.08, 1.04), fitted(0.2, 1.09)]}
     assert search.law_spread(best).tolist() == [[0.06, 0.08]]
@@ -134,7 +139,12 @@ def test_intervals_hold_what_no_residual_shows():
 
 
 def named(**changes):
-    return {"effect": "lag", "where": {"joints": ["j"]}, "held_out": {"before": 1.0, "after": 0.5}, "confidence": 0.9} | changes
+    return {
+        "effect": "lag",
+        "where": {"joints": ["j"]},
+        "held_out": {"before": 1.0, "after": 0.5},
+        "confidence": 0.9,
+    } | changes
 
 
 def test_an_error_within_the_noise_asks_for_nothing():
@@ -166,7 +176,16 @@ def test_what_is_not_borne_out_keeps_little():
 
 
 def doubtful(**changes):
-    given = {"effect": "lag", "joint": "j", "share": 1.0, "earned": 1.0, "left": 0.0, "left_of_rest": 0.0, "folds": [], "members": 1}
+    given = {
+        "effect": "lag",
+        "joint": "j",
+        "share": 1.0,
+        "earned": 1.0,
+        "left": 0.0,
+        "left_of_rest": 0.0,
+        "folds": [],
+        "members": 1,
+    }
     return confidence.Evidence(**(given | {"place": 0, "confidence": 0.99} | changes))
 
 
@@ -180,7 +199,9 @@ def test_nothing_is_explained_by_doubtful_names_alone():
 
 
 def test_what_is_not_sure_is_handed_on_with_what_was_believed():
-    assert doubted(named(confidence=0.79, indistinguishable=[])) and not doubted(named(confidence=0.81, indistinguishable=[]))
+    assert doubted(named(confidence=0.79, indistinguishable=[])) and not doubted(
+        named(confidence=0.81, indistinguishable=[])
+    )
 
 
 def test_what_removes_nothing_keeps_a_share():
@@ -193,7 +214,8 @@ def test_a_name_earns_its_confidence_by_what_it_removes():
 
 
 class Refuted:
-    """An answer on what was kept out, by the error after it over that before, and what it removed where it was fitted."""
+    """An answer on what was kept out, by the error after it over that before, and what it removed where it was
+    fitted."""
 
     def __init__(self, followed=1.0, gain=0.0, told=False):
         self.case = SimpleNamespace(joint="j", told=told)
@@ -206,7 +228,12 @@ class Refuted:
 
 def test_findings_that_do_not_help_are_taken_back():
     for ratio, kept in ((0.975, True), (0.985, False)):
-        d = SimpleNamespace(joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0}}, evidence=[], notes=[], data={"nuisance": {}})
+        d = SimpleNamespace(
+            joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0}},
+            evidence=[],
+            notes=[],
+            data={"nuisance": {}},
+        )
         refuted = Refuted()
         refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
         assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
@@ -214,7 +241,11 @@ def test_findings_that_do_not_help_are_taken_back():
 
 def test_what_was_kept_out_may_side_with_neither():
     reason = lambda a, ratio: conclude._not_refuted(a, a.outcome, ratio, [], None)  # noqa: E731
-    assert reason(Refuted(gain=0.25), 1.01) and not reason(Refuted(gain=0.25), 1.02) and not reason(Refuted(gain=0.23), 1.01)
+    assert (
+        reason(Refuted(gain=0.25), 1.01)
+        and not reason(Refuted(gain=0.25), 1.02)
+        and not reason(Refuted(gain=0.23), 1.01)
+    )
     assert "free run" in reason(Refuted(0.75), 3.0) and not reason(Refuted(0.77), 3.0)
     assert not reason(Refuted(0.1, told=True), 1.0)
 
@@ -225,7 +256,9 @@ def test_what_shows_in_what_was_kept_out_alone():
 
 
 def test_many_effects_on_one_joint_are_doubted():
-    pair, three, five = ([doubtful(effect=e) for e in ("deadband", "supply_sag", "backlash", "lag", "thermal")[:n]] for n in (2, 3, 5))
+    pair, three, five = (
+        [doubtful(effect=e) for e in ("deadband", "supply_sag", "backlash", "lag", "thermal")[:n]] for n in (2, 3, 5)
+    )
     for mine in (pair, three, five):
         confidence.together(mine)
     crowded = lambda mine: [any("effects on one joint" in r for r in e.reasons) for e in mine]  # noqa: E731
@@ -255,7 +288,8 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out():
 
 
 def test_an_effect_may_lose_little_where_it_does_not_act():
-    """Half of the blocks gain much, the others lose a little: what a bootstrap over blocks may lose as a whole decides."""
+    """Half of the blocks gain much, the others lose a little: what a bootstrap over blocks may lose as a whole
+    decides."""
     for lost, hint in ((0.03, False), (0.08, True)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(verdict, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
@@ -265,9 +299,12 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
 def test_an_effect_that_harms_some_recordings_is_a_hint():
     answer = Judged(1.0, 0.1)
     answer.best = "with it"
-    for helped, harmed, hint in ((10, [1.9, 1.9], False), (7, [2.2], True)):  # it harms in 4 and in 7 % of the draws of recordings
+    # it harms in 4 and in 7 % of the draws of recordings
+    for helped, harmed, hint in ((10, [1.9, 1.9], False), (7, [2.2], True)):
         left = np.r_[np.full(helped, 0.5), harmed]
-        answer.search = SimpleNamespace(by_run=lambda trial, left=left: left if trial == "with it" else np.ones(len(left)))
+        answer.search = SimpleNamespace(
+            by_run=lambda trial, left=left: left if trial == "with it" else np.ones(len(left))
+        )
         assert (JointAnswer._harmed(answer, "without it") != "") is hint
 
 
@@ -275,7 +312,9 @@ def test_intervals_grow_with_what_is_left():
     p = param("time_constant", "lag", "set", -1e3, 1e3)
     fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0, np.zeros(1))
     factor = lambda left: float(stretched(np.array([[-1.0, 1.0]]), fit, left)[0, 1])  # noqa: E731
-    assert factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)
+    assert (
+        factor(0.1) == pytest.approx(0.5) and factor(2.0) == pytest.approx(2.0) and factor(100.0) == pytest.approx(4.0)
+    )
 
 
 def test_the_engine_that_trains_confirms():
@@ -284,7 +323,9 @@ def test_the_engine_that_trains_confirms():
 
 
 def test_the_engine_that_trains_confirms_in_the_main():
-    said = lambda left: full_model.Confirmation("C MuJoCo", 5e-4, {"believed": (1.0, 1.0), "found": (left, 0.1)}, {}, [], [], False, 0.1).text()  # noqa: E731
+    said = lambda left: full_model.Confirmation(  # noqa: E731
+        "C MuJoCo", 5e-4, {"believed": (1.0, 1.0), "found": (left, 0.1)}, {}, [], [], False, 0.1
+    ).text()
     assert "Not confirmed" not in said(0.29) and "Not confirmed" in said(0.31)
 
 
@@ -296,7 +337,9 @@ def test_a_stand_in_must_take_a_least_share_off():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(residual_fit, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
             patch.setattr(residual_fit, "_held_out", lambda *_, after=after: (1.0, after))
-            assert (residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None) is offered, after
+            assert (
+                residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None
+            ) is offered, after
 
 
 # -- touch
@@ -326,7 +369,9 @@ def test_a_touch_effect_must_help_in_nearly_all_bootstraps():
 def rest(gains, width=0.05):
     """What is said of taxels that felt nothing, the others' gains [n] being these."""
     count = len(gains)
-    pad = SimpleNamespace(silent={}, runs=[SimpleNamespace(z=np.ones((3, count)))], gain_width=lambda t: np.full(count, width))
+    pad = SimpleNamespace(
+        silent={}, runs=[SimpleNamespace(z=np.ones((3, count)))], gain_width=lambda t: np.full(count, width)
+    )
     return PadAnswer._rest(SimpleNamespace(search=pad, best=SimpleNamespace(gains=np.array(gains), order=None)))
 
 

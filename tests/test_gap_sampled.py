@@ -1,4 +1,5 @@
-"""What a digital drive does to a motion: its loop acts on samples, shows the torque in force, reads speeds through its own encoder."""
+"""What a digital drive does to a motion: its loop acts on samples, shows the torque in force, reads speeds through its
+own encoder."""
 
 from __future__ import annotations
 
@@ -18,8 +19,9 @@ FREE = SERVO | {"coulomb_friction": 0.0, "torque_limit": 1e3, "no_load_speed": 1
 
 
 def sampled(eccentric: tuple[float, float] = (0.0, 0.0), seconds: float = 4.0) -> tuple[Run, np.ndarray]:
-    """(run, torque [n] in force) of the demo's pendulum under a loop of 1 kHz that holds its torque between samples and takes its speed from
-    two of them; the joint in between in steps of 0.05 ms, in NumPy. eccentric: sin and cos of the encoder's error."""
+    """(run, torque [n] in force) of the demo's pendulum under a loop of 1 kHz that holds its torque between samples and
+    takes its speed from two of them; the joint in between in steps of 0.05 ms, in NumPy. eccentric: sin and cos of the
+    encoder's error."""
     m = model()
     d = mujoco.MjData(m)
     mujoco.mj_forward(m, d)
@@ -51,7 +53,16 @@ def sampled(eccentric: tuple[float, float] = (0.0, 0.0), seconds: float = 4.0) -
             q += 5e-5 * v
     t = np.arange(2, steps - 20, 10) * 1e-3 + np.random.default_rng(0).uniform(0, 9e-3, len(range(2, steps - 20, 10)))
     table = ServoTable.from_dict({"joints": {"*": FREE}, "loop_rate": 1000})
-    run = Run("a", ("joint",), t_cmd, cmd[:, None], t, np.interp(t, np.arange(steps) * 1e-3, out)[:, None], table, np.array([0, 0, -9.81]))
+    run = Run(
+        "a",
+        ("joint",),
+        t_cmd,
+        cmd[:, None],
+        t,
+        np.interp(t, np.arange(steps) * 1e-3, out)[:, None],
+        table,
+        np.array([0, 0, -9.81]),
+    )
     run.smooth()
     return run, torque[(t * 1000).astype(int)]
 
@@ -86,11 +97,20 @@ def test_a_motion_as_it_is_from_what_an_encoder_shows():
     t = np.linspace(0.0, 1.0, 2001)
     q = 0.7 * np.sin(5 * t)
     row = np.zeros(len(INDEX))
-    row[INDEX["position_scale"]], row[INDEX["position_offset"]], row[INDEX["eccentric_sin"]], row[INDEX["eccentric_cos"]] = 1.1, 0.03, 0.08, -0.05
+    (
+        row[INDEX["position_scale"]],
+        row[INDEX["position_offset"]],
+        row[INDEX["eccentric_sin"]],
+        row[INDEX["eccentric_cos"]],
+    ) = 1.1, 0.03, 0.08, -0.05
     shown = 1.1 * q + 0.03 + 0.08 * np.sin(q) - 0.05 * (np.cos(q) - 1)
     speed = np.gradient(shown, t)
     x, v, a = _true((t, shown, speed, np.gradient(speed, t)), row)[1:]
-    assert np.abs(x - q).max() < 1e-4 and np.abs(v - 3.5 * np.cos(5 * t))[5:-5].max() < 2e-3 and np.abs(a + 17.5 * np.sin(5 * t))[5:-5].max() < 0.02
+    assert (
+        np.abs(x - q).max() < 1e-4
+        and np.abs(v - 3.5 * np.cos(5 * t))[5:-5].max() < 2e-3
+        and np.abs(a + 17.5 * np.sin(5 * t))[5:-5].max() < 0.02
+    )
 
 
 def test_the_search_finds_the_age_and_nothing_else_is_missing():
@@ -101,7 +121,10 @@ def test_the_search_finds_the_age_and_nothing_else_is_missing():
     assert x["feedback_delay"] == pytest.approx(0.5e-3, abs=0.25e-3) and x["kd"] == pytest.approx(1.0, abs=0.015)
 
 
-@pytest.mark.parametrize(("believed", "low", "high"), [(0.0, 0.0, 0.003), (0.02, 0.017, 0.023), ({"value": 0.02, "low": 0.01, "high": 0.04}, 0.01, 0.04)])
+@pytest.mark.parametrize(
+    ("believed", "low", "high"),
+    [(0.0, 0.0, 0.003), (0.02, 0.017, 0.023), ({"value": 0.02, "low": 0.01, "high": 0.04}, 0.01, 0.04)],
+)
 def test_a_speed_filter_that_is_believed_is_refitted_about_its_belief(believed, low, high):
     """A servo.yaml of an earlier diagnosis states it: it is kept, once, and not replaced by what any drive may have."""
     from test_gap import conditions, plant_run

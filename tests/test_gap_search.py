@@ -1,4 +1,5 @@
-"""The search's judgement of what lasts: fits of their own without each condition, the verdict's word, temperature's reference."""
+"""The search's judgement of what lasts: fits of their own without each condition, the verdict's word, temperature's
+reference."""
 
 from __future__ import annotations
 
@@ -44,7 +45,9 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
     """What a guess saves is the bounded least squares of residuals and beliefs with it and without it."""
     rng = np.random.default_rng(3)
     n, P, H = 200, 5, 3
-    params = [Param(f"p{i}", ("kp",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025 if i < 3 else 0.0) for i in range(P)]
+    params = [
+        Param(f"p{i}", ("kp",), "factor", 0.95, 1.05, 1.0, nuisance=True, sd=0.025 if i < 3 else 0.0) for i in range(P)
+    ]
     span, x = 0.1, np.array([1.05, 0.96, 1.0, 0.95, 1.02])  # the first and the fourth stand at their bounds
     J, d = rng.standard_normal((n, P)), rng.standard_normal((H, n))
     d[0] += 2 * J[:, 0]  # does what the first belief does
@@ -70,11 +73,17 @@ def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
 
 
 def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
-    """before, after: in windows of what was kept out; ratio: of a free run over it; gain: where it was fitted and on conditions left out."""
+    """before, after: in windows of what was kept out; ratio: of a free run over it; gain: where it was fitted and on
+    conditions left out."""
 
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
         none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
-        search = SimpleNamespace(case=SimpleNamespace(told=told), polish=lambda t: t, gain=lambda a, b: gain, in_windows=lambda t, runs, span: before if t is none else after)
+        search = SimpleNamespace(
+            case=SimpleNamespace(told=told),
+            polish=lambda t: t,
+            gain=lambda a, b: gain,
+            in_windows=lambda t, runs, span: before if t is none else after,
+        )
         return conclude._not_refuted(search, SimpleNamespace(none=none, best=best), ratio, [3], None)
 
     assert "moment to moment" in reason(5.0, 1.1, 1.3, 0.8, 5.7)  # another stick, another way
@@ -83,7 +92,8 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     assert "does not show it" in reason(1.0, 1.0, 1.0, 0.6, 2.1)  # a limit that was not reached there
     assert reason(1.0, 1.1, 1.02, 0.6, 2.1) == "" and reason(1.0, 1.0, 1.0, 0.15, 2.1) == ""
     assert reason(1.0, 0.4, 1.0, 0.6, 1.1) == ""  # where nothing was missing nothing is found
-    assert "moment to moment" in reason(1.4, 1.0, 1.0, 0.3, 1.1)  # beliefs moved out to follow: its windows miss it, a free run of it hardly
+    # beliefs moved out to follow: its windows miss it, a free run of it hardly
+    assert "moment to moment" in reason(1.4, 1.0, 1.0, 0.3, 1.1)
 
 
 def test_what_only_the_recording_kept_out_shows_is_said():
@@ -95,7 +105,10 @@ def test_what_only_the_recording_kept_out_shows_is_said():
     assert not alone(16.0, 1.0, {"where": {"joints": ["a"]}})
 
 
-@pytest.mark.parametrize(("confidence", "group", "word"), [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")])
+@pytest.mark.parametrize(
+    ("confidence", "group", "word"),
+    [(0.9, [], "explained"), (0.5, [], "partly_explained"), (0.5, ["lag", "command_delay"], "explained")],
+)
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
     finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
     assert verdict.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
@@ -120,10 +133,20 @@ def valley(n: int = 400) -> tuple[Fitter, list[Param]]:
     rng = np.random.default_rng(0)
     a, c, noise = rng.standard_normal(n), rng.standard_normal(n), 0.02 * rng.standard_normal(n)
     fitter = Fitter.__new__(Fitter)
-    fitter.r, fitter.eliminate, fitter.window, fitter.count = SimpleNamespace(knee=0.0, sigma_q0=0.0, sigma_v0=0.0), False, np.zeros(n, int), 1
-    fitter.residuals = lambda params, x, inits=None: a * 10 * (2.3 - x[:, :1] - x[:, 1:2]) + c * 5 * (x[:, 2:] - 1.0) + noise
-    params = [Param("effect", ("kp",), "set", 0.1, 5.0, 1.0), Param("belief", ("kd",), "factor", 0.5, 2.0, 1.0, nuisance=True, sd=0.1),
-              Param("other", ("lag",), "factor", 0.9, 1.1, 1.0, nuisance=True, sd=0.05)]  # fmt: skip
+    fitter.r, fitter.eliminate, fitter.window, fitter.count = (
+        SimpleNamespace(knee=0.0, sigma_q0=0.0, sigma_v0=0.0),
+        False,
+        np.zeros(n, int),
+        1,
+    )
+    fitter.residuals = lambda params, x, inits=None: (
+        a * 10 * (2.3 - x[:, :1] - x[:, 1:2]) + c * 5 * (x[:, 2:] - 1.0) + noise
+    )
+    params = [
+        Param("effect", ("kp",), "set", 0.1, 5.0, 1.0),
+        Param("belief", ("kd",), "factor", 0.5, 2.0, 1.0, nuisance=True, sd=0.1),
+        Param("other", ("lag",), "factor", 0.9, 1.1, 1.0, nuisance=True, sd=0.05),
+    ]
     return fitter, params
 
 
@@ -142,7 +165,8 @@ def test_intervals_follow_how_well_what_was_kept_out_is_followed():
     bounds = np.array([[1.0, 2.5], [40.0, 60.0]])
     width = lambda left: np.diff(stretched(bounds, f, left))[:, 0]  # noqa: E731
     assert np.allclose(width(1.0), JUDGE.stretch_least * np.array([1.5, 20.0])) and np.allclose(width(2.0)[1], 40.0)
-    assert np.allclose(stretched(bounds, f, 50.0), [[0.0, 3.0], [10.0, 90.0]])  # no farther than is physical, and than was seen to be needed
+    # no farther than is physical, and than was seen to be needed
+    assert np.allclose(stretched(bounds, f, 50.0), [[0.0, 3.0], [10.0, 90.0]])
     assert stretched(bounds, f, 0.0) is bounds  # nothing was kept out
 
 
@@ -157,8 +181,13 @@ def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeyp
 
     assert parallel.together(["knuckle"], work, "cpu", Progress()) == [0]
     lines = capsys.readouterr().out.splitlines()
-    assert [line.strip() for line in lines] == ["searching knuckle (1/1)", "searching knuckle (1/1)", "searching knuckle (1/1), about 36 s left",
-                                                "searching knuckle (1/1), about 16 s left", "searched 1 in 20 s"]  # fmt: skip
+    assert [line.strip() for line in lines] == [
+        "searching knuckle (1/1)",
+        "searching knuckle (1/1)",
+        "searching knuckle (1/1), about 36 s left",
+        "searching knuckle (1/1), about 16 s left",
+        "searched 1 in 20 s",
+    ]
 
 
 def test_a_search_tells_how_far_it_is():
@@ -179,7 +208,12 @@ def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
         r.smooth()
     case = build(model(), [run])[0]
     windows = case.plant.windows(None)
-    error = lambda underway: np.sqrt(np.mean((case.plant.q[windows.sample_row] - errors.free_run(case, [], np.zeros(0), windows, underway=underway)[0]) ** 2))  # noqa: E731
+    error = lambda underway: np.sqrt(  # noqa: E731
+        np.mean(
+            (case.plant.q[windows.sample_row] - errors.free_run(case, [], np.zeros(0), windows, underway=underway)[0])
+            ** 2
+        )
+    )
     case.regimes["_speed"] = case.regimes["_speed"].copy()
     case.regimes["_speed"][0] = case.scales.speed
     assert error(True) < 0.7 * error(False)

@@ -1,4 +1,5 @@
-"""The torque route through gravity and coupled joints, at 100 Hz: friction read off the recorded torque of a two-link arm."""
+"""The torque route through gravity and coupled joints, at 100 Hz: friction read off the recorded torque of a two-link
+arm."""
 
 from __future__ import annotations
 
@@ -13,8 +14,10 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.search import torque_told
 from dexsim.gap.search.body_torque import body, motion
 
-ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" armature="0.02" damping="0.05"/>
-<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="2"/><body name="lower" pos="0 0 -0.4"><joint name="elbow" axis="0 1 0" armature="0.01"/>
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper">
+ <joint name="shoulder" axis="0 1 0" armature="0.02" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="2"/><body name="lower" pos="0 0 -0.4">
+ <joint name="elbow" axis="0 1 0" armature="0.01"/>
 <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/></body></body></worldbody></mujoco>"""
 JOINTS = ("shoulder", "elbow")
 COULOMB, VISCOUS, OFFSET = (0.5, 0.2), (0.3, 0.1), (0.05, -0.03)
@@ -24,14 +27,27 @@ def arm() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ARM)
 
 
-def run(model: mujoco.MjModel, seed: int, seconds: float = 20.0, rate: float = 100.0, friction=COULOMB, viscous=VISCOUS, pushed=None):
-    """A recording of the arm by exact inverse dynamics; pushed(t) [S]: what something outside adds to the elbow, N.m."""
+def run(
+    model: mujoco.MjModel,
+    seed: int,
+    seconds: float = 20.0,
+    rate: float = 100.0,
+    friction=COULOMB,
+    viscous=VISCOUS,
+    pushed=None,
+):
+    """A recording of the arm by exact inverse dynamics; pushed(t) [S]: what something outside adds to the elbow,
+    N.m."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 1 / rate)
     w = 2 * np.pi * np.array([[0.21, 0.53, 0.83], [0.33, 0.47, 1.07]])
     size, phase = np.array([[0.5, 0.3, 0.1], [0.6, 0.3, 0.1]]), rng.uniform(0, 6, (2, 3))
     wave = lambda f: np.stack([(size[j] * f(j, w[j] * t[:, None] + phase[j])).sum(1) for j in (0, 1)], 1)  # noqa: E731
-    q, v, a = wave(lambda j, x: np.sin(x)), wave(lambda j, x: w[j] * np.cos(x)), wave(lambda j, x: -(w[j] ** 2) * np.sin(x))
+    q, v, a = (
+        wave(lambda j, x: np.sin(x)),
+        wave(lambda j, x: w[j] * np.cos(x)),
+        wave(lambda j, x: -(w[j] ** 2) * np.sin(x)),
+    )
     data, torque = mujoco.MjData(model), np.empty_like(q)
     for i in range(len(t)):
         data.qpos[:], data.qvel[:], data.qacc[:] = q[i], v[i], a[i]
@@ -41,8 +57,16 @@ def run(model: mujoco.MjModel, seed: int, seconds: float = 20.0, rate: float = 1
     if pushed is not None:
         torque[:, 1] -= pushed(t)  # the motor gives less of what the body needs
     torque += 0.02 * rng.standard_normal(q.shape)
-    return SimpleNamespace(name=f"run{seed}.mcap", joints=JOINTS, t=t, q=q + 1e-5 * rng.standard_normal(q.shape), torque=torque, torque_unit="N.m",
-                           gravity=np.array([0, 0, -9.81]), duration=float(t[-1] - t[0]))  # fmt: skip
+    return SimpleNamespace(
+        name=f"run{seed}.mcap",
+        joints=JOINTS,
+        t=t,
+        q=q + 1e-5 * rng.standard_normal(q.shape),
+        torque=torque,
+        torque_unit="N.m",
+        gravity=np.array([0, 0, -9.81]),
+        duration=float(t[-1] - t[0]),
+    )
 
 
 def cases() -> list[SimpleNamespace]:
@@ -60,7 +84,9 @@ def test_friction_of_coupled_joints_under_gravity_is_read_off_at_100_hz():
         assert x.value["viscous_friction"] == pytest.approx(viscous, rel=0.1)  # beyond the model's own damping
         assert x.residual < 0.05 and not x.refused
         assert abs(x.value.get("gravity", 0.0)) < 0.02
-    assert given[0][1].value["inertia"] == pytest.approx(np.median(body(model, np.array([0, 0, -9.81]), JOINTS, moved(runs[0])).inertia[:, 0]), rel=0.05)
+    assert given[0][1].value["inertia"] == pytest.approx(
+        np.median(body(model, np.array([0, 0, -9.81]), JOINTS, moved(runs[0])).inertia[:, 0]), rel=0.05
+    )
 
 
 def moved(r):
@@ -80,7 +106,9 @@ def test_what_is_kept_out_takes_no_part():
     model = arm()
     r = run(model, 0, 40.0)
     r.torque[r.t > 30, 0] += 5.0
-    given = torque_told.found(cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)})
+    given = torque_told.found(
+        cases(), [r], [0], [0], model=model, span_train={0: (0.0, 29.5)}, span_test={0: (30.0, 40.0)}
+    )
     assert given[0][1].value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
 
@@ -114,7 +142,9 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     case.scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=x.value["inertia"])
     case.plant = SimpleNamespace(nominal=np.zeros((1, len(INDEX))))
     torque_told.believe(given[:1])
-    servo = ServoTable.from_dict({"drive": "torque", "joints": {"*": {"kp": 80.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}}})
+    servo = ServoTable.from_dict(
+        {"drive": "torque", "joints": {"*": {"kp": 80.0, "coulomb_friction": "unknown", "viscous_friction": "unknown"}}}
+    )
     d = SimpleNamespace(servo=servo, notes=[], data={"findings": [], "nuisance": {"coulomb_friction@shoulder": 9.0}})
     trial = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
     outcomes = [(case, SimpleNamespace(polish=lambda t: t), SimpleNamespace(none=trial, best=trial))]
@@ -125,7 +155,8 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     assert servo.value("shoulder", "viscous_friction").value == pytest.approx(VISCOUS[0], rel=0.1)
     assert servo.value("elbow", "coulomb_friction").unknown
     notes: list[str] = []
-    stages = [SimpleNamespace(joint="shoulder", fit=0.1), SimpleNamespace(joint="elbow", fit=0.1)]  # of the elbow the torque told nothing
+    # of the elbow the torque told nothing
+    stages = [SimpleNamespace(joint="shoulder", fit=0.1), SimpleNamespace(joint="elbow", fit=0.1)]
     given[1][0].told = False
     assert torque_told.mute(given, stages, notes) == {"shoulder"} and "controller is another" in notes[0]
     assert torque_told.mute(given, [SimpleNamespace(joint="shoulder", fit=0.9)], notes) == set()

@@ -1,4 +1,5 @@
-"""Touch in the diagnosis: its own plant against the taxel kernels, effects planted on a press rig, sets, what is not known."""
+"""Touch in the diagnosis: its own plant against the taxel kernels, effects planted on a press rig, sets, what is not
+known."""
 
 from __future__ import annotations
 
@@ -42,15 +43,28 @@ def found(folder, seconds=7.0, **planted):
 
 
 def test_catalogue_of_touch_is_that_of_the_specification():
-    assert {e.id for e in TOUCH_CATALOGUE} == {"tactile_gain", "tactile_stiffening", "tactile_hysteresis", "tactile_crosstalk", "tactile_delay", "contact_friction",
-                                     "contact_stiffness", "thermal"}  # fmt: skip
-    assert touch_confusable("tactile_gain", "contact_stiffness") and touch_confusable("thermal", "tactile_hysteresis") and not touch_confusable("tactile_gain", "tactile_delay")
+    assert {e.id for e in TOUCH_CATALOGUE} == {
+        "tactile_gain",
+        "tactile_stiffening",
+        "tactile_hysteresis",
+        "tactile_crosstalk",
+        "tactile_delay",
+        "contact_friction",
+        "contact_stiffness",
+        "thermal",
+    }
+    assert (
+        touch_confusable("tactile_gain", "contact_stiffness")
+        and touch_confusable("thermal", "tactile_hysteresis")
+        and not touch_confusable("tactile_gain", "tactile_delay")
+    )
     for e in TOUCH_CATALOGUE:
         assert all(len(s) == len(e.fits) for s in e.starts) and {k for k, _ in e.report} <= set(e.fits)
 
 
 def test_the_plant_reads_what_the_rig_reads(plain):
-    """The rig's contact is MuJoCo's and its taxels are the kernels': readings agree to the counts, with and without the load cell."""
+    """The rig's contact is MuJoCo's and its taxels are the kernels': readings agree to the counts, with and without the
+    load cell."""
     data, _, _ = collected(*plain)
     assert len(data.runs) == 3 and not data.blind and data.scale_known
     for run in data.runs:
@@ -91,11 +105,18 @@ def test_a_slipping_bristle_stops_at_friction_times_force(plain):
     assert out[-1, 0] == pytest.approx(0.5 * touch_read.FRICTION * 3.0) and out[-1, 1] == 0
     early = 5  # before anything slips: stiffness times area times path
     k = touch_plant.SHEAR_STIFFNESS * run.area[[60, 61]].sum()
-    assert out[early, 0] == pytest.approx(k * (np.interp(run.t[early], run.grid, run.slide[:, 0]) - np.interp(run.t[0], run.grid, run.slide[:, 0])), rel=1e-6)
+    assert out[early, 0] == pytest.approx(
+        k * (np.interp(run.t[early], run.grid, run.slide[:, 0]) - np.interp(run.t[0], run.grid, run.slide[:, 0])),
+        rel=1e-6,
+    )
 
 
 QUICK = [
-    ("tactile_hysteresis", {"sensor": {"hysteresis": 0.3, "hysteresis_time": 0.4}}, {"fraction": 0.3, "time_constant": 0.4}),
+    (
+        "tactile_hysteresis",
+        {"sensor": {"hysteresis": 0.3, "hysteresis_time": 0.4}},
+        {"fraction": 0.3, "time_constant": 0.4},
+    ),
 ]
 MORE = [
     ("contact_stiffness", {"stiffness": 4500.0}, {"stiffness": 4500.0}),
@@ -148,41 +169,63 @@ def test_two_effects_at_once(tmp_path):
 def test_gains_dead_stuck_and_exchanged_taxels(tmp_path):
     out = found(tmp_path, gains={54: 0.5, 66: 1.5, 67: 0.0}, stuck={80: 2.0}, swapped=[(55, 65)])
     (f,) = out.findings
-    assert f["effect"] == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(f["where"]["taxels"])
+    assert f["effect"] == "tactile_gain" and {"1:54", "1:55", "1:65", "1:66", "1:67", "1:80"} == set(
+        f["where"]["taxels"]
+    )
     gain = dict(zip(f["where"]["taxels"], f["parameters"]["gain"]["value"], strict=True))
-    assert gain["1:54"] == pytest.approx(0.5, abs=0.1) and gain["1:66"] == pytest.approx(1.5, abs=0.2) and gain["1:67"] < 0.05 and gain["1:80"] == 0
+    assert (
+        gain["1:54"] == pytest.approx(0.5, abs=0.1)
+        and gain["1:66"] == pytest.approx(1.5, abs=0.2)
+        and gain["1:67"] < 0.05
+        and gain["1:80"] == 0
+    )
     assert f["parameters"]["taxels"]["swapped"] == [["1:55", "1:65"]]
 
 
 @pytest.mark.slow
 def test_without_a_load_cell_gain_and_stiffness_are_a_set(tmp_path):
     (f,) = found(tmp_path, load_cell=False, stiffness=4500.0).findings
-    assert set(f["indistinguishable"]) == {"tactile_gain", "contact_stiffness"} and "load cell" in f["separating_experiment"] and f["confidence"] < 0.8
+    assert (
+        set(f["indistinguishable"]) == {"tactile_gain", "contact_stiffness"}
+        and "load cell" in f["separating_experiment"]
+        and f["confidence"] < 0.8
+    )
 
 
-# -- the whole diagnosis ---------------------------------------------------------------------------------------------------
+# -- the whole diagnosis
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_the_rig_is_diagnosed_from_end_to_end(tmp_path):
     paths, model, servo = press_rig.record(tmp_path / "rig", 3, 7.0, seed=5, sensor={"delay": 0.06})
-    d = diagnose(Settings(paths, tmp_path / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None)
+    d = diagnose(
+        Settings(paths, tmp_path / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None
+    )
     save(d, tmp_path / "out")
     data = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert data["verdict"] == "explained" and data["findings"][0]["effect"] == "tactile_delay"
-    assert data["held_out"]["error"] == "tactile_rmse_N" and data["held_out"]["after"] < 0.5 * data["held_out"]["before"]
+    assert (
+        data["held_out"]["error"] == "tactile_rmse_N" and data["held_out"]["after"] < 0.5 * data["held_out"]["before"]
+    )
     assert "index's pad" in d.sentence and any("joints are not judged" in n for n in d.notes)
     page = (tmp_path / "out" / "report.html").read_text()
     assert "taxel 66" in page and "tactile delay" in page
 
 
 def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
-    """The same readings with the xHand's model: no object in it, so forces cannot be predicted; a dead taxel can be told."""
+    """The same readings with the xHand's model: no object in it, so forces cannot be predicted; a dead taxel can be
+    told."""
     paths, model, servo = plain
     r = read(paths[0], audit=False)
     r.tactile.value[:, 1, 66] = 0
     write(tmp_path / "a.mcap", r)
     bare = tmp_path / "bare.xml"
-    bare.write_text(model.read_text().replace('<geom name="ball"', '<geom name="ball" group="1"').replace('type="sphere" ', 'type="ellipsoid" ').replace('"0.012"', '"0.012 0.012 0.012"'))
+    bare.write_text(
+        model.read_text()
+        .replace('<geom name="ball"', '<geom name="ball" group="1"')
+        .replace('type="sphere" ', 'type="ellipsoid" ')
+        .replace('"0.012"', '"0.012 0.012 0.012"')
+    )
     m = mechanism(model, servo)
     from dexsim.gap.touch import read as td
 
@@ -198,7 +241,9 @@ def test_touch_without_the_object_says_what_it_can(plain, tmp_path):
 def test_unknown_counts_leave_the_common_gain_open(tmp_path):
     paths, model, servo = press_rig.record(tmp_path, 3, 6.0, seed=2, gains=dict.fromkeys(range(120), 0.6))
     m = mechanism(model, servo)
-    out = diagnose_touch([read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set())
+    out = diagnose_touch(
+        [read(p, meta={"tactile_lsb": "unknown"}, joints=m.joints, audit=False) for p in paths], m, set()
+    )
     assert not out.findings and any("tactile_lsb is unknown" in n for n in out.notes)
 
 
@@ -209,14 +254,20 @@ def test_joints_are_judged_in_free_air_alone():
     notes: list[str] = []
     pieces, held = inputs.free_air([run], [0], {"a": [(4.0, 5.0), (5.9, 6.5)]}, notes)
     assert [(round(p.t[0], 1), round(p.t[-1], 1)) for p in pieces] == [(0.0, 3.9), (6.8, 12.0)]
-    assert held == [0, 1] and all(len(p.torque) == len(p.t) and p.name == "a" for p in pieces) and "free air" in notes[0]
+    assert (
+        held == [0, 1] and all(len(p.torque) == len(p.t) and p.name == "a" for p in pieces) and "free air" in notes[0]
+    )
     assert inputs.free_air([run], [], {"a": [(0.5, 11.5)]}, notes) == ([], []) and "not judged" in notes[1]
 
 
 def test_a_little_crosstalk_may_be_the_law_of_the_contact():
     def said(low: float) -> float:
-        f = {"effect": "tactile_crosstalk", "confidence": 0.99, "parameters": {"fraction": {"value": low + 0.05, "low": low, "high": low + 0.1}},
-             "held_out": {"before": 0.06, "after": 0.03}}  # fmt: skip
+        f = {
+            "effect": "tactile_crosstalk",
+            "confidence": 0.99,
+            "parameters": {"fraction": {"value": low + 0.05, "low": low, "high": low + 0.1}},
+            "held_out": {"before": 0.06, "after": 0.03},
+        }
         confidence.of_touch([f], 0.06, 0.03)
         return f["confidence"]
 
@@ -225,7 +276,8 @@ def test_a_little_crosstalk_may_be_the_law_of_the_contact():
 
 @pytest.mark.parametrize("spread", [0.8, 1.25])
 def test_a_force_that_spreads_otherwise_than_the_law_is_no_crosstalk(plain, spread, monkeypatch):
-    """Readings of a contact whose pressure reaches further (or less far): the reach is refitted, and nothing is named."""
+    """Readings of a contact whose pressure reaches further (or less far): the reach is refitted, and nothing is
+    named."""
     data, _, _ = collected(*plain)
     for run in data.runs:
         x = touch_plant.readings(run, touch_plant.neutral() | {"spread": spread})
@@ -236,4 +288,7 @@ def test_a_force_that_spreads_otherwise_than_the_law_is_no_crosstalk(plain, spre
         believed = touch_search.PadSearch._keys
         monkeypatch.setattr(touch_search.PadSearch, "_keys", lambda *a: tuple(k for k in believed(*a) if k != "spread"))
         alone = {"tactile_crosstalk"}  # nothing else is tried: what else it could be is another test's
-        assert "tactile_crosstalk" in touch_search.PadSearch(data.runs, set(), data.scale_known, False, allowed=alone).run().best.ids
+        assert (
+            "tactile_crosstalk"
+            in touch_search.PadSearch(data.runs, set(), data.scale_known, False, allowed=alone).run().best.ids
+        )

@@ -1,4 +1,5 @@
-"""What a servo.yaml says of its drives beyond the usual columns: unknown ones are fitted, a dragging joint is the one it names."""
+"""What a servo.yaml says of its drives beyond the usual columns: unknown ones are fitted, a dragging joint is the one
+it names."""
 
 from __future__ import annotations
 
@@ -23,15 +24,34 @@ RUNS = (0, 1, 3)
 
 def searched(unknown: tuple[str, ...], changes: dict[str, float], **more):
     """The search of a joint whose servo.yaml says `unknown` of some columns, on motions with others."""
-    runs = [plant_run(f"run{k}", k, 5.0, changes, seed=k, servo={"loop_encoder": "motor"} | {n: "unknown" for n in unknown}, **more) for k in RUNS]
+    runs = [
+        plant_run(
+            f"run{k}",
+            k,
+            5.0,
+            changes,
+            seed=k,
+            servo={"loop_encoder": "motor"} | {n: "unknown" for n in unknown},
+            **more,
+        )
+        for k in RUNS
+    ]
     for r in runs:
         r.smooth()
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
     return JointSearch(case, list(range(len(runs))), None, conditions(runs))
 
 
-@pytest.mark.parametrize(("name", "true", "effect"), [("softness", 0.2, "compliance"), ("backlash", 0.05, "backlash"), ("thermal_torque", -0.006, "thermal"),
-                                                       ("speed_lag", 0.03, "lag"), ("load_friction", 0.2, "load_friction")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "true", "effect"),
+    [
+        ("softness", 0.2, "compliance"),
+        ("backlash", 0.05, "backlash"),
+        ("thermal_torque", -0.006, "thermal"),
+        ("speed_lag", 0.03, "lag"),
+        ("load_friction", 0.2, "load_friction"),
+    ],
+)
 def test_an_unknown_column_is_fitted_with_every_hypothesis_and_handed_on(name, true, effect):
     search = searched((name,), {name: true}, temperature=name.startswith("thermal"))
     param = next(p for p in search.all_nuisances if p.columns == (name,))
@@ -54,14 +74,22 @@ def test_a_column_that_says_nothing_alone_is_taken_as_absent_and_said():
     assert not {"torque_ripple", "sag"} & {c for p in search.all_nuisances for c in p.columns}
     said = not_considered.not_fitted([search.case])
     assert len(said) == 2 and all("taken as absent" in x for x in said)
-    assert any(search._narrow(v) is not None for v in EFFECTS["torque_ripple"].variants(search.case.scales)), "it is still looked for"
+    assert any(search._narrow(v) is not None for v in EFFECTS["torque_ripple"].variants(search.case.scales)), (
+        "it is still looked for"
+    )
 
 
 def test_the_joint_that_drags_is_the_one_the_servo_names():
     """Three pendulums side by side; the third is said to drag the first."""
-    bodies = "".join(f"""<body name="link{k}" pos="0 {0.4 * k} 0"><joint name="j{k}" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"/>
-      <geom type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/></body>""" for k in range(3))  # fmt: skip
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody></mujoco>")
+    bodies = "".join(
+        f"""<body name="link{k}" pos="0 {0.4 * k} 0">
+ <joint name="j{k}" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"/>
+      <geom type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/></body>"""
+        for k in range(3)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody></mujoco>"
+    )
     names = ("j0", "j1", "j2")
     t_cmd = motion(0, 4.0)[0]
     cmd = np.stack([motion(k, 4.0, seed=k)[1] for k in (0, 1, 3)], 1)
@@ -71,7 +99,17 @@ def test_the_joint_that_drags_is_the_one_the_servo_names():
     def case(joints: dict, order=(0, 1, 2)):
         table = ServoTable.from_dict({"joints": {"*": SERVO, **joints}})
         pick = list(order)
-        run = Run("a", tuple(names[k] for k in pick), t_cmd, cmd[:, pick], t, q[:, pick], table, np.array([0, 0, -9.81]), counted=names)
+        run = Run(
+            "a",
+            tuple(names[k] for k in pick),
+            t_cmd,
+            cmd[:, pick],
+            t,
+            q[:, pick],
+            table,
+            np.array([0, 0, -9.81]),
+            counted=names,
+        )
         run.smooth()
         return build(model, [run])[pick.index(0)]
 
@@ -90,14 +128,21 @@ def test_the_joint_that_drags_is_the_one_the_servo_names():
 
 def test_what_other_joints_draw_follows_their_commands_between_samples():
     """A target that jumps between two samples of a joint loads the supply from its own time on."""
-    bodies = "".join(f"""<body pos="0 {0.4 * k} 0"><joint name="j{k}" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"/>
-      <geom type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/></body>""" for k in range(2))  # fmt: skip
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody></mujoco>")
+    bodies = "".join(
+        f"""<body pos="0 {0.4 * k} 0"><joint name="j{k}" type="hinge" axis="0 1 0" armature="4e-4" range="-2.5 2.5"/>
+      <geom type="sphere" size="0.012" pos="0 0 -0.1" mass="0.15" contype="0" conaffinity="0"/></body>"""
+        for k in range(2)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody></mujoco>"
+    )
     t_cmd = np.r_[0.0, 1.004]
     cmd = np.array([[0.0, 0.0], [0.0, 0.2]])
     t = np.arange(0.0, 2.0, 0.02)
     q = np.stack([0.2 * np.sin(t), np.zeros(len(t))], 1)
-    run = Run("a", ("j0", "j1"), t_cmd, cmd, t, q, ServoTable.from_dict({"joints": {"*": SERVO}}), np.array([0, 0, -9.81]))
+    run = Run(
+        "a", ("j0", "j1"), t_cmd, cmd, t, q, ServoTable.from_dict({"joints": {"*": SERVO}}), np.array([0, 0, -9.81])
+    )
     run.smooth()
     run.fine = (t, run.qs, run.vs, run.as_)
     plant = build(model, [run])[0].plant
@@ -113,7 +158,11 @@ def test_a_plant_in_shorter_steps_is_the_same_joint():
     plant = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0].plant
     fine = plant.refined(4)
     a, b = plant.windows(None), fine.windows(None)
-    assert fine.dt == pytest.approx(plant.dt / 4) and np.array_equal(a.sample_row, b.sample_row) and np.array_equal(a.sample_window, b.sample_window)
+    assert (
+        fine.dt == pytest.approx(plant.dt / 4)
+        and np.array_equal(a.sample_row, b.sample_row)
+        and np.array_equal(a.sample_window, b.sample_window)
+    )
     for r, (g, h) in enumerate(zip(a.window[:, 0], b.window[:, 0], strict=True)):
         k = a.window[r, 1] - 2
         assert np.allclose(plant.series[g : g + k], fine.series[h : h + 4 * k : 4], atol=1e-12)

@@ -1,4 +1,5 @@
-"""The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of time."""
+"""The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of
+time."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from dexsim.gap.touch.result import TouchResult
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
-    return {"effect": "backlash", "where": {"joints": [joint]}, "held_out": {"before": 2.0, "after": 1.0}, "confidence": confidence}
+    return {
+        "effect": "backlash",
+        "where": {"joints": [joint]},
+        "held_out": {"before": 2.0, "after": 1.0},
+        "confidence": confidence,
+    }
 
 
 def test_names_on_joints_that_need_no_effect_are_hints():
@@ -23,17 +29,27 @@ def test_names_on_joints_that_need_no_effect_are_hints():
     assert verdict.firm(found) == [found[1]]
 
 
-@pytest.mark.parametrize(("before", "after", "confidence", "word"), [
-    (1.2, 0.9, 0.45, "none"), (1.2, 0.9, 0.9, "explained"), (4.0, 1.1, 0.9, "explained"), (4.0, 1.1, 0.6, "partly_explained"),
-    (4.0, 2.5, 0.9, "partly_explained"), (4.0, 3.5, 0.9, "unknown"), (4.0, 1.0, 0.45, "unknown"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("before", "after", "confidence", "word"),
+    [
+        (1.2, 0.9, 0.45, "none"),
+        (1.2, 0.9, 0.9, "explained"),
+        (4.0, 1.1, 0.9, "explained"),
+        (4.0, 1.1, 0.6, "partly_explained"),
+        (4.0, 2.5, 0.9, "partly_explained"),
+        (4.0, 3.5, 0.9, "unknown"),
+        (4.0, 1.0, 0.45, "unknown"),
+    ],
+)
 def test_no_verdict_by_a_whisper(before, after, confidence, word):
     found = [finding(confidence)]
     verdict.settle(found, set())
     assert verdict.verdict(found, 1.0, before, 0.9 * before, after, True) == word
 
 
-@pytest.mark.parametrize(("before", "confidence", "word"), [(1.2, 0.9, "explained"), (1.2, 0.4, "none"), (4.0, 0.9, "unknown")])
+@pytest.mark.parametrize(
+    ("before", "confidence", "word"), [(1.2, 0.9, "explained"), (1.2, 0.4, "none"), (4.0, 0.9, "unknown")]
+)
 def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):
     """`none` would say that nothing was amiss; where the rest is not followed either the signal does not explain it."""
     bad = finding(confidence) | {"effect": "bad_channel", "held_out": None}
@@ -63,14 +79,24 @@ class Held:
         slow = 0.1 * np.sin(np.linspace(0, 6, n))
         on = np.concatenate([(np.arange(n) / 100 >= a) & (np.arange(n) / 100 < b) for a, b in saturated])
         count = len(saturated) * n
-        self.regimes = {"saturation": 2.0 * on, "_asked": np.ones(count), "_speed": np.tile(slow, len(saturated)), "speed": np.full(count, 1.0),
-                        "load": np.full(count, 1.0), "acceleration": np.full(count, 1.0), "position": np.tile(np.sin(np.linspace(0, 40, n)), len(saturated))}  # fmt: skip
+        self.regimes = {
+            "saturation": 2.0 * on,
+            "_asked": np.ones(count),
+            "_speed": np.tile(slow, len(saturated)),
+            "speed": np.full(count, 1.0),
+            "load": np.full(count, 1.0),
+            "acceleration": np.full(count, 1.0),
+            "position": np.tile(np.sin(np.linspace(0, 40, n)), len(saturated)),
+        }
         self.plant = type("P", (), {"rows": staticmethod(lambda i: slice(i * n, (i + 1) * n))})()
-        self.runs = [type("R", (), {"t": np.arange(n) / 100, "duration": T, "name": f"r{i}"})() for i in range(len(saturated))]
+        self.runs = [
+            type("R", (), {"t": np.arange(n) / 100, "duration": T, "name": f"r{i}"})() for i in range(len(saturated))
+        ]
 
 
 def test_what_alone_visits_a_regime_is_not_kept_out_whole():
-    case = Held([(0, 0), (0, 0), (0, 0), (1.0, 9.0)])  # the last, which used to be kept out, is the only one at its limit
+    # the last, which used to be kept out, is the only one at its limit
+    case = Held([(0, 0), (0, 0), (0, 0), (1.0, 9.0)])
     parts = keep_out.split(case.runs, [], [0, 1, 2, 3], [case])
     assert parts.test == [2, 3] and parts.train == [0, 1, 3] and not parts.not_judged
     assert parts.span_train[3][1] == parts.span_test[3][0] == 7.5 and parts.span_test[2][0] == 0.0
@@ -100,5 +126,7 @@ def test_a_limit_ends_searches_and_says_which():
 
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():
-    felt = TouchResult([{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03)
+    felt = TouchResult(
+        [{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03
+    )
     assert touch_report._verdict(felt) == "none" and felt.findings[0]["hint"]

@@ -19,7 +19,12 @@ from dexsim.tasks import grasp_eval, make_env, terms
 from dexsim.tasks.grasp import privileged
 
 N = 8
-QUIET = ("task.sensors.joint_noise=0", "task.sensors.torque_noise=0", "task.sensors.tip_noise=0", "task.sensors.vision_z_noise=0")
+QUIET = (
+    "task.sensors.joint_noise=0",
+    "task.sensors.torque_noise=0",
+    "task.sensors.tip_noise=0",
+    "task.sensors.vision_z_noise=0",
+)
 NO_BIAS = ("randomize.sensors.vision_xy=0", "randomize.sensors.torque_bias=0")
 SLICES = observations.slices(observations.rows(12, 5, 5))
 
@@ -43,13 +48,22 @@ def act(env, value: float = 0.0) -> torch.Tensor:
     return a
 
 
-# -- observations ------------------------------------------------------------------------------------------------------------
+# -- observations
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_sizes_and_layout(env):
     rows = [(name, width) for name, width, *_ in env.rows()]
-    assert rows == [("joint_angle", 12), ("joint_torque", 12), ("object_position", 3), ("object_velocity", 3), ("contact_force", 5),
-                    ("contact_centre", 15), ("fingertip_position", 15), ("force_command", 1)]
+    assert rows == [
+        ("joint_angle", 12),
+        ("joint_torque", 12),
+        ("object_position", 3),
+        ("object_velocity", 3),
+        ("contact_force", 5),
+        ("contact_centre", 15),
+        ("fingertip_position", 15),
+        ("force_command", 1),
+    ]
     obs = env.get_observations()
     assert obs["actor"].shape == (N, 66)
     assert obs["critic"].shape == (N, 66 + sum(w for _, w in privileged(12, 5))) == (N, 148)
@@ -75,8 +89,12 @@ def test_every_slice_holds_what_its_name_says(env):
         o = {name: obs[group][:, s].double() for name, s in SLICES.items()}
         q = e.t.qpos[:, e.qpos_index(xhand.JOINTS)]
         torch.testing.assert_close(o["joint_angle"], q, rtol=0, atol=1e-6)
-        torch.testing.assert_close(o["joint_torque"], env.servo.torque / torch.as_tensor(xhand.efforts()), rtol=0, atol=1e-6)
-        torch.testing.assert_close(o["contact_force"], e.t.pair_normal[:, :5].double() / env.f_max, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            o["joint_torque"], env.servo.torque / torch.as_tensor(xhand.efforts()), rtol=0, atol=1e-6
+        )
+        torch.testing.assert_close(
+            o["contact_force"], e.t.pair_normal[:, :5].double() / env.f_max, rtol=1e-4, atol=1e-4
+        )
         sites = torch.stack([_site(env, w) for w in range(N)])
         torch.testing.assert_close(o["fingertip_position"], sites.reshape(N, 15), rtol=0, atol=1e-5)
         torch.testing.assert_close(o["force_command"][:, 0], env.command.double(), rtol=0, atol=0)
@@ -163,7 +181,8 @@ def test_a_new_episode_has_felt_nothing(env):
     assert torch.equal(obs[~mask][:, SLICES["contact_force"]], before[~mask][:, SLICES["contact_force"]])
 
 
-# -- rewards ---------------------------------------------------------------------------------------------------------------
+# -- rewards
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def test_tracking_against_hand_computed_values():
@@ -201,7 +220,15 @@ def terms_of(env) -> dict[str, float]:
 def test_reward_terms_by_hand(posed):
     env = posed
     zero = terms_of(env)
-    assert zero["force"] == zero["torque"] == zero["outer"] == zero["action"] == zero["velocity"] == zero["termination"] == 0
+    assert (
+        zero["force"]
+        == zero["torque"]
+        == zero["outer"]
+        == zero["action"]
+        == zero["velocity"]
+        == zero["termination"]
+        == 0
+    )
     mid = env.q_mid[[4, 6, 8, 10]].double()
     assert zero["diff"] == pytest.approx(float(((mid - mid.mean()) ** 2).mean()), abs=1e-7)
 
@@ -272,7 +299,8 @@ def test_weights_scale_their_terms_and_the_sum_is_the_reward(env):
     assert set(env.rewards()) == set(env.task["rewards"])
 
 
-# -- the force scale -----------------------------------------------------------------------------------------------------------
+# -- the force scale
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_f_max_is_a_static_press_of_about_ten_newtons(env):
@@ -285,7 +313,8 @@ def test_f_max_is_a_static_press_of_about_ten_newtons(env):
     assert fingertip_press(hand, servo, stiffness=20000.0) == pytest.approx(full, rel=0.05)  # and hardly of the rubber
 
 
-# -- ends ------------------------------------------------------------------------------------------------------------------------
+# -- ends
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_a_dropped_object_ends_the_episode_and_the_others_go_on(env):
@@ -330,7 +359,9 @@ def test_a_nan_world_is_ended_counted_and_replaced(env, where):
     for _ in range(3):
         for group in obs.values():
             assert bool(torch.isfinite(group).all())
-        assert bool(torch.isfinite(reward).all()) and all(bool(torch.isfinite(torch.as_tensor(v)).all()) for v in extras["log"].values())
+        assert bool(torch.isfinite(reward).all()) and all(
+            bool(torch.isfinite(torch.as_tensor(v)).all()) for v in extras["log"].values()
+        )
         assert not (env.engine.t.flags & FLAG_NAN).any()
         obs, reward, done, extras = env.step(act(env))
     assert not done.any()
@@ -344,7 +375,8 @@ def test_nan_actions_are_harmless(env):
     assert bool((env.target <= env.q_high).all() and (env.target >= env.q_low).all())
 
 
-# -- actions -----------------------------------------------------------------------------------------------------------------------
+# -- actions
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_relative_actions_move_the_target_within_limits_and_lead(env):
@@ -375,7 +407,8 @@ def test_an_unknown_action_mode_is_a_user_error():
         make_env(cfg, 1, "cpu", 0, "mujoco")
 
 
-# -- commands and pushes --------------------------------------------------------------------------------------------------------------
+# -- commands and pushes
+# --------------------------------------------------------------------------------------------------------------
 
 
 def test_commands_change_within_an_episode(env):
@@ -448,7 +481,8 @@ def test_pushes_can_be_turned_off(env):
         env.pushes = True
 
 
-# -- the same again ---------------------------------------------------------------------------------------------------------------------
+# -- the same again
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def rollout(env, steps: int = 40, seed: int = 5) -> torch.Tensor:
@@ -500,7 +534,8 @@ def test_final_observations_are_those_before_the_reset(env):
         env.keep_final_obs = False
 
 
-# -- bad settings -------------------------------------------------------------------------------------------------------------------------
+# -- bad settings
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("change, word", [
@@ -534,23 +569,44 @@ def test_play_prints_the_papers_columns_of_the_grasp():
     """Ranges and correlations of held episodes, of forces and torques that follow the command exactly or not at all."""
     n = 200
     command = np.linspace(0.1, 1.0, n)
-    r = {"command": command, "mass": np.full(n, 0.05), "friction": np.full(n, 1.0), "load": np.full(n, 0.5), "pushed": np.zeros(n), "held": np.ones(n),
-         "held90": np.ones(n), "held180": np.ones(n), "force": command[:, None] * [1.0, 2, 2, 2, 2], "alive": np.ones(n),
-         "torque": np.tile(np.where(np.arange(n) % 2, 0.2, 0.4)[:, None], 12), "moved": np.zeros(n), "untouched": np.zeros(n)}  # fmt: skip
+    r = {
+        "command": command,
+        "mass": np.full(n, 0.05),
+        "friction": np.full(n, 1.0),
+        "load": np.full(n, 0.5),
+        "pushed": np.zeros(n),
+        "held": np.ones(n),
+        "held90": np.ones(n),
+        "held180": np.ones(n),
+        "force": command[:, None] * [1.0, 2, 2, 2, 2],
+        "alive": np.ones(n),
+        "torque": np.tile(np.where(np.arange(n) % 2, 0.2, 0.4)[:, None], 12),
+        "moved": np.zeros(n),
+        "untouched": np.zeros(n),
+    }
     stage = SimpleNamespace(f_max=2.0, hand=load_hand())
     metrics = grasp_eval._metrics(r, r, stage)
     (title, header, rows), (_, _, intervals) = grasp_eval._papers_columns(metrics)
     assert "paper's columns" in title and header[0] == "contact forces N" and len(rows) == 1
     low, high = (float(x) for x in rows[0][0].split(" .. "))
-    assert low == pytest.approx(9 * np.quantile(command, 0.05), abs=0.01) and high == pytest.approx(9 * np.quantile(command, 0.95), abs=0.01)
+    assert low == pytest.approx(9 * np.quantile(command, 0.05), abs=0.01) and high == pytest.approx(
+        9 * np.quantile(command, 0.95), abs=0.01
+    )
     assert rows[0][1:3] == ("0.2 .. 0.4", "1.000") and abs(float(rows[0][3])) < 0.05
-    assert [i[0] for i in intervals] == ["hold_rate", "hold_rate_pushed", "hold_rate_kept_out_shapes", "force_command_correlation", "torque_command_correlation"]
+    assert [i[0] for i in intervals] == [
+        "hold_rate",
+        "hold_rate_pushed",
+        "hold_rate_kept_out_shapes",
+        "force_command_correlation",
+        "torque_command_correlation",
+    ]
     nothing = r | {"held": np.zeros(n)}
     assert grasp_eval._papers_columns(grasp_eval._metrics(nothing, nothing, stage))[0][2] == [("-", "-", "-", "-")]
 
 
 def test_the_grasps_intervals_are_those_of_theory():
-    """A share of 300 in 400 by its standard error, one of 40 in 40 by Wilson's formula; a correlation of 0.6 in 400 samples by Fisher's z."""
+    """A share of 300 in 400 by its standard error, one of 40 in 40 by Wilson's formula; a correlation of 0.6 in 400
+    samples by Fisher's z."""
     rng = np.random.default_rng(3)
     low, high = grasp_eval._rate_interval(np.arange(500) % 4 != 0, np.arange(500) < 400)
     half = 1.96 * (0.75 * 0.25 / 400) ** 0.5

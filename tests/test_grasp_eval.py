@@ -1,4 +1,5 @@
-"""The evaluation of the grasp on a stage: objects lie where the test says, and what the evaluation does to them is noted."""
+"""The evaluation of the grasp on a stage: objects lie where the test says, and what the evaluation does to them is
+noted."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ MASS = torch.linspace(0.05, 0.3, N)
 
 
 class Stage:
-    """What the evaluation asks of an environment. From SETTLE on, the object of each world lies `away` [N] m beside its place;
-    touched [N, 5]: which fingers touch it. gravity, force: [steps, N, 3], as they were at each step."""
+    """What the evaluation asks of an environment. From SETTLE on, the object of each world lies `away` [N] m beside its
+    place; touched [N, 5]: which fingers touch it. gravity, force: [steps, N, 3], as they were at each step."""
 
     def __init__(self, away: torch.Tensor, touched: torch.Tensor):
         self.num_envs, self.device, self.dt, self.max_episode_length, self.pushes = N, "cpu", DT, 10, True
@@ -67,8 +68,12 @@ def test_the_hand_is_turned_by_90_and_by_180_degrees():
     second = first + TURN_S + STAY_S
     z = g[..., 2]
     assert (z[t <= first] == -1).all()
-    torch.testing.assert_close(z[(t > first + TURN_S + 1e-6) & (t < second)].abs().max(), torch.tensor(0.0), rtol=0, atol=1e-6)
-    torch.testing.assert_close(z[t > second + TURN_S + 1e-6], torch.ones(1, 1).expand(int((t > second + TURN_S + 1e-6).sum()), N))
+    torch.testing.assert_close(
+        z[(t > first + TURN_S + 1e-6) & (t < second)].abs().max(), torch.tensor(0.0), rtol=0, atol=1e-6
+    )
+    torch.testing.assert_close(
+        z[t > second + TURN_S + 1e-6], torch.ones(1, 1).expand(int((t > second + TURN_S + 1e-6).sum()), N)
+    )
     assert (t > second + TURN_S).sum() * DT >= STAY_S - 2 * DT
     across = g[int((second - 0.5 * STAY_S) / DT), :, :2]
     assert float(torch.pdist(across).min()) > 1e-3, "each world is turned about an axis of its own"
@@ -84,7 +89,9 @@ def test_every_second_world_is_pushed_by_twice_its_weight_for_half_a_second():
         assert int(mine.sum()) * DT == pytest.approx(PUSH_S, abs=1.01 * DT)
         assert SETTLE + 0.5 <= float(t[mine].min()) and float(t[mine].max()) <= SETTLE + HOLD - 0.5
         torch.testing.assert_close(force[mine, w].norm(dim=1), (2 * 9.81 * MASS[w]).expand(int(mine.sum())))
-    assert float(torch.pdist(force[:, ::2].sum(0) / force[:, ::2].sum(0).norm(dim=1, keepdim=True)).min()) > 0.1, "in random directions"
+    assert float(torch.pdist(force[:, ::2].sum(0) / force[:, ::2].sum(0).norm(dim=1, keepdim=True)).min()) > 0.1, (
+        "in random directions"
+    )
 
 
 def test_held_is_within_30_mm_of_where_it_settled():

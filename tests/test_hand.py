@@ -36,7 +36,7 @@ def test_the_xhand_is_such_a_folder_to_the_last_bit():
     assert hand.tip_geoms == xhand.TIP_GEOMS and hand.tip_bodies == xhand.TIP_BODIES and hand.opposing == (0,)
     a, b = hand.spec().compile(), xhand.hand_spec().compile()
     for name in ("body_pos", "body_quat", "body_inertia", "jnt_range", "geom_pos", "geom_quat", "geom_size",
-                 "geom_contype", "geom_conaffinity", "geom_margin", "geom_solref", "dof_armature", "mesh_vert"):  # fmt: skip
+                 "geom_contype", "geom_conaffinity", "geom_margin", "geom_solref", "dof_armature", "mesh_vert"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     for skin, finger in zip(tip_skins(hand), xhand.FINGERS, strict=True):
         assert np.array_equal(skin, xhand.tip_skin_mesh(finger)[0])
@@ -153,14 +153,18 @@ def test_what_is_wrong_in_the_file_is_one_line(tmp_path, path, value, said):
 @pytest.mark.parametrize(
     "old, new, said",
     [
-        ("<actuator>", '<tendon><fixed name="pull"><joint joint="a_curl" coef="1"/></fixed></tendon><actuator>', "1 tendon (pull)"),
-        ("<actuator>", '<equality><joint name="tie" joint1="a_curl" joint2="a_bend"/></equality><actuator>', "1 equality constraint (tie)"),
+        ("<actuator>", '<tendon><fixed name="pull"><joint joint="a_curl" '
+                       'coef="1"/></fixed></tendon><actuator>', "1 tendon (pull)"),
+        ("<actuator>", '<equality><joint name="tie" joint1="a_curl" '
+                       'joint2="a_bend"/></equality><actuator>', "1 equality constraint (tie)"),
         ('<light pos="0 0 1"/>', '<geom name="floor" type="plane" size="1 1 1"/>', "geom 'floor' belongs to the world"),
         ('<light pos="0 0 1"/>', '<body name="cup"><freejoint/><geom size="0.1"/></body>', "is a free joint"),
-        ('<light pos="0 0 1"/>', '<body name="cup"><geom size="0.1"/></body>', "2 bodies hang on the world (cup, hull)"),
+        ('<light pos="0 0 '
+         '1"/>', '<body name="cup"><geom size="0.1"/></body>', "2 bodies hang on the world (cup, hull)"),
         ('range="-0.6 0.8"', "", "joint 't_swing' of the model has the range [0, 0] rad, not limited"),
         ('<geom name="t_tip"', '<geom class="seen" name="t_tip"', "'t_tip' is not a colliding geom"),
-        ('<joint name="t_bend"', '<joint name="extra" axis="1 0 0" range="0 1"/><joint name="t_bend"', "lacks 'extra' of the model"),
+        ('<joint name="t_bend"', '<joint name="extra" axis="1 0 0" range="0 1"/><joint '
+                                 'name="t_bend"', "lacks 'extra' of the model"),
         ("<mujoco model", "<mujoco modle", "made.xml"),
     ],
 )  # fmt: skip

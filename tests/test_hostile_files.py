@@ -1,4 +1,5 @@
-"""Files that carry code: none of it runs, whatever opens them. And checkpoints and bundles of wrong parts: one line each."""
+"""Files that carry code: none of it runs, whatever opens them. And checkpoints and bundles of wrong parts: one line
+each."""
 
 from __future__ import annotations
 
@@ -72,15 +73,28 @@ def one_line(error) -> str:
     return text
 
 
-# -- names of classes in the stored settings ---------------------------------------------------------------------------------
+# -- names of classes in the stored settings
+# ---------------------------------------------------------------------------------
 NAMED = [
-    ("actor.class_name", "trap:Net"), ("actor.class_name", "trap.Net"), ("actor.class_name", "os:system"),
-    ("actor.distribution_cfg.class_name", "trap:Net"), ("critic.class_name", "trap:go"),
-    ("critic.distribution_cfg", {"class_name": "trap:go"}), ("algorithm.class_name", "trap:Net"), ("algorithm.class_name", "builtins:exec"),
-    ("algorithm.symmetry_cfg", {"use_data_augmentation": True, "use_mirror_loss": False, "data_augmentation_func": "trap:go"}),
-    ("algorithm.rnd_cfg", {"class_name": "trap:Net"}), ("logger", {"class_name": "trap:Net"}), ("logger", "wandb"),
-    ("_target_", "trap.go"), ("actor._target_", "trap.go"), ("class_name", "trap:Net"),
-]  # fmt: skip
+    ("actor.class_name", "trap:Net"),
+    ("actor.class_name", "trap.Net"),
+    ("actor.class_name", "os:system"),
+    ("actor.distribution_cfg.class_name", "trap:Net"),
+    ("critic.class_name", "trap:go"),
+    ("critic.distribution_cfg", {"class_name": "trap:go"}),
+    ("algorithm.class_name", "trap:Net"),
+    ("algorithm.class_name", "builtins:exec"),
+    (
+        "algorithm.symmetry_cfg",
+        {"use_data_augmentation": True, "use_mirror_loss": False, "data_augmentation_func": "trap:go"},
+    ),
+    ("algorithm.rnd_cfg", {"class_name": "trap:Net"}),
+    ("logger", {"class_name": "trap:Net"}),
+    ("logger", "wandb"),
+    ("_target_", "trap.go"),
+    ("actor._target_", "trap.go"),
+    ("class_name", "trap:Net"),
+]
 
 
 def set_in(node, key, value):
@@ -121,9 +135,23 @@ def test_a_class_that_the_user_types_is_used(payload, trap, tmp_path, capsys):
 
 def config_of_a_run(cfg):
     """The whole config of a run on the dummy task, with the agent of `cfg`."""
-    base = {"choices": {"task": "dummy"}, "worlds": 4, "iterations": 2, "preset": "none", "device": "cpu", "run": None, "out": None, "resume": None,
-            "sim": {"engine": "auto"}, "tactile": {"raw": False}, "save_interval": 10, "final_episodes": 0, "servo_file": None, "servo": {},
-            "randomize": {}}  # fmt: skip
+    base = {
+        "choices": {"task": "dummy"},
+        "worlds": 4,
+        "iterations": 2,
+        "preset": "none",
+        "device": "cpu",
+        "run": None,
+        "out": None,
+        "resume": None,
+        "sim": {"engine": "auto"},
+        "tactile": {"raw": False},
+        "save_interval": 10,
+        "final_episodes": 0,
+        "servo_file": None,
+        "servo": {},
+        "randomize": {},
+    }
     return base | {k: v for k, v in cfg.items() if k in ("agent", "seed")} | {"task": {"name": "dummy", "steps": 20}}
 
 
@@ -134,7 +162,8 @@ def test_a_stored_setting_reads_no_environment(payload, tmp_path):
         checkpoint.load(checkpoint.save(tmp_path / "evil.pt", evil))
 
 
-# -- archives -------------------------------------------------------------------------------------------------------------------
+# -- archives
+# -------------------------------------------------------------------------------------------------------------------
 def whole(tmp_path, payload) -> bytes:
     return checkpoint.save(tmp_path / "good.pt", payload).read_bytes()
 
@@ -182,19 +211,25 @@ ARCHIVES = {
     "a raw pickle, then a whole checkpoint": lambda good, bad: pickle.dumps(bad) + good,
     "a pickle of protocol 0, then a whole checkpoint": lambda good, bad: pickle.dumps(bad, 0) + good,
     "a whole checkpoint, then a pickle": lambda good, bad: good + pickle.dumps(bad),
-    "torch's old format": lambda good, bad: torch_file({"format": checkpoint.FORMAT, "x": bad}, _use_new_zipfile_serialization=False),
+    "torch's old format": lambda good, bad: torch_file(
+        {"format": checkpoint.FORMAT, "x": bad}, _use_new_zipfile_serialization=False
+    ),
     "torch's zip": lambda good, bad: torch_file({"format": checkpoint.FORMAT, "version": 1, "x": bad}),
     "code as a key": lambda good, bad: torch_file({"format": checkpoint.FORMAT, bad: 1}),
-    "a tar, as torch once wrote": lambda good, bad: tarred({"sys_info": pickle.dumps(bad), "pickle": pickle.dumps(bad)}),
+    "a tar, as torch once wrote": lambda good, bad: tarred(
+        {"sys_info": pickle.dumps(bad), "pickle": pickle.dumps(bad)}
+    ),
     "a tar and a zip in one": lambda good, bad: tarred({"pickle": pickle.dumps(bad)}) + good,
     "a compiled module": lambda good, bad: script_module(bad),
     "a zip of code": lambda good, bad: zipped({"archive/data.pkl": pickle.dumps(bad), "archive/version": b"3"}),
     "a compressed zip": lambda good, bad: zipped({"archive/data.pkl": pickle.dumps(bad)}, zipfile.ZIP_DEFLATED),
     "a gzip": lambda good, bad: gzip.compress(pickle.dumps(bad)),
     "python's own archive": lambda good, bad: zipped({"__main__.py": b"import trap"}),
-    "two parts of one name": lambda good, bad: with_part(good, zipfile.ZipFile(io.BytesIO(good)).namelist()[0], pickle.dumps(bad)),
+    "two parts of one name": lambda good, bad: with_part(
+        good, zipfile.ZipFile(io.BytesIO(good)).namelist()[0], pickle.dumps(bad)
+    ),
     "numpy objects": lambda good, bad: npz(bad),
-}  # fmt: skip
+}
 
 
 def npz(bad) -> bytes:
@@ -213,7 +248,9 @@ def test_an_archive_that_holds_code_runs_none(payload, trap, tmp_path, kind):
     except UserError as error:
         assert "\n" not in str(error)
     else:
-        assert kind == "a whole checkpoint, then a pickle", "only this one is a checkpoint, with bytes that nothing reads"
+        assert kind == "a whole checkpoint, then a pickle", (
+            "only this one is a checkpoint, with bytes that nothing reads"
+        )
     assert not trap.exists()
 
 
@@ -226,9 +263,15 @@ def test_a_part_that_unpacks_without_end_is_refused_at_once(tmp_path):
     assert time.process_time() - begun < 0.1
 
 
-# -- YAML, npz, ONNX ---------------------------------------------------------------------------------------------------------------
-TAGS = ["!!python/object/apply:trap.go []", "!!python/object/new:trap.Net []", "!!python/name:trap.go ''", "!!python/module:trap ''",
-        "!!python/object:trap.Net {}"]  # fmt: skip
+# -- YAML, npz, ONNX
+# ---------------------------------------------------------------------------------------------------------------
+TAGS = [
+    "!!python/object/apply:trap.go []",
+    "!!python/object/new:trap.Net []",
+    "!!python/name:trap.go ''",
+    "!!python/module:trap ''",
+    "!!python/object:trap.Net {}",
+]
 
 
 @pytest.mark.parametrize("tag", TAGS)
@@ -240,7 +283,11 @@ def test_yaml_tags_build_nothing(trap, tmp_path, tag):
     text = f"format: dexsim-bundle\nversion: 1\nschema: 1\nx: {tag}\n"
     for name in ("manifest.yaml", "file.yaml"):
         (tmp_path / name).write_text(text)
-    for opens in (lambda: bundle.load(tmp_path), lambda: Calibration.load(tmp_path / "file.yaml"), lambda: ServoTable.load(tmp_path / "file.yaml")):
+    for opens in (
+        lambda: bundle.load(tmp_path),
+        lambda: Calibration.load(tmp_path / "file.yaml"),
+        lambda: ServoTable.load(tmp_path / "file.yaml"),
+    ):
         with pytest.raises(UserError) as error:
             opens()
         one_line(error)
@@ -248,11 +295,18 @@ def test_yaml_tags_build_nothing(trap, tmp_path, tag):
 
 
 LIMITS = {
-    "aliases of aliases": "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
-    "merges of merges": "a0: &a0 {k: 1}\n" + "".join(f"a{k}: &a{k}\n  <<: [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
-    "lists in lists": "[" * 5000, "maps in maps": "{a: " * 5000, "a list that holds itself": "a: &a [*a]", "a date that is none": "x: 2020-99-99",
-    "a list as a key": "? [a]\n: b", "no text": "\x00", "more than the limit": "x: " + "y" * yaml_text.MOST_BYTES,
-}  # fmt: skip
+    "aliases of aliases": "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n"
+    + "".join(f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
+    "merges of merges": "a0: &a0 {k: 1}\n"
+    + "".join(f"a{k}: &a{k}\n  <<: [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)),
+    "lists in lists": "[" * 5000,
+    "maps in maps": "{a: " * 5000,
+    "a list that holds itself": "a: &a [*a]",
+    "a date that is none": "x: 2020-99-99",
+    "a list as a key": "? [a]\n: b",
+    "no text": "\x00",
+    "more than the limit": "x: " + "y" * yaml_text.MOST_BYTES,
+}
 
 
 @pytest.mark.parametrize("kind", LIMITS)
@@ -309,7 +363,10 @@ def test_a_network_reads_no_other_file(b, tmp_path, where, monkeypatch):
     for key, value in (("location", "../secret.bin"), ("offset", "0"), ("length", str(66 * 12 * 4))):
         entry = away.external_data.add()
         entry.key, entry.value = key, value
-    x, y = helper.make_tensor_value_info("observation", 1, ["n", 66]), helper.make_tensor_value_info("action", 1, ["n", 12])
+    x, y = (
+        helper.make_tensor_value_info("observation", 1, ["n", 66]),
+        helper.make_tensor_value_info("action", 1, ["n", 12]),
+    )
     nodes, weights = [helper.make_node("MatMul", ["observation", "w"], ["action"])], [away]
     constant = helper.make_node("Constant", [], ["w"], value=away)
     if where == "attribute":
@@ -319,7 +376,9 @@ def test_a_network_reads_no_other_file(b, tmp_path, where, monkeypatch):
         yes = helper.make_tensor("yes", TensorProto.BOOL, [], [True])
         nodes = [helper.make_node("If", ["yes"], ["w"], then_branch=inner, else_branch=inner), *nodes]
         weights = [yes]
-    model = helper.make_model(helper.make_graph(nodes, "g", [x], [y], weights), opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    model = helper.make_model(
+        helper.make_graph(nodes, "g", [x], [y], weights), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    )
     assert onnx.ModelProto.FromString(model.SerializeToString()) == model
     sealed(b, model.SerializeToString())
     monkeypatch.chdir(b)  # where a network without a folder would look
@@ -331,9 +390,15 @@ def test_a_network_reads_no_other_file(b, tmp_path, where, monkeypatch):
 def test_a_network_of_other_sizes_or_of_nonsense_is_named(b):
     from onnx import helper
 
-    x, y = helper.make_tensor_value_info("observation", 1, ["n", 66]), helper.make_tensor_value_info("action", 1, ["n", 66])
-    model = helper.make_model(helper.make_graph([helper.make_node("Identity", ["observation"], ["action"])], "g", [x], [y]),
-                              opset_imports=[helper.make_opsetid("", 17)], ir_version=8)  # fmt: skip
+    x, y = (
+        helper.make_tensor_value_info("observation", 1, ["n", 66]),
+        helper.make_tensor_value_info("action", 1, ["n", 66]),
+    )
+    model = helper.make_model(
+        helper.make_graph([helper.make_node("Identity", ["observation"], ["action"])], "g", [x], [y]),
+        opset_imports=[helper.make_opsetid("", 17)],
+        ir_version=8,
+    )
     sealed(b, model.SerializeToString())
     with pytest.raises(UserError, match=r"shape \[1, 66\], must give floats of shape \[1, 12\]"):
         export.check(b)
@@ -346,18 +411,48 @@ def test_a_network_of_other_sizes_or_of_nonsense_is_named(b):
         export.check(b)
 
 
-# -- parts of the wrong kind -----------------------------------------------------------------------------------------------------
+# -- parts of the wrong kind
+# -----------------------------------------------------------------------------------------------------
 WRONG = [
-    ("kind", "other"), ("kind", 3), ("kind", []), ("config", None), ("config", "x"), ("config", {"agent": []}), ("config", []), ("versions", []),
+    ("kind", "other"),
+    ("kind", 3),
+    ("kind", []),
+    ("config", None),
+    ("config", "x"),
+    ("config", {"agent": []}),
+    ("config", []),
+    ("versions", []),
     ("versions", {"dexsim": 1}),
-    ("git", None), ("git", {"commit": 1, "dirty": False}), ("layout", []), ("layout", {}), ("layout", {"joints": 3, "action": [], "observations": {}}),
-    ("layout", {"joints": ["a"], "action": [], "observations": {"actor": [["x"]]}}), ("iteration", "3"), ("iteration", -1), ("iteration", None),
-    ("iteration", float("nan")), ("steps", [1]), ("steps", 2**70), ("actor", []), ("actor", {"w": 1.0}), ("actor", {1: torch.zeros(1)}), ("critic", None),
-    ("critic", {"w": [1.0]}), ("optimizer", {}), ("optimizer", {"state": [], "param_groups": {}}), ("optimizer", {"state": {}, "param_groups": []}),
-    ("optimizer", {"state": {0: {"step": "x"}}, "param_groups": [{"params": [0]}]}), ("env", None), ("env", {}), ("env", {"x": torch.zeros(99)}),
-    ("rng", {}), ("rng", {"torch": 1, "cuda": [], "numpy": [], "python": []}), ("actor", {"w": torch.zeros(1).expand(10**9)}),
-    ("actor", {"w": torch.tensor([1.0, float("nan")])}), ("critic", {"w": torch.tensor([float("inf")])}),
-]  # fmt: skip
+    ("git", None),
+    ("git", {"commit": 1, "dirty": False}),
+    ("layout", []),
+    ("layout", {}),
+    ("layout", {"joints": 3, "action": [], "observations": {}}),
+    ("layout", {"joints": ["a"], "action": [], "observations": {"actor": [["x"]]}}),
+    ("iteration", "3"),
+    ("iteration", -1),
+    ("iteration", None),
+    ("iteration", float("nan")),
+    ("steps", [1]),
+    ("steps", 2**70),
+    ("actor", []),
+    ("actor", {"w": 1.0}),
+    ("actor", {1: torch.zeros(1)}),
+    ("critic", None),
+    ("critic", {"w": [1.0]}),
+    ("optimizer", {}),
+    ("optimizer", {"state": [], "param_groups": {}}),
+    ("optimizer", {"state": {}, "param_groups": []}),
+    ("optimizer", {"state": {0: {"step": "x"}}, "param_groups": [{"params": [0]}]}),
+    ("env", None),
+    ("env", {}),
+    ("env", {"x": torch.zeros(99)}),
+    ("rng", {}),
+    ("rng", {"torch": 1, "cuda": [], "numpy": [], "python": []}),
+    ("actor", {"w": torch.zeros(1).expand(10**9)}),
+    ("actor", {"w": torch.tensor([1.0, float("nan")])}),
+    ("critic", {"w": torch.tensor([float("inf")])}),
+]
 
 
 @pytest.mark.parametrize("part, value", WRONG, ids=[f"{k}-{p}" for k, (p, _) in enumerate(WRONG)])
@@ -376,15 +471,55 @@ def test_a_part_of_the_wrong_kind_is_named(payload, tmp_path, part, value):
 def edits():
     nan, inf = float("nan"), float("inf")
     yield from (
-        ("policy", None), ("policy", "x"), ("policy.sha256", 1), ("policy.observation_size", "66"), ("policy.observation_size", 67), ("policy.action_size", 5),
-        ("policy.input", "other"), ("policy.output", None), ("observation", {}), ("observation", []), ("observation.0.start", 3), ("observation.0", None),
-        ("joints", None), ("joints", ["a"]), ("fingers", "thumb"), ("action", []), ("action.mode", "fast"), ("action.scale", nan), ("action.scale", "0.1"),
-        ("action.lead", -1.0), ("action.low", [0.0]), ("action.low.3", nan), ("action.low.3", -9.0), ("action.high.3", inf), ("action.high.0", -2.0),
-        ("action.high.5", 40.0), ("action.speed_limit_rad_s.2", 0.0), ("action.speed_limit_rad_s.2", 1e6), ("rates", 5), ("rates.policy_period_s", 0),
-        ("rates.policy_period_s", nan), ("rates.policy_period_s", "1e-2 s"), ("normalization.tau_max", [1] * 11), ("normalization.tau_max.1", -1.0),
-        ("normalization.force_max_N", None), ("normalization.force_max_N", 0), ("initial_pose.4", 9.0), ("initial_pose", "open"), ("golden.tolerance", "x"),
-        ("golden", None), ("task", "walk"), ("task", ["grasp"]), ("calibration", 3), ("calibration.touch", "x"), ("versions", 1),
-        ("servo", []), ("task", "rotate"), ("version", "1"), ("format", None),
+        ("policy", None),
+        ("policy", "x"),
+        ("policy.sha256", 1),
+        ("policy.observation_size", "66"),
+        ("policy.observation_size", 67),
+        ("policy.action_size", 5),
+        ("policy.input", "other"),
+        ("policy.output", None),
+        ("observation", {}),
+        ("observation", []),
+        ("observation.0.start", 3),
+        ("observation.0", None),
+        ("joints", None),
+        ("joints", ["a"]),
+        ("fingers", "thumb"),
+        ("action", []),
+        ("action.mode", "fast"),
+        ("action.scale", nan),
+        ("action.scale", "0.1"),
+        ("action.lead", -1.0),
+        ("action.low", [0.0]),
+        ("action.low.3", nan),
+        ("action.low.3", -9.0),
+        ("action.high.3", inf),
+        ("action.high.0", -2.0),
+        ("action.high.5", 40.0),
+        ("action.speed_limit_rad_s.2", 0.0),
+        ("action.speed_limit_rad_s.2", 1e6),
+        ("rates", 5),
+        ("rates.policy_period_s", 0),
+        ("rates.policy_period_s", nan),
+        ("rates.policy_period_s", "1e-2 s"),
+        ("normalization.tau_max", [1] * 11),
+        ("normalization.tau_max.1", -1.0),
+        ("normalization.force_max_N", None),
+        ("normalization.force_max_N", 0),
+        ("initial_pose.4", 9.0),
+        ("initial_pose", "open"),
+        ("golden.tolerance", "x"),
+        ("golden", None),
+        ("task", "walk"),
+        ("task", ["grasp"]),
+        ("calibration", 3),
+        ("calibration.touch", "x"),
+        ("versions", 1),
+        ("servo", []),
+        ("task", "rotate"),
+        ("version", "1"),
+        ("format", None),
     )
 
 

@@ -65,7 +65,9 @@ def test_fingertips_approach_each_other_and_no_link_is_in_another(claw):
         data = mujoco.MjData(model)
         data.qpos[ids] = hand.pose(name)
         mujoco.mj_kinematics(model, data)
-        at = np.array([data.body(f.body).xpos + data.body(f.body).xmat.reshape(3, 3) @ f.position for f in hand.fingers])
+        at = np.array(
+            [data.body(f.body).xpos + data.body(f.body).xmat.reshape(3, 3) @ f.position for f in hand.fingers]
+        )
         normals = np.array([data.body(f.body).xmat.reshape(3, 3) @ f.normal for f in hand.fingers])
         gaps.append(np.linalg.norm(at[0] - at[1:].mean(0)))
         way = at[1:].mean(0) - at[0]
@@ -171,22 +173,53 @@ def _broken(tmp_path: Path, change) -> Path:
 
 BAD = {
     "missing mesh": (lambda t: t.replace("meshes/tip.stl", "meshes/gone.stl"), r"mesh meshes/gone\.stl: no such file"),
-    "missing package": (lambda t: t.replace("meshes/tip.stl", "package://none/tip.stl"), r"package://none/tip\.stl: no such file.*packages="),
-    "no inertia": (lambda t: t.replace(t[t.index("<inertial>", t.index("ring_far")): t.index("</inertial>", t.index("ring_far")) + 11], "", 1),
-                   r"link index_far without <inertial>.*density="),
-    "zero limits": (lambda t: t.replace('lower="-0.2" upper="1.7"', 'lower="0" upper="0"', 1), r"joint 'index_1' has .*limits.*low < high"),
+    "missing package": (
+        lambda t: t.replace("meshes/tip.stl", "package://none/tip.stl"),
+        r"package://none/tip\.stl: no such file.*packages=",
+    ),
+    "no inertia": (
+        lambda t: t.replace(
+            t[t.index("<inertial>", t.index("ring_far")) : t.index("</inertial>", t.index("ring_far")) + 11], "", 1
+        ),
+        r"link index_far without <inertial>.*density=",
+    ),
+    "zero limits": (
+        lambda t: t.replace('lower="-0.2" upper="1.7"', 'lower="0" upper="0"', 1),
+        r"joint 'index_1' has .*limits.*low < high",
+    ),
     "degrees": (lambda t: t.replace('upper="1.7"', 'upper="97"', 1), r"joint 'index_1'.*in degrees"),
-    "endless": (lambda t: t.replace('name="ring_1" type="revolute"', 'name="ring_1" type="continuous"'), r"joint 'ring_1' is continuous"),
+    "endless": (
+        lambda t: t.replace('name="ring_1" type="revolute"', 'name="ring_1" type="continuous"'),
+        r"joint 'ring_1' is continuous",
+    ),
     "one name twice": (lambda t: t.replace("ring_far", "middle_far"), r"two links have the name 'middle_far'"),
-    "mimic": (lambda t: t.replace('effort="0.6" velocity="7"/></joint>', 'effort="0.6" velocity="7"/><mimic joint="thumb_1"/></joint>', 2).replace(
-        '<mimic joint="thumb_1"/>', '<mimic joint="index_1"/>', 2).replace('<mimic joint="index_1"/>', "", 1), r"move together.*index_2.*coupled=independent"),
+    "mimic": (
+        lambda t: (
+            t.replace(
+                'effort="0.6" velocity="7"/></joint>', 'effort="0.6" velocity="7"/><mimic joint="thumb_1"/></joint>', 2
+            )
+            .replace('<mimic joint="thumb_1"/>', '<mimic joint="index_1"/>', 2)
+            .replace('<mimic joint="index_1"/>', "", 1)
+        ),
+        r"move together.*index_2.*coupled=independent",
+    ),
     "millimetres": (lambda t: _scaled(t), r"longest finger is .* m, allowed .*millimetres"),
-    "xacro": (lambda t: t.replace('<robot name="claw">', '<robot name="claw" xmlns:xacro="http://x/xacro"><xacro:macro name="a"/>'), r"run xacro"),
+    "xacro": (
+        lambda t: t.replace(
+            '<robot name="claw">', '<robot name="claw" xmlns:xacro="http://x/xacro"><xacro:macro name="a"/>'
+        ),
+        r"run xacro",
+    ),
     "entities": (lambda t: '<!DOCTYPE robot [<!ENTITY a "b">]>' + t, r"defines XML entities"),
     "not XML": (lambda t: "solid tip\n", r"is not XML"),
     "not a robot": (lambda t: "<html/>", r"root element is <html>"),
-    "one finger": (lambda t: "\n".join(line for line in t.splitlines() if not any(f in line for f in ("index", "middle", "thumb"))), r"1 finger"),
-}  # fmt: skip
+    "one finger": (
+        lambda t: "\n".join(
+            line for line in t.splitlines() if not any(f in line for f in ("index", "middle", "thumb"))
+        ),
+        r"1 finger",
+    ),
+}
 
 
 def _scaled(text: str) -> str:
@@ -196,7 +229,9 @@ def _scaled(text: str) -> str:
     def times(match: re.Match[str]) -> str:
         return f'{match[1]}="{" ".join(str(1000 * float(x)) for x in match[2].split())}"'
 
-    return re.sub(r'\b(xyz|size|radius)="([-0-9. e]+)"(?=/>)', times, text).replace('axis xyz="0.0 -1000.0 0.0"', 'axis xyz="0 -1 0"')
+    return re.sub(r'\b(xyz|size|radius)="([-0-9. e]+)"(?=/>)', times, text).replace(
+        'axis xyz="0.0 -1000.0 0.0"', 'axis xyz="0 -1 0"'
+    )
 
 
 @pytest.mark.parametrize("case", BAD)

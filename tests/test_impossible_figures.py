@@ -1,4 +1,5 @@
-"""Figures that no machine has, in metadata and models: one line that names them, instead of an answer fitted around them."""
+"""Figures that no machine has, in metadata and models: one line that names them, instead of an answer fitted around
+them."""
 
 from __future__ import annotations
 
@@ -23,11 +24,20 @@ def test_gravity(tmp_path, value):
     assert "a.mcap" in str(error.value) and "meta.gravity" in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("change", "name"), [
-    ({"joint": 'armature="-0.01"'}, "armature"), ({"joint": 'armature="nan"'}, "armature"), ({"joint": 'damping="-1"'}, "damping"),
-    ({"joint": 'frictionloss="nan"'}, "frictionloss"), ({"inertial": 'mass="-1" diaginertia="1e-3 1e-3 1e-3"'}, "mass"),
-    ({"inertial": 'mass="nan" diaginertia="1e-3 1e-3 1e-3"'}, "(?i)mass|nan"), ({"option": 'gravity="nan 0 0"'}, "gravity"),
-    ({"option": 'gravity="0 0 -1e9"'}, "gravity"), ({"inertial": 'mass="1" diaginertia="nan 1e-3 1e-3"'}, "(?i)inertia|nan")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"joint": 'armature="-0.01"'}, "armature"),
+        ({"joint": 'armature="nan"'}, "armature"),
+        ({"joint": 'damping="-1"'}, "damping"),
+        ({"joint": 'frictionloss="nan"'}, "frictionloss"),
+        ({"inertial": 'mass="-1" diaginertia="1e-3 1e-3 1e-3"'}, "mass"),
+        ({"inertial": 'mass="nan" diaginertia="1e-3 1e-3 1e-3"'}, "(?i)mass|nan"),
+        ({"option": 'gravity="nan 0 0"'}, "gravity"),
+        ({"option": 'gravity="0 0 -1e9"'}, "gravity"),
+        ({"inertial": 'mass="1" diaginertia="nan 1e-3 1e-3"'}, "(?i)inertia|nan"),
+    ],
+)
 def test_a_model(tmp_path, change, name):
     path = tmp_path / "m.xml"
     path.write_text(MODEL.format(**GOOD))

@@ -1,4 +1,5 @@
-"""Sizes, depths, stamps and kinds of file: beyond a stated limit there is one line that names it, soon and in little memory."""
+"""Sizes, depths, stamps and kinds of file: beyond a stated limit there is one line that names it, soon and in little
+memory."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from dexsim.tactile import file as tactile_file
 
 LOADERS = {"servo": ServoTable.load, "calibration": Calibration.load, "tactile": tactile_file.load}
 BOMBS = {
-    "aliases": "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
+    "aliases": "a: &a [1,1,1,1,1,1,1,1,1]\n"
+    + "".join(f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
     "merges": "a: &a {x: 1}\n" + "".join(f"b{i}: &b{i} {{<<: [{','.join(['*a'] * 50)}]}}\n" for i in range(50)),
     "deep": "[" * 5000,
     "deep maps": "{a: " * 3000,
@@ -56,8 +58,11 @@ def test_yaml_beside_a_recording_and_in_its_metadata(tmp_path, bomb):
             read(tmp_path / "b.mcap")
 
 
-@pytest.mark.parametrize("reader", [*LOADERS.values(), read, lambda p: read(p.with_suffix(".csv")), lambda p: read(p.with_suffix(".npz"))],
-                         ids=[*LOADERS, "mcap", "csv", "npz"])  # fmt: skip
+@pytest.mark.parametrize(
+    "reader",
+    [*LOADERS.values(), read, lambda p: read(p.with_suffix(".csv")), lambda p: read(p.with_suffix(".npz"))],
+    ids=[*LOADERS, "mcap", "csv", "npz"],
+)
 @pytest.mark.parametrize("kind", ["fifo", "zero"])
 def test_devices_and_pipes_are_no_files(tmp_path, reader, kind):
     for end in (".mcap", ".csv", ".npz"):
@@ -91,7 +96,8 @@ def test_more_messages_than_are_read_are_refused(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("at", [1e8, 6e2, 3.6e3])
 def test_nothing_is_allocated_by_span_of_time(tmp_path, at):
-    """Half of the samples far later than the others: read, audited and cut in two without a grid over the time between."""
+    """Half of the samples far later than the others: read, audited and cut in two without a grid over the time
+    between."""
     from dexsim.gap.read import channels, inputs
     from dexsim.gap.read.runs import Run
 
@@ -105,8 +111,20 @@ def test_nothing_is_allocated_by_span_of_time(tmp_path, at):
     r = read(tmp_path / "a.mcap")
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><joint name="a"/><joint name="b" axis="0 1 0"/><geom size=".1"/></body></worldbody></mujoco>')
-    run = Run("a", r.joints, r.commands.t, r.commands.value, r.states.position.t, r.states.position.value, ServoTable(), r.gravity)
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="a"/><joint name="b" axis="0 1 0"/><geom '
+        'size=".1"/></body></worldbody></mujoco>'
+    )
+    run = Run(
+        "a",
+        r.joints,
+        r.commands.t,
+        r.commands.value,
+        r.states.position.t,
+        r.states.position.value,
+        ServoTable(),
+        r.gravity,
+    )
     blind = channels.inspect([run], model, {})[2]
     pieces, _ = inputs.free_air([run], [], blind, [], "", "", (0.0, 0.0), inputs.SHORTEST)
     assert tracemalloc.get_traced_memory()[1] < 100e6
@@ -121,7 +139,13 @@ def test_reading_is_linear_in_samples_and_joints(tmp_path, joints):
     t = 0.01 * np.arange(n)
     names = tuple(f"j{i:04d}" for i in range(joints))
     x = np.zeros((n, joints)) + np.sin(t)[:, None]
-    made = Recording(tmp_path / "x", recordings.META | {"joint_names": ",".join(names)}, names, Series(t, x, COMMANDS), States(Series(t, x, STATES)))
+    made = Recording(
+        tmp_path / "x",
+        recordings.META | {"joint_names": ",".join(names)},
+        names,
+        Series(t, x, COMMANDS),
+        States(Series(t, x, STATES)),
+    )
     write(tmp_path / "a.mcap", made)
     start = time.process_time()
     assert len(read(tmp_path / "a.mcap", audit=False).joints) == joints

@@ -1,4 +1,5 @@
-"""Starts at the same time, kills and signals: no shared folders, no files left behind, what was learned or recorded is kept."""
+"""Starts at the same time, kills and signals: no shared folders, no files left behind, what was learned or recorded is
+kept."""
 
 from __future__ import annotations
 
@@ -22,7 +23,14 @@ from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 
 STARTS = 24
-QUICK = ("task=dummy", "device=cpu", "worlds=4", "final_episodes=0", "agent.actor.hidden_dims=[8]", "agent.critic.hidden_dims=[8]")
+QUICK = (
+    "task=dummy",
+    "device=cpu",
+    "worlds=4",
+    "final_episodes=0",
+    "agent.actor.hidden_dims=[8]",
+    "agent.critic.hidden_dims=[8]",
+)
 
 
 @pytest.fixture
@@ -65,7 +73,9 @@ def test_starts_at_once_share_no_folder(place):
     for setting in ({"run": "a"}, {"out": "b"}):
         found = at_once(**setting)
         got = [x for x in found if not x.startswith("error")]
-        assert len(got) == 1 and all("already holds a run" in x or "taken by another" in x for x in found if x not in got), found
+        assert len(got) == 1 and all(
+            "already holds a run" in x or "taken by another" in x for x in found if x not in got
+        ), found
     assert not list(place.rglob("*.tmp"))
 
 
@@ -84,7 +94,12 @@ def test_what_killed_runs_left_is_removed_at_the_next_start(place, capsys):
     for _ in range(3):
         killed_inside_a_write(run / "last.pt")
     assert len(list(run.glob(".*.tmp"))) == 3 and (run / "last.pt").read_bytes() == b"whole"
-    keep = [run / f".last.pt.{files.HOST}.{os.getpid()}.tmp", run / ".last.pt.another-machine.1.tmp", run / "mine.tmp", run / ".notes.tmp"]
+    keep = [
+        run / f".last.pt.{files.HOST}.{os.getpid()}.tmp",
+        run / ".last.pt.another-machine.1.tmp",
+        run / "mine.tmp",
+        run / ".notes.tmp",
+    ]
     for path in keep:
         path.write_bytes(b"x")
     gone = run / ".model_10.pt.another-machine.2.tmp"
@@ -156,7 +171,9 @@ def test_a_signal_in_play_keeps_what_was_recorded(place, configs, monkeypatch, c
 
     monkeypatch.setattr(tap, "PlayRecorder", Tap)
     monkeypatch.setattr(play, "replay", lambda *_: os.kill(os.getpid(), number))
-    code = shell.call("play", configs, "policy=zero", "task=dummy", "device=cpu", "record=x.mcap", f"out={place / 'out'}")
+    code = shell.call(
+        "play", configs, "policy=zero", "task=dummy", "device=cpu", "record=x.mcap", f"out={place / 'out'}"
+    )
     assert code == 128 + number and saved == ["x.mcap"] and "mcap     x.mcap" in capfd.readouterr().out
 
 

@@ -79,8 +79,8 @@ def test_resume_is_bitwise_the_unbroken_run(tmp_path):
 
 
 def test_episodes_that_begin_anew_on_resume_do_not_end_together(tmp_path, monkeypatch):
-    """An environment that keeps its episodes (the dummy) goes on with their ages; of one that begins them all anew they are spread
-    as at the first start, the same each time the checkpoint is resumed."""
+    """An environment that keeps its episodes (the dummy) goes on with their ages; of one that begins them all anew they
+    are spread as at the first start, the same each time the checkpoint is resumed."""
     made = runner(worlds=64, steps=1000)
     made.learn(1)
     saved = checkpoint.save(tmp_path / "last.pt", made.payload())
@@ -180,8 +180,11 @@ def test_agent_settings_rsl_rl_does_not_know():
 def test_checkpoint_round_trip(saved, trained):
     data = checkpoint.load(saved)
     assert data["config"] == trained.full_cfg
-    assert data["layout"] == {"joints": ["left", "right"], "action": [["left", -1.0, 1.0, "-"], ["right", -1.0, 1.0, "-"]],
-                              "observations": {"actor": [["x", 2]], "critic": [["x", 2], ["x clean", 2]]}}
+    assert data["layout"] == {
+        "joints": ["left", "right"],
+        "action": [["left", -1.0, 1.0, "-"], ["right", -1.0, 1.0, "-"]],
+        "observations": {"actor": [["x", 2]], "critic": [["x", 2], ["x clean", 2]]},
+    }
     assert data["iteration"] == 2 and set(data["git"]) == {"commit", "dirty"}
     obs = trained.env.get_observations()
     policy = load_policy(data, trained.env, "last.pt")
@@ -323,7 +326,10 @@ def test_git_state_outside_a_checkout(tmp_path):
 
 def test_git_state_of_a_checkout_and_in_words(tmp_path):
     git = lambda *args: subprocess.run(  # noqa: E731
-        ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c", *args], check=True, capture_output=True, text=True
+        ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c", *args],
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout.strip()
     code = tmp_path / "__init__.py"
     code.write_text("")

@@ -32,19 +32,32 @@ def volume(vertices, faces):
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-@pytest.mark.parametrize("kind, size, expected", [
-    ("box", "0.1 0.2 0.3", 8 * 0.1 * 0.2 * 0.3), ("sphere", "0.1", 4 / 3 * np.pi * 1e-3), ("cylinder", "0.1 0.2", np.pi * 0.01 * 0.4),
-    ("capsule", "0.1 0.2", np.pi * 0.01 * 0.4 + 4 / 3 * np.pi * 1e-3), ("ellipsoid", "0.1 0.2 0.3", 4 / 3 * np.pi * 6e-3)])
+@pytest.mark.parametrize(
+    "kind, size, expected",
+    [
+        ("box", "0.1 0.2 0.3", 8 * 0.1 * 0.2 * 0.3),
+        ("sphere", "0.1", 4 / 3 * np.pi * 1e-3),
+        ("cylinder", "0.1 0.2", np.pi * 0.01 * 0.4),
+        ("capsule", "0.1 0.2", np.pi * 0.01 * 0.4 + 4 / 3 * np.pi * 1e-3),
+        ("ellipsoid", "0.1 0.2 0.3", 4 / 3 * np.pi * 6e-3),
+    ],
+)
 def test_primitives_are_closed_outward_and_of_the_right_size(kind, size, expected):
-    model = mujoco.MjModel.from_xml_string(f'<mujoco><worldbody><body><geom type="{kind}" size="{size}" pos="1 2 3" quat="1 1 0 0"/></body></worldbody></mujoco>')
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body><geom type="{kind}" size="{size}" pos="1 2 3" quat="1 1 0 '
+        '0"/></body></worldbody></mujoco>'
+    )
     (mesh,) = body_meshes(model)[1]
-    assert volume(mesh.vertices - [1, 2, 3], mesh.faces) == pytest.approx(expected, rel=0.03)  # a round shape of 24 sides is smaller
+    # a round shape of 24 sides is smaller
+    assert volume(mesh.vertices - [1, 2, 3], mesh.faces) == pytest.approx(expected, rel=0.03)
     assert np.allclose((mesh.vertices.min(0) + mesh.vertices.max(0)) / 2, [1, 2, 3])
 
 
 def test_parked_hidden_and_far_geoms_are_left_out():
-    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><geom size="0.1"/>
-        <geom size="0.1" pos="0 0 1000"/><geom size="0.1" group="3"/><geom size="0.1" rgba="1 0 0 0"/></body></worldbody></mujoco>""")
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 1"/><body>
+ <geom size="0.1"/>
+        <geom size="0.1" pos="0 0 1000"/><geom size="0.1" group="3"/><geom size="0.1" rgba="1 0 0 0"/></body>
+ </worldbody></mujoco>""")
     found = body_meshes(model)
     assert list(found) == [1] and len(found[1]) == 1 and np.abs(found[1][0].vertices).max() < 0.11
 
@@ -53,7 +66,11 @@ def test_parked_hidden_and_far_geoms_are_left_out():
 
 def test_colours_darken_with_force():
     values = panels.colours(np.linspace(0, 1, 20), 1.0).astype(int)
-    assert values.shape == (20, 3) and (np.diff(values[:, 1]) <= 0).sum() >= 17 and values[0].sum() > 550 > 150 > values[-1].sum()
+    assert (
+        values.shape == (20, 3)
+        and (np.diff(values[:, 1]) <= 0).sum() >= 17
+        and values[0].sum() > 550 > 150 > values[-1].sum()
+    )
     assert (panels.colours(np.array([2.0]), 1.0) == values[-1]).all()
 
 
@@ -95,7 +112,12 @@ def test_force_bars_show_force_and_command():
 
 def test_reward_bars_go_left_for_losses_and_names_are_escaped():
     text = panels.reward_bars({"good": 0.5, "<bad>": -0.25}, {"good": 2.0, "<bad>": -1.0}, 1.0)
-    assert "&lt;bad&gt;" in text and "<bad>" not in text and re.search(r"width:25.0%;left:50%", text) and re.search(r"width:12.5%;right:50%", text)
+    assert (
+        "&lt;bad&gt;" in text
+        and "<bad>" not in text
+        and re.search(r"width:25.0%;left:50%", text)
+        and re.search(r"width:12.5%;right:50%", text)
+    )
     assert "this step +0.250, this episode +1.0" in text and "-0.000" not in panels.reward_bars({"x": -1e-6}, {}, 1.0)
 
 
@@ -115,7 +137,9 @@ def env():
     torch.set_num_threads(1)
     from dexsim.tasks import make_env
 
-    start = start_up.for_play(["policy=zero", "task=grasp", "device=cpu", "view=true", "worlds=2", "seed=3", "sim.threads=1"], CONFIGS)
+    start = start_up.for_play(
+        ["policy=zero", "task=grasp", "device=cpu", "view=true", "worlds=2", "seed=3", "sim.threads=1"], CONFIGS
+    )
     assert start.cfg["tactile"]["raw"] is True
     return make_env(start.cfg, 2, "cpu", 3, "auto")
 
@@ -157,7 +181,8 @@ def test_pause_step_world_policy_command_and_restart(view, env):
     w.world, w.steps = 1, 1
     view.run(seconds=0.7)
     assert "1 of 2" in view._facts.content
-    assert len(view._object[0].vertices) != len(shown) or not np.allclose(view._object[0].vertices, shown)  # the other world's object
+    # the other world's object
+    assert len(view._object[0].vertices) != len(shown) or not np.allclose(view._object[0].vertices, shown)
     w.policy, w.command, w.steps = "zero", 0.75, 2
     view.run(seconds=0.7)
     assert view.name == "zero" and view.steps == 2 and float(env.command[1]) == 0.75
@@ -172,7 +197,8 @@ def test_touch_is_shown_where_it_is_felt(view, env):
     blank = view._image.image.copy()
     give_up = time.monotonic() + 60.0
     felt = np.zeros((5, 120))
-    while view.steps <= 60 or felt.sum() == 0:  # how far "fastest" comes is the machine's affair; an object between two throws is not felt
+    # how far "fastest" comes is the machine's affair; an object between two throws is not felt
+    while view.steps <= 60 or felt.sum() == 0:
         assert time.monotonic() < give_up, f"{view.steps} steps, none of the last of a second felt anything"
         view.run(seconds=1.0)
         felt = env.touch.raw[0].numpy()
@@ -212,8 +238,11 @@ def test_the_page_in_a_browser(view, env, tmp_path):
         return int(page.js("document.querySelector('[data-fact=step]').innerText"))
 
     try:
-        page.wait("['[data-fact=step]', '[data-panel=rewards]', 'canvas'].every(x => document.querySelector(x) !== null)")
-        assert page.js("document.querySelectorAll('[data-panel=force-bars] > div:last-child > div').length") == 15  # 5 fingers x 3 cells
+        page.wait(
+            "['[data-fact=step]', '[data-panel=rewards]', 'canvas'].every(x => document.querySelector(x) !== null)"
+        )
+        # 5 fingers x 3 cells
+        assert page.js("document.querySelectorAll('[data-panel=force-bars] > div:last-child > div').length") == 15
         assert page.js("[...document.images].some(i => i.naturalWidth > 300)")  # the taxel maps
         first = step()
         page.wait(f"+document.querySelector('[data-fact=step]').innerText > {first + 5}")
@@ -242,7 +271,9 @@ def test_the_page_in_a_browser(view, env, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", [("policy=scripted", "task=grasp"), ("policy=zero", "task=rotate", "task.perception=imu")])
+@pytest.mark.parametrize(
+    "what", [("policy=scripted", "task=grasp"), ("policy=zero", "task=rotate", "task.perception=imu")]
+)
 def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
     import signal
     import subprocess
@@ -250,8 +281,21 @@ def test_play_serves_and_ends_with_ctrl_c(tmp_path, what):
 
     port = free_port()
     with open(tmp_path / "log", "w") as log:
-        process = subprocess.Popen([sys.executable, str(shell.ROOT / "play.py"), *what, "view=true", f"view_port={port}", "device=cpu", "worlds=2",
-                                    "sim.threads=1"], cwd=tmp_path, stdout=log, stderr=log)
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                str(shell.ROOT / "play.py"),
+                *what,
+                "view=true",
+                f"view_port={port}",
+                "device=cpu",
+                "worlds=2",
+                "sim.threads=1",
+            ],
+            cwd=tmp_path,
+            stdout=log,
+            stderr=log,
+        )
     end = time.monotonic() + 120
     while "ssh -L" not in (tmp_path / "log").read_text():
         assert process.poll() is None and time.monotonic() < end, (tmp_path / "log").read_text()[-2000:]
@@ -275,8 +319,18 @@ def pack(kind: str, **fields) -> bytes:
 
 
 def camera() -> bytes:
-    return pack("ViewerCameraMessage", wxyz=[1, 0, 0, 0], position=[0, 0, 1], fov=1.0, image_height=10, image_width=10, near=0.01, far=10.0,
-                look_at=[0, 0, 0], up_direction=[0, 0, 1])  # fmt: skip
+    return pack(
+        "ViewerCameraMessage",
+        wxyz=[1, 0, 0, 0],
+        position=[0, 0, 1],
+        fov=1.0,
+        image_height=10,
+        image_width=10,
+        near=0.01,
+        far=10.0,
+        look_at=[0, 0, 0],
+        up_direction=[0, 0, 1],
+    )
 
 
 def open_socket(port: int, origin: str | None = "same", host: str | None = None, path: str = "", headers=()):
@@ -284,8 +338,14 @@ def open_socket(port: int, origin: str | None = "same", host: str | None = None,
     from websockets.sync.client import connect
 
     extra = dict(headers) | ({"Host": host} if host else {})
-    return connect(f"ws://127.0.0.1:{port}{path}", origin=f"http://127.0.0.1:{port}" if origin == "same" else origin,
-                   subprotocols=[f"viser-v{viser.__version__}"], additional_headers=extra, open_timeout=20, max_size=2**26)  # fmt: skip
+    return connect(
+        f"ws://127.0.0.1:{port}{path}",
+        origin=f"http://127.0.0.1:{port}" if origin == "same" else origin,
+        subprotocols=[f"viser-v{viser.__version__}"],
+        additional_headers=extra,
+        open_timeout=20,
+        max_size=2**26,
+    )
 
 
 def status(port: int, **how) -> int:
@@ -298,11 +358,17 @@ def status(port: int, **how) -> int:
     return 101
 
 
-def fetch(port: int, path: str = "/", host: str | None = None, address: str = "127.0.0.1", **headers) -> tuple[int, dict]:
+def fetch(
+    port: int, path: str = "/", host: str | None = None, address: str = "127.0.0.1", **headers
+) -> tuple[int, dict]:
     import http.client
 
     connection = http.client.HTTPConnection(address, port, timeout=20)
-    connection.request("GET", path, headers={"Host": host or f"{address}:{port}"} | {k.replace("_", "-"): v for k, v in headers.items()})
+    connection.request(
+        "GET",
+        path,
+        headers={"Host": host or f"{address}:{port}"} | {k.replace("_", "-"): v for k, v in headers.items()},
+    )
     answer = connection.getresponse()
     answer.read()
     connection.close()
@@ -312,31 +378,99 @@ def fetch(port: int, path: str = "/", host: str | None = None, address: str = "1
 def test_only_the_page_that_is_served_may_connect(view):
     port = view.port
     assert status(port) == 101 and fetch(port)[0] == 200
-    for origin in ("http://evil.example", "null", None, f"http://localhost:{port}", f"http://127.0.0.1:{port + 1}", "http://127.0.0.1",
-                   f"http://127.0.0.1:{port}.evil.example", f"http://evil@127.0.0.1:{port}", f"file://127.0.0.1:{port}", "http://["):  # fmt: skip
+    for origin in (
+        "http://evil.example",
+        "null",
+        None,
+        f"http://localhost:{port}",
+        f"http://127.0.0.1:{port + 1}",
+        "http://127.0.0.1",
+        f"http://127.0.0.1:{port}.evil.example",
+        f"http://evil@127.0.0.1:{port}",
+        f"file://127.0.0.1:{port}",
+        "http://[",
+    ):
         assert status(port, origin=origin) == 403, origin
-    for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", "169.254.169.254", f"localhost.evil:{port}"):
+    for host in (
+        "evil.example",
+        f"evil.example:{port}",
+        f"127.0.0.1.evil.example:{port}",
+        "169.254.169.254",
+        f"localhost.evil:{port}",
+    ):
         assert fetch(port, host=host)[0] == 403, host
-    assert fetch(port, host=f"localhost:{port}")[0] == 200 and fetch(port, host=f"LOCALHOST:{port + 5}")[0] == 200, "through ssh -L too"
+    assert fetch(port, host=f"localhost:{port}")[0] == 200 and fetch(port, host=f"LOCALHOST:{port + 5}")[0] == 200, (
+        "through ssh -L too"
+    )
     assert fetch(port, "/../../etc/passwd")[0] == 404 and fetch(port, "/%2e%2e/%2e%2e/etc/passwd")[0] == 404
 
 
 def hostile(ids: dict[str, str]):
     """1,000 messages that no page of ours sends."""
-    values = [-1000, 10**9, "abc", "0/1", "1/0", "", None, [], {}, [1] * 1000, float("nan"), float("inf"), True, 2.5, "x" * 10_000, b"\0" * 100, {"a": {"b": []}},
-              "../../etc/passwd", "<script>alert(1)</script>", -1]  # fmt: skip
+    values = [
+        -1000,
+        10**9,
+        "abc",
+        "0/1",
+        "1/0",
+        "",
+        None,
+        [],
+        {},
+        [1] * 1000,
+        float("nan"),
+        float("inf"),
+        True,
+        2.5,
+        "x" * 10_000,
+        b"\0" * 100,
+        {"a": {"b": []}},
+        "../../etc/passwd",
+        "<script>alert(1)</script>",
+        -1,
+    ]
     for value in values:
         for uuid in ids.values():
             yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": value})
     for uuid in ids.values():
-        for prop in ("update_cb", "sync_cb", "removed", "uuid", "props", "is_button", "__class__", "update_timestamp", "nothing"):
+        for prop in (
+            "update_cb",
+            "sync_cb",
+            "removed",
+            "uuid",
+            "props",
+            "is_button",
+            "__class__",
+            "update_timestamp",
+            "nothing",
+        ):
             yield pack("GuiUpdateMessage", uuid=uuid, updates={prop: 5})
             yield pack("GuiUpdateMessage", uuid=uuid, updates={"value": "1", prop: [5]})
         yield pack("GuiUpdateMessage", uuid=uuid, updates=[])
         yield pack("GuiButtonHoldMessage", uuid=uuid, frequency=10.0)
-        yield pack("FileTransferStartUpload", source_component_uuid=uuid, transfer_uuid="x", filename="../x", mime_type="a", part_count=10**9, size_bytes=10**12)
-    others = ["ViewerCameraMessage", "ResetSceneMessage", "RemoveSceneNodeMessage", "SceneNodeClickMessage", "TransformControlsUpdateMessage", "Nothing",
-              "RunJavascriptMessage", "SetPositionMessage", "ShareUrlRequest", "GuiCloseModalMessage", "FileTransferPart", "CommandTriggerMessage"]  # fmt: skip
+        yield pack(
+            "FileTransferStartUpload",
+            source_component_uuid=uuid,
+            transfer_uuid="x",
+            filename="../x",
+            mime_type="a",
+            part_count=10**9,
+            size_bytes=10**12,
+        )
+    others = [
+        "ViewerCameraMessage",
+        "ResetSceneMessage",
+        "RemoveSceneNodeMessage",
+        "SceneNodeClickMessage",
+        "TransformControlsUpdateMessage",
+        "Nothing",
+        "RunJavascriptMessage",
+        "SetPositionMessage",
+        "ShareUrlRequest",
+        "GuiCloseModalMessage",
+        "FileTransferPart",
+        "CommandTriggerMessage",
+    ]
     for kind in others:
         yield pack(kind)
         yield pack(kind, name="/bodies", uuid="x", wxyz=[1], position="abc", updates={})
@@ -369,10 +503,14 @@ def test_a_thousand_hostile_messages_end_nothing(view, env):
             socket_.send(camera())
     socket_.close()
     time.sleep(0.3)
-    assert loop.is_alive() and view.wishes.world in (0, 1) and view.wishes.speed in ("1/10", "1/4", "1/2", "1", "fastest")
+    assert (
+        loop.is_alive() and view.wishes.world in (0, 1) and view.wishes.speed in ("1/10", "1/4", "1/2", "1", "fastest")
+    )
     with open_socket(view.port) as ours:  # and the controls still work
         ours.send(camera())
-        world = next(u for u, h in view.server.gui._gui_input_handle_from_uuid.items() if getattr(h, "label", "") == "world")
+        world = next(
+            u for u, h in view.server.gui._gui_input_handle_from_uuid.items() if getattr(h, "label", "") == "world"
+        )
         ours.send(pack("GuiUpdateMessage", uuid=world, updates={"value": 1 - view.wishes.world}))
         before, limit = view.wishes.world, time.monotonic() + 10
         while view.wishes.world == before and time.monotonic() < limit:
@@ -394,7 +532,14 @@ def test_three_hundred_sockets_end_nothing(view):
     view.wishes.speed = "1/4"
     raw = [socket.create_connection(("127.0.0.1", view.port), timeout=20) for _ in range(240)]
     for k, s in enumerate(raw):
-        s.sendall((b"GET / HTTP/1.1\r\n", b"\x16\x03\x01" + bytes(50), b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n", b"")[k % 4])
+        s.sendall(
+            (
+                b"GET / HTTP/1.1\r\n",
+                b"\x16\x03\x01" + bytes(50),
+                b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n",
+                b"",
+            )[k % 4]
+        )
     full = []
     for _ in range(60):
         full.append(open_socket(view.port))
@@ -445,13 +590,19 @@ def test_beyond_loopback_a_token_is_asked_for(view, env):
     try:
         port, token = wide.port, wide.token
         assert len(token) >= 20
-        assert fetch(port)[0] == 401 and fetch(port, "/?token=wrong")[0] == 401 and fetch(port, "/index.html", Cookie="dexsim=x")[0] == 401
+        assert (
+            fetch(port)[0] == 401
+            and fetch(port, "/?token=wrong")[0] == 401
+            and fetch(port, "/index.html", Cookie="dexsim=x")[0] == 401
+        )
         assert status(port) == 401 and status(port, path="/?token=no") == 401
         code, headers = fetch(port, f"/?token={token}", host="any.name:1")
         assert code == 200 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
         cookie = headers["Set-Cookie"].split(";")[0]
         assert fetch(port, Cookie=cookie)[0] == 200 and status(port, headers={"Cookie": cookie}) == 101
-        assert status(port, headers={"Cookie": cookie}, origin="http://evil.example") == 403, "a foreign page with the cookie"
+        assert status(port, headers={"Cookie": cookie}, origin="http://evil.example") == 403, (
+            "a foreign page with the cookie"
+        )
     finally:
         wide.stop()
 
@@ -477,7 +628,8 @@ def test_the_page_with_its_token_in_a_browser(view, env):
 
 
 def test_sockets_that_say_nothing_make_room_for_a_page(view):
-    """Two hundred that never finish their handshake: the oldest go, a page is served meanwhile, and all are gone in time."""
+    """Two hundred that never finish their handshake: the oldest go, a page is served meanwhile, and all are gone in
+    time."""
     from dexsim.view import live_gate
 
     silent = [socket.create_connection(("127.0.0.1", view.port), timeout=10) for _ in range(100)]

@@ -12,14 +12,28 @@ from benchmarks.multi_gpu import Job, efficiency, pack, series
 
 
 def _rows(n, kept=0.002, dropped=0.001, length=100.0):
-    return [{"end/time_out": repr(kept), "end/dropped": repr(dropped), "length": repr(length), "collect_s": "0.5", "learn_s": "0.25",
-             "steps": str(1000 * (k + 1)), "rate": "1"} for k in range(n)]
+    return [
+        {
+            "end/time_out": repr(kept),
+            "end/dropped": repr(dropped),
+            "length": repr(length),
+            "collect_s": "0.5",
+            "learn_s": "0.25",
+            "steps": str(1000 * (k + 1)),
+            "rate": "1",
+        }
+        for k in range(n)
+    ]
 
 
 def test_share_is_of_the_episodes_that_ended_lately():
     rows = _rows(30) + _rows(30, dropped=0.0)
     found = series(rows)
-    assert found["share"][20] == pytest.approx(2 / 3) and found["share"][-1] == 1.0 and found["time_s"][-1] == pytest.approx(45)
+    assert (
+        found["share"][20] == pytest.approx(2 / 3)
+        and found["share"][-1] == 1.0
+        and found["time_s"][-1] == pytest.approx(45)
+    )
     assert 2 / 3 < found["share"][34] < 1  # half of the window
     assert found["share"][:9].max() == 0.0  # not a full window yet
 
@@ -71,5 +85,7 @@ def test_one_process_is_started_stopped_and_read(tmp_path):
         job.watch(learn_s=3.0, until=2.0, end=end)
         assert time.perf_counter() < end, job.process.kill()
     found = job.result()
-    assert found["status"] == 130 and found["steps_per_s"] > 0 and found["start_s"] > 0, (tmp_path / "1_gpu.log").read_text()[-2000:]
+    assert found["status"] == 130 and found["steps_per_s"] > 0 and found["start_s"] > 0, (
+        tmp_path / "1_gpu.log"
+    ).read_text()[-2000:]
     assert (tmp_path / "1_gpu" / "last.pt").exists()

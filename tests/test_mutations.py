@@ -14,7 +14,9 @@ def test_every_mutation_applies_and_its_test_exists(m):
     assert changed != (ROOT / m.file).read_text(encoding="utf-8")
     ast.parse(changed)
     file, name = m.test.split("::")
-    known = {n.name for n in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))) if isinstance(n, ast.FunctionDef)}
+    known = {
+        n.name for n in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))) if isinstance(n, ast.FunctionDef)
+    }
     assert name.partition("[")[0] in known
 
 

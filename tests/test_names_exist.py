@@ -1,4 +1,5 @@
-"""Every name that a file imports from the project exists, also where it is imported inside a function that no test runs."""
+"""Every name that a file imports from the project exists, also where it is imported inside a function that no test
+runs."""
 
 from __future__ import annotations
 

@@ -61,7 +61,8 @@ def _strict(monkeypatch):
 
 def test_the_loop_never_waits(env, monkeypatch):
     actions = torch.rand(8, 12, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    env.episode_length_buf = torch.tensor([0, env.max_episode_length - 1, 0, 0, env.max_episode_length - 2, 0, 0, 0])  # resets on the way
+    # resets on the way
+    env.episode_length_buf = torch.tensor([0, env.max_episode_length - 1, 0, 0, env.max_episode_length - 2, 0, 0, 0])
     with monkeypatch.context() as strict, NoSync() as mode:
         _strict(strict)
         for _ in range(4):
@@ -93,10 +94,18 @@ def test_a_full_sensor_does_not_wait_either(monkeypatch):
         env.reset_all()
 
 
-@pytest.mark.parametrize("call", [
-    lambda t: t.sum().item(), lambda t: bool(t.any()), lambda t: t[t > 0], lambda t: t.nonzero(), lambda t: t.cpu().numpy(),
-    lambda t: torch.tensor([1.0, 2.0]), lambda t: t.masked_select(t > 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda t: t.sum().item(),
+        lambda t: bool(t.any()),
+        lambda t: t[t > 0],
+        lambda t: t.nonzero(),
+        lambda t: t.cpu().numpy(),
+        lambda t: torch.tensor([1.0, 2.0]),
+        lambda t: t.masked_select(t > 0),
+    ],
+)
 def test_the_guard_can_fail(call, monkeypatch):
     t = torch.randn(4)
     with pytest.raises(AssertionError, match="wait|host"), monkeypatch.context() as strict, NoSync():

@@ -1,5 +1,5 @@
-"""What is not finite: worlds that diverge cost their episode and no run, rewards and observations that are not numbers reach no
-learner, and a policy of NaN is refused by name."""
+"""What is not finite: worlds that diverge cost their episode and no run, rewards and observations that are not numbers
+reach no learner, and a policy of NaN is refused by name."""
 
 from __future__ import annotations
 
@@ -92,7 +92,9 @@ def test_one_diverged_world_leaves_the_others_as_they_are(made):
         made.engine.step(2, made.servo.before_each)
         results.append((t.qpos.clone(), t.pair_normal.clone()))
     others = torch.arange(N) != 3
-    assert torch.equal(results[0][0][others], results[1][0][others]) and torch.equal(results[0][1][others], results[1][1][others])
+    assert torch.equal(results[0][0][others], results[1][0][others]) and torch.equal(
+        results[0][1][others], results[1][1][others]
+    )
     assert not results[1][1][3].any() and bool(t.flags[3]) and not t.flags[others].any()
 
 
@@ -107,7 +109,9 @@ def test_a_reward_that_is_no_number_ends_the_worlds_episode_only(env, value):
 
     env.rewards = spoiled
     _, reward, done, extras = env.step(torch.zeros(N, 12))
-    assert bool(reward.isfinite().all()) and float(reward[2]) == 0 and bool(done[2]) and not bool(extras["time_outs"][2])
+    assert (
+        bool(reward.isfinite().all()) and float(reward[2]) == 0 and bool(done[2]) and not bool(extras["time_outs"][2])
+    )
     assert done.sum() == 1
     env.check()
 
@@ -141,7 +145,8 @@ def test_a_setting_that_makes_all_rewards_no_numbers_is_named(env):
     assert "\n" not in str(error.value)
 
 
-# -- learning -------------------------------------------------------------------------------------------------------------------
+# -- learning
+# -------------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("what", ["reward", "observation"])
 def test_an_environment_that_hands_out_nan_is_one_line(what):
     made = runner()

@@ -1,4 +1,5 @@
-"""Results: nothing that is not ours is overwritten, nothing outside the folder is written, and what is there is whole."""
+"""Results: nothing that is not ours is overwritten, nothing outside the folder is written, and what is there is
+whole."""
 
 from __future__ import annotations
 
@@ -87,8 +88,10 @@ def test_a_models_meshes_stay_in_its_folder(tmp_path, where):
     (folder / where).mkdir(exist_ok=True, parents=True)
     mesh = folder / where / "cube.obj"
     mesh.write_text(CUBE)
-    (folder / "m.xml").write_text(f'<mujoco><asset><mesh name="c" file="{where}/cube.obj"/></asset><worldbody><body><joint/>'
-                                  '<geom type="mesh" mesh="c"/></body></worldbody></mujoco>')  # fmt: skip
+    (folder / "m.xml").write_text(
+        f'<mujoco><asset><mesh name="c" file="{where}/cube.obj"/></asset><worldbody><body><joint/>'
+        '<geom type="mesh" mesh="c"/></body></worldbody></mujoco>'
+    )
     spec = mujoco.MjSpec.from_file(str(folder / "m.xml"))
     spec.compile()
     out = tmp_path / "x" / "y" / "out"
@@ -140,8 +143,8 @@ def killed(work) -> None:
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 5])
 def test_a_kill_among_the_renames_is_made_good_at_the_next_start(tmp_path, at):
-    """Notes and results are renamed one by one: after a kill before the k-th of them the next start has all of the old or all of
-    the new, and nothing unfinished."""
+    """Notes and results are renamed one by one: after a kill before the k-th of them the next start has all of the old
+    or all of the new, and nothing unfinished."""
     import os
     import signal
 
@@ -188,8 +191,14 @@ def test_a_note_of_strangers_moves_nothing(tmp_path):
     (out / "mine").write_text("mine")
     (stage / "mine").write_text("new")
     digest = hashlib.sha256(b"new").hexdigest()
-    for pending in ({"stage": "../other", "files": {"x": "0"}}, {"stage": stage.name, "files": {"../../other/x": digest, "mine": digest}},
-                    {"stage": 3, "files": {"a": 1}}, {"stage": stage.name, "files": []}, {"files": {"x": "y"}}, [1]):  # fmt: skip
+    for pending in (
+        {"stage": "../other", "files": {"x": "0"}},
+        {"stage": stage.name, "files": {"../../other/x": digest, "mine": digest}},
+        {"stage": 3, "files": {"a": 1}},
+        {"stage": stage.name, "files": []},
+        {"files": {"x": "y"}},
+        [1],
+    ):
         (out / outputs.WRITTEN).write_text(json.dumps({"files": {}, "pending": pending}))
         outputs.recover(out)
         assert (other / "x").read_text() == "mine" and (out / "mine").read_text() == "mine" and other.is_dir()

@@ -118,7 +118,9 @@ def test_names_paths_and_folders(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="neither object.npz .* nor meshes"):
         own.expand([str(tmp_path / "empty")])
-    found = own.named({"train": ["box", str(tmp_path / "a.stl")], "held_out": ["cross"], "own": {"scale": 1.0, "hulls": 4}})
+    found = own.named(
+        {"train": ["box", str(tmp_path / "a.stl")], "held_out": ["cross"], "own": {"scale": 1.0, "hulls": 4}}
+    )
     assert list(found) == ["box", str(tmp_path / "a.stl"), "cross"]
     with pytest.raises(UserError, match="no shape 'mugg'"):
         own.named({"train": ["mugg"], "held_out": []})
@@ -151,7 +153,11 @@ def test_settings_reach_the_task(tmp_path):
     plain = _plain(objects=[str(tmp_path)], kept_out=["box"], object_scale=0.001)
     settings.apply(plain)
     objects = plain["task"]["objects"]
-    assert objects == {"train": [str(tmp_path / "block.stl")], "held_out": ["box"], "own": {"scale": 0.001, "hulls": 16}}
+    assert objects == {
+        "train": [str(tmp_path / "block.stl")],
+        "held_out": ["box"],
+        "own": {"scale": 0.001, "hulls": 16},
+    }
     settings.apply(plain)  # a resumed run has them already
     assert plain["task"]["objects"] == objects
     np.testing.assert_allclose(sorted(own.named(objects)[objects["train"][0]].extents), [0.03, 0.04, 0.05])
@@ -168,7 +174,9 @@ def test_a_scene_has_a_slot_for_every_part_and_true_sizes():
         spec.worldbody.add_body(name="hand").add_geom(size=[0.01, 0, 0])
         return spec
 
-    many = replace(library()["rock"], name="many", hulls=[box((0.01,) * 3, (0.03 * k, 0, 0)) for k in range(5)], true_size=True)
+    many = replace(
+        library()["rock"], name="many", hulls=[box((0.01,) * 3, (0.03 * k, 0, 0)) for k in range(5)], true_size=True
+    )
     scene = hand_object_scene(hand(), [library()["box"], many, library()["rock"]], [1.25, 1.5], 0.005)
     assert scene.slots == (*SLOTS, "object_hull3", "object_hull4") and scene.dataid.shape == (4, 8)
     assert [v.scale for v in scene.variants] == [1.0, 1.0, 1.25, 1.5]
@@ -186,7 +194,8 @@ def test_import_object_writes_what_a_task_takes(tmp_path, capsys, monkeypatch):
     assert {p.name for p in out.iterdir()} >= {"object.npz", "picture.png", "part_0.obj", "part_2.obj"}
     assert "3 convex part(s)" in capsys.readouterr().out
     wall = trimesh.load(out / "part_1.obj")
-    np.testing.assert_allclose(wall.bounds, [[-0.030, -0.015, -0.02], [-0.018, 0.015, 0.02]], atol=1e-5)  # the file's frame
+    # the file's frame
+    np.testing.assert_allclose(wall.bounds, [[-0.030, -0.015, -0.02], [-0.018, 0.015, 0.02]], atol=1e-5)
     shape = own.named({"train": [str(out)], "held_out": []})[str(out)]
     assert len(shape.hulls) == 3 and shape.name == str(out)
     assert import_object.main([str(tmp_path / "u.stl"), f"out={out}"]) == 0  # its own files it may write again

@@ -52,7 +52,13 @@ def test_the_written_scene_is_the_environments(folder):
 
 
 def test_ratios_take_the_better_turn():
-    rows = [{"name": "dexsim", "ms": 20.0}, {"name": "bare", "ms": 30.0}, {"name": "dexsim", "ms": 25.0}, {"name": "bare", "ms": 18.0}, {"name": "mjlab", "error": "x"}]
+    rows = [
+        {"name": "dexsim", "ms": 20.0},
+        {"name": "bare", "ms": 30.0},
+        {"name": "dexsim", "ms": 25.0},
+        {"name": "bare", "ms": 18.0},
+        {"name": "mjlab", "error": "x"},
+    ]
     assert peers.ratios(rows) == {"dexsim": 1.0, "bare": 0.9}
     assert peers.ratios(rows[1:2]) == {}
 
@@ -66,7 +72,9 @@ def test_children_that_fail_are_told(tmp_path):
         peers.interpreter("/no/such/python")
 
 
-@pytest.mark.parametrize("argv, said", [([], "say which"), (["gpu", "wrlds=3"], "unknown setting 'wrlds'"), (["cpu"], "shadow=")])
+@pytest.mark.parametrize(
+    "argv, said", [([], "say which"), (["gpu", "wrlds=3"], "unknown setting 'wrlds'"), (["cpu"], "shadow=")]
+)
 def test_slips_are_one_line(argv, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=said):

@@ -16,7 +16,10 @@ def test_what_refitted_figures_take_over_is_no_size_and_sizes_grow_to_what_is_wa
     noise = 5e-4
     kind = planted.PLANTS["coulomb_friction"]
     sizes = np.geomspace(*kind.span, 8)
-    hidden = planted._joined(b["off"], {"*kp": 0.999 * 1.05 / b["off"]["*kp"], "*gravity_scale": 1.04 / b["off"]["*gravity_scale"]})  # inside the beliefs
+    # inside the beliefs
+    hidden = planted._joined(
+        b["off"], {"*kp": 0.999 * 1.05 / b["off"]["*kp"], "*gravity_scale": 1.04 / b["off"]["*gravity_scale"]}
+    )
     tries = [b["off"], *(planted._joined(b["off"], kind.change(b, s)) for s in sizes), hidden]
     cases, q, _ = planted._simulate(b, runs, tries, 1e-3, 2)
     none = planted._apply(cases[0].plant.base()[0], b["off"])

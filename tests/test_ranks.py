@@ -31,10 +31,26 @@ def configs(tmp_path_factory):
 
 def torchrun(configs, folder, mode, *settings, ranks=2) -> subprocess.Popen:
     """torchrun of rank_main.py in `folder`, in a process group of its own."""
-    env = os.environ | {"OMP_NUM_THREADS": "1", "REPORT": str(folder / "report"), "PYTHONPATH": f"{shell.ROOT}:{MAIN.parent}"}
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={ranks}", str(MAIN), str(configs), mode,
-               *QUICK, *settings]
-    return subprocess.Popen(command, cwd=folder, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+    env = os.environ | {
+        "OMP_NUM_THREADS": "1",
+        "REPORT": str(folder / "report"),
+        "PYTHONPATH": f"{shell.ROOT}:{MAIN.parent}",
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        f"--nproc_per_node={ranks}",
+        str(MAIN),
+        str(configs),
+        mode,
+        *QUICK,
+        *settings,
+    ]
+    return subprocess.Popen(
+        command, cwd=folder, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
 
 
 def finish(process, seconds=100):
@@ -76,8 +92,13 @@ def test_one_process_is_the_leader_and_needs_nothing():
 
 
 def environment(rank, size, here=None):
-    return {"WORLD_SIZE": str(size), "RANK": str(rank), "LOCAL_RANK": str(rank % (here or size)), "LOCAL_WORLD_SIZE": str(here or size),
-            "MASTER_ADDR": "localhost"}
+    return {
+        "WORLD_SIZE": str(size),
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank % (here or size)),
+        "LOCAL_WORLD_SIZE": str(here or size),
+        "MASTER_ADDR": "localhost",
+    }
 
 
 def test_each_rank_gets_the_gpu_of_its_number():
@@ -96,7 +117,8 @@ def test_each_rank_gets_the_gpu_of_its_number():
 def test_seeds_differ_between_ranks_and_neighbouring_runs():
     seeds = {Ranks(environment(k, 8)).seed(seed) for k in range(8) for seed in range(1, 50)}
     assert len(seeds) == 8 * 49
-    assert Ranks(environment(1, 8)).seed(1, 100) != Ranks(environment(1, 8)).seed(1)  # a resumed run does not repeat itself
+    # a resumed run does not repeat itself
+    assert Ranks(environment(1, 8)).seed(1, 100) != Ranks(environment(1, 8)).seed(1)
 
 
 def test_without_torchrun_is_said():
@@ -141,7 +163,10 @@ def test_two_ranks_learn_one_policy(configs, tmp_path):
     with open(tmp_path / "run" / "progress.csv") as file:
         rows = list(csv.DictReader(file))
     assert [int(r["steps"]) for r in rows] == [192, 384, 576]
-    assert len(list((tmp_path / "run").glob("events.*"))) == 1 and sorted(p.name for p in tmp_path.iterdir()) == ["report", "run"]
+    assert len(list((tmp_path / "run").glob("events.*"))) == 1 and sorted(p.name for p in tmp_path.iterdir()) == [
+        "report",
+        "run",
+    ]
     assert checkpoint.load(tmp_path / "run" / "last.pt")["config"]["seed"] == 1
 
 
@@ -167,9 +192,14 @@ def test_a_killed_rank_ends_the_run(configs, tmp_path, lost, by):
     assert status != 0 and time.monotonic() - start < 20  # most of it torchrun's own start and end on a busy machine
     lines = [x for x in err.splitlines() if x.startswith("error:")]
     assert len(lines) == 1, err
-    assert f"rank {lost} is gone" in lines[0] and "torchrun --nproc_per_node=2 -m dexsim train resume=run/last.pt" in lines[0]
+    assert (
+        f"rank {lost} is gone" in lines[0]
+        and "torchrun --nproc_per_node=2 -m dexsim train resume=run/last.pt" in lines[0]
+    )
     saved = checkpoint.load(tmp_path / "run" / "last.pt")
-    status, out, err = finish(torchrun(configs, tmp_path, "plain", "resume=run/last.pt", f"iterations={saved['iteration'] + 1}", "out=again"))
+    status, out, err = finish(
+        torchrun(configs, tmp_path, "plain", "resume=run/last.pt", f"iterations={saved['iteration'] + 1}", "out=again")
+    )
     assert status == 0 and checkpoint.load(tmp_path / "again" / "last.pt")["iteration"] == saved["iteration"] + 1
 
 
@@ -177,7 +207,8 @@ def test_a_killed_rank_ends_the_run(configs, tmp_path, lost, by):
 def test_ctrl_c_saves_once(configs, tmp_path):
     process = torchrun(configs, tmp_path, "slow", "iterations=100000", "out=run", "save_interval=1")
     wait_for(tmp_path / "run" / "model_2.pt", process)
-    os.killpg(process.pid, signal.SIGINT)  # a terminal's Ctrl-C reaches torchrun and both ranks; torchrun passes it on again
+    # a terminal's Ctrl-C reaches torchrun and both ranks; torchrun passes it on again
+    os.killpg(process.pid, signal.SIGINT)
     status, out, err = finish(process, 60)
     assert status != 0 and out.count("stopping and saving") == 1 and out.count("saved run/last.pt") == 1, (out, err)
     done = int(out.split("stopped after ")[1].split()[0])
@@ -185,8 +216,14 @@ def test_ctrl_c_saves_once(configs, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode, said", [("fail0", "error: contact overflow, say"), ("fail1", "error: rank 1: contact overflow, say"),
-                                        ("bug1", "error: rank 1: ValueError: a bug, say")])
+@pytest.mark.parametrize(
+    "mode, said",
+    [
+        ("fail0", "error: contact overflow, say"),
+        ("fail1", "error: rank 1: contact overflow, say"),
+        ("bug1", "error: rank 1: ValueError: a bug, say"),
+    ],
+)
 def test_an_error_of_one_rank_is_said_once(configs, tmp_path, mode, said):
     start = time.monotonic()
     status, out, err = finish(torchrun(configs, tmp_path, mode, "iterations=100000", "out=run"), 60)
@@ -199,14 +236,37 @@ def test_an_error_of_one_rank_is_said_once(configs, tmp_path, mode, said):
 @pytest.mark.slow
 def test_a_wrong_setting_is_said_once(configs, tmp_path):
     status, out, err = finish(torchrun(configs, tmp_path, "plain", "wrlds=3"), 60)
-    assert status != 0 and len([x for x in err.splitlines() if x.startswith("error:")]) == 1 and "did you mean worlds?" in err
+    assert (
+        status != 0
+        and len([x for x in err.splitlines() if x.startswith("error:")]) == 1
+        and "did you mean worlds?" in err
+    )
 
 
 @pytest.mark.slow
 def test_two_ranks_of_the_grasp(tmp_path):
     env = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(shell.ROOT / "train.py"),
-                           "task=grasp", "device=cpu", "worlds=2", "iterations=2", "final_episodes=0", "out=run", "sim.threads=1"],
-                          cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            "--standalone",
+            "--nproc_per_node=2",
+            str(shell.ROOT / "train.py"),
+            "task=grasp",
+            "device=cpu",
+            "worlds=2",
+            "iterations=2",
+            "final_episodes=0",
+            "out=run",
+            "sim.threads=1",
+        ],
+        cwd=tmp_path,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     assert checkpoint.load(tmp_path / "run" / "last.pt")["steps"] == 2 * 24 * 2 * 2

@@ -13,7 +13,10 @@ from dexsim.errors import UserError
 from dexsim.recording import read
 
 PANDA = """<mujoco><compiler angle="radian"/><worldbody>{open}{close}</worldbody></mujoco>"""
-LINK = '<body pos="0 0 0.2"><inertial mass="1" pos="0.05 0 0" diaginertia="0.02 0.02 0.02"/><joint name="joint{k}" axis="{axis}"/>'
+LINK = (
+    '<body pos="0 0 0.2"><inertial mass="1" pos="0.05 0 0" diaginertia="0.02 0.02 0.02"/><joint name="joint{k}" '
+    'axis="{axis}"/>'
+)
 
 
 def finger(folder, name: str, dead: bool = False) -> None:
@@ -25,7 +28,14 @@ def finger(folder, name: str, dead: bool = False) -> None:
         angle = np.clip(angle - 0.04e-3 * duty[i], 0.0, 0.45)
         way = 1.0 if angle >= 0.4 else -1.0 if angle <= 0.0 else way
         q[i] = angle
-    np.savez(folder / f"{name}.npz", t=t, pwm_set=duty, pwm_read=np.zeros_like(duty) if dead else duty, theta_deg=np.degrees(q) * (not dead), pid_out=duty)
+    np.savez(
+        folder / f"{name}.npz",
+        t=t,
+        pwm_set=duty,
+        pwm_read=np.zeros_like(duty) if dead else duty,
+        theta_deg=np.degrees(q) * (not dead),
+        pid_out=duty,
+    )
 
 
 def test_a_fingers_run_becomes_clips_of_whole_cycles_with_the_duty_as_command(tmp_path):

@@ -50,7 +50,14 @@ def test_its_drives_have_effects_that_no_training_randomizes():
     nominal = {k for columns in cfg["servo"]["joints"].values() for k in columns}
     seen = nominal | set(cfg["randomize"]["servo"])
     for columns in world("task=rotate")["servo"]["joints"].values():
-        assert {"stribeck_peak", "friction_asymmetry", "load_friction", "lag", "position_offset", "position_scale"} <= set(columns) - seen
+        assert {
+            "stribeck_peak",
+            "friction_asymmetry",
+            "load_friction",
+            "lag",
+            "position_offset",
+            "position_scale",
+        } <= set(columns) - seen
         assert all(columns[k] != 0 for k in columns)
 
 
@@ -67,18 +74,26 @@ def test_what_it_draws_are_ranges_that_the_task_has(task):
 def test_physics_and_drives_are_its_own(env):
     table = env.cfg["reality"]
     m = env.engine.mjm
-    assert env.engine.kind == "mujoco" and m.opt.timestep == table["sim"]["timestep"] and m.opt.solver == reality.SOLVERS["cg"]
+    assert (
+        env.engine.kind == "mujoco"
+        and m.opt.timestep == table["sim"]["timestep"]
+        and m.opt.solver == reality.SOLVERS["cg"]
+    )
     tip = m.geom("tip_index")
     assert m.geom_condim[tip.id] == 6 and tuple(m.geom_solimp[tip.id]) == tuple(table["contact"]["tip_solimp"])
     kp = [table["servo"]["joints"][j]["kp"] for j in xhand.JOINTS]
-    assert torch.allclose(env.servo.column("kp"), torch.tensor(kp).double().expand(4, 12))  # one hand, the same in every trial
+    # one hand, the same in every trial
+    assert torch.allclose(env.servo.column("kp"), torch.tensor(kp).double().expand(4, 12))
     mu = env.engine.field("geom_friction")[:, tip.id, 0]
     world_mu = table["tasks"]["rotate"]["randomize"]["object.friction"]
-    assert torch.allclose(mu, torch.full((4,), world_mu * table["contact"]["friction_by_finger"][1]).double(), atol=1e-6)
+    assert torch.allclose(
+        mu, torch.full((4,), world_mu * table["contact"]["friction_by_finger"][1]).double(), atol=1e-6
+    )
 
 
 def test_touch_is_its_own(env):
-    """Every imperfection that the world names is what its taxels have, in each task, and differs from what training believes."""
+    """Every imperfection that the world names is what its taxels have, in each task, and differs from what training
+    believes."""
     own = yaml.safe_load((CONFIGS / "reality" / "bench.yaml").read_text())["tactile"]
     assert {"threshold", "noise", "gain_spread", "dead", "delay", "hysteresis", "stiffness_scale"} <= set(own)
     for task in ("rotate", "grasp"):
@@ -98,7 +113,10 @@ def test_sensors_report_counts(env):
     counts = env.q / step
     assert torch.allclose(counts, counts.round(), atol=1e-3)
     assert torch.allclose(env.q.double(), env.servo.position(), atol=step)
-    offset = env.servo.column("position_offset") + (env.servo.column("position_scale") - 1) * env.engine.t.qpos[:, env.joint_q]
+    offset = (
+        env.servo.column("position_offset")
+        + (env.servo.column("position_scale") - 1) * env.engine.t.qpos[:, env.joint_q]
+    )
     assert torch.allclose(env.servo.position() - env.engine.t.qpos[:, env.joint_q], offset)
     assert offset.abs().max() > 5 * step
     amps = env.torque / 0.01

@@ -107,8 +107,13 @@ def test_messages_are_decoded_to_what_mcap_ros2_decodes(kind):
     """Both libraries, on messages that either of them wrote, of both byte orders for those of numbers alone."""
     rng = np.random.default_rng(0)
     t, x = 12 * 10**9 + 34, rng.standard_normal(12)
-    made = {JOINT_STATE: cdr.joint_state(t, ("one", "two"), x[:2], None, x[2:4]), MULTI_ARRAY: cdr.multi_array(x.reshape(3, 4), ("row", "column")),
-            WRENCH: cdr.wrench(t, "palm", x[:6]), POSE: cdr.pose(t, "", x[:7]), IMU_TYPE: cdr.imu(t, "object", x[:10])}[kind]  # fmt: skip
+    made = {
+        JOINT_STATE: cdr.joint_state(t, ("one", "two"), x[:2], None, x[2:4]),
+        MULTI_ARRAY: cdr.multi_array(x.reshape(3, 4), ("row", "column")),
+        WRENCH: cdr.wrench(t, "palm", x[:6]),
+        POSE: cdr.pose(t, "", x[:7]),
+        IMU_TYPE: cdr.imu(t, "object", x[:10]),
+    }[kind]
     theirs = generate_dynamic(kind, DEFINITIONS[kind])[kind]
     ours = ros2.decoder(kind, "ros2msg", DEFINITIONS[kind])
     for data in (made, bytes(serialize_dynamic(kind, DEFINITIONS[kind])[kind](theirs(made)))):
@@ -138,11 +143,19 @@ def test_a_bag_that_rosbags_wrote(tmp_path):
     assert r.states.position.stamp[7] == pytest.approx(0.07) and r.states.velocity is None
 
 
-@pytest.mark.parametrize("name, text, says", [
-    ("a/msg/B", "a/C c\n", "not defined"), ("a/msg/B", "B b\n", "itself"), ("a/msg/B", "float64[99999999] x\n", "at most"),
-    ("a/msg/B\nimport os", "float64 x\n", "no message's"), ("a/msg/B", "float64 x\n" * 9999, "characters"), ("B", "float64 x", "no message's"),
-    ("a/msg/B", "float64 1x\n", "."), ("a/msg/B", "\x00", "."),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, text, says",
+    [
+        ("a/msg/B", "a/C c\n", "not defined"),
+        ("a/msg/B", "B b\n", "itself"),
+        ("a/msg/B", "float64[99999999] x\n", "at most"),
+        ("a/msg/B\nimport os", "float64 x\n", "no message's"),
+        ("a/msg/B", "float64 x\n" * 9999, "characters"),
+        ("B", "float64 x", "no message's"),
+        ("a/msg/B", "float64 1x\n", "."),
+        ("a/msg/B", "\x00", "."),
+    ],
+)
 def test_definitions_of_no_message_are_refused(name, text, says):
     with pytest.raises(ros2.BadDefinition, match=says):
         ros2.decoder(name, "ros2msg", text)
@@ -322,7 +335,9 @@ def test_metadata_beside_the_file_and_by_hand(tmp_path):
             read(path, meta=bad)
 
 
-@pytest.mark.parametrize("key, value", [("gravity", "down"), ("gravity", "0 0"), ("tactile_axis_sign", "1"), ("tactile_lsb", "a tenth")])
+@pytest.mark.parametrize(
+    "key, value", [("gravity", "down"), ("gravity", "0 0"), ("tactile_axis_sign", "1"), ("tactile_lsb", "a tenth")]
+)
 def test_metadata_that_is_no_number_is_named(tmp_path, key, value):
     path = foreign(tmp_path / "a.mcap")
     with pytest.raises(UserError, match=f"metadata {key}='{value}'"):
@@ -461,20 +476,41 @@ uint32 nanosec
 
 
 def write_idl(path, definition):
-    """A bag whose joint states are of a type of its own, described in IDL, beside commands of the standard type, also in IDL."""
+    """A bag whose joint states are of a type of its own, described in IDL, beside commands of the standard type, also
+    in IDL."""
     encode = serialize_dynamic("my_robot/msg/HandState", SAME)["my_robot/msg/HandState"]
     with open(path, "wb") as file:
         w = McapWriter(file)
         w.start(profile="ros2")
-        states = w.register_channel("/joint_states", "cdr", w.register_schema("my_robot/msg/HandState", "ros2idl", definition.encode()))
-        commands = w.register_channel("/joint_commands", "cdr", w.register_schema(JOINT_STATE, "ros2idl", b"module sensor_msgs {};"))
+        states = w.register_channel(
+            "/joint_states", "cdr", w.register_schema("my_robot/msg/HandState", "ros2idl", definition.encode())
+        )
+        commands = w.register_channel(
+            "/joint_commands", "cdr", w.register_schema(JOINT_STATE, "ros2idl", b"module sensor_msgs {};")
+        )
         for i in range(20):
             t = 10**18 + i * 10**7
             header = {"stamp": {"sec": t // 10**9, "nanosec": t % 10**9}, "frame_id": "palm"}
             boards = [{"code": 7, "temperature": 30.5, "label": "tip"}] * (i % 3)
-            w.add_message(states, t, bytes(encode({
-                "header": header, "mode": 3, "name": ["a", "b", "c"], "position": [0.1 * i, 0.2, 0.3], "effort": [1.0, 2.0, i], "boards": boards,
-                "ok": True, "homed": False})), t)  # fmt: skip
+            w.add_message(
+                states,
+                t,
+                bytes(
+                    encode(
+                        {
+                            "header": header,
+                            "mode": 3,
+                            "name": ["a", "b", "c"],
+                            "position": [0.1 * i, 0.2, 0.3],
+                            "effort": [1.0, 2.0, i],
+                            "boards": boards,
+                            "ok": True,
+                            "homed": False,
+                        }
+                    )
+                ),
+                t,
+            )
             w.add_message(commands, t, cdr.joint_state(t, ("a", "b", "c"), np.array([0.0, 0.1, 0.2])), t)
         w.finish()
     return path
@@ -488,9 +524,12 @@ def test_messages_described_in_idl(tmp_path):
 
 
 @pytest.mark.parametrize("change, says", [
-    (lambda s: s.replace("boolean ok, homed;", "map<string, long> ok;"), "IDL definition of my_robot/msg/HandState is not read"),
+    (lambda s: s.replace("boolean ok, homed;", "map<string, long> "
+                                               "ok;"), "IDL definition of my_robot/msg/HandState is not read"),
     (lambda s: s[:300], "is not read"),
-    (lambda s: s.replace("IDL: my_robot/msg/Board", "").replace("struct Board", "struct Bored"), "my_robot/msg/Board is used and not defined"),
+    (lambda s: s.replace("IDL: my_robot/msg/Board", "").replace("struct Board", "struct Bored"), "my_robot/msg/Board "
+                                                                                                 "is used and not "
+                                                                                                 "defined"),
     (lambda s: s.replace("struct HandState", "union HandState"), "is not"),
 ])  # fmt: skip
 def test_idl_that_is_not_read_says_so(tmp_path, change, says):

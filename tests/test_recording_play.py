@@ -380,7 +380,8 @@ def test_recording_ends_with_the_episode(played):
 
 
 def test_the_object_of_a_real_recording_is_placed(played, tmp_path):
-    """A recording that knows only the object's path: a mark that touches nothing, or the object as it is stated to be."""
+    """A recording that knows only the object's path: a mark that touches nothing, or the object as it is stated to
+    be."""
     from dataclasses import replace
 
     from dexsim.recording import led_object
@@ -391,7 +392,11 @@ def test_the_object_of_a_real_recording_is_placed(played, tmp_path):
     r, forces = read(tmp_path / "real.mcap"), {}
     o = env.objects
     size = 2 * o.size[0].numpy()
-    box = led_object.Stated("box", tuple(size)) if env.scene.variants[int(o.variant[0])].shape.name == "box" else led_object.Stated("box", (0.05, 0.06, 0.05))
+    box = (
+        led_object.Stated("box", tuple(size))
+        if env.scene.variants[int(o.variant[0])].shape.name == "box"
+        else led_object.Stated("box", (0.05, 0.06, 0.05))
+    )
     for name, stated in (("marked", None), ("led", box)):
         m = mech.for_recording(r)
         assert led_object.add_object(m, r, stated) == name
@@ -401,27 +406,51 @@ def test_the_object_of_a_real_recording_is_placed(played, tmp_path):
         assert np.abs(np.diff(run.qpos[:, -7:-4], axis=0)).max() > 1e-4, "it moves along"
     assert (forces["marked"] == 0).all()
     out = tmp_path / "out"
-    assert replay_cli.run(replay_cli.settings([f"replay={tmp_path / 'real.mcap'}", f"out={out}", "video=false"], CONFIGS)) == 0
+    assert (
+        replay_cli.run(replay_cli.settings([f"replay={tmp_path / 'real.mcap'}", f"out={out}", "video=false"], CONFIGS))
+        == 0
+    )
     assert json.loads((out / "metrics.json").read_text())["object"] == "marked"
-    assert replay_cli.run(replay_cli.settings([f"replay={tmp_path / 'real.mcap'}", f"out={out}", "video=false", "object=sphere", "object_size=0.05"], CONFIGS)) == 0
+    assert (
+        replay_cli.run(
+            replay_cli.settings(
+                [f"replay={tmp_path / 'real.mcap'}", f"out={out}", "video=false", "object=sphere", "object_size=0.05"],
+                CONFIGS,
+            )
+        )
+        == 0
+    )
     assert json.loads((out / "metrics.json").read_text())["object"] == "led" and (out / "force.png").is_file()
 
 
-@pytest.mark.parametrize("stated, half", [
-    (("box", (0.05, 0.06, 0.07)), [0.025, 0.03, 0.035]), (("sphere", (0.05,)), [0.025, 0, 0]), (("capsule", (0.04, 0.1)), [0.02, 0.03, 0]),
-    (("rock", (0.09,)), [1.5, 1.5, 1.5]), (("capsule", ()), [0.019, 0.011, 0]), (("sphere", ()), [0.03, 0, 0]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "stated, half",
+    [
+        (("box", (0.05, 0.06, 0.07)), [0.025, 0.03, 0.035]),
+        (("sphere", (0.05,)), [0.025, 0, 0]),
+        (("capsule", (0.04, 0.1)), [0.02, 0.03, 0]),
+        (("rock", (0.09,)), [1.5, 1.5, 1.5]),
+        (("capsule", ()), [0.019, 0.011, 0]),
+        (("sphere", ()), [0.03, 0, 0]),
+    ],
+)
 def test_sizes_of_a_stated_object(stated, half):
     from dexsim.recording.led_object import Stated
 
     np.testing.assert_allclose(Stated(*stated).about()["size"], half, atol=1e-6)
 
 
-@pytest.mark.parametrize("arguments, says", [
-    (["object=blob"], "object=blob"), (["object_size=0.05"], "say object="), (["object=box", "object_size=0.05"], "has 3 extents"),
-    (["object=sphere", "object_size=5"], "object_size=5"), (["object=box", "object_mass=heavy"], "object_mass=heavy"),
-    (["object=capsule", "object_size=0.1,0.05"], "must be over its diameter"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["object=blob"], "object=blob"),
+        (["object_size=0.05"], "say object="),
+        (["object=box", "object_size=0.05"], "has 3 extents"),
+        (["object=sphere", "object_size=5"], "object_size=5"),
+        (["object=box", "object_mass=heavy"], "object_mass=heavy"),
+        (["object=capsule", "object_size=0.1,0.05"], "must be over its diameter"),
+    ],
+)
 def test_an_impossible_object_is_named(arguments, says):
     with pytest.raises(UserError, match=says) as caught:
         replay_cli.settings(["replay=a.mcap", *arguments], CONFIGS)

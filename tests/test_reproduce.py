@@ -1,4 +1,5 @@
-"""benchmarks.reproduce: rows are settings that train.py takes, interrupted runs go on, the table says what the trials say."""
+"""benchmarks.reproduce: rows are settings that train.py takes, interrupted runs go on, the table says what the trials
+say."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def plan(out: Path, task: str = "rotate", **changed) -> jobs.Plan:
-    return replace(jobs.Plan(out, task, 400.0, 100, None, {"simulation": 10, "reality": 5}, 60.0, "bench", 1, (), "cpu"), **changed)
+    return replace(
+        jobs.Plan(out, task, 400.0, 100, None, {"simulation": 10, "reality": 5}, 60.0, "bench", 1, (), "cpu"), **changed
+    )
 
 
 def train_file(path: Path, iteration: int) -> None:
@@ -38,7 +41,9 @@ def train_file(path: Path, iteration: int) -> None:
         "config": {"agent": {}, "task": {}, "choices": {}}, "git": {"commit": "", "dirty": False},
         "layout": {"joints": [], "action": [], "observations": {}}, "rng": checkpoint.rng_state(),
         "optimizer": {"state": {0: {"exp_avg": torch.ones(9)}}, "param_groups": []}})
-    (path.parent / "progress.csv").write_text("iteration,steps\n" + "".join(f"{i},{100 * i}\n" for i in range(1, iteration + 1)))
+    (path.parent / "progress.csv").write_text(
+        "iteration,steps\n" + "".join(f"{i},{100 * i}\n" for i in range(1, iteration + 1))
+    )
 
 
 def put(job: jobs.Job, p: jobs.Plan, world: str, successes: list[int], fall: float = 30.0, iteration: int = 2) -> None:
@@ -47,9 +52,17 @@ def put(job: jobs.Job, p: jobs.Plan, world: str, successes: list[int], fall: flo
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"episodes": len(successes), "capped": 1, "cap_s": 60.0, "seconds_to_fall": fall,
                                 "consecutive_successes": {"all": sorted(successes)}}))
-    (path.parent / "judged.json").write_text(json.dumps({
-        "iteration": iteration, "steps": 100 * iteration, "episodes": p.episodes[world], "cap_s": p.cap if p.task == "rotate" else None,
-        "reality": p.reality if world == "reality" else None}))
+    (path.parent / "judged.json").write_text(
+        json.dumps(
+            {
+                "iteration": iteration,
+                "steps": 100 * iteration,
+                "episodes": p.episodes[world],
+                "cap_s": p.cap if p.task == "rotate" else None,
+                "reality": p.reality if world == "reality" else None,
+            }
+        )
+    )
     train_file(job.folder(p) / "train_0" / "last.pt", iteration)
 
 
@@ -65,9 +78,12 @@ def test_rows_are_settings_of_train():
 
 
 def test_the_rotation_rows_keep_the_reward_they_were_trained_with():
-    """All but `paper_reward` with the term `spin` that the default leaves out; a user's own setting comes after a row's; what was
-    begun goes on with its own config."""
-    kept = {r.key: start.for_train(["task=rotate", "device=cpu", *r.settings], CONFIGS).cfg["task"] for r in (*rows.ROTATION, *rows.OURS)}
+    """All but `paper_reward` with the term `spin` that the default leaves out; a user's own setting comes after a
+    row's; what was begun goes on with its own config."""
+    kept = {
+        r.key: start.for_train(["task=rotate", "device=cpu", *r.settings], CONFIGS).cfg["task"]
+        for r in (*rows.ROTATION, *rows.OURS)
+    }
     assert {k: t["rewards"]["spin"] for k, t in kept.items()} == {k: 0.0 if k == "paper_reward" else 0.01 for k in kept}
     assert kept["paper_reward"] == start.for_train(["task=rotate", "device=cpu"], CONFIGS).cfg["task"]
     changed = [k for k in kept["full"] if kept["full"][k] != kept["paper_reward"][k]]
@@ -81,16 +97,24 @@ def test_a_row_begins_with_its_settings_and_goes_on_with_its_own(tmp_path, monke
     begun = children.commands[0]
     assert begun.index("task.rewards.spin=0.01") < begun.index("task.rewards.spin=0")  # the last one counts
     jobs.train(job, replace(p, extra=(), steps=2 * p.steps), None, silent)
-    assert any(a.startswith("resume=") for a in children.commands[1]) and not any("spin" in a for a in children.commands[1])
+    assert any(a.startswith("resume=") for a in children.commands[1]) and not any(
+        "spin" in a for a in children.commands[1]
+    )
 
 
 def test_the_torque_row_is_paid_for_no_contact_force():
-    """Every reward of the default task that looks at the commanded force is off in it; R_torque is off in the force row."""
-    weights = {r.key: start.for_train(["task=grasp", "device=cpu", *r.settings], CONFIGS).cfg["task"]["rewards"] for r in rows.GRASP}
+    """Every reward of the default task that looks at the commanded force is off in it; R_torque is off in the force
+    row."""
+    weights = {
+        r.key: start.for_train(["task=grasp", "device=cpu", *r.settings], CONFIGS).cfg["task"]["rewards"]
+        for r in rows.GRASP
+    }
     by_command = {"force", "force_near", "worst"}  # `torque` is the other half of the ablation
     assert {k for k, w in weights["both"].items() if w != weights["torque"][k]} == by_command
     assert all(weights["torque"][k] == 0 != weights["both"][k] for k in by_command)
-    assert {k for k, w in weights["both"].items() if w != weights["force"][k]} == {"torque"} and weights["force"]["torque"] == 0
+    assert {k for k, w in weights["both"].items() if w != weights["force"][k]} == {"torque"} and weights["force"][
+        "torque"
+    ] == 0
 
 
 def test_the_command_line_is_checked():
@@ -105,7 +129,15 @@ def test_the_command_line_is_checked():
 def test_averages_orderings_and_intervals(tmp_path):
     """Rows of known trials: the pooled numbers are theirs, a clear difference holds, a reversed one is called so."""
     p = plan(tmp_path)
-    by = {"full": 20, "quaternion": 3, "plain_centre": 10, "no_force": 12, "neither": 30, "no_touch": 1, "no_orientation": 20}
+    by = {
+        "full": 20,
+        "quaternion": 3,
+        "plain_centre": 10,
+        "no_force": 12,
+        "neither": 30,
+        "no_touch": 1,
+        "no_orientation": 20,
+    }
     every = [jobs.Job(r, s) for s in (1, 2) for r in rows.ROTATION]
     for job in every:
         centre = by[job.row.key]
@@ -119,7 +151,8 @@ def test_averages_orderings_and_intervals(tmp_path):
     assert verdict["full", "quaternion", "average"].startswith("holds (+17.0")
     assert verdict["full", "neither", "average"].startswith("reversed (-10.0")
     assert verdict["full", "no_orientation", "average"].startswith("undecided")
-    assert verdict["no_orientation", "full", "seconds_per_success"].startswith("undecided")  # 2 s a success in every row
+    # 2 s a success in every row
+    assert verdict["no_orientation", "full", "seconds_per_success"].startswith("undecided")
     assert full["seconds_by_seed"] == pytest.approx([2.0, 2.0]) and "| 2.00 (2.00, 2.00) | 40.0 (40.0, 40.0) |" in text
     assert {c["here"] for c in data["orderings"]["reality"]} == {"not judged"}
     assert "| quaternion instead of 6D | 3.0 (" in text and "2.9, 2.5, 5.24, 15.2" in text
@@ -144,12 +177,22 @@ def test_an_ordering_is_not_decided_within_what_seeds_do(tmp_path):
     every = [jobs.Job(r, s) for r in rows.ROTATION for s in (1, 2)]
     average = {"full": 320, "quaternion": 20, "plain_centre": 305}
     for job in every:
-        put(job, p, "simulation", [average.get(job.row.key, 100) + (30 * job.seed if job.row.key == "no_force" else 0)] * 20)
-    verdict = {(c["first"], c["second"], c["quantity"]): c["here"] for c in report.rotation(p, every)[1]["orderings"]["simulation"]}
+        put(
+            job,
+            p,
+            "simulation",
+            [average.get(job.row.key, 100) + (30 * job.seed if job.row.key == "no_force" else 0)] * 20,
+        )
+    verdict = {
+        (c["first"], c["second"], c["quantity"]): c["here"]
+        for c in report.rotation(p, every)[1]["orderings"]["simulation"]
+    }
     assert verdict["full", "plain_centre", "average"].startswith("undecided (+15.0")
     assert verdict["full", "quaternion", "average"].startswith("holds (+300.0")
     # by hand: variances 0 in six rows and 450 in one, 7 degrees of freedom, t = 2.3646
-    assert report._between_seeds([[100.0, 100.0]] * 6 + [[130.0, 160.0]]) == pytest.approx(2.3646 * (450 / 7) ** 0.5, rel=1e-4)
+    assert report._between_seeds([[100.0, 100.0]] * 6 + [[130.0, 160.0]]) == pytest.approx(
+        2.3646 * (450 / 7) ** 0.5, rel=1e-4
+    )
 
 
 def test_seeds_that_differ_widen_the_interval(tmp_path):
@@ -161,7 +204,9 @@ def test_seeds_that_differ_widen_the_interval(tmp_path):
     assert row["average"] == 15.0 and row["interval"] == [10.0, 20.0]
 
 
-def judged(p: jobs.Plan, key: str, seed: int, world: str, successes: list[int], iteration: int = 2, stage: str = "") -> jobs.Job:
+def judged(
+    p: jobs.Plan, key: str, seed: int, world: str, successes: list[int], iteration: int = 2, stage: str = ""
+) -> jobs.Job:
     """A row's seed, judged as it stood after 100 * iteration steps; stage: folder of a stage's judging."""
     job = jobs.Job(next(r for r in (*rows.ROTATION, *rows.OURS) if r.key == key), seed)
     put(job, p, world, successes, iteration=iteration)
@@ -174,7 +219,8 @@ def judged(p: jobs.Plan, key: str, seed: int, world: str, successes: list[int], 
 
 
 def test_rows_of_our_own_are_compared_at_the_same_steps(tmp_path):
-    """Ours after 200 steps: against the first row's judging of then, at a stage, not against what it became after 400."""
+    """Ours after 200 steps: against the first row's judging of then, at a stage, not against what it became after
+    400."""
     p, ours = plan(tmp_path), []
     for seed in (1, 2):
         for world, at_200, at_400 in (("simulation", 60, 100), ("reality", 30, 90)):
@@ -185,15 +231,29 @@ def test_rows_of_our_own_are_compared_at_the_same_steps(tmp_path):
     ours = list(dict.fromkeys(ours))
     text, data, draw = own.table(p, ours)
     said = data["against"]
-    assert said["fixed"]["simulation"]["difference"] == 0.0 and said["fixed"]["simulation"]["here"].startswith("undecided (+0.0")
-    assert said["curriculum"]["reality"]["here"].startswith("more (+163.5") and said["curriculum"]["reality"]["to_steps"] == 200
-    # by hand: variances of pairs 0.5, 0.5, 50 over 3 degrees of freedom, t = 3.1824; the difference of two rows of two seeds
+    assert said["fixed"]["simulation"]["difference"] == 0.0 and said["fixed"]["simulation"]["here"].startswith(
+        "undecided (+0.0"
+    )
+    assert (
+        said["curriculum"]["reality"]["here"].startswith("more (+163.5")
+        and said["curriculum"]["reality"]["to_steps"] == 200
+    )
+    # by hand: variances of pairs 0.5, 0.5, 50 over 3 degrees of freedom, t = 3.1824; the difference of two rows of two
+    # seeds
     half = 3.1824 * (51 / 3) ** 0.5
     assert said["curriculum"]["reality"]["interval"] == pytest.approx([163.5 - half, 163.5 + half], rel=1e-3)
     losses = data["lost_in_the_other_world"]
-    assert losses["fixed"]["lost"] == pytest.approx(1 - 37.5 / 61.5) and losses["fixed"]["by_seed"] == pytest.approx([1 - 37 / 61, 1 - 38 / 62])
-    assert losses["full"]["lost"] == pytest.approx(1 - 31.5 / 61.5) and losses["fixed"]["interval"][0] >= 1 - 38 / 62 - 1e-9
-    assert "Trained without randomization, 2 of 2 seeds lose at least a third" in text and "| everything, 6D orientation (the paper's first row), 0.0002 M steps | 61.5 (" in text
+    assert losses["fixed"]["lost"] == pytest.approx(1 - 37.5 / 61.5) and losses["fixed"]["by_seed"] == pytest.approx(
+        [1 - 37 / 61, 1 - 38 / 62]
+    )
+    assert (
+        losses["full"]["lost"] == pytest.approx(1 - 31.5 / 61.5)
+        and losses["fixed"]["interval"][0] >= 1 - 38 / 62 - 1e-9
+    )
+    assert (
+        "Trained without randomization, 2 of 2 seeds lose at least a third" in text
+        and "| everything, 6D orientation (the paper's first row), 0.0002 M steps | 61.5 (" in text
+    )
     from matplotlib.figure import Figure
     axes = Figure().subplots(1, 2)
     draw(axes)
@@ -202,7 +262,8 @@ def test_rows_of_our_own_are_compared_at_the_same_steps(tmp_path):
 
 
 def test_rows_of_our_own_without_their_reference(tmp_path):
-    """The first row judged at other steps, or under another cap; seeds of ours at different steps; one seed: said, not compared."""
+    """The first row judged at other steps, or under another cap; seeds of ours at different steps; one seed: said, not
+    compared."""
     p = plan(tmp_path)
     judged(p, "full", 1, "simulation", [50] * 10, iteration=4)
     job = judged(p, "fixed", 1, "simulation", [60] * 10)
@@ -222,11 +283,19 @@ def test_own_rows_have_a_table_of_their_own(tmp_path):
     every = [judged(p, key, 1, "simulation", [5] * 10) for key in ("full", "fixed")]
     names = [path.name for path in report.write("rotation", p, every, {"command": "x", "device": "y"})]
     assert names == ["rotation.md", "rotation_own.md"]
-    assert "without randomization" not in (tmp_path / "rotation.md").read_text() and "| everything, trained without" in (tmp_path / "rotation_own.md").read_text()
+    assert (
+        "without randomization" not in (tmp_path / "rotation.md").read_text()
+        and "| everything, trained without" in (tmp_path / "rotation_own.md").read_text()
+    )
     assert set(json.loads((tmp_path / "rotation.json").read_text())["rows"]) == {"full"}
-    assert set(json.loads((tmp_path / "rotation_own.json").read_text())["rows"]) == {"fixed"} and (tmp_path / "rotation_own.png").stat().st_size > 1000
+    assert (
+        set(json.loads((tmp_path / "rotation_own.json").read_text())["rows"]) == {"fixed"}
+        and (tmp_path / "rotation_own.png").stat().st_size > 1000
+    )
     (tmp_path / "rotation.md").unlink()
-    assert [path.name for path in report.write("rotation", p, every[1:], {"command": "x", "device": "y"})] == ["rotation_own.md"]
+    assert [path.name for path in report.write("rotation", p, every[1:], {"command": "x", "device": "y"})] == [
+        "rotation_own.md"
+    ]
     assert not (tmp_path / "rotation.md").exists()
 
 
@@ -236,10 +305,22 @@ def test_the_grasp_table(tmp_path):
     for job, corr in zip(every, (0.95, 0.8, 0.9), strict=True):
         put(job, p, "simulation", [0])
         path = job.metrics(p, "simulation")
-        path.write_text(json.dumps({"hold_rate": 0.9, "contact_force_range_N": [3.0, 40.0], "joint_torque_range_Nm": [0.1, 0.8],
-                                    "force_command_correlation": corr, "torque_command_correlation": 0.7}))
+        path.write_text(
+            json.dumps(
+                {
+                    "hold_rate": 0.9,
+                    "contact_force_range_N": [3.0, 40.0],
+                    "joint_torque_range_Nm": [0.1, 0.8],
+                    "force_command_correlation": corr,
+                    "torque_command_correlation": 0.7,
+                }
+            )
+        )
     text, data, _ = report.grasp(p, every)
-    assert [o["here"] for o in data["orderings"]["simulation"]] == ["so for one seed each (0.950, 0.800)", "not so for one seed each (0.800, 0.900)"]
+    assert [o["here"] for o in data["orderings"]["simulation"]] == [
+        "so for one seed each (0.950, 0.800)",
+        "not so for one seed each (0.800, 0.900)",
+    ]
     assert [o["here"] for o in data["orderings"]["reality"]] == ["not judged"] * 2
     assert "| R_force + R_torque | 0.90 (0.90) | 3.00 (3.00) | 40.00 (40.00) |" in text
 
@@ -256,7 +337,8 @@ def test_a_correlation_is_stronger_beyond_what_seeds_do():
 
 
 class Children:
-    """Stands for subprocess: trainings write the checkpoint they were asked for, or what they reach before their limit."""
+    """Stands for subprocess: trainings write the checkpoint they were asked for, or what they reach before their
+    limit."""
 
     def __init__(self, monkeypatch):
         self.commands: list[list[str]] = []
@@ -274,7 +356,9 @@ class Children:
         command = command[command.index(sys.executable):]
         said = dict(c.split("=", 1) for c in command[2:])
         self.commands.append(command)
-        (Path(said["out"]) / "metrics.json").write_text(json.dumps({"of": said["checkpoint"], "episodes": int(said["episodes"])}))
+        (Path(said["out"]) / "metrics.json").write_text(
+            json.dumps({"of": said["checkpoint"], "episodes": int(said["episodes"])})
+        )
         return subprocess.CompletedProcess(command, 0)
 
     def wait(self, timeout=None):
@@ -292,11 +376,15 @@ def silent(text: str) -> None:
 
 
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
-    """An unfinished training is resumed from its last checkpoint, a finished one is not repeated, judged metrics stay."""
+    """An unfinished training is resumed from its last checkpoint, a finished one is not repeated, judged metrics
+    stay."""
     p, job, children = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1), Children(monkeypatch)
     put(job, p, "simulation", [1])
     last = jobs.train(job, p, None, silent)
-    assert f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in children.commands[0] and last == job.folder(p) / "train_1" / "last.pt"
+    assert (
+        f"resume={job.folder(p) / 'train_0' / 'last.pt'}" in children.commands[0]
+        and last == job.folder(p) / "train_1" / "last.pt"
+    )
     assert jobs.train(job, p, None, silent) == last and len(children.commands) == 1
     jobs.judge(job, p, last, "simulation", None, silent)  # it had been judged after two iterations
     assert len(children.commands) == 2 and jobs.read(job, p, "simulation")["trained_steps"] == 400
@@ -307,10 +395,15 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
 
 
 def test_a_larger_budget_goes_on_from_the_smaller(tmp_path, monkeypatch):
-    """budget=1 and then 3: the same row learns twice as much again and is judged anew; so does one that `minutes` had ended."""
+    """budget=1 and then 3: the same row learns twice as much again and is judged anew; so does one that `minutes` had
+    ended."""
     p, job, children = plan(tmp_path), jobs.Job(rows.ROTATION[0], 1), Children(monkeypatch)
     jobs.run([job], p, [None], 1)
-    assert [c[1] for c in children.commands] == ["train.py", "play.py", "play.py"] and "iterations=4" in children.commands[0]
+    assert [c[1] for c in children.commands] == [
+        "train.py",
+        "play.py",
+        "play.py",
+    ] and "iterations=4" in children.commands[0]
     jobs.run([job], replace(p, steps=1200.0), [None], 1)
     more = children.commands[3:]
     assert [c[1] for c in more] == ["train.py", "play.py", "play.py"] and "iterations=12" in more[0]
@@ -330,7 +423,8 @@ def test_a_larger_budget_goes_on_from_the_smaller(tmp_path, monkeypatch):
 
 
 def test_a_sitting_ends_and_the_next_goes_on(tmp_path, monkeypatch):
-    """When the sitting is over, what runs is saved and not judged, what waits is not begun; the next sitting does both."""
+    """When the sitting is over, what runs is saved and not judged, what waits is not begun; the next sitting does
+    both."""
     p, children = plan(tmp_path, sitting=1e-9), Children(monkeypatch)
     pair = [jobs.Job(rows.ROTATION[0], s) for s in (1, 2)]
     children.reach = 2
@@ -339,7 +433,9 @@ def test_a_sitting_ends_and_the_next_goes_on(tmp_path, monkeypatch):
     assert len(children.commands) == 1 and jobs.read(pair[0], p, "simulation") is None
     children.reach = None
     jobs.run(pair, replace(p, sitting=None), [None], 1)
-    assert [c[1] for c in children.commands].count("train.py") == 3 and all(jobs.read(j, p, w) for j in pair for w in jobs.WORLDS)
+    assert [c[1] for c in children.commands].count("train.py") == 3 and all(
+        jobs.read(j, p, w) for j in pair for w in jobs.WORLDS
+    )
 
 
 def lanes_at_work(schedule: Schedule, lanes: int, until: float = math.inf) -> list[tuple[float, int, float]]:
@@ -365,7 +461,8 @@ def test_every_row_reaches_a_stage_before_any_goes_on():
 
 
 def test_cut_trainings_end_together():
-    """14 trainings on 3 lanes: in one go two lanes work at the end while the third idles; with 5 of them in pieces none does."""
+    """14 trainings on 3 lanes: in one go two lanes work at the end while the third idles; with 5 of them in pieces none
+    does."""
     idle = {}
     for cut in (False, True):
         ends = lanes_at_work(Schedule([50.0] * 14, [50.0, 90.0], 3, cut=cut), 3)
@@ -388,11 +485,16 @@ def test_the_budget_that_fits_a_sitting():
 
 
 def test_stages_are_judged_and_told_apart(tmp_path, monkeypatch):
-    """Two rows, a stage at half: trained and judged there, then at the end; the stage has a table of its own and is packed."""
+    """Two rows, a stage at half: trained and judged there, then at the end; the stage has a table of its own and is
+    packed."""
     p, children = plan(tmp_path / "a", stages=(200.0,)), Children(monkeypatch)
     pair = [jobs.Job(r, 1) for r in rows.ROTATION[:2]]
     ended = jobs.run(pair, p, [None], 1)
-    trained = [next(c for c in command if c.startswith("iterations=")) for command in children.commands if command[1] == "train.py"]
+    trained = [
+        next(c for c in command if c.startswith("iterations="))
+        for command in children.commands
+        if command[1] == "train.py"
+    ]
     assert trained == ["iterations=2", "iterations=2", "iterations=4", "iterations=4"] and ended.steps == 400.0
     for stage, steps in zip(ended.each(), (200, 400), strict=True):
         assert all(jobs.read(j, stage, w)["trained_steps"] == steps for j in pair for w in jobs.WORLDS)
@@ -426,7 +528,8 @@ def test_the_end_of_a_running_training_is_seen(tmp_path):
 
 
 def test_pack_takes_along_what_the_next_sitting_needs(tmp_path):
-    """Packed, unpacked elsewhere: the same progress and judging, without the optimizer's moments; a whole job in a part."""
+    """Packed, unpacked elsewhere: the same progress and judging, without the optimizer's moments; a whole job in a
+    part."""
     p, q = plan(tmp_path / "a"), plan(tmp_path / "b")
     pair = [jobs.Job(rows.ROTATION[0], s) for s in (1, 2)]
     for job in pair:
@@ -470,7 +573,8 @@ said = dict(a.split("=", 1) for a in sys.argv[1:])
 
 @pytest.mark.slow
 def test_a_sitting_is_shared_by_all_rows(tmp_path, monkeypatch):
-    """Seven trainings on three lanes for 12 s: all judged at the stage, all settled on one budget within the sitting, none beyond it."""
+    """Seven trainings on three lanes for 12 s: all judged at the stage, all settled on one budget within the sitting,
+    none beyond it."""
     for name, text in (("train.py", TRAIN), ("play.py", PLAY)):
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(jobs.tools, "ROOT", tmp_path)
@@ -481,7 +585,8 @@ def test_a_sitting_is_shared_by_all_rows(tmp_path, monkeypatch):
     ended = jobs.run(every, p, ["0", "1", "2"], 2)
     steps = [jobs.done(j.folder(p)).steps for j in every]
     assert 2000 < ended.steps < 1e6 and max(steps) <= ended.steps and min(steps) > 2000
-    assert sum(s == ended.steps for s in steps) >= 4  # all of them on a machine that is as fast at the end as at the beginning
+    # all of them on a machine that is as fast at the end as at the beginning
+    assert sum(s == ended.steps for s in steps) >= 4
     assert all(jobs.read(j, ended.each()[0], w)["trained_steps"] == 2000 for j in every for w in jobs.WORLDS)
     assert time.monotonic() - began < 40
 
@@ -489,8 +594,22 @@ def test_a_sitting_is_shared_by_all_rows(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_row_end_to_end(tmp_path):
     """Train, judge in both worlds, write the table, on the CPU with a tiny budget."""
-    argv = [sys.executable, "-m", "benchmarks.reproduce", "table=rotation", "rows=full,fixed", "seeds=1", "budget=1e-7", "episodes=4", "cap=2",
-            f"out={tmp_path}", "worlds=4", "device=cpu", "agent.num_steps_per_env=8", "agent.algorithm.num_mini_batches=2"]  # fmt: skip
+    argv = [
+        sys.executable,
+        "-m",
+        "benchmarks.reproduce",
+        "table=rotation",
+        "rows=full,fixed",
+        "seeds=1",
+        "budget=1e-7",
+        "episodes=4",
+        "cap=2",
+        f"out={tmp_path}",
+        "worlds=4",
+        "device=cpu",
+        "agent.num_steps_per_env=8",
+        "agent.algorithm.num_mini_batches=2",
+    ]
     done = subprocess.run(argv, capture_output=True, text=True, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["missing"] == 0
@@ -499,9 +618,17 @@ def test_a_row_end_to_end(tmp_path):
     pack.main([f"out={tmp_path}", f"into={tmp_path / 'state'}"])
     elsewhere = tmp_path / "elsewhere"
     pack.main([f"unpack={tmp_path / 'state'}", f"out={elsewhere}"])
-    again = [a for a in argv if not a.startswith(("budget=", "out=", "rows="))] + ["budget=3e-7", "rows=full", f"out={elsewhere}"]
+    again = [a for a in argv if not a.startswith(("budget=", "out=", "rows="))] + [
+        "budget=3e-7",
+        "rows=full",
+        f"out={elsewhere}",
+    ]
     done = subprocess.run(again, capture_output=True, text=True, cwd=ROOT, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads((elsewhere / "rotation.json").read_text())["rows"]["full"]["simulation"]["steps"] == [64]
-    assert set(table) == {"full"} and set(ours) == {"fixed"} and set(table["full"]) == set(ours["fixed"]) == {"simulation", "reality"}
+    assert (
+        set(table) == {"full"}
+        and set(ours) == {"fixed"}
+        and set(table["full"]) == set(ours["fixed"]) == {"simulation", "reality"}
+    )
     assert (tmp_path / "rotation.md").exists() and (tmp_path / "rotation.png").stat().st_size > 1000

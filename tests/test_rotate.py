@@ -39,7 +39,8 @@ def random_quaternions(n: int, seed: int = 0) -> torch.Tensor:
     return q / q.norm(dim=1, keepdim=True)
 
 
-# -- rotations -------------------------------------------------------------------------------------------------------------
+# -- rotations
+# -------------------------------------------------------------------------------------------------------------
 
 
 def test_matrix_and_back_agree_up_to_sign():
@@ -74,7 +75,8 @@ def test_six_is_the_first_two_columns():
 
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_upright_removes_tilt_and_nothing_else(axis):
-    """A cube lying on a face, turned by yaw about the axis, then tilted about a direction across it: the tilt goes, yaw stays."""
+    """A cube lying on a face, turned by yaw about the axis, then tilted about a direction across it: the tilt goes, yaw
+    stays."""
     n = torch.tensor(axis, dtype=torch.float64)
     across = torch.linalg.cross(n, torch.tensor([0.3, 1.0, -0.2], dtype=torch.float64))
     across = across / across.norm()
@@ -88,7 +90,8 @@ def test_upright_removes_tilt_and_nothing_else(axis):
             assert rotation.error(rotation.upright(q, n), lying) < 1e-7
 
 
-# -- the task ----------------------------------------------------------------------------------------------------------------
+# -- the task
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def test_sizes():
@@ -99,11 +102,18 @@ def test_sizes():
     assert sum(r[1] for r in tables["actor"]) == 65 and sum(r[1] for r in tables["critic"]) == 149
 
 
-@pytest.mark.parametrize(("overrides", "size"), [
-    (["task.observe.orientation=quaternion"], 63), (["task.observe.orientation=none"], 59), (["task.observe.contact_force=false"], 60),
-    (["task.observe.contact_centre=false", "task.observe.contact_force=false"], 45), (["task.observe.force_weighted=false"], 65),
-    (["task.perception=proprioception"], 4 * 56), (["task.critic=paper"], 65),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("overrides", "size"),
+    [
+        (["task.observe.orientation=quaternion"], 63),
+        (["task.observe.orientation=none"], 59),
+        (["task.observe.contact_force=false"], 60),
+        (["task.observe.contact_centre=false", "task.observe.contact_force=false"], 45),
+        (["task.observe.force_weighted=false"], 65),
+        (["task.perception=proprioception"], 4 * 56),
+        (["task.critic=paper"], 65),
+    ],
+)
 def test_ablations(overrides, size):
     env = make(*overrides, worlds=2)
     obs = env.step(torch.zeros(2, 12))[0]
@@ -115,8 +125,16 @@ def test_ablations(overrides, size):
 
 def test_actor_slices_hold_what_they_say():
     """With noise off, each slice of the actor equals its definition."""
-    env = make("task.sensors.joint_noise=0", "task.sensors.tip_noise=0", "task.sensors.imu_noise=0", "task.sensors.imu_heading_walk=0",
-               "randomize.sensors.joint_bias=0", "randomize.imu.delay=0", "randomize.imu.heading_rate=0", "randomize.imu.tilt=0")
+    env = make(
+        "task.sensors.joint_noise=0",
+        "task.sensors.tip_noise=0",
+        "task.sensors.imu_noise=0",
+        "task.sensors.imu_heading_walk=0",
+        "randomize.sensors.joint_bias=0",
+        "randomize.imu.delay=0",
+        "randomize.imu.heading_rate=0",
+        "randomize.imu.tilt=0",
+    )
     act = 0.5 * torch.ones(4, 12)
     obs = env.step(act)[0]
     actor, critic = obs["actor"], obs["critic"]
@@ -236,8 +254,8 @@ def test_tilt_does_not_accumulate(env):
 
 
 def test_turning_the_cube_from_outside_reaches_goals(env):
-    """Cubes turned by hand, 4.3 rad: each quarter turn is a success and pays the bonus once; the other way there is none
-    (until 270 degrees back are the same as 90 on)."""
+    """Cubes turned by hand, 4.3 rad: each quarter turn is a success and pays the bonus once; the other way there is
+    none (until 270 degrees back are the same as 90 on)."""
     env.reset_all()
     base = env.object_pose.clone()
     flat = rotation.upright(base[:, 3:], env.axis)
@@ -313,7 +331,8 @@ def test_endings(env):
 
 
 def test_quaternion_jumps_and_six_does_not():
-    """A cube turned once round, its goal turning with it: the same relative rotation, but the quaternion's sign jumps."""
+    """A cube turned once round, its goal turning with it: the same relative rotation, but the quaternion's sign
+    jumps."""
     env = make("task.observe.orientation=quaternion", worlds=1)
     six, four = [], []
     for k in range(200):
@@ -331,8 +350,14 @@ def test_quaternion_jumps_and_six_does_not():
 
 
 def test_imu_is_late_and_drifts():
-    env = make("randomize.imu.delay=0.05", "randomize.imu.heading_rate=0.01", "randomize.imu.tilt=0", "task.sensors.imu_noise=0",
-               "task.sensors.imu_heading_walk=0", worlds=2)
+    env = make(
+        "randomize.imu.delay=0.05",
+        "randomize.imu.heading_rate=0.01",
+        "randomize.imu.tilt=0",
+        "task.sensors.imu_noise=0",
+        "task.sensors.imu_heading_walk=0",
+        worlds=2,
+    )
     truth = []
     for _ in range(20):
         env.step(torch.full((2, 12), 0.3))
@@ -353,7 +378,11 @@ def test_plain_centre_is_the_mean_of_touched_taxels():
     points = [pos + rot @ env.taxel_point[1, k] for k in (5, 80)]
     centre = env._plain_centre().reshape(4, 5, 3)
     assert torch.allclose(centre[0, 1], (points[0] + points[1]) / 2, atol=1e-6)
-    assert torch.allclose(centre[1, 1], env.engine.t.xpos[1, body].float() + env.engine.t.xmat[1, body].float() @ env.pad_centre[1], atol=1e-6)
+    assert torch.allclose(
+        centre[1, 1],
+        env.engine.t.xpos[1, body].float() + env.engine.t.xmat[1, body].float() @ env.pad_centre[1],
+        atol=1e-6,
+    )
 
 
 def test_proprioception_remembers():
@@ -378,7 +407,8 @@ def test_impossible_settings_are_named(overrides, word):
         make(*overrides, worlds=1)
 
 
-# -- held poses ----------------------------------------------------------------------------------------------------------------
+# -- held poses
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def test_set_is_large_and_covers_sizes():
@@ -387,14 +417,16 @@ def test_set_is_large_and_covers_sizes():
     assert held_file(load_hand()).stat().st_size < 1_000_000
     assert g.edge.min() < 0.047 and g.edge.max() > 0.058
     assert torch.allclose(g.pose[:, 3:].norm(dim=1), torch.ones(len(g)), atol=1e-4)
-    yaw = torch.atan2(*rotation.to_matrix(rotation.upright(g.pose[:, 3:], torch.tensor([0.0, 0.0, 1.0])))[:, [1, 0], 0].unbind(1))
+    yaw = torch.atan2(
+        *rotation.to_matrix(rotation.upright(g.pose[:, 3:], torch.tensor([0.0, 0.0, 1.0])))[:, [1, 0], 0].unbind(1)
+    )
     assert len(torch.histc(yaw % (math.pi / 2), 6).nonzero()) == 6  # all attitudes of a cube
 
 
 @pytest.mark.slow
 def test_poses_hold():
-    """Of 96 saved poses, in worlds with other masses, frictions and drives, nearly all lie still for two seconds without
-    an action; none falls."""
+    """Of 96 saved poses, in worlds with other masses, frictions and drives, nearly all lie still for two seconds
+    without an action; none falls."""
     env = make(worlds=96, seed=5)
     env.in_order = True
     env.grasps = env.grasps[torch.randperm(len(env.grasps), generator=torch.Generator().manual_seed(1))[:96]]
@@ -406,7 +438,8 @@ def test_poses_hold():
     assert (env.d_pos < 1.5 * DRIFT).float().mean() > 0.9
 
 
-# -- evaluation ------------------------------------------------------------------------------------------------------------------
+# -- evaluation
+# ------------------------------------------------------------------------------------------------------------------
 
 
 def test_summary_reproduces_the_papers_first_row():
@@ -429,8 +462,8 @@ def test_summary_without_success():
 
 
 def test_evaluation_counts(monkeypatch):
-    """The cubes are turned from outside at 2 rad/s for 3 s, one is thrown away after 2 s, one stays, one turns the wrong way (and so
-    reaches its goal once, from the other side)."""
+    """The cubes are turned from outside at 2 rad/s for 3 s, one is thrown away after 2 s, one stays, one turns the
+    wrong way (and so reaches its goal once, from the other side)."""
     env = make("task.evaluation.cap_s=3.0", "sim.control_period=0.021")
     read = env.read_state
     speed = torch.tensor([2.0, 2.0, 0.0, -2.0])

@@ -111,7 +111,8 @@ def test_a_goal_that_is_not_reached_is_replaced_in_training_only():
     assert torch.equal(env.goal, before)
 
 
-# -- what the actor knows ------------------------------------------------------------------------------------------------
+# -- what the actor knows
+# ------------------------------------------------------------------------------------------------
 
 
 def test_the_actor_does_not_know_size_mass_or_friction(env):
@@ -178,7 +179,9 @@ def test_a_hidden_pose_stays_as_it_was_and_ages():
 
 
 def test_pushes_come_and_are_as_strong_as_they_say():
-    env = make("randomize.push.weights=[1.0,1.5]", "randomize.push.wait=[0.1,0.3]", "randomize.push.duration=0.126", worlds=4)
+    env = make(
+        "randomize.push.weights=[1.0,1.5]", "randomize.push.wait=[0.1,0.3]", "randomize.push.duration=0.126", worlds=4
+    )
     on = []
     for _ in range(40):
         env.step(torch.zeros(4, 12))

@@ -16,9 +16,9 @@ DRAG = 30.0  # N.s/m on the object, so that it stays where it was put
 
 
 def _press(env, seed: int) -> dict[str, torch.Tensor]:
-    """Objects of 30 to 500 g pressed on the middle fingertip, along its pad's normal, by weight and 0 to 4 N more, until
-    at rest; the hand is locked in random postures. Friction of 2 makes
-    contacts stick (they creep, as MuJoCo's friction does)."""
+    """Objects of 30 to 500 g pressed on the middle fingertip, along its pad's normal, by weight and 0 to 4 N more,
+    until at rest; the hand is locked in random postures. Friction of 2 makes contacts stick (they creep, as MuJoCo's
+    friction does)."""
     g = torch.Generator().manual_seed(seed)
 
     def u(low, high, *shape):
@@ -29,7 +29,16 @@ def _press(env, seed: int) -> dict[str, torch.Tensor]:
     rows = torch.tensor([names.index(s) for s in ("sphere", "box", "rock", "egg")])[torch.arange(N) % 4]
     mass = torch.tensor(np.geomspace(0.03, 0.5, N)[torch.randperm(N, generator=g).numpy()], dtype=torch.float32)
     k = u(4000, 9000)
-    o.write(torch.ones(N, dtype=torch.bool), rows, torch.full((N, 3), 1.2), mass, torch.zeros(N, 3), torch.full((N,), 2.0), k, torch.ones(N))
+    o.write(
+        torch.ones(N, dtype=torch.bool),
+        rows,
+        torch.full((N, 3), 1.2),
+        mass,
+        torch.zeros(N, 3),
+        torch.full((N,), 2.0),
+        k,
+        torch.ones(N),
+    )
     env.touch.shape_id.copy_(o.variant.to(torch.int32))
     env.touch.shape_size.copy_(o.size)
     hand = torch.zeros(N, 12)

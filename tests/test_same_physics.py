@@ -1,5 +1,5 @@
-"""dexsim's narrow phase and solver in place of MuJoCo-Warp's change no physics: a held grasp creeps alike, and what bounces keeps
-as much energy."""
+"""dexsim's narrow phase and solver in place of MuJoCo-Warp's change no physics: a held grasp creeps alike, and what
+bounces keeps as much energy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def fibers():
 
 
 def test_a_held_grasp_creeps_alike(fibers):
-    """The same grasp, held for a second with the palm turned down: objects stay, and drift by as much (float32 chaos aside)."""
+    """The same grasp, held for a second with the palm turned down: objects stay, and drift by as much (float32 chaos
+    aside)."""
     envs = {}
     for whose in ("mujoco", "hand"):
         both = (f"sim.collision={whose}", f"sim.solver={whose}")
@@ -60,7 +61,10 @@ def bouncing() -> mujoco.MjModel:
     """A hull of the object library above a box, a contact that gives back most of its energy, no friction."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.cone = 5e-4, mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.integrator, spec.option.jacobian = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtJacobian.mjJAC_SPARSE
+    spec.option.integrator, spec.option.jacobian = (
+        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        mujoco.mjtJacobian.mjJAC_SPARSE,
+    )
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
     spec.option.iterations, spec.option.ls_iterations = 30, 30
     spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
@@ -71,13 +75,15 @@ def bouncing() -> mujoco.MjModel:
     body = spec.worldbody.add_body(name="thing", pos=[0.0, 0.0, 0.12])
     body.add_freejoint()
     body.ipos = [0.0, 0.0, 0.0]
-    body.mass, body.inertia, body.explicitinertial = 0.1, [6e-5, 6e-5, 6e-5], True  # explicit gyroscopic torque would add energy
+    # explicit gyroscopic torque would add energy
+    body.mass, body.inertia, body.explicitinertial = 0.1, [6e-5, 6e-5, 6e-5], True
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull", friction=[0.1, 0.01, 0.001], **spring)
     return spec.compile()
 
 
 def test_what_bounces_keeps_as_much_energy(fibers):
-    """Up to three bounces of a tumbling hull, from six orientations: energy after 0.3 s as with MuJoCo-Warp's own, and as C MuJoCo's."""
+    """Up to three bounces of a tumbling hull, from six orientations: energy after 0.3 s as with MuJoCo-Warp's own, and
+    as C MuJoCo's."""
     model = bouncing()
     n, steps = 6, 600
     rng = np.random.default_rng(0)

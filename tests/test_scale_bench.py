@@ -10,9 +10,14 @@ from dexsim.errors import UserError
 
 
 def test_line_is_the_slope_of_the_large_counts():
-    rows = [{"worlds": n, "simulate_bytes": 2**28 + 5000 * n + (10**7 if n < 1024 else 0)} for n in (1, 16, 1024, 8192, 65_536)]
+    rows = [
+        {"worlds": n, "simulate_bytes": 2**28 + 5000 * n + (10**7 if n < 1024 else 0)}
+        for n in (1, 16, 1024, 8192, 65_536)
+    ]
     fit = scale.line(rows, "simulate_bytes")
-    assert fit["bytes_per_world"] == pytest.approx(5000, rel=1e-6) and fit["fixed_bytes"] == pytest.approx(2**28, rel=1e-6)
+    assert fit["bytes_per_world"] == pytest.approx(5000, rel=1e-6) and fit["fixed_bytes"] == pytest.approx(
+        2**28, rel=1e-6
+    )
     assert scale.line(rows, "train_bytes") is None
 
 

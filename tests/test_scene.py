@@ -12,8 +12,22 @@ from dexsim.assets.objects import library
 from dexsim.sim.scene import HULL_SLOTS, SLOTS
 from dexsim.tactile import reference
 
-WRITTEN = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "geom_pos", "geom_quat", "geom_size", "geom_dataid", "geom_rbound",
-           "geom_aabb", "geom_friction", "geom_solref", "body_invweight0", "body_subtreemass")
+WRITTEN = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_iquat",
+    "geom_pos",
+    "geom_quat",
+    "geom_size",
+    "geom_dataid",
+    "geom_rbound",
+    "geom_aabb",
+    "geom_friction",
+    "geom_solref",
+    "body_invweight0",
+    "body_subtreemass",
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +40,8 @@ def warp_scene():
     return hand_scene(32, scales=(1.1, 1.4), kind="warp")
 
 
-# -- what MuJoCo derives -------------------------------------------------------------------------------------------------
+# -- what MuJoCo derives
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -54,7 +69,8 @@ def test_derived_constants_equal_the_engines_set_const(warp_scene):
 
 
 def test_mass_properties_are_those_of_the_shape(scene):
-    """Against MuJoCo's own: primitives from a compiled geom, irregular shapes from the library's exact mesh integrals."""
+    """Against MuJoCo's own: primitives from a compiled geom, irregular shapes from the library's exact mesh
+    integrals."""
     e, s, objects = scene
     v = write(objects, **random_values(e.n, len(s.variants), 1))
     b = objects.body
@@ -100,7 +116,8 @@ def test_mass_and_centre_act_in_the_engine(which, request):
     assert np.abs(speed[:, 3:]).max() < 2e-3
 
 
-# -- the collision surface --------------------------------------------------------------------------------------------------
+# -- the collision surface
+# --------------------------------------------------------------------------------------------------
 
 
 def _touching(e, w: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -130,10 +147,16 @@ def test_collision_surface_is_where_touch_has_it(scene):
         for w in range(min(e.n, len(s.variants) - first)):
             variant = s.variants[int(v["variant"][w])]
             m, d = _touching(e, w)
-            own = [objects.slots[k].item() for k in range(len(SLOTS)) if np.linalg.norm(m.geom_pos[objects.slots[k]]) < 1]
+            own = [
+                objects.slots[k].item() for k in range(len(SLOTS)) if np.linalg.norm(m.geom_pos[objects.slots[k]]) < 1
+            ]
             assert len(own) == max(len(variant.shape.hulls), 1)
             probe = int(e.geom("tip_mid"))
-            m.geom_type[probe], m.geom_size[probe], m.geom_dataid[probe] = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-4, 0, 0], -1
+            m.geom_type[probe], m.geom_size[probe], m.geom_dataid[probe] = (
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                [1e-4, 0, 0],
+                -1,
+            )
             kind, grid = variant.shape.kind, variant.shape.grid
             touch = objects.size[w].double().numpy()
             for u in directions:
@@ -147,9 +170,14 @@ def test_collision_surface_is_where_touch_has_it(scene):
 
 
 def _march(kind, size, grid, p, u):
-    """The point nearest to the end of the ray p + s u through the origin's neighbourhood where touch's distance is 0."""
+    """The point nearest to the end of the ray p + s u through the origin's neighbourhood where touch's distance is
+    0."""
     inside, outside = p + u * np.linalg.norm(p), p
-    assert reference.distance(kind, size, inside[None], grid)[0] < 0 < reference.distance(kind, size, outside[None], grid)[0]
+    assert (
+        reference.distance(kind, size, inside[None], grid)[0]
+        < 0
+        < reference.distance(kind, size, outside[None], grid)[0]
+    )
     for _ in range(40):  # a star-shaped view is not needed: any crossing is on the surface
         mid = (inside + outside) / 2
         inside, outside = (mid, outside) if reference.distance(kind, size, mid[None], grid)[0] < 0 else (inside, mid)
@@ -161,9 +189,17 @@ FLOOR = -0.5
 
 def _floor(spec: mujoco.MjSpec) -> None:
     # a box, not a plane: parked slots turn with the object, and a plane has no end
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.3, 0.3, 0.05], pos=[0, 0, FLOOR - 0.05], contype=2, conaffinity=1,
-                            friction=[1, 0.005, 1e-4])
-    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)  # faces on faces: one point a pair would rock
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.3, 0.3, 0.05],
+        pos=[0, 0, FLOOR - 0.05],
+        contype=2,
+        conaffinity=1,
+        friction=[1, 0.005, 1e-4],
+    )
+    # faces on faces: one point a pair would rock
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 
 
 def _lowest(variant, size: np.ndarray, rot: np.ndarray) -> float:
@@ -188,8 +224,12 @@ def test_every_shape_comes_to_lie_on_its_surface(kind):
     a = e.mjm.jnt_qposadr[e.joint("object_free")]
     for _ in range(10):
         e.step(40)
-        low = [float(e.t.qpos[w, a + 2]) - FLOOR - _lowest(s.variants[w], objects.size[w].double().numpy(), e.t.xmat[w, objects.body].double().numpy())
-               for w in range(e.n)]
+        low = [
+            float(e.t.qpos[w, a + 2])
+            - FLOOR
+            - _lowest(s.variants[w], objects.size[w].double().numpy(), e.t.xmat[w, objects.body].double().numpy())
+            for w in range(e.n)
+        ]
         assert min(low) > -7e-3, dict(zip(names, low, strict=True))
     assert max(low) < 1e-3 and min(low) > -1.5e-3, dict(zip(names, low, strict=True))
 
@@ -209,8 +249,15 @@ def test_bounding_volumes_hold_each_slot(scene):
                 v = m.mesh_vert[m.mesh_vertadr[mesh]:m.mesh_vertadr[mesh] + m.mesh_vertnum[mesh]]
                 low, high, radius = v.min(0), v.max(0), np.linalg.norm(v, axis=1).max()
             else:
-                high = np.array({"BOX": (a, b, c), "SPHERE": (a, a, a), "CAPSULE": (a, a, a + b)}[kind.name.removeprefix("mjGEOM_")])
-                low, radius = -high, {"BOX": np.hypot(np.hypot(a, b), c), "SPHERE": a, "CAPSULE": a + b}[kind.name.removeprefix("mjGEOM_")]
+                high = np.array(
+                    {"BOX": (a, b, c), "SPHERE": (a, a, a), "CAPSULE": (a, a, a + b)}[kind.name.removeprefix("mjGEOM_")]
+                )
+                low, radius = (
+                    -high,
+                    {"BOX": np.hypot(np.hypot(a, b), c), "SPHERE": a, "CAPSULE": a + b}[
+                        kind.name.removeprefix("mjGEOM_")
+                    ],
+                )
             box = m.geom_aabb[g]
             assert radius * 0.99999 <= m.geom_rbound[g] < 1.8 * radius, (w, g)
             assert (box[:3] - box[3:] <= low + 1e-6).all() and (box[:3] + box[3:] >= high - 1e-6).all()
@@ -228,7 +275,9 @@ def test_parked_slots_are_far_and_per_world_frames_are_used(which, request):
     near = pos.norm(dim=-1) < 0.5
     for w in range(e.n):
         variant = s.variants[int(v["variant"][w])]
-        slots = {"box": [0], "sphere": [1], "capsule": [2]}.get(variant.shape.kind, [3 + k for k in range(len(variant.shape.hulls))])
+        slots = {"box": [0], "sphere": [1], "capsule": [2]}.get(
+            variant.shape.kind, [3 + k for k in range(len(variant.shape.hulls))]
+        )
         assert near[w].nonzero()[:, 0].tolist() == slots, variant.shape.name
     assert bool((pos[~near].norm(dim=-1) > 900).all())
 
@@ -253,7 +302,8 @@ def test_parked_slots_never_collide(scene):
     assert seen > e.n / 2
 
 
-# -- worlds and time -----------------------------------------------------------------------------------------------------------
+# -- worlds and time
+# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("which", ["scene", "warp_scene"])
@@ -279,7 +329,11 @@ def test_writing_again_gives_the_same_and_never_compounds(scene):
     write(objects, **first)
     fields = {f: e.field(f).clone() for f in WRITTEN}
     for k in range(100):
-        write(objects, torch.rand(e.n, generator=torch.Generator().manual_seed(k)) < 0.7, **random_values(e.n, len(s.variants), 100 + k))
+        write(
+            objects,
+            torch.rand(e.n, generator=torch.Generator().manual_seed(k)) < 0.7,
+            **random_values(e.n, len(s.variants), 100 + k),
+        )
     write(objects, **first)
     for f, v in fields.items():
         assert torch.equal(e.field(f), v), f
@@ -302,7 +356,8 @@ def test_friction_and_rubber_are_written_by_world(scene):
         assert m.geom_friction[objects.slots.tolist(), 0].max() < 0.01  # the hand's friction counts: the larger of two
 
 
-# -- environments ---------------------------------------------------------------------------------------------------------------
+# -- environments
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_hundred_resets_stay_in_the_ranges():
@@ -317,8 +372,11 @@ def test_a_hundred_resets_stay_in_the_ranges():
         ratio.append((env.servo.column("kp") / nominal[:, 0]).clone())
     assert torch.equal(env.servo.nominal, nominal)
     kp = ranges["servo.kp"]
-    for name, values, (low, high, log) in (("mass", torch.cat(mass), ranges["object.mass"]), ("friction", torch.cat(friction), ranges["object.friction"]),
-                                           ("kp", torch.cat(ratio), kp)):
+    for name, values, (low, high, log) in (
+        ("mass", torch.cat(mass), ranges["object.mass"]),
+        ("friction", torch.cat(friction), ranges["object.friction"]),
+        ("kp", torch.cat(ratio), kp),
+    ):
         values = values.double()
         assert low * (1 - 1e-5) <= float(values.min()) and float(values.max()) <= high * (1 + 1e-5), name
         u = ((values / low).log() / np.log(high / low)) if log else (values - low) / (high - low)

@@ -14,15 +14,17 @@ WORLDS = 32
 
 
 def test_the_scripted_policy_holds():
-    """Measured: 60 % of 32 episodes held, nothing without a policy. A wrong sign, a soft servo or contacts that shake the
-    object off end well under a third."""
+    """Measured: 60 % of 32 episodes held, nothing without a policy. A wrong sign, a soft servo or contacts that shake
+    the object off end well under a third."""
     env = grasp_env(worlds=WORLDS)
     held = {}
     for name in ("scripted", "zero"):
         env.rng.manual_seed(5)
         torch.manual_seed(5)
         with torch.inference_mode():
-            held[name] = grasp_eval._play_all(env, plain_policy(name, env, 0), WORLDS, env.train_rows, None, "")["held"].mean()
+            held[name] = grasp_eval._play_all(env, plain_policy(name, env, 0), WORLDS, env.train_rows, None, "")[
+                "held"
+            ].mean()
     assert held["scripted"] > 0.35 and held["scripted"] > held["zero"] + 0.3, held
 
 

@@ -85,17 +85,55 @@ def run(engine, servo, seconds: float, each=None) -> np.ndarray:
 def random_params(rng, shape) -> np.ndarray:
     """Params that exercise every column in every regime, some neutral."""
     scale = {
-        "kp": 4.0, "kd": 0.1, "deadband": 0.05, "torque_limit": 1.0, "no_load_speed": 10.0, "efficiency": 0.5,
-        "delay": 0.02, "lag": 0.02, "supply": 0.3, "coulomb_friction": 0.02, "friction_asymmetry": 0.4,
-        "stribeck_peak": 0.02, "stribeck_speed": 1.0, "stribeck_exponent": 3.0, "presliding": 0.02, "ripple_shape": 1.0, "viscous_friction": 0.01, "load_friction": 0.2,
-        "load_friction_backdriven": 0.4, "torque_ripple": 0.02, "ripple_per_turn": 20.0, "ripple_phase": 3.0,
-        "position_offset": 0.05, "position_scale": 0.1,
-        "eccentric_sin": 0.05, "eccentric_cos": 0.05, "speed_lag": 0.02, "deadband_kind": 2.9,
-        "backlash": 0.05, "rebound": 0.5, "softness": 0.2, "hardening": 0.5, "rotor": 3e-3,
-        "thermal_torque": -0.01, "thermal_friction": 0.02, "thermal_resistance": 0.004, "warmth": 40.0,
-        "sag": 0.3, "braking_slope": 1.0, "speed_feedforward": 0.01, "acceleration_feedforward": 1e-5, "integral_gain": 20.0, "coupling": 0.3, "coupling_from": 2.9,
-        "standin_constant": 0.05, "standin_position": -0.2, "standin_speed": -0.01, "standin_drag": -0.002,
-    }  # fmt: skip
+        "kp": 4.0,
+        "kd": 0.1,
+        "deadband": 0.05,
+        "torque_limit": 1.0,
+        "no_load_speed": 10.0,
+        "efficiency": 0.5,
+        "delay": 0.02,
+        "lag": 0.02,
+        "supply": 0.3,
+        "coulomb_friction": 0.02,
+        "friction_asymmetry": 0.4,
+        "stribeck_peak": 0.02,
+        "stribeck_speed": 1.0,
+        "stribeck_exponent": 3.0,
+        "presliding": 0.02,
+        "ripple_shape": 1.0,
+        "viscous_friction": 0.01,
+        "load_friction": 0.2,
+        "load_friction_backdriven": 0.4,
+        "torque_ripple": 0.02,
+        "ripple_per_turn": 20.0,
+        "ripple_phase": 3.0,
+        "position_offset": 0.05,
+        "position_scale": 0.1,
+        "eccentric_sin": 0.05,
+        "eccentric_cos": 0.05,
+        "speed_lag": 0.02,
+        "deadband_kind": 2.9,
+        "backlash": 0.05,
+        "rebound": 0.5,
+        "softness": 0.2,
+        "hardening": 0.5,
+        "rotor": 3e-3,
+        "thermal_torque": -0.01,
+        "thermal_friction": 0.02,
+        "thermal_resistance": 0.004,
+        "warmth": 40.0,
+        "sag": 0.3,
+        "braking_slope": 1.0,
+        "speed_feedforward": 0.01,
+        "acceleration_feedforward": 1e-5,
+        "integral_gain": 20.0,
+        "coupling": 0.3,
+        "coupling_from": 2.9,
+        "standin_constant": 0.05,
+        "standin_position": -0.2,
+        "standin_speed": -0.01,
+        "standin_drag": -0.002,
+    }
     around = ("efficiency", "supply", "position_scale")
     out = np.empty((*shape, len(COLUMNS)))
     for i, c in enumerate(COLUMNS):
@@ -113,14 +151,21 @@ def test_every_column_is_randomized_here():
 
 
 @pytest.mark.parametrize("voltage", [False, True])
-@pytest.mark.parametrize("features", [(), ("braking",), ("controller",), ("presliding", "shape"), ("play",), ("play", "presliding"), tuple(FEATURES)])
+@pytest.mark.parametrize(
+    "features",
+    [(), ("braking",), ("controller",), ("presliding", "shape"), ("play",), ("play", "presliding"), tuple(FEATURES)],
+)
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     """Also that a kernel built without a feature does not see its columns."""
     rng = np.random.default_rng(1)
     n, j = 400, 3
     engine = StubEngine(n, j, real)
-    raw = {"drive": "voltage" if voltage else "torque", "joints": {"*": {"kp": 1.0, "torque_limit": 1.0}}, "loop_encoder": {"j0": "motor"}}
+    raw = {
+        "drive": "voltage" if voltage else "torque",
+        "joints": {"*": {"kp": 1.0, "torque_limit": 1.0}},
+        "loop_encoder": {"j0": "motor"},
+    }
     servo = Servo(engine, ["j2", "j0", "j1"], ServoTable.from_dict(raw), varied=[FEATURES[f][0] for f in features])
     assert servo.features == set(features)
     qi, vi = [7 + 2, 7 + 0, 7 + 1], [6 + 2, 6 + 0, 6 + 1]
@@ -133,7 +178,9 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     slots, queue = servo.slots, servo.queue
     state[..., slots["motor"]] = rng.normal(0, 0.3, (n, j))
     state[..., slots["enabled"]] = rng.random((n, j)) < 0.9
-    state[..., slots["stamp0"] : slots["stamp0"] + queue] = 0.5 * np.sort(rng.uniform(0.9, 1.0, (n, j, queue))) + 0.5 * np.linspace(0.9, 1.0, queue)
+    state[..., slots["stamp0"] : slots["stamp0"] + queue] = 0.5 * np.sort(
+        rng.uniform(0.9, 1.0, (n, j, queue))
+    ) + 0.5 * np.linspace(0.9, 1.0, queue)
     state[..., slots["target0"] : slots["target0"] + queue] = rng.normal(0, 0.3, (n, j, queue))
     servo.base_armature[:] = torch.as_tensor(rng.uniform(0, 2e-3, (n, j)))
     servo.home[:] = torch.as_tensor(rng.normal(0, 0.1, (n, j)))
@@ -166,12 +213,24 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     known = {name: state[..., slots[name]] for name in EXTRA_SLOTS} if extra else {}
     source = np.clip(params[..., INDEX["coupling_from"]].astype(int), 0, j - 1)
     expected = servo_reference(
-        params, target, q, v, dt=engine.dt, voltage=voltage, features=features, base_armature=armature, **known,
-        dragging=np.take_along_axis(q - home, source, 1), others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
-        loop_motor=np.array([False, True, False]), rates=target_rates(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt),
-        last=state[..., slots["motor"]], enabled=state[..., slots["enabled"]], inertia=servo.inertia.numpy(),
+        params,
+        target,
+        q,
+        v,
+        dt=engine.dt,
+        voltage=voltage,
+        features=features,
+        base_armature=armature,
+        **known,
+        dragging=np.take_along_axis(q - home, source, 1),
+        others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
+        loop_motor=np.array([False, True, False]),
+        rates=target_rates(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt),
+        last=state[..., slots["motor"]],
+        enabled=state[..., slots["enabled"]],
+        inertia=servo.inertia.numpy(),
         base_damping=servo.base_damping.numpy(),
-    )  # fmt: skip
+    )
     got = {
         "torque": servo.torque.numpy(),
         "qfrc_applied": engine.t.qfrc_applied[:, vi].numpy(),
@@ -184,7 +243,10 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         got |= {"integral": servo.state[..., slots["integral"]].numpy()} if "controller" in features else {}
         got |= {"filtered": servo.state[..., slots["filtered"]].numpy()} if "rare" in features else {}
     if "play" in features:
-        got |= {"rotor": servo.state[..., slots["rotor"]].numpy(), "dof_armature": engine.field("dof_armature")[:, vi].numpy()}
+        got |= {
+            "rotor": servo.state[..., slots["rotor"]].numpy(),
+            "dof_armature": engine.field("dof_armature")[:, vi].numpy(),
+        }
     # a jump of the law (deadband, back-driven) might fall on either side in the other precision: by the seed none does
     for name, value in got.items():
         size = np.abs(expected[name]) + 1.0  # limits are of order one
@@ -449,12 +511,15 @@ def test_ripple_is_periodic_in_position():
 
 
 def test_stand_in_is_the_torque_it_states():
-    engine, servo = drive({"kp": 0.0, "standin_constant": 0.02, "standin_position": 0.3, "standin_speed": -0.01, "standin_drag": -0.005})
+    engine, servo = drive(
+        {"kp": 0.0, "standin_constant": 0.02, "standin_position": 0.3, "standin_speed": -0.01, "standin_drag": -0.005}
+    )
     for q, v in ((0.0, 0.0), (0.5, 2.0), (-0.4, -3.0)):
         engine.t.qpos[:], engine.t.qvel[:] = q, v
         servo.before_each()
         expected = 0.02 + 0.3 * q - 0.01 * v - 0.005 * v * abs(v)
-        got = engine.t.qfrc_applied[0, 0].item() - engine.field("dof_damping")[0, 0].item() * v  # before the step, v' = v
+        # before the step, v' = v
+        got = engine.t.qfrc_applied[0, 0].item() - engine.field("dof_damping")[0, 0].item() * v
         assert got == pytest.approx(expected, abs=1e-9)
 
 

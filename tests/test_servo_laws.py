@@ -1,4 +1,5 @@
-"""Laws of the drive that the training's servo, its NumPy reference and the search's plant share, against closed forms."""
+"""Laws of the drive that the training's servo, its NumPy reference and the search's plant share, against closed
+forms."""
 
 from __future__ import annotations
 
@@ -47,22 +48,31 @@ def plant_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0,
     constants = JointConstants(0.0, 0.0, -1e6, 1e6, False, 0.0, INERTIA, 0.0)
     plant = JointPlant("joint", constants, dt, False, "joint", "joint")
     series = np.zeros((2, len(SERIES)))
-    for name, value in (("inertia", INERTIA), ("supply", 1.0), ("enabled", 1.0), ("warmth", columns.get("warmth", 0.0))):
+    for name, value in (
+        ("inertia", INERTIA),
+        ("supply", 1.0),
+        ("enabled", 1.0),
+        ("warmth", columns.get("warmth", 0.0)),
+    ):
         series[:, SERIES_INDEX[name]] = value
     row = nominal_row(ServoTable.from_dict({"joints": {"joint": columns}}).nominal(["joint"])[0], 0.0)
     early = [-2.0, *times], [0.0, *targets]
-    plant.add("run", row, np.array([0.0, seconds]), series, *(np.array(x, float) for x in early), t, np.zeros(steps), None, {})
+    plant.add(
+        "run", row, np.array([0.0, seconds]), series, *(np.array(x, float) for x in early), t, np.zeros(steps), None, {}
+    )
     plant.finish()
     q, torque = plant.simulate(plant.base()[None], plant.windows(None), np.array([[0.0, v0]]))
     return np.stack([q[0], torque[0]], 1)
 
 
-# -- the torque limit in four quadrants --------------------------------------------------------------------------------------
+# -- the torque limit in four quadrants
+# --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("slope", [1.0, 0.4, 0.0, -1.0])
 def test_torque_limit_in_four_quadrants(slope):
-    """limit = tau0 max(0, 1 - b |v| / v0), b = 1 where torque and speed agree, braking_slope where they do not: kernel, reference."""
+    """limit = tau0 max(0, 1 - b |v| / v0), b = 1 where torque and speed agree, braking_slope where they do not: kernel,
+    reference."""
     tau0, v0 = FREE["torque_limit"], FREE["no_load_speed"]
     cases = [(sign * v, toward) for v in (0.0, 3.0, 9.0, 14.0) for sign in (1, -1) for toward in (1, -1)]
     engine = make_engine(link_spec(1.0, 1e-4), len(cases), engine="mujoco", fields=FIELDS, threads=1)
@@ -76,20 +86,25 @@ def test_torque_limit_in_four_quadrants(slope):
     expected = toward * tau0 * np.maximum(0.0, 1.0 - b * np.abs(v) / v0)
     np.testing.assert_allclose(servo.torque[:, 0].numpy(), expected, atol=1e-6)
     params = np.tile(table.nominal(["joint"]), (len(cases), 1))
-    np.testing.assert_allclose(servo_reference(params, 50.0 * toward, 0.0, v, dt=1e-4, features=("braking",))["torque"], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        servo_reference(params, 50.0 * toward, 0.0, v, dt=1e-4, features=("braking",))["torque"], expected, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("slope", [1.0, 0.5, 0.0, -0.5, -1.0])
 @pytest.mark.parametrize("motion", [servo_motion, plant_motion])
 def test_braking_follows_the_closed_form(motion, slope):
-    """I v' = -tau0 (1 - b v / v0) from 0.8 v0 until it stands: v0/b - (v0/b - v) exp(b r t); then the driving line, b = -1."""
+    """I v' = -tau0 (1 - b v / v0) from 0.8 v0 until it stands: v0/b - (v0/b - v) exp(b r t); then the driving line, b =
+    -1."""
     tau0, no_load, v0 = FREE["torque_limit"], FREE["no_load_speed"], 8.0
     out = motion(FREE | {"braking_slope": slope}, [0.0], [-1e4], 0.08, v0)
     t = 0.001 * np.arange(len(out))
     r = tau0 / no_load / INERTIA
 
     def fall(t):
-        return v0 - tau0 / INERTIA * t if slope == 0 else no_load / slope - (no_load / slope - v0) * np.exp(slope * r * t)
+        return (
+            v0 - tau0 / INERTIA * t if slope == 0 else no_load / slope - (no_load / slope - v0) * np.exp(slope * r * t)
+        )
 
     stands = v0 * INERTIA / tau0 if slope == 0 else -np.log(1 - slope * v0 / no_load) / (slope * r)
     v = np.where(t < stands, fall(t), -no_load * (1 - np.exp(-r * (t - stands))))
@@ -99,7 +114,9 @@ def test_braking_follows_the_closed_form(motion, slope):
 
 
 def test_braking_slope_round_trip_and_range(tmp_path):
-    table = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "braking_slope": [-1.0, 0.0]}, "a": {"braking_slope": 0.5}}})
+    table = ServoTable.from_dict(
+        {"joints": {"*": {"kp": 1.0, "braking_slope": [-1.0, 0.0]}, "a": {"braking_slope": 0.5}}}
+    )
     table.save(tmp_path / "servo.yaml")
     again = ServoTable.load(tmp_path / "servo.yaml")
     np.testing.assert_array_equal(again.nominal(["a", "b"])[:, INDEX["braking_slope"]], [0.5, -0.5])
@@ -108,7 +125,8 @@ def test_braking_slope_round_trip_and_range(tmp_path):
     assert (low[0, INDEX["braking_slope"]], high[0, INDEX["braking_slope"]]) == (-1.0, 0.0)
 
 
-# -- the controller's other terms --------------------------------------------------------------------------------------------
+# -- the controller's other terms
+# --------------------------------------------------------------------------------------------
 
 LOOP = {"kp": 2.0, "kd": 0.04, "viscous_friction": 0.01}
 TERMS = [
@@ -120,8 +138,15 @@ TERMS = [
 
 
 def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5) -> np.ndarray:
-    """[n] q at every `fine` s of the same link: explicit Euler of the controller's law as `laws.py` states it, written apart."""
-    c = {"speed_feedforward": 0.0, "acceleration_feedforward": 0.0, "integral_gain": 0.0, "torque_limit": np.inf, "no_load_speed": np.inf}
+    """[n] q at every `fine` s of the same link: explicit Euler of the controller's law as `laws.py` states it, written
+    apart."""
+    c = {
+        "speed_feedforward": 0.0,
+        "acceleration_feedforward": 0.0,
+        "integral_gain": 0.0,
+        "torque_limit": np.inf,
+        "no_load_speed": np.inf,
+    }
     c |= columns
     q = v = integral = 0.0
     r, rate, bend, until = 0.0, 0.0, 0.0, np.inf
@@ -137,7 +162,9 @@ def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5
         if now >= until - 1e-9:
             rate, bend = 0.0, 0.0
         e = r - q
-        asked = c["kp"] * e - c["kd"] * v + c["speed_feedforward"] * rate + c["acceleration_feedforward"] * bend + integral
+        asked = (
+            c["kp"] * e - c["kd"] * v + c["speed_feedforward"] * rate + c["acceleration_feedforward"] * bend + integral
+        )
         limit = c["torque_limit"] * max(0.0, 1.0 - abs(v) / c["no_load_speed"])
         if abs(asked) <= limit or asked * e < 0:
             integral += fine * c["integral_gain"] * e
@@ -150,7 +177,8 @@ def controller(columns: dict, times, targets, seconds: float, fine: float = 2e-5
 @pytest.mark.parametrize("motion", [servo_motion, plant_motion])
 @pytest.mark.parametrize("terms", TERMS)
 def test_controller_terms_against_an_independent_integration(motion, terms):
-    """A stream of targets 100 times a second that stops half way: what is commanded is still, and the speed's term with it."""
+    """A stream of targets 100 times a second that stops half way: what is commanded is still, and the speed's term with
+    it."""
     times = np.arange(0.0, 0.3, 0.01)
     targets = 0.4 * np.sin(9.0 * times) ** 2
     steps = 50  # of the integration in a millisecond
@@ -164,7 +192,8 @@ def test_controller_terms_against_an_independent_integration(motion, terms):
 
 
 def test_a_speed_loop_inside_a_position_loop_is_these_columns():
-    """The cascade of `laws.py`: P position loop with full speed feed-forward around a PI speed loop, integrated by itself."""
+    """The cascade of `laws.py`: P position loop with full speed feed-forward around a PI speed loop, integrated by
+    itself."""
     k_pp, k_vp, k_vi, fine = 20.0, 0.05, 0.6, 2e-5
     times = np.arange(0.0, 0.3, 0.01)
     targets = 0.4 * np.sin(9.0 * times) ** 2
@@ -173,7 +202,8 @@ def test_a_speed_loop_inside_a_position_loop_is_these_columns():
     for i in range(round(0.3 / fine)):
         k = int((i + 0.5) * fine / 0.01)
         u = k_pp * (targets[k] - q) + ramp[k]
-        # the integral of r' of held targets is r itself one interval late; the columns' kp acts on r: compare what both see
+        # the integral of r' of held targets is r itself one interval late; the columns' kp acts on r: compare what both
+        # see
         i_v += fine * (k_pp * (targets[k] - q) - v)
         tau = k_vp * (u - v) + k_vi * (i_v + targets[k])
         expected.append(q)
@@ -204,7 +234,8 @@ def test_a_replay_begins_with_the_load_in_the_integral():
     assert sags[0] < 1e-4 < 0.01 < sags[1]
 
 
-# -- friction and ripple -----------------------------------------------------------------------------------------------------
+# -- friction and ripple
+# -----------------------------------------------------------------------------------------------------
 
 COAST = {"kp": 0.0}
 
@@ -226,9 +257,16 @@ def coast(torque, v0: float, seconds: float, fine: float = 1e-5) -> np.ndarray:
 @pytest.mark.parametrize("exponent", [2.0, 1.0, 0.5])
 def test_stribeck_exponent(motion, exponent):
     """A link that coasts to its stop: I v' = -(c + peak exp(-(v / v_s)^n))."""
-    columns = COAST | {"coulomb_friction": 0.02, "stribeck_peak": 0.03, "stribeck_speed": 1.5, "stribeck_exponent": exponent}
+    columns = COAST | {
+        "coulomb_friction": 0.02,
+        "stribeck_peak": 0.03,
+        "stribeck_speed": 1.5,
+        "stribeck_exponent": exponent,
+    }
     q = motion(columns, [0.0], [0.0], 0.25, v0=6.0)[:, 0]
-    ends = {n: coast(lambda _, v, n=n: -0.02 - 0.03 * np.exp(-((v / 1.5) ** n)), 6.0, 0.25)[-1] for n in (2.0, 1.0, 0.5)}
+    ends = {
+        n: coast(lambda _, v, n=n: -0.02 - 0.03 * np.exp(-((v / 1.5) ** n)), 6.0, 0.25)[-1] for n in (2.0, 1.0, 0.5)
+    }
     assert abs(q[-1] - ends[exponent]) < 0.012
     assert min(abs(a - ends[exponent]) for n, a in ends.items() if n != exponent) > 0.03  # a law of its own each
 
@@ -241,7 +279,8 @@ def sawtooth(angle):
 
 @pytest.mark.parametrize("shape", [0.0, 1.0, -1.0, 0.4])
 def test_ripple_shape(shape):
-    """Kernel and reference against the sawtooth's Fourier series; the plant against an integration of the kernel's wave."""
+    """Kernel and reference against the sawtooth's Fourier series; the plant against an integration of the kernel's
+    wave."""
     q = np.linspace(-1.0, 1.0, 57)
     angle = 9.0 * q + 0.3
     saw = sawtooth(angle) if shape >= 0 else -sawtooth(angle - np.pi)
@@ -252,20 +291,24 @@ def test_ripple_shape(shape):
     servo = Servo(engine, ["joint"], table)
     engine.t.qpos[:, 0] = torch.as_tensor(q)
     servo.before_each()
-    away = np.abs(np.mod(angle - (np.pi if shape > 0 else 0.0) + np.pi, 2 * np.pi) - np.pi) > 0.1  # of the jump, where the series rings
+    # of the jump, where the series rings
+    away = np.abs(np.mod(angle - (np.pi if shape > 0 else 0.0) + np.pi, 2 * np.pi) - np.pi) > 0.1
     np.testing.assert_allclose(engine.t.qfrc_applied[:, 0].numpy()[away], expected[away], atol=3e-4)
     params = np.tile(table.nominal(["joint"]), (len(q), 1))
     law = servo_reference(params, 0.0, q, 0.0 * q, dt=1e-4, features=("shape",))["qfrc_applied"]
     np.testing.assert_allclose(law[away], expected[away], atol=3e-4)
     fine = np.linspace(-10.0, 10.0, 200001)
-    table_of = servo_reference(np.tile(params[:1], (len(fine), 1)), 0.0, fine, 0.0 * fine, dt=1e-9, features=("shape",))["qfrc_applied"]
+    table_of = servo_reference(
+        np.tile(params[:1], (len(fine), 1)), 0.0, fine, 0.0 * fine, dt=1e-9, features=("shape",)
+    )["qfrc_applied"]
     moved = coast(lambda q, v: np.interp(q, fine, table_of), 3.0, 0.2, fine=1e-4)
     assert np.abs(plant_motion(columns, [0.0], [0.0], 0.2, v0=3.0)[:, 0] - moved).max() < 0.004
     assert np.abs(moved - 3e-3 * np.arange(200)).max() > 0.01
 
 
 def dahl(amount: float, level: float, times, targets, seconds: float, fine: float = 1e-5) -> np.ndarray:
-    """[ms] q of the link on a PD (2, 0.02) with Dahl's friction level z, dz = (1 - z sign(v)) v dt / amount, by explicit Euler."""
+    """[ms] q of the link on a PD (2, 0.02) with Dahl's friction level z, dz = (1 - z sign(v)) v dt / amount, by
+    explicit Euler."""
     q = v = z = 0.0
     out = []
     for i in range(round(seconds / fine)):
@@ -280,7 +323,8 @@ def dahl(amount: float, level: float, times, targets, seconds: float, fine: floa
 
 @pytest.mark.parametrize("motion", [servo_motion, plant_motion])
 def test_presliding_is_dahls_law(motion):
-    """Small motions inside the dry friction, then one out of it: with a stiff friction the small ones would not be there."""
+    """Small motions inside the dry friction, then one out of it: with a stiff friction the small ones would not be
+    there."""
     times = np.arange(0.0, 0.8, 0.01)
     targets = np.where(times < 0.5, 0.02 * np.sin(15.0 * times), 0.2)
     columns = {"kp": 2.0, "kd": 0.02, "coulomb_friction": 0.08, "presliding": 0.01}
@@ -294,13 +338,24 @@ def test_presliding_is_dahls_law(motion):
 
 
 def test_presliding_is_stable_at_any_step_and_inertia():
-    """A finger's last link of 1e-5 kg.m2 at 5 ms, friction of a twentieth of the stall torque: it holds still, off its target."""
-    columns = {"kp": 1.5, "kd": 0.03, "torque_limit": 0.4, "no_load_speed": 14.38, "coulomb_friction": 0.02, "presliding": 0.002}
+    """A finger's last link of 1e-5 kg.m2 at 5 ms, friction of a twentieth of the stall torque: it holds still, off its
+    target."""
+    columns = {
+        "kp": 1.5,
+        "kd": 0.03,
+        "torque_limit": 0.4,
+        "no_load_speed": 14.38,
+        "coulomb_friction": 0.02,
+        "presliding": 0.002,
+    }
     for extra, dt in (({}, 0.005), ({"softness": 0.3, "rotor": 1e-5}, 0.001)):
         engine, servo = drive(columns | extra, inertia=1e-5, dt=dt)
         servo.send(torch.full((1, 1), 0.5))
         out = run(engine, servo, 1.0)
-        assert np.isfinite(out).all() and abs(out[-1, 0] - 0.5) < 0.03 and np.abs(out[-40:, 1]).max() < 0.02, (extra, out[-1])
+        assert np.isfinite(out).all() and abs(out[-1, 0] - 0.5) < 0.03 and np.abs(out[-40:, 1]).max() < 0.02, (
+            extra,
+            out[-1],
+        )
 
 
 @pytest.mark.parametrize("motion", [servo_motion, plant_motion])

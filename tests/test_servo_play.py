@@ -1,5 +1,6 @@
-"""What stands between motor and joint, and what joints do to each other, against solutions of their own: an explicit two-body
-integration at 10 us, momentum, statics. The kernel's lines themselves are compared with NumPy's in test_servo.py."""
+"""What stands between motor and joint, and what joints do to each other, against solutions of their own: an explicit
+two-body integration at 10 us, momentum, statics. The kernel's lines themselves are compared with NumPy's in
+test_servo.py."""
 
 from __future__ import annotations
 
@@ -24,14 +25,34 @@ def target(t: float) -> float:
     return -0.3 + 0.4 * math.sin(2 * math.pi * 1.5 * t)
 
 
-def rig(columns: dict, dt: float, loop: str = "joint", gravity: float = G, engine: str = "mujoco", position: str = "joint", joints: int = 1, **table):
+def rig(
+    columns: dict,
+    dt: float,
+    loop: str = "joint",
+    gravity: float = G,
+    engine: str = "mujoco",
+    position: str = "joint",
+    joints: int = 1,
+    **table,
+):
     """An engine with hinges side by side (each a link on an arm, along x at q = 0) and their servo."""
     own = LINK - MASS * ARM**2
-    bodies = "".join(f"""<body pos="0 {k} 0"><joint name="j{k}" type="hinge" axis="0 -1 0" armature="{ROTOR}" solimpfriction="0.9999 0.9999 0.001 0.5 2"/>
-        <inertial pos="{ARM} 0 0" mass="{MASS}" diaginertia="{own} {own} {own}"/></body>""" for k in range(joints))
-    spec = mujoco.MjSpec.from_string(f'<mujoco><option timestep="{dt}" integrator="implicitfast" gravity="0 0 {-gravity}"/><worldbody>{bodies}</worldbody></mujoco>')
+    bodies = "".join(
+        f"""<body pos="0 {k} 0"><joint name="j{k}" type="hinge" axis="0 -1 0" armature="{ROTOR}"
+ solimpfriction="0.9999 0.9999 0.001 0.5 2"/>
+        <inertial pos="{ARM} 0 0" mass="{MASS}" diaginertia="{own} {own} {own}"/></body>"""
+        for k in range(joints)
+    )
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{dt}" integrator="implicitfast" gravity="0 0 '
+        f'{-gravity}"/><worldbody>{bodies}</worldbody></mujoco>'
+    )
     e = make_engine(spec, 1, "cpu", engine, fields=FIELDS, threads=1)
-    raw = {"joints": columns if "j0" in columns else {"*": columns}, "loop_encoder": loop, "position_encoder": position} | table
+    raw = {
+        "joints": columns if "j0" in columns else {"*": columns},
+        "loop_encoder": loop,
+        "position_encoder": position,
+    } | table
     servo = Servo(e, [f"j{k}" for k in range(joints)], ServoTable.from_dict(raw), control_period=PERIOD)
     return e, servo
 
@@ -55,7 +76,16 @@ def moved(columns: dict, dt: float, loop: str, seconds: float = 2.0, engine: str
     return np.array(out)
 
 
-def explicit(kp: float, kd: float, loop: str, backlash: float = 0.0, softness: float = 0.0, friction: float = 0.0, seconds: float = 2.0, dt: float = 1e-5) -> np.ndarray:
+def explicit(
+    kp: float,
+    kd: float,
+    loop: str,
+    backlash: float = 0.0,
+    softness: float = 0.0,
+    friction: float = 0.0,
+    seconds: float = 2.0,
+    dt: float = 1e-5,
+) -> np.ndarray:
     """The same two bodies by small explicit steps: rotor with dry friction, spring with a gap, link under gravity."""
     total = LINK + ROTOR
     stiff = 1 / softness if softness else STOP_GAIN * kp + STOP_RATE**2 * total
@@ -87,7 +117,14 @@ def explicit(kp: float, kd: float, loop: str, backlash: float = 0.0, softness: f
 ])  # fmt: skip
 def test_two_bodies_as_integrated_apart(columns, loop):
     """First order in the step: half the step, half the error; and far nearer than a rigid joint."""
-    true = explicit(2.0, 0.05, loop, columns.get("backlash", 0.0), columns.get("softness", 0.0), columns.get("coulomb_friction", 0.0))
+    true = explicit(
+        2.0,
+        0.05,
+        loop,
+        columns.get("backlash", 0.0),
+        columns.get("softness", 0.0),
+        columns.get("coulomb_friction", 0.0),
+    )
 
     def error(c: dict, dt: float) -> float:
         q = moved({"kp": 2.0, "kd": 0.05} | c, dt, loop, 1.995)
@@ -107,7 +144,8 @@ def test_both_engines_carry_a_rotor_alike():
 
 
 def test_what_the_rotor_loses_the_link_receives():
-    """No motor, no friction, no gravity: a rotor that flies through its play. Momentum stays, energy falls at the impact only."""
+    """No motor, no friction, no gravity: a rotor that flies through its play. Momentum stays, energy falls at the
+    impact only."""
     dt = 5e-4
     e, servo = rig({"kp": 0.0, "backlash": 0.1}, dt, gravity=0.0)
     begin(e, servo, 0.0)
@@ -123,12 +161,18 @@ def test_what_the_rotor_loses_the_link_receives():
     assert (link[:40] == 0).all() and (link != 0).any()  # 0.05 rad at 2 rad/s: 25 ms until it hits
     np.testing.assert_allclose(ROTOR * rotor + LINK * link, ROTOR * 2.0, rtol=1e-9)
     energy = ROTOR * rotor**2 + LINK * link**2
-    assert energy.max() <= ROTOR * 2.0**2 + 1e-12 and (ROTOR * 2.0) ** 2 / (ROTOR + LINK) <= energy[-1] < 0.9 * energy[0]
+    assert (
+        energy.max() <= ROTOR * 2.0**2 + 1e-12 and (ROTOR * 2.0) ** 2 / (ROTOR + LINK) <= energy[-1] < 0.9 * energy[0]
+    )
 
 
-@pytest.mark.parametrize(("columns", "sag"), [({"backlash": 0.04}, lambda load, stop: 0.02 + load / stop), ({"softness": 0.2}, lambda load, stop: 0.2 * load)])
+@pytest.mark.parametrize(
+    ("columns", "sag"),
+    [({"backlash": 0.04}, lambda load, stop: 0.02 + load / stop), ({"softness": 0.2}, lambda load, stop: 0.2 * load)],
+)
 def test_a_held_link_hangs_by_its_play_and_its_softness(columns, sag):
-    """Loop on the motor: the rotor stands where the PD holds the load, the link hangs below; the reported side is the table's."""
+    """Loop on the motor: the rotor stands where the PD holds the load, the link hangs below; the reported side is the
+    table's."""
     for position in ("joint", "motor"):
         e, servo = rig({"kp": 2.0, "kd": 0.05} | columns, 1e-3, "motor", position=position)
         begin(e, servo, 0.0)
@@ -143,14 +187,25 @@ def test_a_held_link_hangs_by_its_play_and_its_softness(columns, sag):
 
 
 def test_the_servo_without_play_does_not_change_by_having_the_column():
-    """A table that states no play is built without it; one that does, with worlds where it is zero, moves those as before."""
-    plain = moved({"kp": 2.0, "kd": 0.05, "coulomb_friction": 0.02, "torque_ripple": 0.01, "ripple_per_turn": 9}, 1e-3, "joint", 0.5)
+    """A table that states no play is built without it; one that does, with worlds where it is zero, moves those as
+    before."""
+    plain = moved(
+        {"kp": 2.0, "kd": 0.05, "coulomb_friction": 0.02, "torque_ripple": 0.01, "ripple_per_turn": 9},
+        1e-3,
+        "joint",
+        0.5,
+    )
     e, servo = rig({"kp": 2.0, "kd": 0.05}, 1e-3)
     assert servo.features == frozenset()
     zero = {"backlash": {"value": 0.0, "low": 0.0, "high": 0.01}, "speed_lag": {"value": 0.0, "low": 0.0, "high": 0.01}}
     e, servo = rig({"kp": 2.0} | zero, 1e-3)
     assert servo.features == {"play", "rare"}
-    again = moved({"kp": 2.0, "kd": 0.05, "coulomb_friction": 0.02, "torque_ripple": 0.01, "ripple_per_turn": 9} | zero, 1e-3, "joint", 0.5)
+    again = moved(
+        {"kp": 2.0, "kd": 0.05, "coulomb_friction": 0.02, "torque_ripple": 0.01, "ripple_per_turn": 9} | zero,
+        1e-3,
+        "joint",
+        0.5,
+    )
     np.testing.assert_allclose(again, plain, atol=1e-12)
 
 
@@ -174,7 +229,12 @@ def test_an_eccentric_encoder_is_believed_by_the_loop_and_by_who_reads_it():
 
 
 def test_a_joint_is_dragged_by_another():
-    q, _ = hold({"j0": {"kp": 2.0, "kd": 0.05}, "j1": {"kp": 2.0, "kd": 0.05, "coupling": 0.25, "coupling_from": 0}}, 2, [0.6, 0.1], gravity=0.0)
+    q, _ = hold(
+        {"j0": {"kp": 2.0, "kd": 0.05}, "j1": {"kp": 2.0, "kd": 0.05, "coupling": 0.25, "coupling_from": 0}},
+        2,
+        [0.6, 0.1],
+        gravity=0.0,
+    )
     assert q[0] == pytest.approx(0.6, abs=1e-6) and q[1] == pytest.approx(0.1 + 0.25 * 0.6, abs=1e-6)
     with pytest.raises(UserError, match=r"coupling_from.*0 to 1"):
         rig({"j0": {"kp": 2.0}, "j1": {"kp": 2.0, "coupling": 0.25, "coupling_from": 2}}, 1e-3, joints=2)
@@ -186,7 +246,10 @@ def test_a_supply_sags_under_the_other_joints():
     _, servo = hold({"j0": columns, "j1": columns | {"sag": 0.8}}, 2, [0.0, 0.0], drive="voltage")
     load = servo.torque[0, 0].item()
     assert load == pytest.approx(MASS * G * ARM, rel=0.02)
-    _, servo = hold({"j0": columns, "j1": columns | {"sag": 0.8, "coulomb_friction": 1.0}}, 2, [0.0, 3.0], drive="voltage")  # stuck, at full duty
+    # stuck, at full duty
+    _, servo = hold(
+        {"j0": columns, "j1": columns | {"sag": 0.8, "coulomb_friction": 1.0}}, 2, [0.0, 3.0], drive="voltage"
+    )
     assert servo.torque[0, 1].item() == pytest.approx(0.2 * (1 - 0.8 * load), rel=0.01)
 
 
@@ -208,7 +271,8 @@ def test_a_filtered_speed_damps_late():
     for _ in range(1600):
         e.step(1, servo.before_each)
         q.append(e.t.qpos[0, 0].item())
-    system = np.array([[0, 1, 0], [-kp / inertia, 0, -kd / inertia], [0, 1 / lag, -1 / lag]])  # of (q - target, v, filtered)
+    # of (q - target, v, filtered)
+    system = np.array([[0, 1, 0], [-kp / inertia, 0, -kd / inertia], [0, 1 / lag, -1 / lag]])
     values, vectors = np.linalg.eig(system)
     parts = np.linalg.solve(vectors, np.array([-0.2, 0.0, 0.0]))
     t = dt * np.arange(1, 1601)

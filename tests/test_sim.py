@@ -37,8 +37,16 @@ FIELDS = ("opt.gravity", "body_mass", "body_inertia", "geom_friction", "geom_siz
 def stack_spec(cone: str = "elliptic", meshes: bool = False) -> mujoco.MjSpec:
     """A slab (60 x 60 x 20 mm) on a floor, a ball (10 mm radius) on the slab, both free."""
     mesh = '<mesh name="low" vertex="{0}"/><mesh name="high" vertex="{1}"/>'.format(
-        *(" ".join(f"{x} {y} {z}" for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-h, h)) for h in (0.010, 0.016)))
-    slab = '<geom name="slab" type="mesh" mesh="low" mass="0.4"/>' if meshes else '<geom name="slab" type="box" size=".03 .03 .01" mass="0.4" condim="4"/>'
+        *(
+            " ".join(f"{x} {y} {z}" for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-h, h))
+            for h in (0.010, 0.016)
+        )
+    )
+    slab = (
+        '<geom name="slab" type="mesh" mesh="low" mass="0.4"/>'
+        if meshes
+        else '<geom name="slab" type="box" size=".03 .03 .01" mass="0.4" condim="4"/>'
+    )
     return mujoco.MjSpec.from_string(f"""
 <mujoco>
   <option timestep="0.002" integrator="implicitfast" cone="{cone}" impratio="10" iterations="20" ls_iterations="30"/>
@@ -46,14 +54,23 @@ def stack_spec(cone: str = "elliptic", meshes: bool = False) -> mujoco.MjSpec:
   <worldbody>
     <geom name="floor" type="plane" size="1 1 .1"/>
     <body name="slab" pos="0 0 .01"><freejoint name="slab_free"/>{slab}</body>
-    <body name="ball" pos="0 0 .03"><freejoint name="ball_free"/><geom name="ball" type="sphere" size=".01" mass="{BALL}" condim="4"/></body>
+    <body name="ball" pos="0 0 .03"><freejoint name="ball_free"/>
+ <geom name="ball" type="sphere" size=".01" mass="{BALL}" condim="4"/></body>
   </worldbody>
 </mujoco>""")
 
 
 def stack(kind: str, n: int = N, **kw):
     spec = kw.pop("spec", None)
-    return make_engine(stack_spec() if spec is None else spec, n, "cpu", kind, fields=FIELDS, pairs=PAIRS, **{"nconmax": 20, "njmax": 64, **kw})
+    return make_engine(
+        stack_spec() if spec is None else spec,
+        n,
+        "cpu",
+        kind,
+        fields=FIELDS,
+        pairs=PAIRS,
+        **{"nconmax": 20, "njmax": 64, **kw},
+    )
 
 
 def run(engine, seconds: float, chunk: int = 25) -> None:
@@ -80,14 +97,19 @@ def fresh(engine):
     return engine
 
 
-# -- names ---------------------------------------------------------------------------------------------------------------
+# -- names
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def test_names_are_resolved_and_unknown_ones_answered(fresh):
     e = fresh
     assert e.mjm.body("ball").id == e.body("ball") and e.pair("ball_slab") == 2
-    for call, known in ((lambda: e.body("bal"), "ball"), (lambda: e.geom("x"), "floor"), (lambda: e.joint("x"), "slab_free"),
-                        (lambda: e.pair("x"), "slab_floor")):
+    for call, known in (
+        (lambda: e.body("bal"), "ball"),
+        (lambda: e.geom("x"), "floor"),
+        (lambda: e.joint("x"), "slab_free"),
+        (lambda: e.pair("x"), "slab_floor"),
+    ):
         with pytest.raises(UserError, match=known):
             call()
 
@@ -100,13 +122,18 @@ def test_a_pair_of_unknown_geoms_is_a_user_error_on_both_engines(kind, bad):
 
 
 def test_bad_engine_settings():
-    for kw, word in ((dict(engine="bullet"), "bullet"), (dict(worlds=0), "worlds"), (dict(engine="mujoco", device="cuda:0"), "CPU")):
+    for kw, word in (
+        (dict(engine="bullet"), "bullet"),
+        (dict(worlds=0), "worlds"),
+        (dict(engine="mujoco", device="cuda:0"), "CPU"),
+    ):
         with pytest.raises(UserError, match=word):
             make_engine(**{"spec": pendulum_spec(), "worlds": 1, **kw})
     assert make_engine(pendulum_spec(), 1, "cpu", "auto").kind == "mujoco"
 
 
-# -- state ---------------------------------------------------------------------------------------------------------------
+# -- state
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def test_set_state_and_reset_touch_masked_worlds_only(fresh):
@@ -120,7 +147,9 @@ def test_set_state_and_reset_touch_masked_worlds_only(fresh):
     q, v = torch.rand(N, 14, dtype=torch.float64), torch.rand(N, 12, dtype=torch.float64)
     q[1], v[1] = float("nan"), float("nan")  # what is not selected must not leak, not even through 0 * nan
     e.set_state(mask, q, v)
-    assert torch.equal(e.t.qpos[mask], q[mask].to(e.t.qpos.dtype)) and torch.equal(e.t.qvel[mask], v[mask].to(e.t.qvel.dtype))
+    assert torch.equal(e.t.qpos[mask], q[mask].to(e.t.qpos.dtype)) and torch.equal(
+        e.t.qvel[mask], v[mask].to(e.t.qvel.dtype)
+    )
     for k in names:
         now = getattr(e.t, k)
         assert torch.equal(now[~mask], before[k][~mask]), k
@@ -160,7 +189,8 @@ def test_poses_belong_to_the_present_state(fresh):
     assert e.t.qpos[0, 7] > 0.001
 
 
-# -- fields --------------------------------------------------------------------------------------------------------------
+# -- fields
+# --------------------------------------------------------------------------------------------------------------
 
 
 def test_gravity_and_mass_act_by_world(fresh):
@@ -237,7 +267,8 @@ def test_fields_written_are_seen_by_a_recorded_step(fresh):
         assert np.allclose(e.t.qvel[:, 6].double(), 7 * e.dt * k, rtol=1e-4)
 
 
-# -- contact forces -------------------------------------------------------------------------------------------------------
+# -- contact forces
+# -------------------------------------------------------------------------------------------------------
 
 
 def _rest(e) -> None:
@@ -291,13 +322,24 @@ def test_pair_forces_with_a_pyramidal_cone(kind):
 
 def centipede(kind: str, feet: int):
     """A body of 0.2 kg on so many spherical feet."""
-    foot = "".join(f'<geom type="sphere" size=".004" pos="{0.01 * (i - feet / 2 + 0.5)} {0.02 * (-1) ** i} 0" mass="{0.2 / feet}"/>'
-                   for i in range(feet))
+    foot = "".join(
+        f'<geom type="sphere" size=".004" pos="{0.01 * (i - feet / 2 + 0.5)} {0.02 * (-1) ** i} 0" '
+        f'mass="{0.2 / feet}"/>'
+        for i in range(feet)
+    )
     spec = mujoco.MjSpec.from_string(f"""
 <mujoco><option timestep="0.002" integrator="implicitfast" cone="elliptic"/>
 <worldbody><geom name="floor" type="plane" size="1 1 .1"/>
 <body name="centipede" pos="0 0 .004"><freejoint/>{foot}</body></worldbody></mujoco>""")
-    return make_engine(spec, 2, "cpu", kind, pairs=[ContactPair("feet", ("body", "centipede"), ("geom", "floor"))], nconmax=20, njmax=64)
+    return make_engine(
+        spec,
+        2,
+        "cpu",
+        kind,
+        pairs=[ContactPair("feet", ("body", "centipede"), ("geom", "floor"))],
+        nconmax=20,
+        njmax=64,
+    )
 
 
 @pytest.mark.parametrize("kind", ENGINES)
@@ -317,7 +359,8 @@ def test_a_pair_with_more_contacts_than_can_be_summed_fails():
         e.check_overflow()
 
 
-# -- flags ----------------------------------------------------------------------------------------------------------------
+# -- flags
+# ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("where", ["qpos", "qvel", "fast"])
@@ -377,7 +420,8 @@ def test_one_world_out_of_rows_is_seen_among_others(fresh):
     assert not e.t.overflow.any()
 
 
-# -- the same again -------------------------------------------------------------------------------------------------------
+# -- the same again
+# -------------------------------------------------------------------------------------------------------
 
 
 def _tumble(e, steps: int = 12) -> torch.Tensor:
@@ -422,13 +466,16 @@ def _tumble_first(n: int, m: int) -> torch.Tensor:
     return _tumble(stack("mujoco", n=n, threads=0))[:m]
 
 
-# -- the smallest mechanism --------------------------------------------------------------------------------------------------
+# -- the smallest mechanism
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ENGINES)
 def test_pendulum_swings_as_computed(kind):
     m, length, armature = 0.1, 0.1, 1e-4
-    e = make_engine(pendulum_spec(m, length, armature, timestep=0.001), 3, "cpu", kind, fields=("dof_damping", "dof_armature"))
+    e = make_engine(
+        pendulum_spec(m, length, armature, timestep=0.001), 3, "cpu", kind, fields=("dof_damping", "dof_armature")
+    )
     e.field("dof_armature")[1] = 4e-4
     e.field("dof_damping")[2] = 2e-3
     q = torch.full((3, 1), 0.05, dtype=e.t.qpos.dtype)
@@ -475,7 +522,11 @@ def _write_time(real):
         log[w, count[w]] = wp.float64(time[w])
         count[w] = count[w] + 1
 
-    write.__annotations__ = {"time": wp.array(dtype=real), "count": wp.array(dtype=int), "log": wp.array2d(dtype=wp.float64)}
+    write.__annotations__ = {
+        "time": wp.array(dtype=real),
+        "count": wp.array(dtype=int),
+        "log": wp.array2d(dtype=wp.float64),
+    }
     return wp.kernel(write, module="unique", enable_backward=False)
 
 
@@ -486,13 +537,16 @@ def _count(n: wp.array(dtype=int)):
 
 
 def test_poses_of_the_c_engine_follow_mujoco_for_every_kind_of_joint():
-    """Its own kinematics against mj_kinematics: free, ball, slide and hinge joints, several on a body, offset anchors."""
+    """Its own kinematics against mj_kinematics: free, ball, slide and hinge joints, several on a body, offset
+    anchors."""
     spec = mujoco.MjSpec.from_string("""
 <mujoco>
   <worldbody>
     <body name="free" pos="0.1 0 0"><freejoint/><geom size="0.1"/>
-      <body name="ball" pos="0 0.2 0.1" quat="0.9 0.1 0.3 0.2"><joint type="ball" pos="0.05 0.02 -0.03"/><geom size="0.05"/>
-        <body name="two" pos="0.1 0 0.3"><joint type="slide" axis="1 2 0"/><joint type="hinge" axis="0 1 1" pos="0 0.03 0.01" ref="0.4"/><geom size="0.05"/></body>
+      <body name="ball" pos="0 0.2 0.1" quat="0.9 0.1 0.3 0.2"><joint type="ball" pos="0.05 0.02 -0.03"/>
+ <geom size="0.05"/>
+        <body name="two" pos="0.1 0 0.3"><joint type="slide" axis="1 2 0"/>
+ <joint type="hinge" axis="0 1 1" pos="0 0.03 0.01" ref="0.4"/><geom size="0.05"/></body>
       </body>
       <body name="fixed" pos="-0.1 0.2 0" euler="10 20 30"><geom size="0.05"/></body>
     </body>
@@ -501,7 +555,8 @@ def test_poses_of_the_c_engine_follow_mujoco_for_every_kind_of_joint():
     e = make_engine(spec, 6, "cpu", "mujoco", fields=("body_pos",))
     rng = np.random.default_rng(0)
     e.field("body_pos").add_(torch.from_numpy(0.02 * rng.normal(size=e.field("body_pos").shape)))
-    e.t.qpos.copy_(torch.from_numpy(rng.normal(size=(6, e.mjm.nq))))  # quaternions of any length: MuJoCo normalizes them
+    # quaternions of any length: MuJoCo normalizes them
+    e.t.qpos.copy_(torch.from_numpy(rng.normal(size=(6, e.mjm.nq))))
     e.refresh()
     data = mujoco.MjData(e.mjm)
     for w in range(6):
@@ -513,7 +568,9 @@ def test_poses_of_the_c_engine_follow_mujoco_for_every_kind_of_joint():
 
 
 def test_the_c_engine_refuses_what_it_cannot_place():
-    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>')
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>'
+    )
     with pytest.raises(UserError, match="mocap"):
         make_engine(spec, 1, "cpu", "mujoco")
 

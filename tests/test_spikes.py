@@ -20,9 +20,19 @@ def signals():
     for i in range(1, len(T)):
         servo[i] = servo[i - 1] + 0.2 * (steps[i] - servo[i - 1])
     stick = np.round(0.5 * np.sin(2 * T) / 0.05) * 0.05
-    return {"steps": steps, "servo": servo, "sine": 0.6 * np.sin(9 * T) + 1e-3 * rng.standard_normal(len(T)), "chirp": np.sin(2 * np.pi * (0.2 + 0.14 * T) * T),
-            "stick": stick, "prbs": np.repeat(rng.choice([-1.0, 1.0], 500), 2), "alternating": np.where(np.arange(len(T)) % 2, 1.0, -1.0),
-            "noise": rng.standard_normal(len(T)), "triangle": np.abs((T % 1.0) - 0.5), "rest": np.zeros_like(T), "ramp": T}  # fmt: skip
+    return {
+        "steps": steps,
+        "servo": servo,
+        "sine": 0.6 * np.sin(9 * T) + 1e-3 * rng.standard_normal(len(T)),
+        "chirp": np.sin(2 * np.pi * (0.2 + 0.14 * T) * T),
+        "stick": stick,
+        "prbs": np.repeat(rng.choice([-1.0, 1.0], 500), 2),
+        "alternating": np.where(np.arange(len(T)) % 2, 1.0, -1.0),
+        "noise": rng.standard_normal(len(T)),
+        "triangle": np.abs((T % 1.0) - 0.5),
+        "rest": np.zeros_like(T),
+        "ramp": T,
+    }
 
 
 @pytest.mark.parametrize("name", list(signals()))
@@ -85,4 +95,6 @@ def test_a_recording_of_jumped_stamps_is_read_on_its_true_clock(tmp_path):
             w.add_state(t, made.states.position.value[i])
     r = read(tmp_path / "a.mcap")
     assert r.duration < 4.1 and len(r.states.position) == 388
-    assert {f.topic for f in r.findings if f.kind == "time_not_monotonic" and f.count == 12 and "left out" in f.text} == {"/joint_states", "/joint_commands"}
+    assert {
+        f.topic for f in r.findings if f.kind == "time_not_monotonic" and f.count == 12 and "left out" in f.text
+    } == {"/joint_states", "/joint_commands"}

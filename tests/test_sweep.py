@@ -38,7 +38,8 @@ def test_every_combination_runs_once_in_its_own_folder(script, tmp_path, capfd):
     assert all({"task=grasp", "iterations=7", f"out={tmp_path / 's' / name}"} <= r for name, r in runs.items())
     out = capfd.readouterr().out
     table = out[out.index("\nsweep "):]
-    assert "servo=ideal seed=3" in table and "iterations=7" not in table and "1" in table  # what is common is not repeated
+    # what is common is not repeated
+    assert "servo=ideal seed=3" in table and "iterations=7" not in table and "1" in table
 
 
 def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
@@ -46,7 +47,9 @@ def test_a_failed_job_is_told_and_the_others_still_run(script, tmp_path, capfd):
     assert [json.loads((tmp_path / "s" / str(k) / "job.json").read_text())["status"] for k in range(3)] == [0, 3, 0]
 
 
-@pytest.mark.parametrize("argv, said", [(["wrlds=1,2"], "wrlds"), (["task=grsp,grasp"], "grsp"), (["seed=1,2", "out=x"], "sweep=FOLDER")])
+@pytest.mark.parametrize(
+    "argv, said", [(["wrlds=1,2"], "wrlds"), (["task=grsp,grasp"], "grsp"), (["seed=1,2", "out=x"], "sweep=FOLDER")]
+)
 def test_a_slip_is_one_line(argv, said, script, tmp_path):
     with pytest.raises(UserError, match=said) as error:
         sweep.run(["--multirun", *argv, f"sweep={tmp_path / 's'}"], CONFIGS, [sys.executable, str(script)])
@@ -67,7 +70,23 @@ def test_without_multirun_a_list_is_still_refused(capfd):
 
 @pytest.mark.slow
 def test_a_sweep_of_real_runs(tmp_path):
-    done = subprocess.run([sys.executable, str(shell.ROOT / "train.py"), "--multirun", "task=grasp", "device=cpu", "worlds=2", "iterations=1",
-                           "final_episodes=0", "seed=1,2", "sim.threads=1", f"sweep={tmp_path / 's'}"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [
+            sys.executable,
+            str(shell.ROOT / "train.py"),
+            "--multirun",
+            "task=grasp",
+            "device=cpu",
+            "worlds=2",
+            "iterations=1",
+            "final_episodes=0",
+            "seed=1,2",
+            "sim.threads=1",
+            f"sweep={tmp_path / 's'}",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     assert all((tmp_path / "s" / str(k) / "last.pt").exists() for k in range(2))

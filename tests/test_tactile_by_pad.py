@@ -1,4 +1,5 @@
-"""Settings of single pads (`tactile.pads`): each effect against its law in NumPy, the order of them against the diagnosis's own plant."""
+"""Settings of single pads (`tactile.pads`): each effect against its law in NumPy, the order of them against the
+diagnosis's own plant."""
 
 from __future__ import annotations
 
@@ -24,12 +25,22 @@ INDEX, MID = 1, 2
 
 
 def ball(cfg: dict, n: int = 2, **kw):
-    """A ball at the middle of every pad of N hands, each 20 cm from the next; `press(depth, time)` moves it over the index's and feels."""
+    """A ball at the middle of every pad of N hands, each 20 cm from the next; `press(depth, time)` moves it over the
+    index's and feels."""
     layout = xhand_layout()
     pads = [f"tip_{f}" for f in xhand.FINGERS]
     engine = PosedEngine(n, [*xhand.TIP_BODIES, "object"], pads)
     tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
-    touch = Tactile(engine, layout, ShapeSet(primitives()), "object", {"raw": True, "others": False, "period": 0.01, **cfg}, pairs=pads, tips=tips, **kw)
+    touch = Tactile(
+        engine,
+        layout,
+        ShapeSet(primitives()),
+        "object",
+        {"raw": True, "others": False, "period": 0.01, **cfg},
+        pairs=pads,
+        tips=tips,
+        **kw,
+    )
     touch.shape_id[:], touch.shape_size[:] = 1, torch.tensor([RADIUS, 0.0, 0.0])
     felt = layout.lifted(tips)
 
@@ -62,7 +73,9 @@ def test_crosstalk_is_the_law_of_the_diagnosis_and_keeps_the_sum():
     x = clean()
     assert (x > 0.05).sum() > 4
     np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), 0.7 * x + 0.3 * touch_plant.BESIDE @ x, atol=1e-6)
-    assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-5) and touch.force_clean[0, INDEX].item() == pytest.approx(FORCE, rel=1e-5)
+    assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-5) and touch.force_clean[
+        0, INDEX
+    ].item() == pytest.approx(FORCE, rel=1e-5)
     press(pad=MID)  # no other pad has it
     other, press_other, _ = ball({})
     press_other(pad=MID)
@@ -73,7 +86,20 @@ def test_gains_dead_stuck_and_exchanged_taxels():
     x = clean()
     a, b, c, d = (int(k) for k in np.argsort(-x)[:4])
     far = int(np.argmin(x))
-    touch, press, _ = ball({"pads": {"index": {"gain": 0.5, "taxels": {str(a): [0.4, 0.6]}, "dead": [b], "stuck": {far: 2.0}, "swapped": [[c, d]]}}}, n=200)
+    touch, press, _ = ball(
+        {
+            "pads": {
+                "index": {
+                    "gain": 0.5,
+                    "taxels": {str(a): [0.4, 0.6]},
+                    "dead": [b],
+                    "stuck": {far: 2.0},
+                    "swapped": [[c, d]],
+                }
+            }
+        },
+        n=200,
+    )
     press()
     z = touch.raw[:, INDEX].double().numpy()
     share = z[:, a] / x[a]
@@ -88,7 +114,9 @@ def test_gains_dead_stuck_and_exchanged_taxels():
     touch.randomize(mask)
     assert torch.equal(before[~mask], touch.gain[~mask]) and before[7, INDEX, a] != touch.gain[7, INDEX, a]
     press(-1e-3, force=0.0)
-    assert np.allclose(touch.raw[:, INDEX, far].numpy(), 2.0) and touch.raw[:, INDEX].sum().item() == pytest.approx(400.0)
+    assert np.allclose(touch.raw[:, INDEX, far].numpy(), 2.0) and touch.raw[:, INDEX].sum().item() == pytest.approx(
+        400.0
+    )
 
 
 def test_stuck_readings_are_whole_counts_where_there_are_counts():
@@ -98,31 +126,48 @@ def test_stuck_readings_are_whole_counts_where_there_are_counts():
 
 
 def test_hysteresis_of_one_pad_is_that_of_the_setting():
-    one, press_one, _ = ball({"hysteresis": 0.1, "hysteresis_time": 0.7, "pads": {"index": {"hysteresis": 0.4, "hysteresis_time": 0.2}}})
+    one, press_one, _ = ball(
+        {"hysteresis": 0.1, "hysteresis_time": 0.7, "pads": {"index": {"hysteresis": 0.4, "hysteresis_time": 0.2}}}
+    )
     every, press_every, _ = ball({"hysteresis": 0.4, "hysteresis_time": 0.2})
     for k in range(40):
         for press in (press_one, press_every):
             press(time=0.01 * k, force=FORCE if k < 20 else 1.0)
         assert torch.allclose(one.raw[:, INDEX], every.raw[:, INDEX], rtol=1e-6)
-    # what relaxes after a step, by the law: f (1 + a e^(-t / T)) at first, and from the last step on less than the force
+    # what relaxes after a step, by the law: f (1 + a e^(-t / T)) at first, and from the last step on less than the
+    # force
     x = np.r_[np.full(20, FORCE), np.ones(20)]
-    np.testing.assert_allclose(one.force[0, INDEX].item(), touch_plant.relaxed(x[:, None], 0.01, 0.4, 0.2)[-1, 0], rtol=0.02)
+    np.testing.assert_allclose(
+        one.force[0, INDEX].item(), touch_plant.relaxed(x[:, None], 0.01, 0.4, 0.2)[-1, 0], rtol=0.02
+    )
     press_one(pad=MID, time=0.4)
-    assert one.force[0, MID].item() == pytest.approx(FORCE * (1 + 0.1 * np.exp(-0.01 / 0.7)), rel=1e-4)  # the world's setting
+    # the world's setting
+    assert one.force[0, MID].item() == pytest.approx(FORCE * (1 + 0.1 * np.exp(-0.01 / 0.7)), rel=1e-4)
     one.reset(torch.tensor([True, False]))
     press_one(time=0.41)
-    assert one.force[0, INDEX].item() == pytest.approx(1.4 * FORCE, rel=1e-4) and one.force[1, INDEX].item() < 1.38 * FORCE
+    assert (
+        one.force[0, INDEX].item() == pytest.approx(1.4 * FORCE, rel=1e-4) and one.force[1, INDEX].item() < 1.38 * FORCE
+    )
 
 
 @pytest.mark.parametrize("feel_others", [False, True])
 def test_rubber_spreads_the_force_as_it_presses(feel_others):
     c10, c01 = 8e4, 2e4
-    touch, press, distance = ball({"others": feel_others, "feel_others": feel_others, "stiffness": {"hertz": 5e6}, "pads": {"index": {"rubber": {"c10": c10, "c01": c01}}}})
+    touch, press, distance = ball(
+        {
+            "others": feel_others,
+            "feel_others": feel_others,
+            "stiffness": {"hertz": 5e6},
+            "pads": {"index": {"rubber": {"c10": c10, "c01": c01}}},
+        }
+    )
     press()
     area = xhand_layout().area[INDEX]
     w = ref.mooney_rivlin_force(np.maximum(-distance(), 0.0), area, THICKNESS, c10, c01)
     np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), FORCE * w / w.sum(), atol=2e-4)
-    assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-4) and not np.allclose(touch.raw[0, INDEX].numpy(), clean(), atol=0.02)
+    assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-4) and not np.allclose(
+        touch.raw[0, INDEX].numpy(), clean(), atol=0.02
+    )
     press(-0.2e-3)  # the physics presses, no taxel is inside: as without rubber
     plain, press_plain, _ = ball({})
     press_plain(-0.2e-3)
@@ -130,7 +175,9 @@ def test_rubber_spreads_the_force_as_it_presses(feel_others):
 
 
 def test_rubber_by_springs_is_its_own_force():
-    touch, press, distance = ball({"sum": "spring", "law": "linear", "stiffness": {"linear": 2e8}, "pads": {"index": {"rubber": {"c10": 8e4}}}})
+    touch, press, distance = ball(
+        {"sum": "spring", "law": "linear", "stiffness": {"linear": 2e8}, "pads": {"index": {"rubber": {"c10": 8e4}}}}
+    )
     press()
     want = ref.mooney_rivlin_force(np.maximum(-distance(), 0.0), xhand_layout().area[INDEX], THICKNESS, 8e4, 0.0)
     np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), want, rtol=2e-3, atol=1e-6)
@@ -143,7 +190,8 @@ def test_delay_of_one_pad():
         for pad in (INDEX, MID):
             press(time=0.02 * k + 0.01 * (pad - 1), force=1.0 + k, pad=pad)
         seen.append(touch.force[0].tolist())
-    # a reading every 10 ms, the pads in turn, seen after the mid's: of 30 ms ago for the index, whose turn it was; of 10 ms ago for the mid, too
+    # a reading every 10 ms, the pads in turn, seen after the mid's: of 30 ms ago for the index, whose turn it was; of
+    # 10 ms ago for the mid, too
     seen = np.array(seen)
     np.testing.assert_allclose(seen[2:, INDEX], np.arange(2, 10), rtol=1e-5)
     assert (seen[:, MID] == 0.0).all() and touch.raw3[0, INDEX, :, 2].sum().item() == pytest.approx(9.0, rel=1e-5)
@@ -154,7 +202,9 @@ def test_delay_of_one_pad():
 
 
 def test_a_delay_between_two_readings_lies_between_them():
-    touch, press, _ = ball({"lsb": 0.001, "full_scale": 20000, "threshold": 0.0005, "pads": {"index": {"delay": 0.025}}}, n=1)
+    touch, press, _ = ball(
+        {"lsb": 0.001, "full_scale": 20000, "threshold": 0.0005, "pads": {"index": {"delay": 0.025}}}, n=1
+    )
     seen = []
     for k in range(8):
         press(time=0.01 * k, force=1.0 + k)
@@ -171,7 +221,8 @@ def test_a_delay_between_two_readings_lies_between_them():
 
 
 def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
-    """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the counts."""
+    """A press rig with pads' settings, recorded in counts: the plant with the same numbers reads the same to the
+    counts."""
     from test_gap_touch import collected
 
     from dexsim.gap.touch import press_rig
@@ -179,10 +230,19 @@ def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 2 / 90}}
     paths = press_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})
     run = collected(*paths)[0].runs[0]
-    v = touch_plant.neutral() | {"gain": 0.8, "neighbours": 0.25, "fraction": 0.3, "time_constant": 0.4, "delay": 2 / 90}
+    v = touch_plant.neutral() | {
+        "gain": 0.8,
+        "neighbours": 0.25,
+        "fraction": 0.3,
+        "time_constant": 0.4,
+        "delay": 2 / 90,
+    }
     on = run.z.max(1) > 0
     felt = run.z.max(0) > 0.3
-    rms = [float(np.sqrt(np.mean((touch_plant.readings(run, p)[on] - run.z[on])[:, felt] ** 2))) for p in (v, touch_plant.neutral())]
+    rms = [
+        float(np.sqrt(np.mean((touch_plant.readings(run, p)[on] - run.z[on])[:, felt] ** 2)))
+        for p in (v, touch_plant.neutral())
+    ]
     assert rms[0] < 0.055 and rms[1] > 3 * rms[0], rms
 
 
@@ -201,13 +261,28 @@ def test_without_pads_nothing_is_there():
     assert all(torch.equal(a, b) for a, b in zip(out[0][1], out[1][1], strict=True))
     assert out[0][0]._m.taxel is out[1][0]._m.taxel and out[0][0]._m.report is out[1][0]._m.report
     with_pads, *_ = ball({**cfg, "pads": {"index": {"crosstalk": 0.1}}})
-    assert with_pads.by_pad is not None and with_pads._m.report is out[0][0]._m.report  # what reports is the same also then
+    # what reports is the same also then
+    assert with_pads.by_pad is not None and with_pads._m.report is out[0][0]._m.report
 
 
 def test_recorded_sequences_replay_and_lanes_agree(monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    cfg = {"shear": True, "lsb": 0.01, "pads": {"index": {"gain": [0.5, 0.9], "crosstalk": [0.1, 0.3], "hysteresis": 0.3, "delay": 0.02, "stuck": {5: 1.0},
-                                                         "swapped": [[66, 67]], "dead": [78], "rubber": {"c10": 8e4}}}}  # fmt: skip
+    cfg = {
+        "shear": True,
+        "lsb": 0.01,
+        "pads": {
+            "index": {
+                "gain": [0.5, 0.9],
+                "crosstalk": [0.1, 0.3],
+                "hysteresis": 0.3,
+                "delay": 0.02,
+                "stuck": {5: 1.0},
+                "swapped": [[66, 67]],
+                "dead": [78],
+                "rubber": {"c10": 8e4},
+            }
+        },
+    }
     out = []
     for lanes in (False, True):
         torch.manual_seed(0)
@@ -225,8 +300,10 @@ def test_recorded_sequences_replay_and_lanes_agree(monkeypatch):
     assert out[0][0][:, INDEX].min() > 1.0
 
 
-PADS = ("+tactile.pads.index={gain:[0.5,0.9],crosstalk:[0.1,0.3],hysteresis:0.3,delay:[0.0,0.04],stuck:{5:1.0},swapped:[[66,67]],dead:[78],"
-        "rubber:{c10:8e4},taxels:{40:[0.2,0.4]}}")  # fmt: skip
+PADS = (
+    "+tactile.pads.index={gain:[0.5,0.9],crosstalk:[0.1,0.3],hysteresis:0.3,delay:[0.0,0.04],stuck:{5:1.0},swapped:[[66,67]],dead:[78],"
+    "rubber:{c10:8e4},taxels:{40:[0.2,0.4]}}"
+)
 
 
 def test_a_control_step_with_pads_does_not_wait(monkeypatch):

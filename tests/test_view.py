@@ -37,7 +37,9 @@ def read(path):
 def test_video_has_every_frame_and_shows_the_ball_move(tmp_path):
     seen = []
     try:
-        video.render([clip(), clip(5)], tmp_path / "a.mp4", dt=0.05, size=(160, 128), progress=lambda *a: seen.append(a))
+        video.render(
+            [clip(), clip(5)], tmp_path / "a.mp4", dt=0.05, size=(160, 128), progress=lambda *a: seen.append(a)
+        )
     except video.NoRenderer as error:
         pytest.skip(str(error))
     meta, frames = read(tmp_path / "a.mp4")

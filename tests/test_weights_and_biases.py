@@ -18,7 +18,9 @@ class Error(Exception): pass
 def note(*what):
     with open("told.jsonl", "a") as file: file.write(json.dumps(what, default=str) + "\\n")
 class config:
-    update = staticmethod(lambda value: note("config", {k: v["task"]["name"] for k, v in value.items() if k == "env_cfg"}))
+    update = staticmethod(
+        lambda value: note("config", {k: v["task"]["name"] for k, v in value.items() if k == "env_cfg"})
+    )
 def save(path, base_path): note("file", path)
 def init(project, entity, name, config):
     if os.environ.get("REFUSED"): raise Error("api_key not configured (no-tty)\\ncall wandb login")
@@ -55,7 +57,10 @@ def test_not_installed_is_one_line_before_anything_is_built(configs, capfd):
     Path("wandb").mkdir()  # what its runs leave is no package
     assert shell.call("train", configs, *QUICK) == 2
     said = capfd.readouterr()
-    assert said.err == "error: agent.logger=wandb: Weights & Biases is not installed here; pip install wandb, then wandb login\n"
+    assert (
+        said.err
+        == "error: agent.logger=wandb: Weights & Biases is not installed here; pip install wandb, then wandb login\n"
+    )
     assert "compiling" not in said.out and not Path("runs").exists()
 
 
@@ -78,5 +83,6 @@ def test_not_logged_in_is_one_line(configs, stand_in, capfd, monkeypatch):
     monkeypatch.setenv("REFUSED", "1")
     assert shell.call("train", configs, *QUICK) == 2
     assert capfd.readouterr().err.endswith(
-        "error: agent.logger=wandb: api_key not configured (no-tty) (wandb login; or WANDB_MODE=offline, and wandb sync later)\n"
+        "error: agent.logger=wandb: api_key not configured (no-tty) (wandb login; or WANDB_MODE=offline, and wandb "
+        "sync later)\n"
     )

@@ -1,4 +1,5 @@
-"""What a stranger installs: the wheel alone, in an environment of its own, from an empty folder outside the repository."""
+"""What a stranger installs: the wheel alone, in an environment of its own, from an empty folder outside the
+repository."""
 
 from __future__ import annotations
 
@@ -60,7 +61,10 @@ def test_hints_name_what_was_typed(monkeypatch):
     for called, said in (
         ("/home/a/.venv/bin/dexsim", "dexsim train, dexsim play, torchrun -m dexsim train, dexsim audit"),
         ("train.py", "python train.py, python play.py, torchrun -m dexsim train, dexsim audit"),
-        ("/x/dexsim/__main__.py", "python -m dexsim train, python -m dexsim play, torchrun -m dexsim train, dexsim audit"),
+        (
+            "/x/dexsim/__main__.py",
+            "python -m dexsim train, python -m dexsim play, torchrun -m dexsim train, dexsim audit",
+        ),
     ):
         monkeypatch.setattr(sys, "argv", [called])
         assert program.words(text) == said
@@ -75,7 +79,19 @@ def wheel(tmp_path_factory) -> Path:
     shutil.copytree(ROOT / "dexsim", source / "dexsim", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--wheel-dir", out, source]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "--wheel-dir",
+        out,
+        source,
+    ]
     subprocess.run(command, check=True)
     (made,) = out.glob("dexsim-*.whl")
     return made
@@ -87,18 +103,24 @@ def installed(wheel, tmp_path_factory) -> Path:
     home = tmp_path_factory.mktemp("fresh")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True)
     python = home / "bin" / "python"
-    subprocess.run([sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel],
+        check=True,
+    )
     ask = [python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"]
     own = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
     theirs = sorted({sysconfig.get_paths()[k] for k in ("purelib", "platlib")})
-    (own / "dependencies.pth").write_text("\n".join(theirs) + "\n")  # their .pth files, this checkout among them, are not read
+    # their .pth files, this checkout among them, are not read
+    (own / "dependencies.pth").write_text("\n".join(theirs) + "\n")
     return home / "bin"
 
 
 def call(installed: Path, folder: Path, *argv: str | Path) -> str:
     """What a command of the fresh environment says, run in a folder."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    done = subprocess.run([installed / argv[0], *argv[1:]], cwd=folder, capture_output=True, text=True, timeout=600, env=clean)
+    done = subprocess.run(
+        [installed / argv[0], *argv[1:]], cwd=folder, capture_output=True, text=True, timeout=600, env=clean
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
 
@@ -127,10 +149,31 @@ def test_from_an_empty_folder(installed, tmp_path):
     recording = min((tmp_path / "out/demo/recordings").glob("*.mcap"))
     assert "states" in call(installed, tmp_path, "python", "-m", "dexsim", "audit", recording)
 
-    said = call(installed, tmp_path, "dexsim", "train", "task=grasp", "device=cpu", "worlds=4", "iterations=1", "final_episodes=0", "run=first")
+    said = call(
+        installed,
+        tmp_path,
+        "dexsim",
+        "train",
+        "task=grasp",
+        "device=cpu",
+        "worlds=4",
+        "iterations=1",
+        "final_episodes=0",
+        "run=first",
+    )
     assert "play it:  dexsim play checkpoint=runs/grasp/first/policy.pt" in said
     assert yaml.safe_load((tmp_path / "runs/grasp/first/config.yaml").read_text())["worlds"] == 4
-    call(installed, tmp_path, "dexsim", "play", "checkpoint=runs/grasp/first/policy.pt", "device=cpu", "worlds=2", "episodes=2", "video=false")
+    call(
+        installed,
+        tmp_path,
+        "dexsim",
+        "play",
+        "checkpoint=runs/grasp/first/policy.pt",
+        "device=cpu",
+        "worlds=2",
+        "episodes=2",
+        "video=false",
+    )
     assert (tmp_path / "runs/grasp/first/play/metrics.json").is_file()
     assert {p.name for p in tmp_path.iterdir()} == {"out", "runs"}
     assert {p for p in package.rglob("*") if "__pycache__" not in p.parts} == before, "a command wrote into the package"
@@ -139,8 +182,15 @@ def test_from_an_empty_folder(installed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("uvx") is None, reason="uv is not installed")
 def test_uvx_runs_the_wheel(wheel, tmp_path):
-    """No installation at all; uv takes the dependencies from its cache or the network, hence only where DEXSIM_UVX says so."""
+    """No installation at all; uv takes the dependencies from its cache or the network, hence only where DEXSIM_UVX says
+    so."""
     if not os.environ.get("DEXSIM_UVX"):
         pytest.skip("set DEXSIM_UVX=1: uv downloads the dependencies")
-    done = subprocess.run(["uvx", "--from", wheel, "dexsim", "diagnose", "demo=true"], cwd=tmp_path, capture_output=True, text=True, timeout=1800)
+    done = subprocess.run(
+        ["uvx", "--from", wheel, "dexsim", "diagnose", "demo=true"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=1800,
+    )
     assert done.returncode == 0 and "What was hidden" in done.stdout, done.stdout + done.stderr

@@ -212,7 +212,8 @@ def test_only_capsules_and_one_small_hull_per_tip_collide(model):
 
 
 def test_self_collision_pairs_are_the_meant_ones(model):
-    """42 pairs: finger tips 6, thumb tip (2 proxies) on finger tips 8, on finger links 8 and palm 8, thumb links on tips 12."""
+    """42 pairs: finger tips 6, thumb tip (2 proxies) on finger tips 8, on finger links 8 and palm 8, thumb links on
+    tips 12."""
     colliding = [g for g in range(model.ngeom) if model.geom_contype[g]]
     count = 0
     for i, a in enumerate(colliding):
@@ -235,7 +236,11 @@ def test_collision_filter_lets_an_object_touch_every_hand_geom(model):
                   conaffinity=xhand.HAND_BIT)  # fmt: skip
     with_ball = spec.compile()
     data = mujoco.MjData(with_ball)
-    targets = [g for g in range(with_ball.ngeom) if with_ball.geom_contype[g] & xhand.HAND_BIT and with_ball.geom_bodyid[g] < 14]
+    targets = [
+        g
+        for g in range(with_ball.ngeom)
+        if with_ball.geom_contype[g] & xhand.HAND_BIT and with_ball.geom_bodyid[g] < 14
+    ]
     for g in targets:
         data.qpos[:] = 0
         mujoco.mj_forward(with_ball, data)

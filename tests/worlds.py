@@ -39,14 +39,25 @@ def grasp_env(*settings: str, worlds: int = 8, engine: str = "mujoco", seed: int
 
 
 def play_env(checkpoint: str, worlds: int, *settings: str, engine: str = "mujoco"):
-    """(environment, policy) of an included checkpoint, as `python play.py checkpoint=... device=cpu SETTINGS` has them."""
+    """(environment, policy) of an included checkpoint, as `python play.py checkpoint=... device=cpu SETTINGS` has
+    them."""
     from dexsim.cli import start
     from dexsim.learning.ppo import load_policy
     from dexsim.paths import CONFIGS
     from dexsim.tasks import make_env
 
     path = Path(__file__).parents[1] / "checkpoints" / f"{checkpoint}.pt"
-    begun = start.for_play([f"checkpoint={path}", "device=cpu", f"episodes={worlds}", f"worlds={worlds}", f"sim.engine={engine}", *settings], CONFIGS)
+    begun = start.for_play(
+        [
+            f"checkpoint={path}",
+            "device=cpu",
+            f"episodes={worlds}",
+            f"worlds={worlds}",
+            f"sim.engine={engine}",
+            *settings,
+        ],
+        CONFIGS,
+    )
     env = make_env(begun.cfg, worlds, "cpu", begun.cfg["seed"], engine)
     return env, load_policy(begun.data, env, str(begun.source), begun.typed)
 
@@ -78,9 +89,14 @@ def write(objects: Objects, mask=None, **given) -> dict[str, torch.Tensor]:
     """objects.write with defaults for what is not given; returns what was written."""
     n = objects.engine.n
     values = {
-        "variant": torch.arange(n) % len(objects.scene.variants), "scale": torch.ones(n, 3), "mass": torch.full((n,), 0.1),
-        "com": torch.zeros(n, 3), "friction": torch.ones(n), "stiffness": torch.full((n,), 7000.0), "damping_ratio": torch.ones(n),
-    }  # fmt: skip
+        "variant": torch.arange(n) % len(objects.scene.variants),
+        "scale": torch.ones(n, 3),
+        "mass": torch.full((n,), 0.1),
+        "com": torch.zeros(n, 3),
+        "friction": torch.ones(n),
+        "stiffness": torch.full((n,), 7000.0),
+        "damping_ratio": torch.ones(n),
+    }
     for k, v in given.items():
         values[k] = torch.as_tensor(v, dtype=values[k].dtype).expand_as(values[k]).clone()
     objects.write(torch.ones(n, dtype=torch.bool) if mask is None else mask, **values)
@@ -94,9 +110,14 @@ def random_values(n: int, rows: int, seed: int) -> dict[str, torch.Tensor]:
         return low + (high - low) * torch.rand(n, *shape, generator=g)
 
     return {
-        "variant": torch.randint(rows, (n,), generator=g), "scale": u(0.9, 1.5, 3), "mass": u(0.03, 0.5), "com": u(-0.1, 0.1, 3),
-        "friction": u(0.4, 1.2), "stiffness": u(5e3, 9e3), "damping_ratio": u(0.3, 1.0),
-    }  # fmt: skip
+        "variant": torch.randint(rows, (n,), generator=g),
+        "scale": u(0.9, 1.5, 3),
+        "mass": u(0.03, 0.5),
+        "com": u(-0.1, 0.1, 3),
+        "friction": u(0.4, 1.2),
+        "stiffness": u(5e3, 9e3),
+        "damping_ratio": u(0.3, 1.0),
+    }
 
 
 def put_object(engine, position, quat=(1.0, 0, 0, 0), hand=None) -> None:

@@ -170,7 +170,9 @@ class Calibration:
         unknown = [j for j, v in zip(hand.joints, out["current_per_torque"], strict=True) if not np.isfinite(v)]
         if unknown and how == "matched":
             names = "every joint" if len(unknown) == J else ", ".join(unknown)
-            assumed.append(f"current_per_torque of {names} is not measured: {ASSUMED_CURRENT_PER_TORQUE} A per N.m assumed")
+            assumed.append(
+                f"current_per_torque of {names} is not measured: {ASSUMED_CURRENT_PER_TORQUE} A per N.m assumed"
+            )
         missing = ~np.isfinite(out["current_per_torque"])
         out["current_per_torque"][missing] = ASSUMED_CURRENT_PER_TORQUE
         unmeasured = ~np.isfinite(out["current_max"])
@@ -179,8 +181,15 @@ class Calibration:
         out["current_max"] = np.where(unmeasured, out["current_per_torque"] * out["torque_max"], out["current_max"])
         sign = content.current_sign
         sign = [sign.get(j, -1) for j in hand.joints] if isinstance(sign, dict) else [sign] * J
-        return cls(**out, current_sign=np.array(sign, float), normalization=how, **_touch(content.touch or Touch(), assumed, where, hand), hand=hand,
-                   assumed=assumed, raw=raw)  # fmt: skip
+        return cls(
+            **out,
+            current_sign=np.array(sign, float),
+            normalization=how,
+            **_touch(content.touch or Touch(), assumed, where, hand),
+            hand=hand,
+            assumed=assumed,
+            raw=raw,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The file's content with every value that deployment uses stated."""
@@ -220,11 +229,17 @@ def _content(raw: Any, where: str, hand: Hand) -> Content:
         for part, (there, known) in keys.items():
             for key in there if isinstance(there, dict) else ():
                 if key not in known:
-                    raise UserError(f"{where}: {part}{'.' if part else ''}{key}: no such {'key' if part in ('', 'touch') else 'joint'};"
-                                    f" there are: {', '.join(known)}")  # fmt: skip
+                    raise UserError(
+                        f"{where}: {part}{'.' if part else ''}{key}: no such "
+                        f"{'key' if part in ('', 'touch') else 'joint'};"
+                        f" there are: {', '.join(known)}"
+                    )
         raw = {k: raw[k] for k in Content.__struct_fields__ if k in raw}
         if isinstance(raw.get("joints"), dict):
-            raw["joints"] = {j: {k: e[k] for k in Joint.__struct_fields__ if k in e} if isinstance(e, dict) else e for j, e in raw["joints"].items()}
+            raw["joints"] = {
+                j: {k: e[k] for k in Joint.__struct_fields__ if k in e} if isinstance(e, dict) else e
+                for j, e in raw["joints"].items()
+            }
         if isinstance(raw.get("touch"), dict):
             raw["touch"] = {k: raw["touch"][k] for k in Touch.__struct_fields__ if k in raw["touch"]}
     return typed.convert(raw, Content, where, "correct the file, or fit it anew with dexsim calibrate")

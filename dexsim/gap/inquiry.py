@@ -1,4 +1,5 @@
-"""What a diagnosis is asked and has read: mechanism, recordings, their runs, what is wrong with signals. Every part begins from it."""
+"""What a diagnosis is asked and has read: mechanism, recordings, their runs, what is wrong with signals. Every part
+begins from it."""
 
 from __future__ import annotations
 
@@ -22,8 +23,9 @@ from dexsim.recording.schema import Recording
 class Inquiry:
     """A diagnosis under way: what is asked, and what the recordings hold.
 
-    recordings: as they are, None for one that cannot be read; runs: of those that can be used; held: numbers of the runs that are kept out of
-    the fit; channel: findings about signals; lengths: s, by recording; notes: what the page says beside the findings."""
+    recordings: as they are, None for one that cannot be read; runs: of those that can be used; held: numbers of the
+    runs that are kept out of the fit; channel: findings about signals; lengths: s, by recording; notes: what the page
+    says beside the findings."""
 
     settings: Settings
     say: Callable[[str], None]
@@ -160,7 +162,8 @@ def _copies(train: Sequence[Any], held: Sequence[Any]) -> None:
                 and (a.value != a.value[0]).any()
             ):
                 raise UserError(
-                    f"held_out: {h.path.name} holds the same readings as {r.path.name}; what is held out must not be fitted"
+                    f"held_out: {h.path.name} holds the same readings as {r.path.name}; what is held out must not be "
+                    "fitted"
                 )
 
 
@@ -177,6 +180,7 @@ def _still(s: Settings) -> str:
             continue
         bad = [f.text for f in r.findings if f.severity == "error"]
         said.append(
-            f"{path.name}: {r.duration:.1f} s of {len(r.joints)} joint{'s' * (len(r.joints) != 1)}, {'; '.join(bad[:2]) if bad else 'no fault'}"
+            f"{path.name}: {r.duration:.1f} s of {len(r.joints)} joint{'s' * (len(r.joints) != 1)}, "
+            f"{'; '.join(bad[:2]) if bad else 'no fault'}"
         )
     return f" (of the recordings themselves: {' | '.join(said)})" if said else ""

@@ -103,7 +103,8 @@ class SearchRules:
 
 @dataclass(frozen=True)
 class JudgeRules:
-    """What the verdict and the confidence of a name of the drives are decided by; touch has its own beside the verdict's."""
+    """What the verdict and the confidence of a name of the drives are decided by; touch has its own beside the
+    verdict's."""
 
     within: float = _rule(
         1.3,
@@ -221,14 +222,16 @@ class JudgeRules:
     )
     one_load: float = _rule(
         0.3,
-        "standard deviation over mean of the load on the gear while a joint slides: less is one load, under which friction that"
+        "standard deviation over mean of the load on the gear while a joint slides: less is one load, under which "
+        "friction that"
         " grows with it is not told from friction that does not",
         "between 0.12 (a case of another plant with one load) and 0.54 (the least of six with several)",
         "test_friction_at_one_load_is_a_set",
     )
     overstated: float = _rule(
         2.0,
-        "x what is left with what was found: a floor from repeats that is larger holds what differs between them, not noise",
+        "x what is left with what was found: a floor from repeats that is larger holds what differs between them, not "
+        "noise",
         "by judgement; a drive that warms up between two repeats gave 3.0",
         "test_repeats_that_differ_by_what_was_found_are_no_floor",
     )
@@ -276,7 +279,8 @@ class JudgeRules:
     )
     apart: float = _rule(
         1.3,
-        "x: the engine that trains confirms the search's plant where it leaves no more than so much of what that leaves",
+        "x: the engine that trains confirms the search's plant where it leaves no more than so much of what that "
+        "leaves",
         "by judgement",
         "test_the_engine_that_trains_confirms",
     )
@@ -399,7 +403,10 @@ class TouchRules:
         "",
     )
     timing: float = _rule(
-        3e-3, "s by which a reading's time is uncertain", "by judgement: between two positions of the joints the contact is a guess", ""
+        3e-3,
+        "s by which a reading's time is uncertain",
+        "by judgement: between two positions of the joints the contact is a guess",
+        "",
     )
     gain_prior: float = _rule(0.3, "standard deviation of a taxel's gain, before anything is seen", "by judgement", "")
     structured: float = _rule(

@@ -207,8 +207,8 @@ def draw(seed: int, servo: dict[str, Any], hand: Hand | None = None) -> dict[str
 
 
 HEAD = """\
-# Another world to be judged in (`python play.py checkpoint=... reality={name}`): never trained in, standing in for hardware.
-# Drawn once, not tuned: python -m dexsim.tasks.reality seed={seed} out=dexsim/configs/reality/{name}.yaml. See dexsim/tasks/reality.py.
+# Another world to be judged in (`python play.py checkpoint=... reality={name}`): never trained in, standing in for
+# hardware. Drawn once, not tuned: python -m dexsim.tasks.reality seed={seed} out=dexsim/configs/reality/{name}.yaml
 """
 
 

@@ -1,8 +1,9 @@
-"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [out=FOLDER]`: damaged files without end.
+"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [out=FOLDER]`: damaged files
+without end.
 
-Each case has a limit of 20 s of processor time and 2 GiB of memory. What breaks is kept in out= (out/fuzz) with its seed;
-`python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke. kind=ci: every
-third a recording, as continuous integration runs it.
+Each case has a limit of 20 s of processor time and 2 GiB of memory. What breaks is kept in out= (out/fuzz) with its
+seed; `python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke.
+kind=ci: every third a recording, as continuous integration runs it.
 """
 
 from __future__ import annotations
@@ -60,7 +61,11 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
 def work(kinds: list[str], first: int, count: int, out: Path, folder: Path, send) -> None:
     """A batch in a process of its own: a crash ends this one alone."""
     warnings.simplefilter("ignore")
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() if Path("/proc/self/statm").exists() else 0
+    used = (
+        int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        if Path("/proc/self/statm").exists()
+        else 0
+    )
     resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, used + BYTES))
     files = corpus.build(folder / "corpus")
     cases = folder / "case"
@@ -94,7 +99,9 @@ def main(argv: list[str]) -> int:
         while time.monotonic() < end and sum(counts.values()) < most:
             receive, send = multiprocessing.Pipe(False)
             count = min(BATCH, most - sum(counts.values()))
-            worker = multiprocessing.get_context("fork").Process(target=work, args=(kinds, seed, count, out, Path(folder), send))
+            worker = multiprocessing.get_context("fork").Process(
+                target=work, args=(kinds, seed, count, out, Path(folder), send)
+            )
             worker.start()
             send.close()
             begun = None
@@ -119,8 +126,17 @@ def main(argv: list[str]) -> int:
                 print(f"{begun[1]} from={begun[0]}: ended its process with {worker.exitcode}", flush=True)
                 broken.setdefault(f"crash {worker.exitcode}", []).append(f"{begun[1]} {begun[0]}")
                 seed = begun[0] + 1
-    print(json.dumps({"cases": sum(counts.values()), **{k: counts[k] for k in ("fine", "refused", "traceback", "message", "over 20 s", "over 2 GB", "crash")},
-                      "next": seed}))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "cases": sum(counts.values()),
+                **{
+                    k: counts[k] for k in ("fine", "refused", "traceback", "message", "over 20 s", "over 2 GB", "crash")
+                },
+                "next": seed,
+            }
+        )
+    )
     return int(bool(broken))
 
 

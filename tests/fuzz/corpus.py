@@ -19,32 +19,99 @@ from dexsim.recording import Recording, Series, States, schema, write
 ROOT = Path(__file__).parents[2]
 JOINTS = ("a", "b")
 SERVO = {
-    "drive": "torque", "control_rate": 100, "loop_encoder": {"a": "motor"}, "current_per_torque": {"a": 0.9, "b": "unknown"}, "supply_voltage": 24.0,
-    "joints": {"*": {"kp": 1.5, "kd": [0.01, 0.03], "torque_limit": 2.0}, "a": {"kp": {"value": 1.0, "low": 0.9, "high": 1.1}, "delay": "unknown"}},
-}  # fmt: skip
+    "drive": "torque",
+    "control_rate": 100,
+    "loop_encoder": {"a": "motor"},
+    "current_per_torque": {"a": 0.9, "b": "unknown"},
+    "supply_voltage": 24.0,
+    "joints": {
+        "*": {"kp": 1.5, "kd": [0.01, 0.03], "torque_limit": 2.0},
+        "a": {"kp": {"value": 1.0, "low": 0.9, "high": 1.1}, "delay": "unknown"},
+    },
+}
 CALIBRATION = {
-    "schema": 1, "normalization": "matched", "current_sign": {"index_joint1": 1, "mid_joint1": -1},
-    "joints": {"index_joint1": {"current_per_torque": {"value": 2.7, "low": 2.5, "high": 2.9, "r2": 0.99}, "current_max": 1.2, "torque_max": 1.1}},
-    "touch": {"lsb": 0.1, "axis_sign": [-1, -1, 1], "threshold": {"value": 0.1}, "gain": {"thumb": [1.0] * 120}, "bias": {"mid": [0.0] * 120},
-              "dead": {"thumb": [3, 4]}, "swapped": {"mid": [[1, 2], [5, 6]]}},
-}  # fmt: skip
+    "schema": 1,
+    "normalization": "matched",
+    "current_sign": {"index_joint1": 1, "mid_joint1": -1},
+    "joints": {
+        "index_joint1": {
+            "current_per_torque": {"value": 2.7, "low": 2.5, "high": 2.9, "r2": 0.99},
+            "current_max": 1.2,
+            "torque_max": 1.1,
+        }
+    },
+    "touch": {
+        "lsb": 0.1,
+        "axis_sign": [-1, -1, 1],
+        "threshold": {"value": 0.1},
+        "gain": {"thumb": [1.0] * 120},
+        "bias": {"mid": [0.0] * 120},
+        "dead": {"thumb": [3, 4]},
+        "swapped": {"mid": [[1, 2], [5, 6]]},
+    },
+}
 TACTILE = {
-    "tactile": {"friction": [0.35, 0.45], "pads": {"index": {"gain": {"value": 0.6, "low": 0.57, "high": 0.63}, "taxels": {17: [0.4, 0.5]}, "dead": [3],
-                "stuck": {33: 0.4}, "swapped": [[14, 15]], "crosstalk": [0.2, 0.3], "delay": [0.018, 0.022], "rubber": {"c10": [9e4, 1.1e5], "c01": 2e4}}}},
+    "tactile": {
+        "friction": [0.35, 0.45],
+        "pads": {
+            "index": {
+                "gain": {"value": 0.6, "low": 0.57, "high": 0.63},
+                "taxels": {17: [0.4, 0.5]},
+                "dead": [3],
+                "stuck": {33: 0.4},
+                "swapped": [[14, 15]],
+                "crosstalk": [0.2, 0.3],
+                "delay": [0.018, 0.022],
+                "rubber": {"c10": [9e4, 1.1e5], "c01": 2e4},
+            }
+        },
+    },
     "randomize": {"object.friction": [0.35, 0.45], "contact.stiffness": {"value": 4500, "low": 4300, "high": 4700}},
-}  # fmt: skip
-METADATA = {"gravity": "0 0 -9.81", "effort_is": "torque_Nm", "effort_sign": "+1,-1", "robot": "rig", "position_unit": "rad", "tactile_lsb": "0.1",
-            "servo": SERVO, "joint_names": ["a", "b"], "tactile_axis_sign": "1 1 1"}  # fmt: skip
+}
+METADATA = {
+    "gravity": "0 0 -9.81",
+    "effort_is": "torque_Nm",
+    "effort_sign": "+1,-1",
+    "robot": "rig",
+    "position_unit": "rad",
+    "tactile_lsb": "0.1",
+    "servo": SERVO,
+    "joint_names": ["a", "b"],
+    "tactile_axis_sign": "1 1 1",
+}
 CONFIG = {
-    "sim": {"timestep": 0.002, "iterations": 10}, "task": {"contact": {"impedance": 0.9}},
-    "recorded_world": {"index": 0, "object": {"kind": "box", "shape": "cube", "size": [0.02, 0.02, 0.02], "mass": 0.1, "friction": 0.5, "stiffness": 4000.0,
-                                              "damping_ratio": 0.3}},
-}  # fmt: skip
+    "sim": {"timestep": 0.002, "iterations": 10},
+    "task": {"contact": {"impedance": 0.9}},
+    "recorded_world": {
+        "index": 0,
+        "object": {
+            "kind": "box",
+            "shape": "cube",
+            "size": [0.02, 0.02, 0.02],
+            "mass": 0.1,
+            "friction": 0.5,
+            "stiffness": 4000.0,
+            "damping_ratio": 0.3,
+        },
+    },
+}
 OVERRIDES = (
-    "task=grasp", "device=cpu", "worlds=4", "task.rewards.force_near=2.0", "task.objects.train=[box,sphere]", "randomize.object.mass=[0.05,0.2]",
-    "sim.timestep=0.007", "agent.actor.hidden_dims=[16,16]", "agent.algorithm.learning_rate=1e-3", "servo=ideal", "tactile.delay=[0.0,0.02]",
-    "task.reward.reach_length=0.05", "randomize.contact.stiffness={log: [4000,9000]}", "task.critic=paper", "save_worlds=true",
-)  # fmt: skip
+    "task=grasp",
+    "device=cpu",
+    "worlds=4",
+    "task.rewards.force_near=2.0",
+    "task.objects.train=[box,sphere]",
+    "randomize.object.mass=[0.05,0.2]",
+    "sim.timestep=0.007",
+    "agent.actor.hidden_dims=[16,16]",
+    "agent.algorithm.learning_rate=1e-3",
+    "servo=ideal",
+    "tactile.delay=[0.0,0.02]",
+    "task.reward.reach_length=0.05",
+    "randomize.contact.stiffness={log: [4000,9000]}",
+    "task.critic=paper",
+    "save_worlds=true",
+)
 TREES = {"servo": SERVO, "calibration": CALIBRATION, "tactile": TACTILE, "metadata": METADATA, "config": CONFIG}
 
 
@@ -52,9 +119,21 @@ def recording(seconds: float = 1.5, tactile: bool = True, config: str | None = N
     """Two joints at 100 Hz, touch and an object now and then."""
     t = np.arange(0, seconds, 0.01)
     q = np.stack([0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t)], 1)
-    meta = schema.DEFAULTS | {"effort_is": "torque_Nm", "joint_names": "a,b", "tactile_lsb": "0.1", "servo": yaml.safe_dump(SERVO)}
-    out = Recording(Path("made"), meta, JOINTS, Series(t, q, schema.COMMANDS), States(*(Series(t, x, schema.STATES) for x in (np.roll(q, 3, 0), q, q))),
-                    start_ns=1_700_000_000_000_000_000, config=config)  # fmt: skip
+    meta = schema.DEFAULTS | {
+        "effort_is": "torque_Nm",
+        "joint_names": "a,b",
+        "tactile_lsb": "0.1",
+        "servo": yaml.safe_dump(SERVO),
+    }
+    out = Recording(
+        Path("made"),
+        meta,
+        JOINTS,
+        Series(t, q, schema.COMMANDS),
+        States(*(Series(t, x, schema.STATES) for x in (np.roll(q, 3, 0), q, q))),
+        start_ns=1_700_000_000_000_000_000,
+        config=config,
+    )
     out.temperature = Series(t[::10], np.full((len(t[::10]), 2), 30.0), schema.TEMPERATURES)
     out.enabled = Series(t[::50], np.ones((len(t[::50]), 2)), schema.ENABLED)
     out.supply_voltage = Series(t[::10], np.full(len(t[::10]), 24.0), schema.SUPPLY)
@@ -75,10 +154,15 @@ def build(folder: Path) -> dict[str, list[Path]]:
     foreign(folder / "json.mcap", CompressionType.NONE, "json")
     r = recording(0.5, tactile=False)
     t, q = r.commands.t, r.commands.value
-    rows = "".join(f"{x:.3f},{a:.6f},{b:.6f},{c:.6f},{d:.6f}\n" for x, (a, b), (c, d) in zip(t, q, r.states.position.value, strict=True))
+    rows = "".join(
+        f"{x:.3f},{a:.6f},{b:.6f},{c:.6f},{d:.6f}\n"
+        for x, (a, b), (c, d) in zip(t, q, r.states.position.value, strict=True)
+    )
     (folder / "plain.csv").write_text("time,command.a,command.b,position.a,position.b\n" + rows)
     np.savez(folder / "plain.npz", time=t, command=q, position=r.states.position.value, joint_names=list(JOINTS))
-    np.savez_compressed(folder / "packed.npz", **{"time_ms": 1e3 * t, "position.a": q[:, 0], "command.a [deg]": q[:, 1]})
+    np.savez_compressed(
+        folder / "packed.npz", **{"time_ms": 1e3 * t, "position.a": q[:, 0], "command.a [deg]": q[:, 1]}
+    )
     for kind, tree in TREES.items():
         (folder / f"{kind}.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     files = sorted(folder.iterdir())
@@ -88,7 +172,11 @@ def build(folder: Path) -> dict[str, list[Path]]:
         with contextlib.redirect_stdout(io.StringIO()):
             export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=2)
     (folder / "overrides.txt").write_text("\n".join(OVERRIDES))
-    out |= {"checkpoint": [folder / "checkpoint.pt"], "manifest": [folder / "bundle" / "manifest.yaml"], "overrides": [folder / "overrides.txt"]}
+    out |= {
+        "checkpoint": [folder / "checkpoint.pt"],
+        "manifest": [folder / "bundle" / "manifest.yaml"],
+        "overrides": [folder / "overrides.txt"],
+    }
     return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
 
 
@@ -111,7 +199,14 @@ def foreign(path: Path, compression: CompressionType, encoding: str) -> None:
                 if encoding == "cdr":
                     data = cdr.joint_state(ns, JOINTS, x, None, x)
                 else:
-                    data = json.dumps({"name": JOINTS, "position": x.tolist(), "effort": x.tolist(), "header": {"stamp": {"sec": 1, "nanosec": i}}}).encode()
+                    data = json.dumps(
+                        {
+                            "name": JOINTS,
+                            "position": x.tolist(),
+                            "effort": x.tolist(),
+                            "header": {"stamp": {"sec": 1, "nanosec": i}},
+                        }
+                    ).encode()
                 w.add_message(channel, log_time=ns, data=data, publish_time=ns)
         w.finish()
 
@@ -124,12 +219,30 @@ def checkpoint_payload() -> dict:
     from dexsim.paths import CONFIGS
 
     cfg = start.for_train(["task=grasp", "device=cpu", "worlds=2", "iterations=3"], CONFIGS).cfg
-    weights = {"mlp.0.weight": torch.ones(2, 3), "obs_normalizer._mean": torch.zeros(1, 3), "obs_normalizer.count": torch.tensor(5)}
+    weights = {
+        "mlp.0.weight": torch.ones(2, 3),
+        "obs_normalizer._mean": torch.zeros(1, 3),
+        "obs_normalizer.count": torch.tensor(5),
+    }
     return {
-        "kind": "train", "config": cfg, "versions": {"dexsim": "0.1.0"}, "git": {"commit": "unknown", "dirty": False},
-        "layout": {"joints": ["a", "b"], "action": [["a", -1.0, 1.0, "rad"]], "observations": {"actor": [["x", 3]], "critic": [["x", 3]]}},
-        "iteration": 3, "steps": 144, "actor": weights, "critic": dict(weights),
-        "optimizer": {"state": {0: {"step": torch.tensor(3.0), "exp_avg": torch.zeros(2, 3)}}, "param_groups": [{"lr": 1e-3, "params": [0]}]},
-        "env": {"rng": torch.zeros(16, dtype=torch.uint8), "nan_count": torch.tensor(0)}, "rng": checkpoint.rng_state(),
+        "kind": "train",
+        "config": cfg,
+        "versions": {"dexsim": "0.1.0"},
+        "git": {"commit": "unknown", "dirty": False},
+        "layout": {
+            "joints": ["a", "b"],
+            "action": [["a", -1.0, 1.0, "rad"]],
+            "observations": {"actor": [["x", 3]], "critic": [["x", 3]]},
+        },
+        "iteration": 3,
+        "steps": 144,
+        "actor": weights,
+        "critic": dict(weights),
+        "optimizer": {
+            "state": {0: {"step": torch.tensor(3.0), "exp_avg": torch.zeros(2, 3)}},
+            "param_groups": [{"lr": 1e-3, "params": [0]}],
+        },
+        "env": {"rng": torch.zeros(16, dtype=torch.uint8), "nan_count": torch.tensor(0)},
+        "rng": checkpoint.rng_state(),
         "worlds": {"env.q": torch.zeros(2, 12), "rng": torch.zeros(16, dtype=torch.uint8)},
-    }  # fmt: skip
+    }

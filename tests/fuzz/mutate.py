@@ -1,4 +1,5 @@
-"""Damage to files: bytes, texts, trees, and recordings that are sound as files but hold what no machine sends. A seed makes a case."""
+"""Damage to files: bytes, texts, trees, and recordings that are sound as files but hold what no machine sends. A seed
+makes a case."""
 
 from __future__ import annotations
 
@@ -17,11 +18,63 @@ from dexsim.recording import write
 from . import corpus
 
 ODD: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 2**31, 2**63, -(2**63), 1e-300, 1e300, float("nan"), float("inf"), float("-inf"), "", " ", "x", "unknown", "1e3", "*", "nan",
-    "0 0 -9.81", "a" * 5000, "\u0000", "é\u202e", [], {}, [[]], [1], [1, 2], [2, 1], [1, 2, 3], [None], ["x"], {"value": 1}, {"value": None}, {"low": 1},
-    {"value": float("nan"), "low": 0, "high": 1}, {"x": {"y": {"z": 1}}}, {1: 2}, {None: None}, {True: 1}, "2020-01-01", "!!binary x", [0] * 200, "\n", "a: b",
-)  # fmt: skip
-WORDS = (b"\x00" * 8, b"\xff" * 8, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x01" + b"\x00" * 7, b"\x00\x00\x00\x00\x00\x00\xf0\x7f", b"\x00\x00\x00\x00\x00\x00\xf8\x7f")
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    2**31,
+    2**63,
+    -(2**63),
+    1e-300,
+    1e300,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    "",
+    " ",
+    "x",
+    "unknown",
+    "1e3",
+    "*",
+    "nan",
+    "0 0 -9.81",
+    "a" * 5000,
+    "\u0000",
+    "é\u202e",
+    [],
+    {},
+    [[]],
+    [1],
+    [1, 2],
+    [2, 1],
+    [1, 2, 3],
+    [None],
+    ["x"],
+    {"value": 1},
+    {"value": None},
+    {"low": 1},
+    {"value": float("nan"), "low": 0, "high": 1},
+    {"x": {"y": {"z": 1}}},
+    {1: 2},
+    {None: None},
+    {True: 1},
+    "2020-01-01",
+    "!!binary x",
+    [0] * 200,
+    "\n",
+    "a: b",
+)
+WORDS = (
+    b"\x00" * 8,
+    b"\xff" * 8,
+    b"\xff\xff\xff\x7f",
+    b"\x00\x00\x00\x80",
+    b"\x01" + b"\x00" * 7,
+    b"\x00\x00\x00\x00\x00\x00\xf0\x7f",
+    b"\x00\x00\x00\x00\x00\x00\xf8\x7f",
+)
 
 
 def bytes_(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
@@ -64,7 +117,9 @@ def tree(value: Any, rng: np.random.Generator) -> Any:
         node, key = root, 0
         for _ in range(int(rng.integers(0, 7))):
             inner = node[key]
-            keys = list(inner) if isinstance(inner, dict) else list(range(len(inner))) if isinstance(inner, list) else []
+            keys = (
+                list(inner) if isinstance(inner, dict) else list(range(len(inner))) if isinstance(inner, list) else []
+            )
             if not keys:
                 break
             node, key = inner, keys[int(rng.integers(0, len(keys)))]
@@ -86,15 +141,35 @@ def tree(value: Any, rng: np.random.Generator) -> Any:
 
 def text_of(kind: str, rng: np.random.Generator) -> bytes:
     """A damaged YAML file of a kind."""
-    text = yaml.dump(tree(corpus.TREES[kind], rng), Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+    text = yaml.dump(
+        tree(corpus.TREES[kind], rng),
+        Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
+        sort_keys=False,
+        allow_unicode=True,
+    ).encode("utf-8", "surrogatepass")
     return bytes_(text, rng, [text, b"{[&a*a!!python/name:os.system <<: ]}" * 20]) if rng.random() < 0.4 else text
 
 
 def values(path: Path, rng: np.random.Generator) -> None:
     """Writes a sound file whose values, times or metadata are none that a machine sends."""
     r = corpus.recording(float(rng.choice([0.02, 0.3, 1.2])), bool(rng.random() < 0.2))
-    series = [s for s in (r.commands, r.states.position, r.states.velocity, r.states.effort, r.temperature, r.enabled, r.supply_voltage, r.tactile,
-                          r.object_pose, r.external_force, r.imu) if s is not None]  # fmt: skip
+    series = [
+        s
+        for s in (
+            r.commands,
+            r.states.position,
+            r.states.velocity,
+            r.states.effort,
+            r.temperature,
+            r.enabled,
+            r.supply_voltage,
+            r.tactile,
+            r.object_pose,
+            r.external_force,
+            r.imu,
+        )
+        if s is not None
+    ]
     for _ in range(int(rng.integers(1, 5))):
         s = series[int(rng.integers(0, len(series)))]
         n = len(s.t)
@@ -117,7 +192,9 @@ def values(path: Path, rng: np.random.Generator) -> None:
         else:
             s.stamp = np.where(at, float(rng.choice([np.nan, 0.0, 1e8, -5.0])), s.t)
     if rng.random() < 0.4:
-        meta = {k: v for k, v in tree({k: str(v) for k, v in r.meta.items()}, rng).items()} if rng.random() < 0.9 else {}
+        meta = (
+            {k: v for k, v in tree({k: str(v) for k, v in r.meta.items()}, rng).items()} if rng.random() < 0.9 else {}
+        )
         r.meta = {str(k): str(v) for k, v in meta.items() if str(k) in corpus.schema.KEYS}
     if rng.random() < 0.2:
         r.config = text_of("config", rng).decode("utf-8", "replace")
@@ -134,7 +211,9 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
     """Writes the damaged file of a seed; returns where."""
     rng = np.random.default_rng([seed, sum(map(ord, kind))])
     if kind in ("checkpoint", "manifest", "overrides"):
-        return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](rng, files[kind][0], folder)
+        return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](
+            rng, files[kind][0], folder
+        )
     if kind != "recording":
         path = folder / "case.yaml"
         path.write_bytes(text_of(kind, rng))
@@ -174,7 +253,9 @@ def _manifest(rng: np.random.Generator, source: Path, folder: Path) -> Path:
     for name in ("policy.onnx", "golden.npz", "config.yaml"):
         (case / name).symlink_to(source.with_name(name).resolve())
     data = tree(yaml.load(source.read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)), rng)
-    text = yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+    text = yaml.dump(
+        data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, allow_unicode=True
+    ).encode("utf-8", "surrogatepass")
     (case / "manifest.yaml").write_bytes(bytes_(text, rng, [text]) if rng.random() < 0.3 else text)
     return case
 

@@ -23,8 +23,10 @@ from dexsim.tactile import file as tactile_file
 
 from . import corpus
 
-MODEL = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" range="-1 1" limited="true"/><geom size=".02" mass=".1" pos="0 0 -.1"/>
-<body pos="0 0 -.2"><joint name="b" axis="0 1 0"/><geom size=".02" mass=".1" pos="0 0 -.1"/></body></body></worldbody></mujoco>"""
+MODEL = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" range="-1 1" limited="true"/>
+ <geom size=".02" mass=".1" pos="0 0 -.1"/>
+<body pos="0 0 -.2"><joint name="b" axis="0 1 0"/><geom size=".02" mass=".1" pos="0 0 -.1"/></body></body></worldbody>
+ </mujoco>"""
 
 
 def recording(path: Path) -> None:
@@ -42,7 +44,9 @@ def recording(path: Path) -> None:
         runs, _ = inputs.free_air(runs, [], inputs.merged_spans(blind), [], "", "", (0.0, 0.0), inputs.SHORTEST)
     for run in runs:
         run.smooth()
-        assert np.isfinite(run.q).all() and np.isfinite(run.cmd).all() and (np.diff(run.t) > 0).all(), "a run that cannot be simulated"
+        assert np.isfinite(run.q).all() and np.isfinite(run.cmd).all() and (np.diff(run.t) > 0).all(), (
+            "a run that cannot be simulated"
+        )
 
 
 def servo(path: Path) -> None:
@@ -96,8 +100,17 @@ def overrides(path: Path) -> None:
         start.for_train(lines, CONFIGS)
 
 
-TARGETS: dict[str, Callable[[Path], None]] = {"recording": recording, "servo": servo, "calibration": calibration, "tactile": tactile, "metadata": beside,
-                                              "config": config, "checkpoint": checkpoint, "manifest": manifest, "overrides": overrides}  # fmt: skip
+TARGETS: dict[str, Callable[[Path], None]] = {
+    "recording": recording,
+    "servo": servo,
+    "calibration": calibration,
+    "tactile": tactile,
+    "metadata": beside,
+    "config": config,
+    "checkpoint": checkpoint,
+    "manifest": manifest,
+    "overrides": overrides,
+}
 
 
 def verdict(kind: str, path: Path) -> str:
@@ -108,5 +121,9 @@ def verdict(kind: str, path: Path) -> str:
         text = str(error)
         if "\n" in text:
             return f"more than one line: {text[:200]!r}"
-        return "refused" if "case" in text or "servo of" in text or kind == "overrides" else f"the file is not named: {text[:200]}"
+        return (
+            "refused"
+            if "case" in text or "servo of" in text or kind == "overrides"
+            else f"the file is not named: {text[:200]}"
+        )
     return "fine"

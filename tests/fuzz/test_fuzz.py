@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from . import corpus, mutate, strategies, targets
 
-SHORT = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
+SHORT = settings(
+    max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
+)
 WELL = ("fine", "refused")
 
 
@@ -46,7 +48,11 @@ def test_damaged_trees(kind, tmp_path):
     def run(tree):
         mutate.clean(tmp_path)
         path = tmp_path / "case.yaml"
-        path.write_text(yaml.dump(tree, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), allow_unicode=True), encoding="utf-8", errors="surrogatepass")
+        path.write_text(
+            yaml.dump(tree, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), allow_unicode=True),
+            encoding="utf-8",
+            errors="surrogatepass",
+        )
         assert targets.verdict(kind, path) in WELL
 
     run()
@@ -63,8 +69,19 @@ def test_damaged_files(kind, files, tmp_path):
     run()
 
 
-FOUND = [("servo", 307), ("metadata", 58), ("metadata", 274), ("recording", 324), ("recording", 1416), ("calibration", 1898), ("tactile", 3033), ("checkpoint", 96),
-         ("checkpoint", 0), ("checkpoint", 1165), ("overrides", 1153)]
+FOUND = [
+    ("servo", 307),
+    ("metadata", 58),
+    ("metadata", 274),
+    ("recording", 324),
+    ("recording", 1416),
+    ("calibration", 1898),
+    ("tactile", 3033),
+    ("checkpoint", 96),
+    ("checkpoint", 0),
+    ("checkpoint", 1165),
+    ("overrides", 1153),
+]
 """Cases of long runs that once broke something."""
 
 

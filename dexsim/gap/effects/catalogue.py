@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from dexsim.gap.effects.backlash import Backlash
+from dexsim.gap.effects.braking_limit import BrakingLimit
 from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.effects.compliance import Compliance
 from dexsim.gap.effects.confusion import BLIND, CLASSES
 from dexsim.gap.effects.contact_friction import ContactFriction
 from dexsim.gap.effects.contact_stiffness import ContactStiffness
+from dexsim.gap.effects.controller_term import ControllerTerm
 from dexsim.gap.effects.coulomb_friction import CoulombFriction
 from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.effects.deadband import Deadband
 from dexsim.gap.effects.effect import Effect, Variant
-from dexsim.gap.effects.braking_limit import BrakingLimit
-from dexsim.gap.effects.controller_term import ControllerTerm
-from dexsim.gap.effects.presliding import Presliding
 from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.effects.gain_mismatch import GainMismatch
 from dexsim.gap.effects.inertia import Inertia
@@ -27,6 +26,7 @@ from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.payload import Payload
 from dexsim.gap.effects.position_offset import PositionOffset
 from dexsim.gap.effects.position_scale import PositionScale
+from dexsim.gap.effects.presliding import Presliding
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.gap.effects.supply_sag import SupplySag
 from dexsim.gap.effects.tactile_crosstalk import TactileCrosstalk

@@ -26,9 +26,11 @@ CLASSES: dict[str, str] = {
     "drive weakens": "this joint alone, then with the others loaded, cold and warm in random order",
     "zero or gravity": "static poses over the whole range, and the same with the mechanism turned over: "
     "what gravity does changes sign, an encoder's zero stays",
-    "limits at speed": "large steps at full speed, and stops from it: one limit acts while driving, the other while braking",
+    "limits at speed": "large steps at full speed, and stops from it: one limit acts while driving, the other while "
+                       "braking",
     "loop": "constant speeds from slow to fast, steps of several sizes and long holds against a known load",
-    "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint to a side",
+    "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint "
+                        "to a side",
     "weight or push": "static poses over the whole range, twice, with nothing in reach",
 }
 TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
@@ -36,12 +38,14 @@ TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
 
 
 def at_one_load(case: Case, runs: Sequence[int]) -> bool:
-    """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and one that does not
-    are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its mean."""
+    """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and
+    one that does not are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its
+    mean."""
     slides = case.regimes["speed"] > SLOW * case.scales.speed
     load = np.abs(case.regimes["_load"][slides & np.isin(case.plant.run_of, runs)])
     return bool(len(load)) and float(load.std()) < JUDGE.one_load * float(load.mean())
 
 
 BLIND: dict[str, Callable[[Case, Sequence[int]], bool]] = {"friction and load": at_one_load}
-"""Of classes: whether recordings cannot separate their members, however one of them may fit a little better than the others."""
+"""Of classes: whether recordings cannot separate their members, however one of them may fit a little better than the
+others."""

@@ -17,11 +17,10 @@ from dexsim.gap.locate import bins
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings
-from dexsim.gap.search import baseline
 from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.search import baseline
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
-
 
 
 @dataclass
@@ -33,8 +32,8 @@ class Noise:
     joints: dict[str, float]
 
     def at_most(self, left: dict[str, float]) -> Noise:
-        """The floor, where repeats differ by what was found (a drive that warms up between them): then what is left with it [rad or m, by
-        joint] is far less than they differ by, and is the floor."""
+        """The floor, where repeats differ by what was found (a drive that warms up between them): then what is left
+        with it [rad or m, by joint] is far less than they differ by, and is the floor."""
         lower = {j: x for j, x in left.items() if JUDGE.overstated * x < self.joints[j]}
         if not lower:
             return self
@@ -43,12 +42,20 @@ class Noise:
         return Noise(min(floor, self.floor), f"{self.how}; of {', '.join(lower)} what is left, which is less", joints)
 
 
-def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Kept, noise: Noise, how: str, channel: list[dict[str, Any]],
-             plains: Sequence[baseline.Baseline] = ()) -> None:
+def assemble(
+    d: Diagnosis,
+    s: Settings,
+    answers: Sequence[JointAnswer],
+    kept: Kept,
+    noise: Noise,
+    how: str,
+    channel: list[dict[str, Any]],
+    plains: Sequence[baseline.Baseline] = (),
+) -> None:
     """The joints into a diagnosis that is empty but for its notes and its mechanism.
 
-    answers: of each joint, judged and located; how: what was kept out, in words; channel: findings about signals, of all joints; plains: the
-    plain model of each joint."""
+    answers: of each joint, judged and located; how: what was kept out, in words; channel: findings about signals, of
+    all joints; plains: the plain model of each joint."""
     data, notes, m = d.data, d.notes, d.mechanism
     data["verdict"] = "none"
     findings: list[dict[str, Any]] = []
@@ -67,12 +74,20 @@ def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Ke
     d.spots = bins.control([x for a in answers for x in a.spots])
     refuted = _take_back(d, answers, findings)
     noise = noise.at_most({a.case.joint: rms(a.after) for a in answers if a.found and a.case.joint not in refuted})
-    data["noise_floor"] = {"position_rad": float(noise.floor), "how": noise.how, "joints": {k: float(v) for k, v in noise.joints.items()}}
+    data["noise_floor"] = {
+        "position_rad": float(noise.floor),
+        "how": noise.how,
+        "joints": {k: float(v) for k, v in noise.joints.items()},
+    }
     findings = [f for f in findings if EFFECTS[f["effect"]].effort_only or not set(f["where"]["joints"]) & refuted]
     for joint in _shown_there_alone(d.joints, findings) if s.held_out else ():
         v = d.joints[joint]
-        notes.append(f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by {1e3 * v['fitted']:.3g}: "
-                     "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with others held out")
+        notes.append(
+            f"{joint}: the recordings kept out are missed by {1e3 * v['before']:.3g} mrad, those that were fitted by "
+            f"{1e3 * v['fitted']:.3g}: "
+            "something shows there alone, and what is held out is not fitted. Give them as recordings= too, with "
+            "others held out"
+        )
     fits = [(a.case, a.none, a.before) if a.case.joint in refuted else (a.case, a.best, a.after) for a in answers]
     worse = baseline.refused(plains, d.joints, fits, kept.train, noise.floor)
     _not_better(d, worse)
@@ -92,7 +107,8 @@ def assemble(d: Diagnosis, s: Settings, answers: Sequence[JointAnswer], kept: Ke
 
 
 def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
-    """Doubts what was found on joints that a plain model follows better, or of which a recorded motion says that it cannot be."""
+    """Doubts what was found on joints that a plain model follows better, or of which a recorded motion says that it
+    cannot be."""
     for joint, reason in worse.items():
         d.notes.append(f"{joint}: {reason}; what was fitted is not handed on")
         for e in d.evidence:
@@ -102,7 +118,8 @@ def _not_better(d: Diagnosis, worse: dict[str, str]) -> None:
 
 
 def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict[str, Any]]) -> set[str]:
-    """Joints whose findings did not help on what was kept out: they keep none of them, and are left as they were believed."""
+    """Joints whose findings did not help on what was kept out: they keep none of them, and are left as they were
+    believed."""
     refuted = set()
     for a in answers:
         joint = a.case.joint
@@ -118,8 +135,14 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
                     e.confidence = min(e.confidence, JUDGE.doubted)
             continue
         refuted.add(joint)
-        d.notes += [f"{f['effect']} on {joint} earned its place on the training conditions but not on what was kept out; not claimed" for f in mine]
-        d.data["nuisance"] = {key: x for key, x in d.data["nuisance"].items() if not key.endswith(f"@{joint}")} | nuisances(joint, a.none)
+        d.notes += [
+            f"{f['effect']} on {joint} earned its place on the training conditions but not on what was kept out; not "
+            "claimed"
+            for f in mine
+        ]
+        d.data["nuisance"] = {
+            key: x for key, x in d.data["nuisance"].items() if not key.endswith(f"@{joint}")
+        } | nuisances(joint, a.none)
         v["as_fitted"], v["after"], v["mae_after"] = v["after"], v["before"], v["mae_before"]
     return refuted
 
@@ -135,45 +158,86 @@ def _hand_on(d: Diagnosis, m: Mechanism, answers: Sequence[JointAnswer], finding
     members = {(a.case.joint, mm.id): (a.case, mm) for a in answers for mm in a.outcome.best.members}
     for f in findings:
         joint, effect = f["where"]["joints"][0], f["effect"]
-        if f["confidence"] < JUDGE.sure and (joint, effect) in members and widen(servo, *members[joint, effect], f["confidence"], earned(f)):
-            d.notes.append(f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed")
+        if (
+            f["confidence"] < JUDGE.sure
+            and (joint, effect) in members
+            and widen(servo, *members[joint, effect], f["confidence"], earned(f))
+        ):
+            d.notes.append(
+                f"{effect} on {joint} is not sure: in servo.yaml its range reaches towards what was believed"
+            )
     d.servo, d.model_spec, d.untrained = servo, spec if changed else None, sorted(untrained)
 
 
-def _verdict(d: Diagnosis, answers: Sequence[JointAnswer], kept: Kept, findings: list[dict[str, Any]], refuted: set[str], floor: float, how: str,
-             seed: int, quiet: bool) -> None:
+def _verdict(
+    d: Diagnosis,
+    answers: Sequence[JointAnswer],
+    kept: Kept,
+    findings: list[dict[str, Any]],
+    refuted: set[str],
+    floor: float,
+    how: str,
+    seed: int,
+    quiet: bool,
+) -> None:
     """Errors over all joints on what was kept out, and the word for it."""
     data, times = d.data, [a.t for a in answers]
     b, bl, bh = errors.rms_interval([a.before for a in answers], times, seed)
     a, al, ah = errors.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
     slide = all(x.case.constants.slide for x in answers)
-    data["held_out"] = {"recordings": [kept.runs[i].name for i in kept.test], "error": "position_rmse_m" if slide else "position_rmse_rad", "before": b,
-                        "after": a, "before_low": bl, "before_high": bh, "after_low": al, "after_high": ah, "how": how}  # fmt: skip
-    structured = any(x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers)
+    data["held_out"] = {
+        "recordings": [kept.runs[i].name for i in kept.test],
+        "error": "position_rmse_m" if slide else "position_rmse_rad",
+        "before": b,
+        "after": a,
+        "before_low": bl,
+        "before_high": bh,
+        "after_low": al,
+        "after_high": ah,
+        "how": how,
+    }
+    structured = any(
+        x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
+    )
     data["verdict"] = verdict.verdict(data["findings"], floor, b, bl, a, structured, quiet)
     findings = [f for f in findings if f["confidence"] >= JUDGE.firm]
     if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
         squares = [[x.effort_before for x in answers], [x.effort_after for x in answers]]
         eb, ea = (float(np.sqrt(np.concatenate([x for x in xs if x is not None]).mean())) for xs in squares)
-        data["held_out"] |= {"error": "effort_rmse_Nm", "before": eb, "after": ea, "before_low": eb, "before_high": eb, "after_low": ea, "after_high": ea}
+        data["held_out"] |= {
+            "error": "effort_rmse_Nm",
+            "before": eb,
+            "after": ea,
+            "before_low": eb,
+            "before_high": eb,
+            "after_low": ea,
+            "after_high": ea,
+        }
     gap = b**2 - floor**2
-    data["unexplained"]["fraction_of_gap"] = round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * floor else 0.0
+    data["unexplained"]["fraction_of_gap"] = (
+        round(float(np.clip((a**2 - floor**2) / gap, 0.0, 1.0)), 4) if gap > 0 and b > JUDGE.within * floor else 0.0
+    )
     if data["verdict"] in ("none", "explained"):
         data["unexplained"]["depends_on"] = []
 
 
 def _shown_there_alone(joints: dict[str, dict[str, float]], findings: list[dict[str, Any]]) -> list[str]:
-    """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing (a limit, a sag) shows
-    there alone, and what is kept out must not be fitted."""
+    """Joints without a finding of which what was kept out is followed far worse than what was fitted: what is missing
+    (a limit, a sag) shows there alone, and what is kept out must not be fitted."""
     found = {j for f in findings for j in f["where"]["joints"]}
-    return [j for j, v in joints.items() if j not in found and v["before"] > max(JUDGE.far * v["sigma"], JUDGE.alone * v["fitted"])]
+    return [
+        j
+        for j, v in joints.items()
+        if j not in found and v["before"] > max(JUDGE.far * v["sigma"], JUDGE.alone * v["fitted"])
+    ]
 
 
 def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequence[int], span: dict | None) -> str:
-    """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are doubted, not dropped; empty
-    where they are refuted. One stick more or less sends a free run another way; and a limit may just not have been reached there. What the
-    recorded torque has told of a joint is known: nothing that is not shown goes beyond it."""
+    """Why findings that do not lessen the error of a free run over what was kept out (after / before: `ratio`) are
+    doubted, not dropped; empty where they are refuted. One stick more or less sends a free run another way; and a limit
+    may just not have been reached there. What the recorded torque has told of a joint is known: nothing that is not
+    shown goes beyond it."""
     if search.case.told:
         return ""
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
@@ -190,7 +254,11 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
     mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
     for joint in {e.joint for e in mine}:
         confidence.together([e for e in mine if e.joint == joint])
-    coupled = {f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"] for f in findings if EFFECTS[f["effect"]].couples}
+    coupled = {
+        f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"]
+        for f in findings
+        if EFFECTS[f["effect"]].couples
+    }
     signs = {j for f in channel if f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
     others = {j for f in channel if not f["regime"].startswith(SIGN) for j in f["where"]["joints"]}
     confidence.of_the_whole(mine, coupled, signs | others, signs - others)
@@ -201,16 +269,28 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
 
 
 def _elsewhere(channel: dict[str, Any], kept: Kept) -> bool:
-    """Whether a signal is wrong only where its joint is not judged: that casts no doubt on what the other recordings tell of it."""
+    """Whether a signal is wrong only where its joint is not judged: that casts no doubt on what the other recordings
+    tell of it."""
     left_out = {(run.name, joint) for run in kept.runs for joint in run.left_out}
-    return bool(channel["when"]) and all((w["recording"], j) in left_out for w in channel["when"] for j in channel["where"]["joints"])
+    return bool(channel["when"]) and all(
+        (w["recording"], j) in left_out for w in channel["when"] for j in channel["where"]["joints"]
+    )
 
 
 def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) -> list[dict[str, Any]]:
-    """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is the end that is
-    dragged, where one of them feels only the pull; the name is as sure as its surer end."""
-    pulled = {a.case.joint for a in answers for mm in a.outcome.best.members if mm.effect.couples and mm.variant.params[0].columns == ("reaction",)}
-    ends = {(f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f for f in findings if EFFECTS[f["effect"]].couples}
+    """The findings with every linkage once: two joints of which each is dragged by the other are its two ends. Kept is
+    the end that is dragged, where one of them feels only the pull; the name is as sure as its surer end."""
+    pulled = {
+        a.case.joint
+        for a in answers
+        for mm in a.outcome.best.members
+        if mm.effect.couples and mm.variant.params[0].columns == ("reaction",)
+    }
+    ends = {
+        (f["where"]["joints"][0], f["parameters"]["from_joint"]["value"]): f
+        for f in findings
+        if EFFECTS[f["effect"]].couples
+    }
     out = list(findings)
     for (joint, other), f in ends.items():
         second = ends.get((other, joint))
@@ -220,7 +300,14 @@ def _linkages(findings: list[dict[str, Any]], answers: Sequence[JointAnswer]) ->
         place = min(out.index(first), out.index(second))
         out = [x for x in out if x is not first and x is not second]
         joints = [*first["where"]["joints"], *second["where"]["joints"]]
-        out.insert(place, first | {"where": first["where"] | {"joints": joints}, "confidence": max(first["confidence"], second["confidence"])})
+        out.insert(
+            place,
+            first
+            | {
+                "where": first["where"] | {"joints": joints},
+                "confidence": max(first["confidence"], second["confidence"]),
+            },
+        )
     return out
 
 
@@ -230,8 +317,8 @@ def _weight(f: dict) -> float:
 
 
 def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -> None:
-    """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque that is left
-    on the recording kept out, where the loop's own error shows nothing."""
+    """What the recorded motor torque names beyond what it was believed to be, into the diagnosis; judged by the torque
+    that is left on the recording kept out, where the loop's own error shows nothing."""
     if not findings:
         return
     data = d.data
@@ -240,10 +327,23 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
     data["findings"] += [f for f in findings if (f["effect"], *f["where"]["joints"]) not in taken]
     if not shown:
         judged = [(x, names) for c, x, names in by_torque if any(c.joint in f["where"]["joints"] for f in findings)]
-        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]  # not what the catalogue has no name for
-        b, a = (float(np.sqrt(sum(y**2 for y in ys))) for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last]))
-        data["held_out"] = {"recordings": judged[0][1], "error": findings[0]["held_out"]["error"], "before": b, "after": a, "before_low": None, "before_high": None,
-                            "after_low": None, "after_high": None, "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere"}  # fmt: skip
+        # not what the catalogue has no name for
+        last = [next(n for n in reversed(x.named) if n.effect) for x, _ in judged]
+        b, a = (
+            float(np.sqrt(sum(y**2 for y in ys)))
+            for ys in ([x.named[0].before for x, _ in judged], [n.after for n in last])
+        )
+        data["held_out"] = {
+            "recordings": judged[0][1],
+            "error": findings[0]["held_out"]["error"],
+            "before": b,
+            "after": a,
+            "before_low": None,
+            "before_high": None,
+            "after_low": None,
+            "after_high": None,
+            "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere",
+        }
         data["verdict"] = "partly_explained" if a < 0.7 * b else "unknown"
         data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])

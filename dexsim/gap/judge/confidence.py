@@ -1,8 +1,9 @@
 """How sure a name is: the share of the bootstraps that it wins, and every reason to doubt it.
 
-A confidence is used as a probability, so whatever else could have made the same trace has to lower it: an effect whose interval
-holds "nothing missing", a size that stopped at a physical bound, a second effect that explains little of what the first one left,
-three effects where a machine has one, a temperature that follows the clock. Each reason is a line that the page shows.
+A confidence is used as a probability, so whatever else could have made the same trace has to lower it: an effect whose
+interval holds "nothing missing", a size that stopped at a physical bound, a second effect that explains little of what
+the first one left, three effects where a machine has one, a temperature that follows the clock. Each reason is a line
+that the page shows.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.rules import JUDGE
 
-SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")  # parameters that say what an effect is like, not how large it is
+# parameters that say what an effect is like, not how large it is
+SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 
 
 @dataclass
 class Evidence:
-    """What speaks for and against one finding. share: of the bootstraps; earned: 1 where dropping it costs a tenth of the error
-    kept out; left, left_of_rest: squared error kept out that stays, over that before anything was named, and over that without
-    this effect alone; folds: relative cost of dropping it on each condition left out; reasons: why it is doubted."""
+    """What speaks for and against one finding. share: of the bootstraps; earned: 1 where dropping it costs a tenth of
+    the error kept out; left, left_of_rest: squared error kept out that stays, over that before anything was named, and
+    over that without this effect alone; folds: relative cost of dropping it on each condition left out; reasons: why it
+    is doubted."""
 
     effect: str
     joint: str
@@ -61,7 +64,8 @@ def neutral_of(param, case: Case) -> float:
 
 
 def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> bool:
-    """Whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far as it is believed."""
+    """Whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far as it
+    is believed."""
     sizes = [p for p in params if p.key not in SHAPES]
     for p in sizes:
         low, high = spread[p.key]
@@ -70,7 +74,9 @@ def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case
         believed = p.mode in ("factor", "set") and p.columns[0] not in EXACT
         give = BELIEF * abs(zero) if believed and abs(zero) < 1e8 else 0.0
         # where an effect begins at a bound, the bound is nothing
-        begins = p.mode == "set" and ((zero <= p.low and low <= p.low * (1 + 1e-6) + 1e-12) or (zero >= p.high and high >= p.high * (1 - 1e-6)))
+        begins = p.mode == "set" and (
+            (zero <= p.low and low <= p.low * (1 + 1e-6) + 1e-12) or (zero >= p.high and high >= p.high * (1 - 1e-6))
+        )
         if not begins and not low - give <= zero <= high + give:
             return False
     return bool(sizes)
@@ -92,14 +98,16 @@ def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
 
 
 def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> str:
-    """Key of a size whose 90 % interval reaches, away from nothing, to the end of what is looked for: how large it is is not known; empty
-    where none does."""
+    """Key of a size whose 90 % interval reaches, away from nothing, to the end of what is looked for: how large it is
+    is not known; empty where none does."""
     for p in params:
         if p.key in SHAPES:
             continue
         zero, room = neutral_of(p, case), 1e-3 * p.span
         low, high = spread[p.key]
-        if (low <= p.low + room and zero > p.low + 0.25 * p.span) or (high >= p.high - room and zero < p.high - 0.25 * p.span):
+        if (low <= p.low + room and zero > p.low + 0.25 * p.span) or (
+            high >= p.high - room and zero < p.high - 0.25 * p.span
+        ):
             return p.key
     return ""
 
@@ -111,14 +119,14 @@ def left_over(after: float, before: float, noise: float) -> float:
 
 
 def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a twentieth,
-    half from a third on. What follows only half of a gap may be another effect's likeness."""
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a
+    twentieth, half from a third on. What follows only half of a gap may be another effect's likeness."""
     return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - JUDGE.left_free) / JUDGE.left_span, 0.0, 1.0))
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:
-    """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing is asked for,
-    or is a trifle beside what others removed of the error before; empty where it is not."""
+    """Why an effect is too small to be sure of: it leaves the error kept out (rms, without and with it) where nothing
+    is asked for, or is a trifle beside what others removed of the error before; empty where it is not."""
     if without <= JUDGE.within * noise:
         return "without it the error kept out is hardly above the noise"
     if not alone and without**2 - after**2 < JUDGE.trifle * max(before, without) ** 2:
@@ -127,10 +135,15 @@ def too_small(before: float, without: float, after: float, noise: float, alone: 
 
 
 def unresolved(without: float, after: float, quantum: float) -> str:
-    """Why an effect is below what the encoder resolves: what it does to the motion kept out, rms, is less than half a count (`quantum`, rad
-    or m), so that a reading seldom changes for it; empty where it is not. without, after: rms error without and with the effect."""
+    """Why an effect is below what the encoder resolves: what it does to the motion kept out, rms, is less than half a
+    count (`quantum`, rad or m), so that a reading seldom changes for it; empty where it is not. without, after: rms
+    error without and with the effect."""
     moved = float(np.sqrt(max(without**2 - after**2, 0.0)))
-    return "" if moved >= 0.5 * quantum else f"what it does to the motion ({1e3 * moved:.2g} mrad or mm) is less than half a count of the encoder"
+    return (
+        ""
+        if moved >= 0.5 * quantum
+        else f"what it does to the motion ({1e3 * moved:.2g} mrad or mm) is less than half a count of the encoder"
+    )
 
 
 def kept(earned: float) -> float:
@@ -152,15 +165,25 @@ def together(mine: list[Evidence]) -> None:
     for k, e in enumerate(mine):
         e.place = k
         if e.of_pose and len(slow) > 1:
-            _doubt(e, f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on the pose")
+            _doubt(
+                e,
+                f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on "
+                "the pose",
+            )
         doubtful = next((x for x in mine[:k] if x.confidence < JUDGE.doubted), None)
         if doubtful is not None:
             _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
         alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
         if alike is not None:
-            _doubt(e, f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up for what the other is off by")
+            _doubt(
+                e,
+                f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up "
+                "for what the other is off by",
+            )
         if EFFECTS[e.effect].misreads and any(EFFECTS[x.effect].couples for x in mine):
-            e.hint("it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike")
+            e.hint(
+                "it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike"
+            )
         if len(mine) >= JUDGE.crowd and k > 0:
             _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
 
@@ -171,8 +194,8 @@ def _doubt(e: Evidence, reason: str) -> None:
 
 
 def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
-    """Lowers the confidence of touch's findings that are too small, or that the law of a contact's pressure may stand for; returns
-    why, a line each."""
+    """Lowers the confidence of touch's findings that are too small, or that the law of a contact's pressure may stand
+    for; returns why, a line each."""
     said = []
     for f in findings:
         h = f["held_out"]
@@ -185,8 +208,9 @@ def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
 
 
 def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str], signs: Set[str] = frozenset()) -> None:
-    """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that is not
-    what it says; signs: those of them of which only the effort's sign is not, which is what a wrong sensor looks like."""
+    """What other joints and the signals say. coupled: joint -> the joint that drags it; bad: joints with a signal that
+    is not what it says; signs: those of them of which only the effort's sign is not, which is what a wrong sensor looks
+    like."""
     misread = [e.joint for e in all_ if EFFECTS[e.effect].misreads]
     for e in all_:
         elsewhere = [j for j in misread if j != e.joint]

@@ -1,4 +1,5 @@
-"""One joint's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, where its residual lives."""
+"""One joint's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, where
+its residual lives."""
 
 from __future__ import annotations
 
@@ -21,10 +22,10 @@ from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
 
 
-
 @dataclass
 class Kept:
-    """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept out."""
+    """What every joint is judged by: all runs, those (and the spans of them [s]) that were fitted and those kept
+    out."""
 
     runs: list[Run]
     train: list[int]
@@ -36,10 +37,11 @@ class Kept:
 class JointAnswer:
     """A searched joint on what was kept out.
 
-    before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at times t (rows,) [s];
-    effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 % intervals of the fitted parameters; widest: as
-    they are before it is known how well what was kept out is followed, by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance: refitted beliefs; found,
-    evidence: see `judge`; spots, depends_on: see `locate`."""
+    before, after: squared errors of free runs (rows,) [rad^2 or m^2] without any effect and with what was found, at
+    times t (rows,) [s]; effort_before, effort_after: those of the torque where it was recorded, else None; bounds: 90 %
+    intervals of the fitted parameters; widest: as they are before it is known how well what was kept out is followed,
+    by which names are doubted; raw: fitted values by effect; numbers: the same as figures for the page; nuisance:
+    refitted beliefs; found, evidence: see `judge`; spots, depends_on: see `locate`."""
 
     def __init__(self, case: Case, search: JointSearch, outcome: Outcome, kept: Kept):
         self.case, self.search, self.outcome, self.kept = case, search, outcome, kept
@@ -47,9 +49,15 @@ class JointAnswer:
         self.whole = replace(case, plant=search.whole)
         self.windows = self.whole.plant.windows(None, kept.test, span=kept.span_test)
         rows = self.rows = self.windows.sample_row
-        self.q_before, effort_before = errors.free_run(self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True)
+        self.q_before, effort_before = errors.free_run(
+            self.whole, self.none.fit.params, self.none.fit.x, self.windows, underway=True
+        )
         fixed = [f for mm in self.best.members for f in mm.variant.fixed]
-        with_it = errors.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True) if self.best.members else (self.q_before, effort_before)
+        with_it = (
+            errors.free_run(self.whole, self.best.fit.params, self.best.fit.x, self.windows, fixed, True)
+            if self.best.members
+            else (self.q_before, effort_before)
+        )
         self.q_after, effort_after = with_it
         self.measured, self.t = case.plant.q[rows], case.plant.t[rows] + 1e4 * case.plant.run_of[rows]
         self.before, self.after = (self.measured - self.q_before) ** 2, (self.measured - self.q_after) ** 2
@@ -58,7 +66,10 @@ class JointAnswer:
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
         self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
-        told, laws = stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0), search.law_spread(self.best)
+        told, laws = (
+            stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0),
+            search.law_spread(self.best),
+        )
         self.bounds = np.stack([np.minimum(told[:, 0], laws[:, 0]), np.maximum(told[:, 1], laws[:, 1])], 1)
         self.nuisance = nuisances(case.joint, self.best)
         self.raw: dict[str, dict[str, float]] = {}
@@ -71,9 +82,20 @@ class JointAnswer:
     @property
     def numbers(self) -> dict[str, float]:
         """Errors for the page."""
-        out = {"before": rms(self.before), "after": rms(self.after), "mae_before": float(np.abs(self.measured - self.q_before).mean()),
-               "mae_after": float(np.abs(self.measured - self.q_after).mean()), "sigma": self.case.sigma, "fitted": self._followed(), "left": 0.0}  # fmt: skip
-        return out | ({"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)} if self.effort_before is not None else {})
+        out = {
+            "before": rms(self.before),
+            "after": rms(self.after),
+            "mae_before": float(np.abs(self.measured - self.q_before).mean()),
+            "mae_after": float(np.abs(self.measured - self.q_after).mean()),
+            "sigma": self.case.sigma,
+            "fitted": self._followed(),
+            "left": 0.0,
+        }
+        return out | (
+            {"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)}
+            if self.effort_before is not None
+            else {}
+        )
 
     def mae(self) -> dict[str, tuple[float, float]]:
         """Mean |error| before and after by recording; one that was cut is several runs."""
@@ -81,7 +103,9 @@ class JointAnswer:
         for i in self.kept.test:
             pick = np.isin(run_of, [k for k in self.kept.test if runs[k].name == runs[i].name])
             if pick.any():
-                out[runs[i].name] = tuple(float(np.abs(self.measured - q)[pick].mean()) for q in (self.q_before, self.q_after))
+                out[runs[i].name] = tuple(
+                    float(np.abs(self.measured - q)[pick].mean()) for q in (self.q_before, self.q_after)
+                )
         return out
 
     def judge(self, m: Mechanism) -> None:
@@ -94,15 +118,24 @@ class JointAnswer:
         self.raw[mm.id] = raw
         rest = tuple(x for x in best.members if x is not mm)
         trial = without(self.search, best, mm) if rest else self.none
-        q, effort = errors.free_run(self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True)
+        q, effort = errors.free_run(
+            self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True
+        )
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.effect.effort_only
         of_effort = effort_only and self.effort_after is not None
-        was, left = (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after)) if of_effort else (error_without, rms(self.after))
+        was, left = (
+            (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after))
+            if of_effort
+            else (error_without, rms(self.after))
+        )
         evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], was, left, effort_only)
         gain = verdict.gain_interval((self.measured - q) ** 2, self.after, self.t)
         if left**2 > (1 - JUDGE.part) * was**2:
-            evidence.hint(f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was kept out, less than {100 * JUDGE.part:.0f} %")
+            evidence.hint(
+                f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
+                f"kept out, less than {100 * JUDGE.part:.0f} %"
+            )
         elif not effort_only and gain[0] < -JUDGE.slack:
             evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(trial)):
@@ -125,17 +158,23 @@ class JointAnswer:
             "regime": mm.effect.shows,
             "when": errors.intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
-            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)} if of_effort else
-                        {"before": error_without, "after": rms(self.after), "removed_low": round(gain[0], 4), "removed_high": round(gain[1], 4)},
-        }  # fmt: skip
+            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)}
+            if of_effort
+            else {
+                "before": error_without,
+                "after": rms(self.after),
+                "removed_low": round(gain[0], 4),
+                "removed_high": round(gain[1], 4),
+            },
+        }
         late = jitter.estimate(self.search, best) if mm.effect.jitters and best.fit.loss > jitter.LEFT else None
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
 
     def _harmed(self, without_it: Trial) -> str:
-        """Why an effect is a hint only: what it gains in some recordings it loses in others, as what differs from run to run does; empty
-        where it helps or does nothing in nearly every draw of the recordings."""
+        """Why an effect is a hint only: what it gains in some recordings it loses in others, as what differs from run
+        to run does; empty where it helps or does nothing in nearly every draw of the recordings."""
         lost, mine = (self.search.by_run(t) for t in (without_it, self.best))
         runs = np.flatnonzero(lost > 0)
         if len(runs) < 3:
@@ -150,27 +189,41 @@ class JointAnswer:
         best = self.best
         index = [[p.key for p in best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
         raw = {p.key: float(best.fit.x[i]) for p, i in zip(mm.variant.params, index, strict=True)}
-        spread = {p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)}
-        for p, x, b in zip(best.fit.params, best.fit.x, bounds, strict=True):  # a level that was unknown and is fitted anyway
+        spread = {
+            p.key: (float(bounds[i][0]), float(bounds[i][1])) for p, i in zip(mm.variant.params, index, strict=True)
+        }
+        # a level that was unknown and is fitted anyway
+        for p, x, b in zip(best.fit.params, best.fit.x, bounds, strict=True):
             key = mm.effect.fitted_anyway.get(p.key)
             if key is not None and key not in raw:
                 raw[key], spread[key] = float(x), (float(b[0]), float(b[1]))
         return raw, spread
 
-    def _weighed(self, mm, raw: dict[str, float], spread: dict, error_without: float, after: float, effort_only: bool) -> confidence.Evidence:
-        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out without and with it: of the
-        motion, or of the effort where the motion is unaffected (what is left of the motion then tells nothing of it)."""
+    def _weighed(
+        self, mm, raw: dict[str, float], spread: dict, error_without: float, after: float, effort_only: bool
+    ) -> confidence.Evidence:
+        """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out
+        without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the motion
+        then tells nothing of it)."""
         case, outcome = self.case, self.outcome
         # the one effect of the reading: nothing else explains the effort
         before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (rms(self.before), case.sigma)
-        earned = 1.0 if effort_only else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
+        earned = (
+            1.0
+            if effort_only
+            else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
+        )
         evidence = confidence.Evidence(
             mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, noise),
-            confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)  # fmt: skip
+            confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)
         nothing = confidence.holds_nothing(mm.variant.params, spread, case)
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
-        small = "" if effort_only else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
+        small = (
+            ""
+            if effort_only
+            else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
+        )
         small = small or ("" if effort_only else confidence.unresolved(error_without, after, case.quantum))
         if small:
             evidence.reasons.append(small)
@@ -189,7 +242,8 @@ class JointAnswer:
         return evidence
 
     def locate(self, rng: np.random.Generator, seed: int) -> None:
-        """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is left depends on."""
+        """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is
+        left depends on."""
         case, search = self.case, self.search
         n, blocks = search.long.n, search.blocks[: search.long.n]
         regimes = {k: v[search.long.sample_row] for k, v in case.regimes.items()}
@@ -198,26 +252,51 @@ class JointAnswer:
         if search.fitter.use_torque:
             on = search.fitter.tau_on
             effort = everything[n:][on] * search.r.sigma_torque
-            found += bins.spots(case.joint, effort, blocks[on], {k: v[on] for k, v in regimes.items()}, np.random.default_rng(seed + 1), "effort")
+            found += bins.spots(
+                case.joint,
+                effort,
+                blocks[on],
+                {k: v[on] for k, v in regimes.items()},
+                np.random.default_rng(seed + 1),
+                "effort",
+            )
         with search._fix(self.best.members):
             left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
         spots = bins.control(bins.spots(case.joint, left * case.sigma, blocks, regimes, rng))
-        self.spots, self.depends_on = found, [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.clear else []
+        self.spots, self.depends_on = (
+            found,
+            [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.clear else [],
+        )
 
     def curve(self) -> Curve | None:
         """The stretch where the believed simulator is worst."""
-        return _curve(self.case, self.kept.runs, self.rows, self.q_before, self.q_after, int(np.argmax(self.before))) if len(self.rows) else None
+        return (
+            _curve(self.case, self.kept.runs, self.rows, self.q_before, self.q_after, int(np.argmax(self.before)))
+            if len(self.rows)
+            else None
+        )
 
     def _followed(self) -> float:
         """Error (rms) of a free run over what was fitted, without any effect."""
         case, fit = self.case, self.none.fit
         windows = case.plant.windows(None, self.kept.train, span=self.kept.span_train)
-        return float(np.sqrt(np.mean((case.plant.q[windows.sample_row] - errors.free_run(case, fit.params, fit.x, windows, underway=True)[0]) ** 2)))
+        return float(
+            np.sqrt(
+                np.mean(
+                    (
+                        case.plant.q[windows.sample_row]
+                        - errors.free_run(case, fit.params, fit.x, windows, underway=True)[0]
+                    )
+                    ** 2
+                )
+            )
+        )
 
 
 def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
-    """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the noise is known better than
-    by all that might be off in it, what does not is the likeness of something else. The law is from concealed cases (docs/concepts/gap.md)."""
+    """Intervals [P, 2] about a fit, by how well it follows what was kept out (left: x the noise): what follows to the
+    noise is known better than by all that might be off in it, what does not is the likeness of something else. The law
+    is from concealed cases (docs/concepts/gap.md)."""
     if left <= 0 or not fit.params:
         return bounds
     low, high = (np.array([[getattr(p, k)] for p in fit.params]) for k in ("low", "high"))
@@ -227,14 +306,17 @@ def stretched(bounds: np.ndarray, fit: Fitted, left: float) -> np.ndarray:
 
 
 def traded(fit: Fitted) -> np.ndarray:
-    """[P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the link's), however well all is followed:
-    the variance that the beliefs' own, as far as the residuals leave it, adds to that of the sizes alone. 0 for beliefs."""
+    """[P] half-widths (90 %) of effects' sizes by what they trade with beliefs (a rotor's inertia with the link's),
+    however well all is followed: the variance that the beliefs' own, as far as the residuals leave it, adds to that of
+    the sizes alone. 0 for beliefs."""
     low, high = (np.array([getattr(p, k) for p in fit.params]) for k in ("low", "high"))
     span, mine = high - low, np.array([not p.nuisance for p in fit.params], bool)
     J = fit.jacobian * span
     A = J.T @ J
     believed = prior_weight(fit.params) * span**2
-    A[np.diag_indices(len(A))] += np.where(mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * PRIOR))
+    A[np.diag_indices(len(A))] += np.where(
+        mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * PRIOR)
+    )
     i = np.flatnonzero(mine)
     out = np.zeros(len(span))
     if len(i):

@@ -37,8 +37,11 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     if foreign:
         notes.append(f"{name}: joints that the model has not are left out: {', '.join(foreign)}")
     if not joints:
-        raise Unusable(f"{name}: none of its joints ({', '.join(recording.joints) or 'none named'}) is in the model, whose joints are"
-                       f" {', '.join(m.joints)}; name them with remap.OURS=THEIRS or give its own model=")
+        raise Unusable(
+            f"{name}: none of its joints ({', '.join(recording.joints) or 'none named'}) is in the model, whose "
+            "joints are"
+            f" {', '.join(m.joints)}; name them with remap.OURS=THEIRS or give its own model="
+        )
     if not len(recording.states.position):
         raise Unusable(f"{name}: commands without states: no /joint_states to compare with")
     if not len(recording.commands):
@@ -57,7 +60,9 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     for j in range(q.shape[1]):
         finite = np.isfinite(q[:, j])
         if finite.mean() < 0.5:
-            notes.append(f"{name}: {joints[j]} has {100 * (1 - finite.mean()):.0f} % of its positions missing; left out")
+            notes.append(
+                f"{name}: {joints[j]} has {100 * (1 - finite.mean()):.0f} % of its positions missing; left out"
+            )
             continue
         if not finite.all():
             notes.append(f"{name}: {joints[j]}: {int((~finite).sum())} missing positions are interpolated")
@@ -84,7 +89,9 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     order = np.argsort(ct, kind="stable")
     ct, c = ct[order], c[order]
     if ct[0] > t[-1]:
-        raise Unusable(f"{name}: the commands begin {ct[0] - t[-1]:.1f} s after the last state: the clocks do not belong together")
+        raise Unusable(
+            f"{name}: the commands begin {ct[0] - t[-1]:.1f} s after the last state: the clocks do not belong together"
+        )
     if ct[0] > t[0] + 0.05:
         # what held before is not known: begin where it is
         start = np.searchsorted(t, ct[0])
@@ -94,7 +101,10 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         t, q = t[start:], q[start:]
     table = m.table
     if recording.meta.get("servo"):
-        table = ServoTable.from_dict(merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")), source=f"servo of {name}")
+        table = ServoTable.from_dict(
+            merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")),
+            source=f"servo of {name}",
+        )
     run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
     run.breaks = tuple(recording.breaks)
     run.v = _at(recording.states.velocity, t, column)
@@ -105,7 +115,10 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
             per = table.current(joints)
             values = values / per[None]
             if np.isnan(per).all():
-                notes.append(f"{name}: current_per_torque is unknown, so the current is not compared (python calibrate.py measures it)")
+                notes.append(
+                    f"{name}: current_per_torque is unknown, so the current is not compared (python calibrate.py "
+                    "measures it)"
+                )
         if values is not None and np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0:
             run.torque = values
     run.temperature = _at(recording.temperature, t, column)
@@ -131,7 +144,10 @@ def _without_spikes(recording: Recording, notes: list[str]) -> None:
         if f.kind != "spike" or (quantity, f.joint) in done or f.joint not in recording.joints:
             continue
         done.add((quantity, f.joint))
-        series, j = {"position": s.position, "command": recording.commands, "effort": s.effort}[quantity], recording.joints.index(f.joint)
+        series, j = (
+            {"position": s.position, "command": recording.commands, "effort": s.effort}[quantity],
+            recording.joints.index(f.joint),
+        )
         on = spikes.of_effort(recording, j) if quantity == "effort" else spikes.spiked(series.value[:, j], quantity)
         series.value = series.value.copy()
         series.value[on, j] = np.nan
@@ -139,7 +155,9 @@ def _without_spikes(recording: Recording, notes: list[str]) -> None:
 
 
 def _bad(recording: Recording, topic: str, word: str) -> bool:
-    return any(f.kind in ("wrap", "lost_sign") and f.topic == topic and word in f.text.lower() for f in recording.findings)
+    return any(
+        f.kind in ("wrap", "lost_sign") and f.topic == topic and word in f.text.lower() for f in recording.findings
+    )
 
 
 def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool = False) -> np.ndarray | None:
@@ -160,14 +178,22 @@ def _at(series: Series | None, t: np.ndarray, columns: Sequence[int], hold: bool
     return None if np.isnan(out).all() else out
 
 
-def free_air(runs: list[Run], held: list[int], touched: dict[str, list[tuple[float, float]]], notes: list[str],
-             why: str = "something is touched, or links touch each other", rest: str = "in free air", room: tuple[float, float] = (0.1, 0.3),
-             least: float = 2.0) -> tuple[list[Run], list[int]]:
-    """The runs without the stretches in which something is touched (by recording: start, end in s; `why`, and what is left, `rest`, in
-    words) and `room` s before and after, and which are held out. Pieces shorter than `least` s are left out.
+def free_air(
+    runs: list[Run],
+    held: list[int],
+    touched: dict[str, list[tuple[float, float]]],
+    notes: list[str],
+    why: str = "something is touched, or links touch each other",
+    rest: str = "in free air",
+    room: tuple[float, float] = (0.1, 0.3),
+    least: float = 2.0,
+) -> tuple[list[Run], list[int]]:
+    """The runs without the stretches in which something is touched (by recording: start, end in s; `why`, and what is
+    left, `rest`, in words) and `room` s before and after, and which are held out. Pieces shorter than `least` s are
+    left out.
 
-    A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in between
-    becomes several of the same name, on its own clock.
+    A joint is judged by its own dynamics, which a contact's unknown force would distort; a run that is touched in
+    between becomes several of the same name, on its own clock.
     """
     out: list[Run] = []
     kept: list[int] = []
@@ -195,15 +221,35 @@ def cut(run: Run, start: float, end: float) -> Run:
     """The run between two times [s]; commands stay, for what was sent before still acts."""
     on = (run.t >= start) & (run.t <= end)
     part = lambda x: None if x is None else x[on]  # noqa: E731
-    return Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[on], run.q[on], run.servo, run.gravity, part(run.v), part(run.torque), run.torque_unit,
-               part(run.duty), part(run.temperature), part(run.enabled), part(run.supply), notes=list(run.notes), counted=run.counted, left_out=run.left_out)  # fmt: skip
+    return Run(
+        run.name,
+        run.joints,
+        run.cmd_t,
+        run.cmd,
+        run.t[on],
+        run.q[on],
+        run.servo,
+        run.gravity,
+        part(run.v),
+        part(run.torque),
+        run.torque_unit,
+        part(run.duty),
+        part(run.temperature),
+        part(run.enabled),
+        part(run.supply),
+        notes=list(run.notes),
+        counted=run.counted,
+        left_out=run.left_out,
+    )
 
 
 def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
     """The runs with the joints that all of them have, in one order."""
     shared = [j for j in runs[0].joints if all(j in r.joints for r in runs)]
     if not shared:
-        raise Unusable("the recordings have no joint in common: " + "; ".join(f"{r.name}: {', '.join(r.joints)}" for r in runs))
+        raise Unusable(
+            "the recordings have no joint in common: " + "; ".join(f"{r.name}: {', '.join(r.joints)}" for r in runs)
+        )
     for r in runs:
         extra = [j for j in r.joints if j not in shared]
         if extra:
@@ -214,7 +260,8 @@ def common_joints(runs: list[Run], notes: list[str]) -> list[Run]:
             x = getattr(r, name)
             setattr(r, name, None if x is None else x[:, k])
         r.joints = tuple(shared)
-    for name in ("torque", "temperature", "duty"):  # counts only where every run has it; enabled and supply act in the run that has them
+    # counts only where every run has it; enabled and supply act in the run that has them
+    for name in ("torque", "temperature", "duty"):
         have = [getattr(r, name) is not None for r in runs]
         if any(have) and not all(have):
             for r in runs:
@@ -230,17 +277,30 @@ def channel_findings(recordings: list[Recording], joints: Sequence[str]) -> list
         for f in r.findings:
             if f.kind not in BAD_CHANNEL or f.severity != "error":
                 continue
-            if f.kind == "stuck" and f.text.startswith("position"):  # dry friction may hold it: `channels.inspect` tells beside the others
+            # dry friction may hold it: `channels.inspect` tells beside the others
+            if f.kind == "stuck" and f.text.startswith("position"):
                 continue
             key = (f.kind, f.topic, f.joint)
             sensor = f.kind in SIGN and f.joint in joints
-            entry = out.setdefault(key, {
-                "effect": "bad_channel", "confidence": 0.9, "alternatives": [],
-                "indistinguishable": ["bad_channel", CurrentSensor.id] if sensor else [],
-                "separating_experiment": CurrentSensor.experiment if sensor else None,
-                "where": {"joints": [f.joint] if f.joint in joints else [], "taxels": [], "topics": [f.topic] if f.topic else []},
-                "regime": f"{f.kind}: {f.text}", "when": [], "parameters": {}, "held_out": None,
-            })  # fmt: skip
+            entry = out.setdefault(
+                key,
+                {
+                    "effect": "bad_channel",
+                    "confidence": 0.9,
+                    "alternatives": [],
+                    "indistinguishable": ["bad_channel", CurrentSensor.id] if sensor else [],
+                    "separating_experiment": CurrentSensor.experiment if sensor else None,
+                    "where": {
+                        "joints": [f.joint] if f.joint in joints else [],
+                        "taxels": [],
+                        "topics": [f.topic] if f.topic else [],
+                    },
+                    "regime": f"{f.kind}: {f.text}",
+                    "when": [],
+                    "parameters": {},
+                    "held_out": None,
+                },
+            )
             if np.isfinite(f.time):
                 end = f.end if np.isfinite(f.end) else f.time
                 entry["when"].append({"recording": r.path.name, "start": float(f.time), "end": float(max(end, f.time))})
@@ -267,10 +327,13 @@ def files(given: Any, key: str) -> list[Path]:
     return out
 
 
-def self_touch(runs: list[Run], model: mujoco.MjModel, rate: float = 25.0, depth: float = 3e-4) -> dict[str, list[tuple[float, float]]]:
+def self_touch(
+    runs: list[Run], model: mujoco.MjModel, rate: float = 25.0, depth: float = 3e-4
+) -> dict[str, list[tuple[float, float]]]:
     """By recording, the stretches [s] in which links of the model press on one another along the measured motion.
 
-    A pair that touches nearly always overlaps by design and says nothing. depth [m]: less is left to the geometry's accuracy.
+    A pair that touches nearly always overlaps by design and says nothing. depth [m]: less is left to the geometry's
+    accuracy.
     """
     data = mujoco.MjData(model)
     seen: list[tuple[str, float, set[tuple[int, int]]]] = []

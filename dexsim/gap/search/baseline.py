@@ -1,7 +1,8 @@
-"""The plain model that an engineer fits first, of every joint: PD gains, torque limit, Coulomb and viscous friction, delay.
+"""The plain model that an engineer fits first, of every joint: PD gains, torque limit, Coulomb and viscous friction,
+delay.
 
-A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the bounds. Whatever else a
-diagnosis finds has to follow what was kept out better than this, or this is what is handed on.
+A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the
+bounds. Whatever else a diagnosis finds has to follow what was kept out better than this, or this is what is handed on.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "
 
 @dataclass
 class Baseline:
-    """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over what was kept out
-    [rad or m] with what is believed and with them; squares [n]: those errors squared, at its
-    samples, of half a second a block [n]; at_bound: columns that stopped there."""
+    """Of one joint. value: servo columns that were fitted, in their units; error_before, error: rms of a free run over
+    what was kept out [rad or m] with what is believed and with them; squares [n]: those errors squared, at its samples,
+    of half a second a block [n]; at_bound: columns that stopped there."""
 
     joint: str
     value: dict[str, float]
@@ -50,11 +51,16 @@ class Baseline:
     def entry(self) -> dict[str, Any]:
         """As `diagnosis.json` has it."""
         unit = lambda n: UNITS.get(n, "1").replace("N.m", "N").replace("rad", "m") if self.slide else UNITS.get(n, "1")  # noqa: E731
-        return {"error_before": self.error_before, "error": self.error, "parameters": {n: {"value": x, "unit": unit(n)} for n, x in self.value.items()}}
+        return {
+            "error_before": self.error_before,
+            "error": self.error,
+            "parameters": {n: {"value": x, "unit": unit(n)} for n, x in self.value.items()},
+        }
 
 
 def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
-    """What is fitted of a joint: around its belief, within its stated range where it has one; friction from none to what drives it."""
+    """What is fitted of a joint: around its belief, within its stated range where it has one; friction from none to
+    what drives it."""
     s, out = case.scales, []
 
     def factor(name: str, wide: tuple[float, float]) -> None:
@@ -68,24 +74,60 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
         factor("kd", (0.0, GAIN[1]))
     elif s.nominal["kp"] > 0:  # a loop that is said not to damp: up to critical damping
         stiffness = s.nominal["kp"] * (s.nominal["torque_limit"] if s.voltage else 1.0)
-        out.append(Param("kd", ("kd",), "set", 0.0, 2.0 * s.nominal["kp"] * float(np.sqrt(s.inertia / max(stiffness, 1e-12))), 0.0))
+        out.append(
+            Param(
+                "kd",
+                ("kd",),
+                "set",
+                0.0,
+                2.0 * s.nominal["kp"] * float(np.sqrt(s.inertia / max(stiffness, 1e-12))),
+                0.0,
+            )
+        )
     factor("torque_limit", LIMIT)
     if not case.told:  # what the recorded torque has told is known
         room = min(min(room_for_friction(case, train).values()) - case.constants.friction, s.tau)
         low, high = case.ranges.get("coulomb_friction", (0.0, np.inf))
         room = min(room, high) if high > low else room
         if room > 0:
-            out.append(Param("coulomb_friction", ("coulomb_friction",), "set", 0.0, room, min(s.nominal["coulomb_friction"], room), UNITS["coulomb_friction"]))
+            out.append(
+                Param(
+                    "coulomb_friction",
+                    ("coulomb_friction",),
+                    "set",
+                    0.0,
+                    room,
+                    min(s.nominal["coulomb_friction"], room),
+                    UNITS["coulomb_friction"],
+                )
+            )
         most = max(s.tau / s.speed, 2 * s.nominal["viscous_friction"])
-        out.append(Param("viscous_friction", ("viscous_friction",), "set", 0.0, most, s.nominal["viscous_friction"], UNITS["viscous_friction"]))
+        out.append(
+            Param(
+                "viscous_friction",
+                ("viscous_friction",),
+                "set",
+                0.0,
+                most,
+                s.nominal["viscous_friction"],
+                UNITS["viscous_friction"],
+            )
+        )
     out.append(Param("delay", ("delay",), "set", 0.0, max(LATEST, 2 * s.nominal["delay"]), s.nominal["delay"], "s"))
     return out
 
 
-def fit(case: Case, train: Sequence[int], test: Sequence[int], span_train: dict | None = None, span_test: dict | None = None, seed: int = 0,
-        whole: Any = None) -> Baseline | None:
-    """The plain model of a joint, fitted on runs `train` and judged on `test` (span_*: part of each run, s). whole: the plant on which free runs are
-    judged (None: the case's own). None where there is nothing to fit or to judge."""
+def fit(
+    case: Case,
+    train: Sequence[int],
+    test: Sequence[int],
+    span_train: dict | None = None,
+    span_test: dict | None = None,
+    seed: int = 0,
+    whole: Any = None,
+) -> Baseline | None:
+    """The plain model of a joint, fitted on runs `train` and judged on `test` (span_*: part of each run, s). whole: the
+    plant on which free runs are judged (None: the case's own). None where there is nothing to fit or to judge."""
     from dexsim.gap.judge.errors import free_run
     from dexsim.gap.search.search import subset
 
@@ -97,13 +139,24 @@ def fit(case: Case, train: Sequence[int], test: Sequence[int], span_train: dict 
     pick = np.zeros(len(windows.window), bool)
     pick[np.unique(np.linspace(0, len(pick) - 1, WINDOWS).astype(int))] = True
     params = plain_model(case, train)
-    fitter = Fitter(case.plant, subset(windows, pick), Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)))
+    fitter = Fitter(
+        case.plant,
+        subset(windows, pick),
+        Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)),
+    )
     x = _fitted(fitter, params, np.random.default_rng(seed))
     measured = judged.plant.q[kept.sample_row]
     before = (measured - free_run(judged, [], np.zeros(0), kept, underway=True)[0]) ** 2
     after = (measured - free_run(judged, params, x, kept, underway=True)[0]) ** 2
-    value = {p.key: float(v * case.scales.nominal[p.key] if p.mode == "factor" else v) for p, v in zip(params, x, strict=True)}
-    stopped = tuple(p.key for p, v in zip(params, x, strict=True) if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0))
+    value = {
+        p.key: float(v * case.scales.nominal[p.key] if p.mode == "factor" else v)
+        for p, v in zip(params, x, strict=True)
+    }
+    stopped = tuple(
+        p.key
+        for p, v in zip(params, x, strict=True)
+        if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0)
+    )
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
     block = (judged.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * judged.plant.run_of[kept.sample_row]
     return Baseline(case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped)
@@ -113,15 +166,20 @@ def _fitted(fitter: Fitter, params: list[Param], rng: np.random.Generator) -> np
     """[P] least squares from the best of guesses all over the bounds, and from what is believed."""
     low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
     start = np.clip([p.start for p in params], low, high)
-    cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))  # a Latin square
+    # a Latin square
+    cells = np.stack([rng.permutation(GUESSES) for _ in params], 1) + rng.uniform(size=(GUESSES, len(params)))
     share = cells / GUESSES
-    spread = np.array([p.mode == "factor" and p.low > 0 for p in params])  # factors evenly in their logarithm; the rest denser near none
+    # factors evenly in their logarithm; the rest denser near none
+    spread = np.array([p.mode == "factor" and p.low > 0 for p in params])
     safe = np.where(spread, low, 1.0)
     guesses = np.where(spread, safe * (np.where(spread, high, 2.0) / safe) ** share, low + (high - low) * share**2)
     guesses = np.concatenate([start[None], guesses])
     loss = fitter.loss(fitter.residuals(params, guesses))
     order = np.argsort(loss)[:BEST]
-    fits = [fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3) for k in dict.fromkeys([0, *order.tolist()])]
+    fits = [
+        fitter.fit(params, x0=guesses[k], iterations=ITERATIONS, tolerance=5e-3)
+        for k in dict.fromkeys([0, *order.tolist()])
+    ]
     return min(fits, key=lambda f: f.loss).x
 
 
@@ -130,30 +188,49 @@ def overall(given: Sequence[Baseline]) -> dict[str, Any]:
     if not given:
         return {}
     rms = lambda parts: float(np.sqrt(np.mean(np.concatenate(parts))))  # noqa: E731
-    return {"error_before": rms([b.squares_before for b in given]), "error": rms([b.squares for b in given]),
-            "parameters": sorted({n for b in given for n in b.value}), "joints": {b.joint: b.entry() for b in given}, "handed_on": []}  # fmt: skip
+    return {
+        "error_before": rms([b.squares_before for b in given]),
+        "error": rms([b.squares for b in given]),
+        "parameters": sorted({n for b in given for n in b.value}),
+        "joints": {b.joint: b.entry() for b in given},
+        "handed_on": [],
+    }
 
 
-def refused(given: Sequence[Baseline], joints: dict[str, dict[str, float]], fits: Sequence[tuple[Case, Any, np.ndarray]], train: Sequence[int],
-            floor: float) -> dict[str, str]:
-    """Joints of which what was fitted is not handed on, with the reason: it follows what was kept out worse than the plain model, or its friction
-    forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); fits: each joint's case, the trial that it would hand on and its squared errors on what was kept
-    out, at the plain model's samples; floor: of the noise, as `joints`."""
+def refused(
+    given: Sequence[Baseline],
+    joints: dict[str, dict[str, float]],
+    fits: Sequence[tuple[Case, Any, np.ndarray]],
+    train: Sequence[int],
+    floor: float,
+) -> dict[str, str]:
+    """Joints of which what was fitted is not handed on, with the reason: it follows what was kept out worse than the
+    plain model, or its friction forbids a motion that was recorded. joints: errors by joint (`after`, `sigma`); fits:
+    each joint's case, the trial that it would hand on and its squared errors on what was kept out, at the plain model's
+    samples; floor: of the noise, as `joints`."""
     out = {}
     by = {b.joint: b for b in given}
     for case, trial, squares in fits:
         joint = case.joint
         row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
         friction = float(row[INDEX["coulomb_friction"]])
-        more = friction > (1 + BELIEF) * case.scales.nominal["coulomb_friction"] + 1e-12  # than was believed: that is not this answer's
+        # than was believed: that is not this answer's
+        more = friction > (1 + BELIEF) * case.scales.nominal["coulomb_friction"] + 1e-12
         reason = forbids(case, train, friction, float(row[INDEX["friction_asymmetry"]])) if more else ""
         plain, after = by.get(joint), joints[joint]["after"]
         if reason:
             out[joint] = reason
-        elif plain is not None and after > max(WORSE * plain.error, AT_NOISE * max(joints[joint]["sigma"], floor)) and _surely(squares, plain):
+        elif (
+            plain is not None
+            and after > max(WORSE * plain.error, AT_NOISE * max(joints[joint]["sigma"], floor))
+            and _surely(squares, plain)
+        ):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"
-            out[joint] = (f"a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was kept out to {k * plain.error:.3g} {unit}, "
-                          f"what was found to {k * after:.3g}")  # fmt: skip
+            out[joint] = (
+                "a plain least squares (gains, limit, Coulomb, viscous, delay) follows what was kept out to "
+                f"{k * plain.error:.3g} {unit}, "
+                f"what was found to {k * after:.3g}"
+            )
     return out
 
 
@@ -183,5 +260,8 @@ def text(data: dict[str, Any], unit: str) -> str:
     """One line for a person."""
     if not data:
         return ""
-    said = f"A plain least squares (gains, limit, Coulomb, viscous, delay) leaves {1e3 * data['error']:.3g} {unit} of {1e3 * data['error_before']:.3g} on what was kept out"
+    said = (
+        f"A plain least squares (gains, limit, Coulomb, viscous, delay) leaves {1e3 * data['error']:.3g} {unit} of "
+        f"{1e3 * data['error_before']:.3g} on what was kept out"
+    )
     return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")

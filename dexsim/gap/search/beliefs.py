@@ -8,9 +8,28 @@ from dexsim.gap.plant.case import BELIEF, PHYSICAL, Case
 from dexsim.gap.plant.param import Param
 from dexsim.gap.plant.scales import Scales
 
-USUAL = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_friction", "viscous_friction", "load_friction",
-         "load_friction_backdriven", "lag", "delay", "stribeck_peak", "stribeck_speed", "friction_asymmetry", "deadband",
-         "position_offset", "position_scale", "speed_lag", "backlash", "softness")  # fmt: skip
+USUAL = (
+    "kp",
+    "kd",
+    "torque_limit",
+    "no_load_speed",
+    "efficiency",
+    "coulomb_friction",
+    "viscous_friction",
+    "load_friction",
+    "load_friction_backdriven",
+    "lag",
+    "delay",
+    "stribeck_peak",
+    "stribeck_speed",
+    "friction_asymmetry",
+    "deadband",
+    "position_offset",
+    "position_scale",
+    "speed_lag",
+    "backlash",
+    "softness",
+)
 WITH_OTHERS = (
     "torque_ripple",
     "ripple_per_turn",

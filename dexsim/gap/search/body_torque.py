@@ -1,7 +1,8 @@
 """Filtered derivatives of a recorded motion, and what torque the model's rigid body asks of every joint along it.
 
-Position and torque pass the same low-pass forth and back (Butterworth, 4th order), so that both are late by nothing; the body's
-torque is MuJoCo's inverse dynamics M(q) a + c(q, v) + g(q) less its passive forces, with the model's own dry friction in the joints.
+Position and torque pass the same low-pass forth and back (Butterworth, 4th order), so that both are late by nothing;
+the body's torque is MuJoCo's inverse dynamics M(q) a + c(q, v) + g(q) less its passive forces, with the model's own dry
+friction in the joints.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ RATE = 250.0  # Hz at which the model is evaluated; inertia and bias change slow
 
 @dataclass
 class Motion:
-    """Even times t [n] s; filtered positions q, speeds v, accelerations a and torques u [n, J]; step [s]; cutoff [Hz]."""
+    """Even times t [n] s; filtered positions q, speeds v, accelerations a and torques u [n, J]; step [s]; cutoff
+    [Hz]."""
 
     t: np.ndarray
     q: np.ndarray
@@ -44,8 +46,9 @@ class Motion:
 
 @dataclass
 class Body:
-    """By sample and joint [n, J]: torque that the model's body asks for (positive along positive motion), of it gravity's, gravity's a
-    quarter turn on (what a shifted centre of mass adds), and the inertia about the joint. N.m, N.m, N.m, kg.m2 (N, N, N, kg for a slide)."""
+    """By sample and joint [n, J]: torque that the model's body asks for (positive along positive motion), of it
+    gravity's, gravity's a quarter turn on (what a shifted centre of mass adds), and the inertia about the joint. N.m,
+    N.m, N.m, kg.m2 (N, N, N, kg for a slide)."""
 
     torque: np.ndarray
     gravity: np.ndarray
@@ -74,7 +77,8 @@ def _pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
 
 
 def body(model: mujoco.MjModel, gravity: np.ndarray, joints: Sequence[str], m: Motion) -> Body:
-    """Of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the model has them."""
+    """Of `joints` (the motion's columns) in world gravity [3] m/s2; the model's other joints rest where the model has
+    them."""
     data = mujoco.MjData(model)
     ids = [model.joint(name).id for name in joints]
     at, dof = np.array([model.jnt_qposadr[i] for i in ids]), np.array([model.jnt_dofadr[i] for i in ids])

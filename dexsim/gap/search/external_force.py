@@ -1,8 +1,10 @@
-"""Something outside that pushes: recorded torque that no inertia, gravity or friction of the joint's own makes, in stretches of time.
+"""Something outside that pushes: recorded torque that no inertia, gravity or friction of the joint's own makes, in
+stretches of time.
 
-Of each joint whose torque was logged the torque route is fitted to the half seconds that agree with each other best (least trimmed squares by
-blocks), so that what pushes now and then does not spoil the fit. Where a plain fit leaves much of the torque, and that trimmed fit is missed by far
-in some stretches only, something pushes then, by what is missed. Where nothing agrees, the torque is no witness of this body at all.
+Of each joint whose torque was logged the torque route is fitted to the half seconds that agree with each other best
+(least trimmed squares by blocks), so that what pushes now and then does not spoil the fit. Where a plain fit leaves
+much of the torque, and that trimmed fit is missed by far in some stretches only, something pushes then, by what is
+missed. Where nothing agrees, the torque is no witness of this body at all.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ SURE, HINT = 0.9, 0.4
 
 @dataclass
 class Push:
-    """Of one joint: torque [N.m, N for a slide], the largest from outside (positive along positive motion); its quiet residual as noise; spans by
-    recording [s]; left: share of the torque's variance that a plain fit leaves; clear: whether the rest fits."""
+    """Of one joint: torque [N.m, N for a slide], the largest from outside (positive along positive motion); its quiet
+    residual as noise; spans by recording [s]; left: share of the torque's variance that a plain fit leaves; clear:
+    whether the rest fits."""
 
     joint: str
     torque: float
@@ -50,18 +53,41 @@ class Push:
         """As `diagnosis.json` has it."""
         half, unit = 3.0 * self.noise, "N" if self.slide else "N.m"
         count = sum(map(len, self.spans.values()))
-        said = (f"in {count} stretch{'es' * (count != 1)} of time, {'forwards' if self.torque > 0 else 'backwards'} at its largest; elsewhere the joint's torque fits its body" if self.clear else
-                f"all the time: {100 * self.left:.0f} % of the torque's variance fits no inertia, gravity or friction (or it is not this joint's torque)")  # fmt: skip
+        said = (
+            f"in {count} stretch{'es' * (count != 1)} of time, {'forwards' if self.torque > 0 else 'backwards'} at "
+            "its largest; elsewhere the joint's torque fits its body"
+            if self.clear
+            else f"all the time: {100 * self.left:.0f} % of the torque's variance fits no inertia, gravity or "
+                 "friction (or it is not this joint's torque)"
+        )
         return {
-            "effect": ExternalForce.id, "confidence": SURE if self.clear else HINT, "alternatives": [], "indistinguishable": [], "separating_experiment": None,
-            "where": {"joints": [self.joint], "taxels": [], "topics": []}, "regime": said,
-            "when": [{"recording": name, "start": round(a, 3), "end": round(b, 3)} for name, spans in self.spans.items() for a, b in spans],
-            "parameters": {"torque": {"value": abs(self.torque), "low": max(abs(self.torque) - half, 0.0), "high": abs(self.torque) + half, "unit": unit}}, "held_out": None,
-        }  # fmt: skip
+            "effect": ExternalForce.id,
+            "confidence": SURE if self.clear else HINT,
+            "alternatives": [],
+            "indistinguishable": [],
+            "separating_experiment": None,
+            "where": {"joints": [self.joint], "taxels": [], "topics": []},
+            "regime": said,
+            "when": [
+                {"recording": name, "start": round(a, 3), "end": round(b, 3)}
+                for name, spans in self.spans.items()
+                for a, b in spans
+            ],
+            "parameters": {
+                "torque": {
+                    "value": abs(self.torque),
+                    "low": max(abs(self.torque) - half, 0.0),
+                    "high": abs(self.torque) + half,
+                    "unit": unit,
+                }
+            },
+            "held_out": None,
+        }
 
 
 def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed: int = 0) -> list[Push]:
-    """Of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; [] where no torque was logged."""
+    """Of every joint that is pushed in `runs` (all with the same joints), as told by the recordings `fitted`; [] where
+    no torque was logged."""
     out, motions = [], {}
     rng = np.random.default_rng(seed)
     for j, joint in enumerate(runs[0].joints):
@@ -75,7 +101,10 @@ def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed
                 motions[r] = moved(runs[r], model, cutoff)
         push = _of_joint([columns_of([motions[r]], j) for r in use], [r in own for r in use], rng)
         if push is not None:
-            spans, slide = _spans(push[0], [runs[r] for r in use]), int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+            spans, slide = (
+                _spans(push[0], [runs[r] for r in use]),
+                int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE),
+            )
             if push[4] and not spans:
                 continue
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
@@ -83,9 +112,11 @@ def find(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int], seed
 
 
 def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator):
-    """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest fits); None where little is left.
+    """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest
+    fits); None where little is left.
 
-    Fitted while the joint moves: at rest its dry friction carries any torque up to its level, and only what is beyond that speaks."""
+    Fitted while the joint moves: at rest its dry friction carries any torque up to its level, and only what is beyond
+    that speaks."""
     names = [n for n in pieces[0].names if all(n in p.names for p in pieces)]
     X = [p.X[:, [p.names.index(n) for n in names]] for p in pieces]
     fast = MOVING * float(np.percentile(np.abs(np.concatenate([p.v for p in pieces])), 95))
@@ -105,14 +136,17 @@ def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Gen
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
     fits = noise**2 < QUIET * float(np.var(torque[on])) and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
     least = max(FAR * noise, LEAST * float(np.sqrt(np.mean(torque**2))))
-    residual = [_beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)]
+    residual = [
+        _beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)
+    ]
     pushed = [np.abs(r) > least for r in residual]
     share = float(np.mean(np.concatenate(pushed)))
     if fits and share == 0 or not fits and not _slow(u - A @ x, block):
         return None  # nothing stands out, or noise does
     top = max((float(r[np.argmax(np.abs(r))]) for r in residual if len(r)), key=abs)
     times = [np.concatenate([q.motion.t[q.keep] - q.motion.t[0] for q in p.pieces]) for p in pieces]
-    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < MOST  # what the motor gives less, something else gives
+    # what the motor gives less, something else gives
+    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < MOST
 
 
 def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np.ndarray) -> np.ndarray:
@@ -136,8 +170,11 @@ def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Column
     return replace(of, names=tuple(names), X=A, u=u)
 
 
-def _trimmed(A: np.ndarray, u: np.ndarray, block: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(coefficients [K], fitted blocks [count] bool) of the least trimmed squares by blocks (P. Rousseeuw, K. Van Driessen 2006)."""
+def _trimmed(
+    A: np.ndarray, u: np.ndarray, block: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """(coefficients [K], fitted blocks [count] bool) of the least trimmed squares by blocks (P. Rousseeuw, K. Van
+    Driessen 2006)."""
     grams, sides = sums(A, u, block, count)
     squares, n = np.bincount(block, u * u, count), np.maximum(np.bincount(block, minlength=count), 1)
     keep, best = max(int(HALF * count), 4), (np.inf, None, None)
@@ -177,7 +214,8 @@ def _spans(given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run]) 
 
 
 def without(pushes: Sequence[Push], runs: list[Run], held: list[int], notes: list[str]) -> tuple[list[Run], list[int]]:
-    """The runs without the stretches in which something pushes, and which are held out, where enough is left of both to judge by."""
+    """The runs without the stretches in which something pushes, and which are held out, where enough is left of both to
+    judge by."""
     from dexsim.gap.read import inputs
 
     clear = [p for p in pushes if p.clear]
@@ -185,7 +223,14 @@ def without(pushes: Sequence[Push], runs: list[Run], held: list[int], notes: lis
         return runs, held
     said: list[str] = []
     touched = inputs.merged_spans(*(p.spans for p in clear))
-    rest, kept = inputs.free_air(runs, held, touched, said, f"something outside pushes ({', '.join(p.joint for p in clear)})", "in which nothing does")
+    rest, kept = inputs.free_air(
+        runs,
+        held,
+        touched,
+        said,
+        f"something outside pushes ({', '.join(p.joint for p in clear)})",
+        "in which nothing does",
+    )
     seconds = lambda given: sum(r.duration for r in given)  # noqa: E731
     if not rest or bool(held) != bool(kept) or len(kept) == len(rest) or seconds(rest) < REST * seconds(runs):
         return runs, held
@@ -196,15 +241,25 @@ def without(pushes: Sequence[Push], runs: list[Run], held: list[int], notes: lis
 
 
 def claim(d, pushes: Sequence[Push]) -> None:
-    """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their motion had another cause."""
+    """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
+    motion had another cause."""
     if not pushes:
         return
     from dexsim.gap.effects.catalogue import EFFECTS
     from dexsim.gap.report.sentence import sentence
 
     joints = {p.joint for p in pushes if not p.cut}
-    kept = [f for f in d.data["findings"] if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])]
-    d.notes += [f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or its recorded torque is not its own" for f in d.data["findings"] if f not in kept]
+    kept = [
+        f
+        for f in d.data["findings"]
+        if f["effect"] not in EFFECTS or EFFECTS[f["effect"]].effort_only or not joints & set(f["where"]["joints"])
+    ]
+    d.notes += [
+        f"{f['effect']} on {', '.join(f['where']['joints'])} is not claimed: something outside moved the joint, or "
+        "its recorded torque is not its own"
+        for f in d.data["findings"]
+        if f not in kept
+    ]
     d.data["findings"] = [p.finding() for p in pushes] + kept
     if not any(f["held_out"] for f in kept) and d.data["verdict"] in ("explained", "partly_explained"):
         d.data["verdict"] = "unknown"

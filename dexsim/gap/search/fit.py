@@ -37,7 +37,8 @@ def disbelief(params: list[Param], x: np.ndarray) -> float:
 
 @dataclass
 class Residuals:
-    """How residuals are weighed: sigma_q rad, sigma_torque N.m (0: not used), spread of the initial state, Huber knee."""
+    """How residuals are weighed: sigma_q rad, sigma_torque N.m (0: not used), spread of the initial state, Huber
+    knee."""
 
     sigma_q: float
     sigma_torque: float = 0.0
@@ -78,7 +79,9 @@ class Fitter:
         self.tau = np.where(np.isfinite(tau), tau, 0.0)
         self.tau_on = np.isfinite(tau)
         n = windows.n
-        self.window = np.concatenate([windows.sample_window, windows.sample_window]) if self.use_torque else windows.sample_window
+        self.window = (
+            np.concatenate([windows.sample_window, windows.sample_window]) if self.use_torque else windows.sample_window
+        )
         self.count = len(windows.window)
         order = np.flatnonzero(np.r_[True, np.diff(windows.sample_window) != 0])
         self.starts = np.concatenate([order, order + n]) if self.use_torque else order
@@ -145,9 +148,11 @@ class Fitter:
         res, s = self.init_directions(params, x)
         return self.eliminated(res[None], s)[0]
 
-    def shake(self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20) -> Fitted:
-        """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the loss
-        rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
+    def shake(
+        self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20
+    ) -> Fitted:
+        """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the
+        loss rough, and slopes stop at the first dent. Guesses spread as the fit is uncertain, and wider."""
         P = len(params)
         if P == 0:
             return f
@@ -178,8 +183,9 @@ class Fitter:
         return f
 
     def homeward(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
-        """The fit again from where one belief, or all of them, are back at what is believed, all else following by its slopes, where that is
-        better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at kinks, steps end before they are there."""
+        """The fit again from where one belief, or all of them, are back at what is believed, all else following by its
+        slopes, where that is better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at
+        kinks, steps end before they are there."""
         P = len(params)
         nuisance = np.array([p.nuisance for p in params], bool)
         if not nuisance.any():
@@ -199,13 +205,18 @@ class Fitter:
             if not away.any():
                 return f
             for back in [np.arange(P) == i for i in np.flatnonzero(away)] + [nuisance]:
-                # all else follows, or an effect alone: an inertia's takes over exactly, slopes of rough losses say so only nearly
+                # all else follows, or an effect alone: an inertia's takes over exactly, slopes of rough losses say so
+                # only nearly
                 for rest, pull in ((np.flatnonzero(~back), 1.0), (np.flatnonzero(~back & ~nuisance), 0.0)):
                     z = (centre - f.x) / span * back
                     if len(rest):
                         root = np.linalg.cholesky(A[np.ix_(rest, rest)]).T
-                        right = np.linalg.solve(root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back])
-                        z[rest] = lsq_linear(root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)).x
+                        right = np.linalg.solve(
+                            root.T, pull * b[rest] - A[np.ix_(rest, np.flatnonzero(back))] @ z[back]
+                        )
+                        z[rest] = lsq_linear(
+                            root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
+                        ).x
                     guesses.append(np.clip(f.x + z * span, low, high))
             guesses = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
@@ -221,21 +232,35 @@ class Fitter:
         out = []
         for i, p in enumerate(params):
             zero = p.low if p.mode == "set" and p.low >= 0 else centre_of([p])[0]
-            moves = [0.1 * p.span, -0.1 * p.span, 0.03 * p.span, -0.03 * p.span] if p.nuisance else [(f - 1) * (x[i] - zero) for f in PATTERN]
+            moves = (
+                [0.1 * p.span, -0.1 * p.span, 0.03 * p.span, -0.03 * p.span]
+                if p.nuisance
+                else [(f - 1) * (x[i] - zero) for f in PATTERN]
+            )
             for d in moves:
                 g = x.copy()
                 g[i] += d
                 out.append(g)
         return np.array(out)
 
-    def fit(self, params: list[Param], x0: np.ndarray | None = None, iterations: int = 10, tolerance: float = 2e-3,
-            step: float = 0.01, slopes: dict[str, np.ndarray] | None = None, lazy: bool = False, exact: bool = True) -> Fitted:
+    def fit(
+        self,
+        params: list[Param],
+        x0: np.ndarray | None = None,
+        iterations: int = 10,
+        tolerance: float = 2e-3,
+        step: float = 0.01,
+        slopes: dict[str, np.ndarray] | None = None,
+        lazy: bool = False,
+        exact: bool = True,
+    ) -> Fitted:
         """Levenberg-Marquardt inside the bounds from x0 [P] (the params' starts).
 
-        slopes: change [m] of the residuals per span of a parameter, by its key, known from a fit nearby on the same windows. lazy: once
-        known, from there or from the first batch, the slopes of beliefs and of these parameters follow the steps by Broyden's rank-one
-        updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only where they lead no further: a third of the simulations.
-        exact: end with slopes that were simulated at the end."""
+        slopes: change [m] of the residuals per span of a parameter, by its key, known from a fit nearby on the same
+        windows. lazy: once known, from there or from the first batch, the slopes of beliefs and of these parameters
+        follow the steps by Broyden's rank-one updates (C. G. Broyden, Math. Comp. 19, 1965) and are simulated anew only
+        where they lead no further: a third of the simulations. exact: end with slopes that were simulated at the
+        end."""
         low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
         x = np.array([p.start for p in params], float) if x0 is None else np.array(x0, float)
         x = np.clip(x, low, high)
@@ -283,10 +308,13 @@ class Fitter:
                     steps[i, f] = np.linalg.lstsq(M, b[f], rcond=None)[0]
             steps = np.clip(steps, -0.5, 0.5)
             trial = np.clip(x + steps * span, low, high)
-            tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
+            tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + (
+                (trial - centre) ** 2 @ believed
+            ) / len(res)
             best = int(np.argmin(tried))
             gain = (loss - float(tried[best])) / max(loss, 1e-30)
-            if known.any() and gain < tolerance:  # by slopes from elsewhere: here they are simulated before this is the end
+            # by slopes from elsewhere: here they are simulated before this is the end
+            if known.any() and gain < tolerance:
                 if gain > 0:
                     x = trial[best]
                 known[:], fresh, moved, damping = False, True, None, 1e-2
@@ -301,7 +329,9 @@ class Fitter:
                     continue
                 # a kinked loss has no slope to follow: try sizes outright
                 trial = np.clip(self.pattern(params, x), low, high)
-                tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + ((trial - centre) ** 2 @ believed) / len(res)
+                tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + (
+                    (trial - centre) ** 2 @ believed
+                ) / len(res)
                 best = int(np.argmin(tried))
                 if not tried[best] < loss * (1 - tolerance):
                     break
@@ -318,8 +348,16 @@ class Fitter:
         if exact and known.any():
             res, jac, s = self._slopes(params, x, delta, np.arange(P))
             jac = jac / (delta / span)
-        return Fitted(list(params), x, res, jac / span if P else np.zeros((len(res), 0)), self.window, float(self.loss(res)),
-                      self.window_loss(res), iterations=it)
+        return Fitted(
+            list(params),
+            x,
+            res,
+            jac / span if P else np.zeros((len(res), 0)),
+            self.window,
+            float(self.loss(res)),
+            self.window_loss(res),
+            iterations=it,
+        )
 
     def _known(self, params: list[Param], slopes: dict[str, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
         """(slopes [m, P] per span as far as they are known, which are [P])."""
@@ -331,8 +369,8 @@ class Fitter:
         return jac, known
 
     def _slopes(self, params: list[Param], x: np.ndarray, delta: np.ndarray, which: np.ndarray):
-        """(residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states [2, m]), by one batch of
-        simulations: here, each of them moved, the initial state moved."""
+        """(residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states [2, m]),
+        by one batch of simulations: here, each of them moved, the initial state moved."""
         k = len(which)
         guesses = np.repeat(x[None], k + 3, 0)
         guesses[1 + np.arange(k), which] += delta[which]

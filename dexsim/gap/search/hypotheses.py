@@ -262,8 +262,11 @@ def thin(w: Windows, case: Case, budget: float) -> Windows:
     most = max(int(count * budget / seconds), 8)
     size = np.maximum(np.bincount(w.sample_window, minlength=count), 1)
     chosen: list[int] = []
-    orders = [np.argsort(-np.bincount(w.sample_window, np.abs(case.regimes[name][w.sample_row]), count) / size, kind="stable")
-              for name in EXTREMES if name in case.regimes]  # fmt: skip
+    orders = [
+        np.argsort(-np.bincount(w.sample_window, np.abs(case.regimes[name][w.sample_row]), count) / size, kind="stable")
+        for name in EXTREMES
+        if name in case.regimes
+    ]
     for k in range(count):
         for order in orders:
             if len(chosen) < most // 2 and order[k] not in chosen:

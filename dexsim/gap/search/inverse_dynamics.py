@@ -1,11 +1,13 @@
 """Inverse dynamics: what lies behind the motor, from the recorded motor torque alone, whatever the firmware did.
 
-    torque = body + inertia * a + viscous * v + coulomb * sign(v) + offset + gravity's share      (IDIM-LS: Gautier, Janot, Vandanjon 2013)
+    torque = body + inertia * a + viscous * v + coulomb * sign(v) + offset + gravity's share    (IDIM-LS:
+                                                            Gautier, Janot, Vandanjon 2013)
 
-with the body's torque from the MuJoCo model along the measured motion of all joints (`body_torque.py`), so that coupled joints and
-gravity are no hindrance. Linear, hence at once and without a start; it needs a logged torque of 100 Hz or more. How much is filtered away
-follows from the data: a second derivative is noise above what moves. Further effects are named one after another, each only where it
-helps on quarters of the recordings that its fit has not seen; what is kept out only judges them.
+with the body's torque from the MuJoCo model along the measured motion of all joints (`body_torque.py`), so that coupled
+joints and gravity are no hindrance. Linear, hence at once and without a start; it needs a logged torque of 100 Hz or
+more. How much is filtered away follows from the data: a second derivative is noise above what moves. Further effects
+are named one after another, each only where it helps on quarters of the recordings that its fit has not seen; what is
+kept out only judges them.
 """
 
 from __future__ import annotations
@@ -21,13 +23,19 @@ from dexsim.gap.search import body_torque
 from dexsim.gap.search.torque_columns import WEIGHT, Columns, columns_of, least, misfit, solved, sums, unphysical
 
 SHED = 0.8  # of the misfit: what halving the cutoff leaves, where what it sheds is noise of derivatives
-WEIGHED = 0.03  # what gravity's factor must be known to by the recordings, to be fitted beside the friction and not believed
+# what gravity's factor must be known to by the recordings, to be fitted beside the friction and not believed
+WEIGHED = 0.03
 DRAWS = 300
 QUARTERS = 4
 LEAST = 0.12  # of the squared residual on the quarters left out: what a further effect must remove
 MOST = 4
 LATE = 0.02  # s: a torque that acts later than this is no drive's lag
-BY_DIRECTION, SQUARE, LAG, STRIBECK = "viscous friction that differs by direction", "friction with the square of the speed", "lag", StribeckFriction.id
+BY_DIRECTION, SQUARE, LAG, STRIBECK = (
+    "viscous friction that differs by direction",
+    "friction with the square of the speed",
+    "lag",
+    StribeckFriction.id,
+)
 LOAD = LoadFriction.id
 GIVES = "dry friction that gives way before it slides"
 DISTANCES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # of the whole motion: over which it may give way (P. Dahl 1968)
@@ -36,8 +44,9 @@ SPEEDS = (0.02, 0.04, 0.08, 0.14, 0.2, 0.3)  # of the top speed: where Stribeck'
 
 @dataclass
 class Named:
-    """One further effect. text: as `Inverse.extra` names it; value, low, high (90 %) of its coefficients; share of the bootstraps
-    in which it was the best to add; residual rms before and after on the recording kept out (N.m, N for a slide)."""
+    """One further effect. text: as `Inverse.extra` names it; value, low, high (90 %) of its coefficients; share of the
+    bootstraps in which it was the best to add; residual rms before and after on the recording kept out (N.m, N for a
+    slide)."""
 
     text: str
     value: float
@@ -61,10 +70,11 @@ class Named:
 
 @dataclass
 class Inverse:
-    """value, low, high by `NAMES` (90 %, block bootstrap), in kg.m2, N.m.s/rad, N.m (kg, N.s/m, N for a slide), all but the inertia beyond the
-    model's, and by `WEIGHT` where gravity pulls; residual: rms of what is left over the rms of the torque. extra: (one further effect alone,
-    share of the residual's rms it removes); named: further effects one after another; full: `NAMES` fitted with those of them that the
-    catalogue has. refused: figures that came out negative where nothing can be, with the reason; they are 0 in `value`, the rest refitted."""
+    """value, low, high by `NAMES` (90 %, block bootstrap), in kg.m2, N.m.s/rad, N.m (kg, N.s/m, N for a slide), all but
+    the inertia beyond the model's, and by `WEIGHT` where gravity pulls; residual: rms of what is left over the rms of
+    the torque. extra: (one further effect alone, share of the residual's rms it removes); named: further effects one
+    after another; full: `NAMES` fitted with those of them that the catalogue has. refused: figures that came out
+    negative where nothing can be, with the reason; they are 0 in `value`, the rest refitted."""
 
     value: dict[str, float]
     low: dict[str, float]
@@ -77,14 +87,19 @@ class Inverse:
     cutoff: float = 0.0  # Hz, of the filter
 
 
-def identify(t: np.ndarray, q: np.ndarray, torque: np.ndarray, seed: int = 0, test: tuple[np.ndarray, ...] | None = None) -> Inverse:
-    """From times [n] s, positions [n] and motor torques [n] of one joint without gravity. test: (t, q, torque) of a recording
-    that only judges the further effects. Raises ValueError for fewer than 200 samples."""
+def identify(
+    t: np.ndarray, q: np.ndarray, torque: np.ndarray, seed: int = 0, test: tuple[np.ndarray, ...] | None = None
+) -> Inverse:
+    """From times [n] s, positions [n] and motor torques [n] of one joint without gravity. test: (t, q, torque) of a
+    recording that only judges the further effects. Raises ValueError for fewer than 200 samples."""
     if len(t) < 200:
         raise ValueError(f"{len(t)} samples are too few for inverse dynamics (200)")
 
     def at(cutoff: float) -> tuple[Columns, Columns]:
-        given = [body_torque.motion(x[0], x[1][:, None], x[2][:, None], cutoff) for x in ((t, q, torque), *([] if test is None else [test]))]
+        given = [
+            body_torque.motion(x[0], x[1][:, None], x[2][:, None], cutoff)
+            for x in ((t, q, torque), *([] if test is None else [test]))
+        ]
         made = [columns_of([(m, None)], 0) for m in given]
         return made[0], made[-1]
 
@@ -92,7 +107,8 @@ def identify(t: np.ndarray, q: np.ndarray, torque: np.ndarray, seed: int = 0, te
 
 
 def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int = 0) -> Inverse:
-    """From what `at` makes of the fitted and of the judging recordings at a cutoff [Hz], from `top` down while halving it sheds noise."""
+    """From what `at` makes of the fitted and of the judging recordings at a cutoff [Hz], from `top` down while halving
+    it sheds noise."""
     cutoff, (own, other) = top, at(top)
     while 0.5 * cutoff >= body_torque.LEAST:
         lower = at(0.5 * cutoff)
@@ -116,7 +132,9 @@ def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int 
     named, full = _name(own, other, mine, theirs, rng)
     left = float(np.std(u - X @ theta) / max(np.std(own.torque), 1e-12))
     pack = lambda x: {n: 0.0 for n in refused} | own.pack(x)  # noqa: E731
-    return Inverse(pack(theta), pack(low), pack(high), left, sorted(extra, key=lambda e: -e[1]), named, pack(full), refused, cutoff)
+    return Inverse(
+        pack(theta), pack(low), pack(high), left, sorted(extra, key=lambda e: -e[1]), named, pack(full), refused, cutoff
+    )
 
 
 def _not_weighed(d: Columns) -> list[str]:
@@ -127,7 +145,8 @@ def _not_weighed(d: Columns) -> list[str]:
 
 
 def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
-    """Further effects in the order in which they help on quarters left out, and the coefficients with the catalogue's."""
+    """Further effects in the order in which they help on quarters left out, and the coefficients with the
+    catalogue's."""
     chosen: list[str] = []
     out: list[tuple[str, float, str]] = []
     X, Y, base = own.X, other.X, own.X.shape[1]
@@ -187,7 +206,8 @@ def _kind(name: str) -> str:
 
 
 def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
-    """Whether a coefficient can be what it is called: a lag is late, an excess is more, and what gives way is friction that is there."""
+    """Whether a coefficient can be what it is called: a lag is late, an excess is more, and what gives way is friction
+    that is there."""
     if name == LAG:
         return 0 < c < LATE * abs(theta["inertia"])
     if _kind(name) == GIVES:
@@ -197,7 +217,9 @@ def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
     return c > 0 if _kind(name) == STRIBECK else True
 
 
-def _intervals(X: np.ndarray, u: np.ndarray, blocks: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _intervals(
+    X: np.ndarray, u: np.ndarray, blocks: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least squares and 90 % by a block bootstrap."""
     count = int(blocks.max()) + 1
     grams, sides = sums(X, u, blocks, count)
@@ -214,14 +236,19 @@ def _further(own: Columns) -> dict:
     if own.loaded:
         out[LOAD] = lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))
     for part in SPEEDS:
-        out[f"{STRIBECK} (v_s {part * top:.3g})"] = lambda d, s=part * top: d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / s) ** 2)))
+        out[f"{STRIBECK} (v_s {part * top:.3g})"] = lambda d, s=part * top: d.column(
+            lambda q, v, load: np.sign(v) * np.exp(-((v / s) ** 2))
+        )
     for part in DISTANCES:
-        out[f"{GIVES} (over {part * span:.2g})"] = lambda d, s=part * span: d.column(lambda q, v, load: _taken_up(q, s) - np.sign(v))
+        out[f"{GIVES} (over {part * span:.2g})"] = lambda d, s=part * span: d.column(
+            lambda q, v, load: _taken_up(q, s) - np.sign(v)
+        )
     return out
 
 
 def _taken_up(q: np.ndarray, distance: float) -> np.ndarray:
-    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step exactly."""
+    """[n] share -1..1 of a dry friction that is taken up along q: dz = (1 - z sign(dq)) dq / distance, each step
+    exactly."""
     z, out = 0.0, np.empty(len(q))
     steps = np.diff(q, prepend=q[0])
     keep = np.exp(-np.abs(steps) / distance)

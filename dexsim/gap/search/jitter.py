@@ -1,14 +1,15 @@
 """Jitter of a command delay: how much the time at which single commands act varies.
 
-When each command acts is not recorded, but what its time does to the motion can be simulated: with every 128th command late by
-a little, one guess for each, a batch gives the motion's answer H [commands, samples] to the time of each command of a window. If the
-times vary by chance with standard deviation s, residuals are normal with covariance
+When each command acts is not recorded, but what its time does to the motion can be simulated: with every 128th command
+late by a little, one guess for each, a batch gives the motion's answer H [commands, samples] to the time of each
+command of a window. If the times vary by chance with standard deviation s, residuals are normal with covariance
 
     C(s) = a^2 1 + b^2 exp(-|t - t'| / tau) + sum over k of g_k^2 H' K_k H + s^2 H' H
 
 (a: white noise; b: what the plant follows no better, correlated over tau; g_k: times that are off, but alike for
-commands 50 and 200 ms apart, as what is missing elsewhere looks: jitter is what has no memory), and s comes from the likelihood of all windows, its
-interval from where that falls by 1.35 (90 %). A likelihood-ratio test against s = 0 decides whether there is any to report.
+commands 50 and 200 ms apart, as what is missing elsewhere looks: jitter is what has no memory), and s comes from the
+likelihood of all windows, its interval from where that falls by 1.35 (90 %). A likelihood-ratio test against s = 0
+decides whether there is any to report.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ LEFT = 2.0  # x the noise squared that a hypothesis leaves, from which jitter is
 
 @dataclass
 class Jitter:
-    """Standard deviation [s] of the delay of single commands, its 90 % interval, gain of the log likelihood over none."""
+    """Standard deviation [s] of the delay of single commands, its 90 % interval, gain of the log likelihood over
+    none."""
 
     value: float
     low: float
@@ -78,7 +80,9 @@ def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
         on = fitter.window[use] == w
         if on.sum() > 8:
             h = 1e-3 * moved[:, on]  # in units in which 1 ms counts as 1
-            windows.append((residual[0, on], h.T @ h, [h.T @ k @ h for k in kernels], np.abs(t[on][:, None] - t[on][None])))
+            windows.append(
+                (residual[0, on], h.T @ h, [h.T @ k @ h for k in kernels], np.abs(t[on][:, None] - t[on][None]))
+            )
     if not windows or max(float(np.trace(h)) for _, h, _, _ in windows) < 1e-6:
         return None
 
@@ -102,7 +106,13 @@ def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
     bounds = [(np.log(0.75 * noise), np.log(1.5 * noise)), (-4, 6), (-4, 0.7)] + [(-4, 5)] * len(ALIKE)
     options = {"maxiter": 30}
     none = minimize(cost, start, args=(0.0,), method="L-BFGS-B", bounds=bounds, options=options)
-    both = minimize(lambda z: cost(z[:-1], np.exp(z[-1])), np.r_[none.x, np.log(1.0)], method="L-BFGS-B", bounds=[*bounds, (-4, 5)], options=options)
+    both = minimize(
+        lambda z: cost(z[:-1], np.exp(z[-1])),
+        np.r_[none.x, np.log(1.0)],
+        method="L-BFGS-B",
+        bounds=[*bounds, (-4, 5)],
+        options=options,
+    )
     best, value = float(both.fun), float(np.exp(both.x[-1]))
     gain = float(none.fun) - best
     # where more than noise stays beside it, something else is missing that looks alike (an unmodelled resonance does)

@@ -13,22 +13,31 @@ from dexsim.gap.plant.batch import THREADS
 
 T = TypeVar("T")
 MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
-SWITCH = 2e-4  # s that a lane may keep the interpreter while another waits for it after a launch (Python: 5 ms, as long as a launch of few guesses)
+# s that a lane may keep the interpreter while another waits for it after a launch (Python: 5 ms, as long as a launch of
+# few guesses)
+SWITCH = 2e-4
 
 
 def lanes(device: str, jobs: int) -> int:
-    """How many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's launch hides. On
-    a CPU one for every `THREADS` cores (OMP_NUM_THREADS, where it is set, counts as the cores)."""
+    """How many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's launch
+    hides. On a CPU one for every `THREADS` cores (OMP_NUM_THREADS, where it is set, counts as the cores)."""
     if device != "cpu":
         return max(1, min(jobs, MOST_GPU))
     given = os.environ.get("OMP_NUM_THREADS", "")
-    cores = int(given) if given.isdigit() and int(given) > 0 else len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        int(given)
+        if given.isdigit() and int(given) > 0
+        else len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
     return max(1, min(jobs, MOST_CPU, cores // THREADS))
 
 
 def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
              progress: Callable[[float, int, str], None] | None = None) -> list[T]:
-    """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is worked on)."""
+    """work(k, tell) for each name, in their order; tell(part) says how much of it is done; progress(done, of, which is
+    worked on)."""
     parts = [0.0] * len(names)
     lock = threading.Lock()
 

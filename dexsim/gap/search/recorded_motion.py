@@ -1,7 +1,8 @@
 """What recorded motions say against a friction: a joint that sets itself in motion has less of it than what drives it.
 
-A stretch that begins at rest and moves the joint on needs, at its best moment, more driving torque than dry friction. The drive's part is known
-where the drive is off (0) or its torque was recorded, and is otherwise at most its limit; gravity and the other joints' pull are the model's.
+A stretch that begins at rest and moves the joint on needs, at its best moment, more driving torque than dry friction.
+The drive's part is known where the drive is off (0) or its torque was recorded, and is otherwise at most its limit;
+gravity and the other joints' pull are the model's.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ BELIEVED = 1.1  # x the driving torque: gravity and limits are off by a few perc
 
 
 def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
-    """By direction (1, -1): the largest dry friction [N.m] with which every motion of these runs that began at rest could begin; infinite
-    where none did."""
+    """By direction (1, -1): the largest dry friction [N.m] with which every motion of these runs that began at rest
+    could begin; infinite where none did."""
     out = {1: np.inf, -1: np.inf}
     plant, speed = case.plant, case.regimes["_speed"]
     for r in runs:
@@ -34,7 +35,11 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
             on = way * v > MOVING * case.scales.speed
             edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
             for a, b in zip(edge[::2], edge[1::2], strict=True):
-                if a == 0 or t[b - 1] - t[a] < LASTS or abs(q[b - 1] - q[a]) < max(TRAVEL * case.scales.span, 20 * case.sigma):
+                if (
+                    a == 0
+                    or t[b - 1] - t[a] < LASTS
+                    or abs(q[b - 1] - q[a]) < max(TRAVEL * case.scales.span, 20 * case.sigma)
+                ):
                     continue
                 a = max(a - 2, 0)  # the torque that set it off is from just before
                 out[way] = min(out[way], max(BELIEVED * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))
@@ -42,13 +47,17 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
 
 
 def forbids(case: Case, runs: Sequence[int], friction: float, asymmetry: float = 0.0) -> str:
-    """Why a dry friction [N.m] (its asymmetry as in servo.yaml) cannot be: a motion was recorded that it forbids. Empty where none is."""
+    """Why a dry friction [N.m] (its asymmetry as in servo.yaml) cannot be: a motion was recorded that it forbids. Empty
+    where none is."""
     for way, room in room_for_friction(case, runs).items():
         level = friction * (1 + 0.5 * way * asymmetry) + case.constants.friction
         if level > room:
             unit = "N" if case.scales.slide else "N.m"
-            return (f"a dry friction of {level:.3g} {unit} would hold the joint, but it was recorded setting itself in motion "
-                    f"{'forwards' if way > 0 else 'backwards'} with at most {room:.3g} {unit} to drive it")  # fmt: skip
+            return (
+                f"a dry friction of {level:.3g} {unit} would hold the joint, but it was recorded setting itself in "
+                "motion "
+                f"{'forwards' if way > 0 else 'backwards'} with at most {room:.3g} {unit} to drive it"
+            )
     return ""
 
 

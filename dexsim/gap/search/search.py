@@ -143,8 +143,14 @@ class JointSearch(JointSelection):
         if len(i) and len(k):
             M = A[np.ix_(i, i)] + 1e-9 * np.trace(A) * np.eye(len(i))
             answer = np.linalg.solve(M, A[np.ix_(i, k)]) * span[i][:, None] / span[k][None]  # d effect / d nuisance
-            off = np.array([SEARCH.off * abs(v) if p.mode == "factor" else 0.25 * min(p.span, 4 * SEARCH.off * abs(v) + 1e-3 * p.span)
-                            for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)])  # fmt: skip
+            off = np.array(
+                [
+                    SEARCH.off * abs(v)
+                    if p.mode == "factor"
+                    else 0.25 * min(p.span, 4 * SEARCH.off * abs(v) + 1e-3 * p.span)
+                    for p, v in zip(np.array(f.params, object)[k], x[k], strict=True)
+                ]
+            )
             square[i] += ((1.645 * answer * off) ** 2).sum(1)
         itself = np.array([0.03 if p.key.endswith(("kp_factor", "kd_factor")) else SEARCH.doubt for p in f.params])
         square += (1.645 * itself * np.abs(x)) ** 2

@@ -153,8 +153,16 @@ class JointSelection(JointScan):
         for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
             own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
             at = expand_one(self.case, trial.fit.params, trial.fit.x)[0][columns]
-            x0 = [own.get(p.key, p.start) if not p.nuisance else a / b if p.mode == "factor" else a - b if p.mode == "add" else a
-                  for p, a, b in zip(params, at, believed, strict=True)]  # fmt: skip
+            x0 = [
+                own.get(p.key, p.start)
+                if not p.nuisance
+                else a / b
+                if p.mode == "factor"
+                else a - b
+                if p.mode == "add"
+                else a
+                for p, a, b in zip(params, at, believed, strict=True)
+            ]
             with self._fix(current.members):
                 new = Trial(
                     current.members,

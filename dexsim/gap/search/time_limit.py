@@ -9,7 +9,8 @@ JUDGING = 0.2  # of the limit: what is left for judging, the replay and the page
 
 
 class TimeLimit:
-    """seconds: for the whole diagnosis from now on; None for no limit. `stop()` (Ctrl-C) ends searches at their next step."""
+    """seconds: for the whole diagnosis from now on; None for no limit. `stop()` (Ctrl-C) ends searches at their next
+    step."""
 
     def __init__(self, seconds: float | None = None):
         self.seconds, self._start, self._stop = seconds, time.monotonic(), threading.Event()

@@ -1,5 +1,5 @@
-"""One joint's recorded torque as columns of a linear least squares: what the model's body leaves, and what friction, inertia, offset and
-gravity's factors would make of it."""
+"""One joint's recorded torque as columns of a linear least squares: what the model's body leaves, and what friction,
+inertia, offset and gravity's factors would make of it."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Piece:
 
 @dataclass
 class Columns:
-    """One joint's pieces in a row, thinned to what the filter leaves: columns X [m, K] by `names`, torque beyond the body u [m], speeds v [m], what
-    a lag of one second would add per unit of inertia `rise` [m], the torque itself [m], blocks [m]; inertia of the model (median), extent
-    of the motion, whether gravity pulls, seconds in all."""
+    """One joint's pieces in a row, thinned to what the filter leaves: columns X [m, K] by `names`, torque beyond the
+    body u [m], speeds v [m], what a lag of one second would add per unit of inertia `rise` [m], the torque itself [m],
+    blocks [m]; inertia of the model (median), extent of the motion, whether gravity pulls, seconds in all."""
 
     pieces: list[Piece]
     names: tuple[str, ...]
@@ -69,8 +69,14 @@ class Columns:
 def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0) -> Columns:
     """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed."""
     pieces, parts, at = [], [], 0
-    inertia = float(np.median(np.concatenate([b.inertia[:, j] for _, b, *_ in given]))) if given[0][1] is not None else 0.0
-    weights = [np.abs(b.gravity[:, j]).max() / max(float(np.abs(m.u[:, j]).max()), 1e-12) for m, b, *_ in given if b is not None]
+    inertia = (
+        float(np.median(np.concatenate([b.inertia[:, j] for _, b, *_ in given]))) if given[0][1] is not None else 0.0
+    )
+    weights = [
+        np.abs(b.gravity[:, j]).max() / max(float(np.abs(m.u[:, j]).max()), 1e-12)
+        for m, b, *_ in given
+        if b is not None
+    ]
     loaded = bool(weights) and max(weights) > HEAVY
     for m, b, *rest in given:
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
@@ -88,14 +94,24 @@ def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0) -> Colum
         pieces.append(Piece(m, q, v, load, keep))
     X, u, v, rise, torque, block = (np.concatenate(x) for x in zip(*parts, strict=True))
     q = np.concatenate([p.q[p.keep] for p in pieces])
-    seconds = sum(float(p.keep.sum()) * max(int(1.0 / (PER_CUTOFF * p.motion.cutoff * p.motion.step)), 1) * p.motion.step for p in pieces)
+    seconds = sum(
+        float(p.keep.sum()) * max(int(1.0 / (PER_CUTOFF * p.motion.cutoff * p.motion.step)), 1) * p.motion.step
+        for p in pieces
+    )
     _, block = np.unique(block, return_inverse=True)
     names = NAMES + (WEIGHT if loaded else ())
-    return Columns(pieces, names, X, u, v, rise, torque, block, inertia, float(np.ptp(q)) if len(q) else 0.0, loaded, seconds)
+    return Columns(
+        pieces, names, X, u, v, rise, torque, block, inertia, float(np.ptp(q)) if len(q) else 0.0, loaded, seconds
+    )
 
 def readable(run: Run, j: int) -> bool:
     """Whether a run's torque of joint j can be differentiated beside its motion."""
-    if run.torque is None or run.torque_unit != "N.m" or not np.isfinite(run.torque[:, j]).all() or len(run.t) < 2 * EDGE + 100:
+    if (
+        run.torque is None
+        or run.torque_unit != "N.m"
+        or not np.isfinite(run.torque[:, j]).all()
+        or len(run.t) < 2 * EDGE + 100
+    ):
         return False
     return 1 / np.median(np.diff(run.t)) >= 0.97 * RATE
 
@@ -112,7 +128,8 @@ def sums(X: np.ndarray, u: np.ndarray, of: np.ndarray, count: int) -> tuple[np.n
 
 
 def solved(grams: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Coefficients [.., K] of normal equations [.., K, K], [.., K], columns scaled alike; 0 for a column that is not there."""
+    """Coefficients [.., K] of normal equations [.., K, K], [.., K], columns scaled alike; 0 for a column that is not
+    there."""
     scale = np.sqrt(np.maximum(np.einsum("...kk->...k", grams), 1e-300))
     scaled = grams / (scale[..., :, None] * scale[..., None, :]) + 1e-13 * np.eye(grams.shape[-1])
     return np.linalg.solve(scaled, (sides / scale)[..., None])[..., 0] / scale
@@ -135,4 +152,6 @@ def unphysical(d: Columns) -> dict[str, str]:
         negative = [n for n in ("inertia", "coulomb_friction", "viscous_friction") if n not in out and x[n] < 0]
         if not negative:
             return out
-        out[negative[0]] = f"the least squares give {x[negative[0]]:.3g}, and nothing has a negative {negative[0].replace('_', ' ')}"
+        out[negative[0]] = (
+            f"the least squares give {x[negative[0]]:.3g}, and nothing has a negative {negative[0].replace('_', ' ')}"
+        )
