@@ -118,10 +118,15 @@ def test_the_torque_row_is_paid_for_no_contact_force():
 
 
 def test_the_command_line_is_checked():
-    for argv, text in ((["table=chess"], "table=chess"), (["table=rotation", "rows=full,half"], "rows=full,half"),
-                       (["table=rotation", "budget=-1"], "budget=-1"), (["table=grasp", "seeds=0.5"], "seeds=0.5"),
-                       (["table=rotation", "judge=me"], "judge=me"), (["table=rotation", "fit=true"], "fit=true"),
-                       (["table=rotation", "stages=0.5,0.2"], "stages=0.5,0.2")):
+    for argv, text in (
+        (["table=chess"], "table=chess"),
+        (["table=rotation", "rows=full,half"], "rows=full,half"),
+        (["table=rotation", "rows=full", "budget=-1"], "budget=-1"),
+        (["table=grasp", "rows=both", "seeds=0.5"], "seeds=0.5"),
+        (["table=rotation", "rows=full", "judge=me"], "judge=me"),
+        (["table=rotation", "rows=full", "fit=true"], "fit=true"),
+        (["table=rotation", "rows=full", "stages=0.5,0.2"], "stages=0.5,0.2"),
+    ):
         with pytest.raises(UserError, match=text):
             command.main([*argv, "device=cpu"])
 
