@@ -44,6 +44,26 @@ def test_what_the_tree_and_the_axes_say(claw):
     assert (hand.efforts == 0.6).all() and (hand.speeds == 7).all()  # the file's own <limit effort= velocity=>
 
 
+def test_a_gripper_with_slides_looks_along_its_fingers(tmp_path):
+    links = ""
+    for name, side in (("left", 1), ("right", -1)):
+        inertia = hands._inertial(0.05, (0.06, 0.012, 0.02), (0.05, 0, 0))
+        links += (
+            f'<link name="{name}">{inertia}' + hands._shape('<box size="0.06 0.012 0.02"/>', (0.05, 0, 0)) + "</link>"
+        )
+        joint = hands._joint(f"slide_{name}", "base", name, f"0.03 {0.05 * side} 0", f"0 {-side} 0", 0.0, 0.04)
+        links += joint.replace("revolute", "prismatic")
+    base = hands._inertial(0.5, (0.06, 0.12, 0.04), (0, 0, 0)) + hands._shape('<box size="0.06 0.12 0.04"/>', (0, 0, 0))
+    path = tmp_path / "gripper.urdf"
+    path.write_text(f'<robot name="gripper"><link name="base">{base}</link>{links}</robot>')
+    result = import_hand(path, tmp_path / "hand", picture=False)
+    hand = load_hand(tmp_path / "hand")
+    np.testing.assert_allclose(hand.file.palm.normal, [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(np.abs(hand.file.palm.forward), [0, 1, 0], atol=1e-6)
+    assert result.hand["handedness"] == "none" and len(hand.joints) == 2
+    assert all(m.closer > 0.002 for m in moves.moves(hand))
+
+
 def test_mirrored_it_is_a_left_hand(tmp_path):
     result = import_hand(hands.write(tmp_path / "robot", left=True), tmp_path / "hand", picture=False)
     assert result.hand["handedness"] == "left"
@@ -209,6 +229,10 @@ BAD = {
             '<robot name="claw">', '<robot name="claw" xmlns:xacro="http://x/xacro"><xacro:macro name="a"/>'
         ),
         r"run xacro",
+    ),
+    "not finite": (
+        lambda t: t.replace('xyz="0.045 0 0"', 'xyz="nan 0 0"', 1),
+        r"position of 'index_far' is \[nan 0. 0.\]: must be finite",
     ),
     "entities": (lambda t: '<!DOCTYPE robot [<!ENTITY a "b">]>' + t, r"defines XML entities"),
     "not XML": (lambda t: "solid tip\n", r"is not XML"),

@@ -181,8 +181,11 @@ def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]
     forward = unit(unit(along).mean(0))
     normals = np.array([d.xmat[x.finger.tip].reshape(3, 3) @ x.normal for x in fingers])
     normal = normals.mean(0)
-    if np.linalg.norm(normal) < 0.3:  # fingers around a centre (a gripper): they close towards it, it faces forward
+    facing = [d.xmat[x.finger.tip].reshape(3, 3) @ x.normal for x in motions]
+    if np.linalg.norm(normal) < 0.3 or (len(motions) < 4 and np.linalg.norm(np.mean(facing, axis=0)) < 0.3):
+        # fingers around a centre (a gripper): they close towards it, its palm looks along them
         every = np.array([tip_at(d, x.finger.tip, x.position) for x in motions])
+        forward = body_forward(d, motions)
         normal = forward
         forward = every[thumbs[0]] - every.mean(0)
     body = d.xmat[tree.palm].reshape(3, 3)
@@ -196,6 +199,17 @@ def palm(m: mujoco.MjModel, tree: Tree, motions: list[Motion], thumbs: list[int]
     else:
         middle = body.T @ (roots.mean(0) - d.xpos[tree.palm])
     return Palm(middle, body.T @ forward, body.T @ normal)
+
+
+def body_forward(d: mujoco.MjData, motions: list[Motion]) -> np.ndarray:
+    """Mean direction [3] of the tips' links, from the distal joint out, in the world."""
+    out = []
+    for x in motions:
+        turn = d.xmat[x.finger.tip].reshape(3, 3)
+        along = tip_at(d, x.finger.tip, x.position) - d.xanchor[x.finger.joints[-1]]
+        normal = turn @ x.normal
+        out.append(unit(along - normal * (normal @ along)))
+    return unit(np.mean(out, axis=0))
 
 
 def _snapped(v: np.ndarray) -> np.ndarray:

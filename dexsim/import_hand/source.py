@@ -72,10 +72,24 @@ def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", den
         model = _compiled(spec, path, notes)
     finally:
         scratch.cleanup()
+    _finite(model, path)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             efforts.setdefault(model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max()))
     return Source(path, model, efforts, speeds, bare, notes, taken)
+
+
+def _finite(m: mujoco.MjModel, path: Path) -> None:
+    """UserError for a figure that is no number: MuJoCo's reader takes "nan"."""
+    for what, values, name in (
+        ("position", m.body_pos, m.body), ("orientation", m.body_quat, m.body), ("mass", m.body_mass, m.body),
+        ("inertia", m.body_inertia, m.body), ("centre of mass", m.body_ipos, m.body), ("axis", m.jnt_axis, m.joint),
+        ("shape's position", m.geom_pos, m.geom), ("shape's size", m.geom_size, m.geom),
+    ):  # fmt: skip
+        bad = ~np.isfinite(np.asarray(values, float).reshape(len(values), -1)).all(axis=1)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise UserError(f"model {path}: {what} of '{name(k).name or k}' is {values[k]}: must be finite numbers")
 
 
 def _parsed(path: Path, read) -> mujoco.MjSpec:
