@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dexsim.hand import load_hand
-from dexsim.tasks import grasp_eval
+from dexsim.tasks import base_path, grasp_eval
 from dexsim.tasks.grasp_eval import HOLD, PUSH_S, SETTLE, STAY_S, TURN_S
 from dexsim.tasks.randomize import Sampler
 
@@ -27,7 +27,7 @@ class Stage:
         self.rng = torch.Generator().manual_seed(0)
         self.sampler = Sampler({}, self.rng, N, "cpu")
         self.objects = SimpleNamespace(mass=MASS, friction=torch.ones(N), variant=torch.zeros(N, dtype=torch.long))
-        self.hand, self.unit = load_hand(), 1.0
+        self.hand, self.unit, self.task = load_hand(), 1.0, {}
         self.opposing, self.others = torch.tensor([0]), torch.tensor([1, 2, 3, 4])
         self.fixed_command, self.outside_force, self.f_max = None, torch.zeros(N, 3), 8.0
         self.fields = {"opt.gravity": torch.zeros(N, 3)}
@@ -143,3 +143,29 @@ def test_episodes_are_sorted_by_what_fingertips_carry():
 def test_what_fingertips_carry_is_measured_against_links_and_palm():
     _, out = play()
     assert np.allclose(out["tips"], 0.5)
+
+
+def test_a_lift_is_gravity_of_a_carried_frame():
+    """The path's acceleration, integrated, rises by LIFT and comes to rest; shaken, it returns to where it was."""
+    h = 1e-4
+    t = np.arange(0.0, 2.0, h) + h / 2
+    for path, end in ((base_path.lifted, [0, 0, base_path.LIFT]), (base_path.shaken, [0, 0, 0])):
+        v = np.cumsum([path(x) for x in t], 0) * h
+        x = np.cumsum(v, 0) * h
+        assert np.abs(v[-1]).max() < 1e-3 and np.abs(x[-1] - end).max() < 1e-3, path
+    assert np.abs(x).max(0) == pytest.approx([2 * base_path.SHAKE, 2 * base_path.SHAKE, 0.0], abs=1e-3)
+
+
+def test_the_hand_is_lifted_and_shaken_instead_of_turned():
+    stage = Stage(torch.zeros(N), torch.ones(N, 5, dtype=torch.bool))
+    stage.task = {"evaluation": {"base": "lift"}}
+    out = grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
+    g = torch.stack(stage.gravity)[:, 0].numpy()
+    t = DT * np.arange(len(g))
+    still = (t < SETTLE + HOLD) | ((t > SETTLE + HOLD + TURN_S) & (t < SETTLE + HOLD + TURN_S + STAY_S))
+    assert np.allclose(g[still], [0, 0, -9.81], atol=1e-5)
+    lifting = (t > SETTLE + HOLD) & (t < SETTLE + HOLD + TURN_S)
+    assert g[lifting, 2].min() < -12 and g[lifting, 2].max() > -8 and np.allclose(g[lifting, :2], 0)
+    shaking = t >= SETTLE + HOLD + TURN_S + STAY_S
+    assert np.abs(g[shaking, :2]).max(0).min() > 5 and np.allclose(g[shaking, 2], -9.81, atol=1e-5)
+    assert out["held180"].all()

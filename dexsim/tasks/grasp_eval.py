@@ -4,7 +4,8 @@ One episode (seconds): the object is dropped at 0; at `SETTLE` its place in the 
 it must stay within `RADIUS` of that place, touched at every control step by an opposing finger and another. In every
 second episode a push of twice the object's weight acts for half a second within the hold, in a random direction. Then
 the hand is turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame,
-slowly enough that the turn itself adds nothing.
+slowly enough that the turn itself adds nothing. With task.evaluation.base=lift the hand is lifted and then shaken
+instead (`tasks/base_path.py`), the palm up.
 
 The command is constant in an episode, uniform in [0, 1] over episodes.
 """
@@ -15,6 +16,8 @@ import numpy as np
 import torch
 
 from dexsim import intervals
+from dexsim.errors import UserError
+from dexsim.tasks import base_path
 
 SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
@@ -74,7 +77,7 @@ def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: s
 
 def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episodes: int) -> dict:
     """One episode in every world."""
-    n, dev, dt = env.num_envs, env.device, env.dt
+    n, dev, dt, lift = env.num_envs, env.device, env.dt, _lifts(env)
     steps = int(round(_END / dt))
     training_length, env.max_episode_length = env.max_episode_length, steps + 2
     env.pushes = False
@@ -106,7 +109,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         t = k * dt
         pushing = pushed & (t >= push_at) & (t < push_at + PUSH_S)
         env.outside_force.copy_(torch.where(pushing[:, None], push_force, torch.zeros_like(push_force)))
-        env.engine.field("opt.gravity").copy_(9.81 * _turned(down, axis, _angle(t)))
+        env.engine.field("opt.gravity").copy_(_carried(down, t) if lift else 9.81 * _turned(down, axis, _angle(t)))
         obs, _, dones, _ = env.step(policy(obs))
         alive &= ~dones.bool()
         p = env.object_pose[:, :3]
@@ -174,6 +177,20 @@ def _angle(t: float) -> float:
     return np.pi / 2 * (np.clip((t - first) / TURN_S, 0, 1) + np.clip((t - second) / TURN_S, 0, 1))
 
 
+def _lifts(env) -> bool:
+    """Whether the base is lifted and shaken, not turned; checkpoints from before cannot say."""
+    base = (env.task.get("evaluation") or {}).get("base", "turn")
+    if base not in ("turn", "lift"):
+        raise UserError(f"task.evaluation.base={base}: must be turn or lift")
+    return base == "lift"
+
+
+def _carried(down: torch.Tensor, t: float) -> torch.Tensor:
+    """Gravity [N, 3] m/s2 of a hand that is lifted after the hold, then shaken."""
+    a = base_path.lifted(t - SETTLE - HOLD) + base_path.shaken(t - SETTLE - HOLD - TURN_S - STAY_S)
+    return 9.81 * down - torch.as_tensor(a, dtype=down.dtype, device=down.device)
+
+
 def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
     """v [N, 3] rotated about unit axes [N, 3] (Rodrigues)."""
     c, s = float(np.cos(angle)), float(np.sin(angle))
@@ -214,7 +231,9 @@ def _metrics(r: dict, k: dict, env) -> dict:
         "hold_rate_kept_out_shapes": _rate(k["held"], k["pushed"].astype(bool) & able_k),
         "hold_rate_kept_out_shapes_unpushed": _rate(k["held"], ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
         "hold_rate_all": float(held.mean()),
-        "hold_rate_turned_90": _rate(r["held90"], carried), "hold_rate_turned_180": _rate(r["held180"], carried),
+        **dict(zip(("hold_rate_lifted", "hold_rate_shaken") if _lifts(env) else
+                   ("hold_rate_turned_90", "hold_rate_turned_180"),
+                   (_rate(r["held90"], carried), _rate(r["held180"], carried)), strict=True)),
         "force_command_correlation": _corr(r["command"][held], total[held]),
         "force_max_N": float(f_max),
         # why episodes were not held: they overlap; dropped includes the turned part
