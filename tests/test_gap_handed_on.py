@@ -231,7 +231,7 @@ def test_model_file_is_the_hand_that_trains(tmp_path):
     env.step(torch.zeros(2, 12))
     for text, word in (
         ("nowhere.xml", "no such file"),
-        (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not the xHand"),
+        (str(_write(tmp_path / "other.xml", demo.MODEL)), "is not a model of hand=xhand: it lacks thumb_bend_joint"),
     ):
         with pytest.raises(UserError, match=word):
             grasp_env(f"model_file={text}", worlds=2)

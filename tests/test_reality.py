@@ -11,6 +11,7 @@ import yaml
 from dexsim.assets import xhand
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.tactile.config import COLUMNS
 from dexsim.tasks import make_env, reality
@@ -134,7 +135,7 @@ def test_the_force_scale_stays_what_training_believed():
 
 def test_timing_varies_about_the_nominal():
     cfg = yaml.safe_load((CONFIGS / "reality" / "bench.yaml").read_text())
-    w = reality.Reality(cfg, torch.Generator().manual_seed(0))
+    w = reality.Reality(cfg, torch.Generator().manual_seed(0), load_hand())
     steps = torch.tensor([w.substeps(14) for _ in range(2000)]).double()
     assert steps.min() == 12 and steps.max() == 16 and abs(steps.mean() - 14) < 0.1
     late, arrives = w.late(20000)
