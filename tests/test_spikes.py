@@ -41,6 +41,28 @@ def test_a_clean_signal_has_no_spike(name, quantity):
     assert not spiked(signals()[name], quantity).any()
 
 
+def test_the_fast_end_of_a_slow_chirp_has_no_spike():
+    """Most of it is slow, so that the crests of its last seconds lie far from the median of their neighbours."""
+    t = np.arange(0, 120, 0.02)
+    x = 0.15 * np.sin(2 * np.pi * np.cumsum(0.05 * 80.0 ** (t / 120)) * 0.02)
+    x[t < 60] *= 0.3
+    for quantity in ("position", "command", "effort"):
+        assert not spiked(x, quantity).any(), quantity
+    x[[1000, 3000, 5900]] += 1.5
+    assert spiked(x, "command").nonzero()[0].tolist() == [1000, 3000, 5900]
+
+
+def test_a_command_that_goes_to_a_level_for_one_sample_means_it():
+    """A pseudo-random binary sequence with a long shortest pulse, but for a few of one sample: the level is one that it holds."""
+    rng = np.random.default_rng(3)
+    x = np.repeat(rng.choice([-0.12, 0.12], 400), 15)
+    for k in (1007, 2515, 4003):
+        x[k] = -x[k]
+    assert not spiked(x, "command").any()
+    x[[300, 777]] = 0.9
+    assert spiked(x, "command").nonzero()[0].tolist() == [300, 777]
+
+
 @pytest.mark.parametrize("name", ["steps", "servo", "sine", "chirp", "stick", "rest"])
 @pytest.mark.parametrize("share", [0.002, 0.02, 0.05])
 def test_planted_spikes_are_found(name, share):

@@ -20,6 +20,12 @@ LEAST = {"position": 0.03, "command": 0.03, "effort": 0.0}
 """Least size: rad (m); less does no harm."""
 MOST = 0.12
 """More of all samples are no spikes but the signal."""
+NEARBY, JUMP = 10, 2.0
+"""A spike is reached and left by more than so many times what the samples so near it (on each side) change by: the
+crest of a fast chirp is as far from the median of its neighbours, and is reached in steps like any other."""
+LEVELS = 5
+"""Plateaus at one value from which on it is a level that a command (a pulse train, a pseudo-random binary sequence)
+goes to on purpose."""
 AFTER = 0.06
 """s after a jump of its target in which a drive's effort may well be a single high sample."""
 
@@ -57,10 +63,40 @@ def spiked(x: np.ndarray, quantity: str) -> np.ndarray:
         )
     )
     far &= back
+    far &= _jumps(v, far)
+    if quantity == "command" and far.any():
+        far &= ~_on_purpose(v)
     if far.mean() > MOST:
         return out
     out[ok[far]] = True
     return out
+
+
+def _jumps(v: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """[n] bool: of samples `far`, those of a stretch that begins and ends with a jump (`JUMP`); False elsewhere."""
+    out = np.zeros(len(v), bool)
+    step = np.abs(np.diff(v))
+    usual = np.where(far[1:] | far[:-1], np.nan, step)
+    edge = np.flatnonzero(np.diff(np.r_[0, far.astype(int), 0]))
+    for a, b in zip(edge[::2], edge[1::2], strict=True):
+        ordinary = usual[max(a - NEARBY, 0) : b + NEARBY]
+        ordinary = ordinary[np.isfinite(ordinary)]
+        most = float(np.quantile(ordinary, 0.8)) if len(ordinary) else 0.0
+        sides = [step[k] for k in (a - 1, b - 1) if 0 <= k < len(step)]
+        out[a:b] = all(x > JUMP * most for x in sides)
+    return out
+
+
+def _on_purpose(v: np.ndarray) -> np.ndarray:
+    """[n] bool: samples at a value that is held for three samples and more at least `LEVELS` times, between others that
+    are."""
+    same = np.r_[False, np.abs(np.diff(v)) <= 1e-6 * max(float(np.ptp(v)), 1e-12)]
+    start = np.flatnonzero(~same)
+    length = np.diff(np.r_[start, len(v)])
+    level = np.round(v / max(1e-5 * float(np.ptp(v)), 1e-12)).astype(np.int64)
+    held, count = np.unique(level[start[length >= 3]], return_counts=True)
+    on = np.isin(level, held[count >= LEVELS])
+    return on & np.r_[True, on[:-1]] & np.r_[on[1:], True]
 
 
 def of_effort(r: Recording, j: int) -> np.ndarray:
