@@ -67,6 +67,7 @@ def test_observations_follow_the_hand(hands, pads):
         assert sum(r[1] for r in groups["actor"]) == actor and sum(r[1] for r in groups["critic"]) == actor + critic
         assert any("contact" in r[0] for r in groups["actor"]) is pads
         assert any("no touch" in note for note in env.describe()["notes"]) is not pads
+        assert any("guessed" in note and "palm.normal" in note for note in env.describe()["notes"])
         out = env.step(torch.zeros(4, 9))[0]
         assert out["actor"].isfinite().all() and env.q.shape == (4, 9) and env.tip_force.shape == (4, 3)
         # joints are the hand's, in its order: none is another's position

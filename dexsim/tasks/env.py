@@ -542,6 +542,14 @@ class HandEnv(VecEnv):
                 " sim.timestep"
             )
 
+    def hand_notes(self) -> list[str]:
+        """What a reader of the first screen must know of the hand."""
+        guessed = self.hand.file.guessed
+        return [
+            *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
+            *([f"guessed in {self.hand.folder}/hand.yaml, to be checked: {', '.join(guessed)}"] if guessed else []),
+        ]
+
     @property
     def action_names(self) -> tuple[str, ...]:
         return self.hand.joints

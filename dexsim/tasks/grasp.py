@@ -411,7 +411,7 @@ class GraspEnv(HandEnv):
             "notes": [
                 f"F_max = {self.f_max:.2f} N a fingertip: static press at {self.tau_max[self.others[0]].item():.2f} N.m"
                 " (command 1)",
-                *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
+                *self.hand_notes(),
             ],
             "headline": ["task/held", "task/force_error"],
         }

@@ -487,7 +487,7 @@ class RotateEnv(HandEnv):
                 f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
                 f"reached: rotation error below {r['delta_rot']} rad and drift below"
                 f" {self.unit * r['delta_pos']:.3g} m",
-                *([] if self.pads else ["no touch: this hand has no pads; nothing of touch is observed"]),
+                *self.hand_notes(),
             ],
         }
 
