@@ -10,7 +10,7 @@ import pytest
 from benchmarks import tools
 from benchmarks.touch_matters import analysis, rows
 from benchmarks.touch_matters.__main__ import chosen, common
-from benchmarks.touch_matters.judge import metrics_of
+from benchmarks.touch_matters.judge import columns, metrics_of
 from dexsim.errors import UserError
 
 
@@ -106,3 +106,10 @@ def test_each_seeds_metrics_are_of_its_own_trials():
     assert m["consecutive_successes"]["average"] == 4 and m["capped"] == 1 and m["seconds_to_fall"] == 15
     assert m["ends"] == {"dropped": 1, "leaned": 0, "nan": 0, "capped": 1}
     assert m["touched_by_others"] == pytest.approx(1 / 30)
+
+
+def test_muted_rows_are_those_columns():
+    layout = [["joint_angle", 12], ["contact_centre", 15], ["contact_force", 5], ["gravity", 3]]
+    assert columns(layout, ["contact_force", "gravity"]) == list(range(27, 35))
+    with pytest.raises(UserError, match="mute=touch: the actor has joint_angle"):
+        columns(layout, ["touch"])

@@ -1,8 +1,11 @@
 """Judge the policies of a row in one or more worlds, all its seeds at once: python -m benchmarks.touch_matters.judge
-out=FOLDER row=R seeds=1,2,.. at=ITERATION worlds=training,wide [episodes=512] [cap=120] [threads=1] [states=true].
+out=FOLDER row=R seeds=1,2,.. at=ITERATION worlds=training,wide [episodes=512] [cap=120] [threads=1] [states=true]
+[mute=contact_force,contact_centre].
 
 Writes FOLDER/R/seed<k>/<world>.json, and with `states` FOLDER/R/<world>_states.npz (joints and cube of a few trials of
-the first seed, for a film). Every policy plays `episodes` worlds of its own.
+the first seed, for a film). Every policy plays `episodes` worlds of its own. `mute` gives a policy, in place of rows of
+its observation, what they were in training on average (<world>_without_<rows>.json): what this policy leans on, which
+is not what another would do that has learned without.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from dexsim.paths import CONFIGS
 from dexsim.tasks.rotate_eval import summary
 
 OWN = {"out": "", "row": "", "seeds": "1", "at": "0", "worlds": "training", "episodes": "512", "cap": "120",
-       "threads": "1", "states": "false"}  # fmt: skip
+       "threads": "1", "states": "false", "mute": ""}  # fmt: skip
 TRIALS_SEED = 1000
 
 
@@ -43,6 +46,19 @@ def metrics_of(trials: list, cap: float, resamples: int) -> dict:
         "touched_by_others": float(other.sum() / max(time.sum(), 1e-9)),
         "trials": trials,
     }
+
+
+def columns(layout: list, names: list[str]) -> list[int]:
+    """Columns of the named rows of an observation. layout: [name, width] of each row. Raises UserError for no such
+    row."""
+    found, at = [], 0
+    for name, width in layout:
+        found += range(at, at + width) if name in names else ()
+        at += width
+    wrong = [n for n in names if n not in [row[0] for row in layout]]
+    if wrong:
+        raise UserError(f"mute={wrong[0]}: the actor has {', '.join(row[0] for row in layout)}")
+    return found
 
 
 def judge(own: dict[str, str], world: str) -> None:
@@ -64,23 +80,34 @@ def judge(own: dict[str, str], world: str) -> None:
         checkpoint.check_layout(data, checkpoint.layout_of(env), str(path))
     policies = [load_policy(data, env, str(path)) for data, path in zip(loaded, paths, strict=True)]
 
+    muted = columns(loaded[0]["layout"]["observations"]["actor"], own["mute"].split(",")) if own["mute"] else []
+
     def act(obs):
-        return torch.cat([p(obs[i * each : (i + 1) * each]) for i, p in enumerate(policies)])
+        out = []
+        for i, (policy, data) in enumerate(zip(policies, loaded, strict=True)):
+            part = obs[i * each : (i + 1) * each]
+            if muted:
+                part = part.clone()
+                part["actor"][:, muted] = data["actor"]["obs_normalizer._mean"][:, muted].to(part["actor"])
+            out.append(policy(part))
+        return torch.cat(out)
+
+    name = world + ("_without_" + own["mute"].replace(",", "_") if own["mute"] else "")
 
     found = env.evaluate(act, total, TRIALS_SEED)
     trials, evaluation = found["metrics"]["trials"], begun.cfg["task"]["evaluation"]
     for i, (seed, data) in enumerate(zip(seeds, loaded, strict=True)):
         metrics = metrics_of(trials[i * each : (i + 1) * each], evaluation["cap_s"], evaluation["resamples"])
-        target = folder / f"seed{seed}" / f"{world}.json"
+        target = folder / f"seed{seed}" / f"{name}.json"
         part = target.with_suffix(".part")
         part.write_text(json.dumps({
-            "row": own["row"], "seed": seed, "world": world, "steps": int(data["steps"]),
+            "row": own["row"], "seed": seed, "world": name, "steps": int(data["steps"]),
             "iteration": int(data["iteration"]), "metrics": metrics,
         }))  # fmt: skip
         os.replace(part, target)
-        print(f"{own['row']} {seed} {world}: {metrics['consecutive_successes']['average']:.2f}", flush=True)
+        print(f"{own['row']} {seed} {name}: {metrics['consecutive_successes']['average']:.2f}", flush=True)
     if own["states"] == "true":
-        keep_states(found["frames"], folder / f"{world}_states.npz")
+        keep_states(found["frames"], folder / f"{name}_states.npz")
     build.close(env)
 
 
