@@ -49,6 +49,11 @@ def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
     return found
 
 
+def begun(out: Path, name: str) -> Path:
+    """What is there once a part has done its first turn."""
+    return out / "run" / "progress.csv" if name == "training" else out / name / "ready"
+
+
 def main(argv: list[str]) -> int:
     given = dict(a.split("=", 1) for a in argv if "=" in a)
     if set(given) - set(SETTINGS) or any("=" not in a for a in argv):
@@ -57,14 +62,15 @@ def main(argv: list[str]) -> int:
     s = SETTINGS | given
     out = Path(s["out"])
     out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / "run", ignore_errors=True)
+    for old in ("run", *(p.parent.name for p in out.glob("*/ready"))):
+        shutil.rmtree(out / old, ignore_errors=True)
     env = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
     running: dict[str, tuple[subprocess.Popen, Watch]] = {}
     for name, args in commands(s, out).items():
         log = open(out / f"{name}.log", "w")
         child = subprocess.Popen([sys.executable, *args], cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT)
         log.close()
-        running[name] = child, Watch(child, gpu=name == "training" and s["device"] != "cpu")
+        running[name] = child, Watch(child, name == "training" and s["device"] != "cpu", ready=begun(out, name))
     end = time.monotonic() + (60 * float(s["minutes"]) or math.inf)
     cut = set()
     while any(child.poll() is None for child, _ in running.values()):

@@ -68,6 +68,7 @@ def deploy(hours: float, folder: Path) -> str:
     loop = Loop(
         bundle.load(made), Lagging(clock), FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings, clock
     )
+    (folder / "ready").touch()
     report = loop.run()
     if report.ended != "done" or report.not_relaxed:
         raise SystemExit(f"the loop ended: {report.ended} {report.not_relaxed}")
@@ -96,6 +97,7 @@ def envs(count: float, folder: Path) -> str:
         for _ in range(2):
             env.step(torch.zeros(worlds, 12))
         env.close()
+        (folder / "ready").touch()
     return f"{int(count)} environments made, stepped and closed"
 
 
@@ -129,6 +131,7 @@ def diagnoses(count: float, folder: Path) -> str:
         )
         d = diagnose(asked, say=lambda _: None)
         save(d, out)
+        (folder / "ready").touch()
         named += any(f["effect"] == effect for f in d.data["findings"])
     return f"{int(count)} diagnoses, the hidden effect among the findings of {named}"
 

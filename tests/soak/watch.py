@@ -45,13 +45,16 @@ def gpu_mib() -> float:
 class Watch(threading.Thread):
     """Looks at a child every `every` s until it ends; `rows` are of COLUMNS. gpu: at the first GPU's memory too."""
 
-    def __init__(self, child: subprocess.Popen, gpu: bool = False, every: float = 0.5):
+    def __init__(self, child: subprocess.Popen, gpu: bool = False, every: float = 0.5, ready: Path | None = None):
         super().__init__(daemon=True)
         self.child, self.gpu, self.every, self.rows = child, gpu, every, []
-        self.begun = time.monotonic()
+        self.begun, self.ready = time.monotonic(), ready
         self.start()
 
     def run(self) -> None:
+        while self.ready is not None and not self.ready.exists() and self.child.poll() is None:
+            time.sleep(self.every)  # it is still being started
+        self.begun = time.monotonic()
         while self.child.poll() is None:
             seen = look(self.child.pid)
             if seen is not None and seen[0] > 0:  # a process that has ended, and was not waited for, has no memory
