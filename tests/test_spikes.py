@@ -53,7 +53,7 @@ def test_the_fast_end_of_a_slow_chirp_has_no_spike():
 
 
 def test_a_command_that_goes_to_a_level_for_one_sample_means_it():
-    """A pseudo-random binary sequence with a long shortest pulse, but for a few of one sample: the level is one that it holds."""
+    """A pseudo-random binary sequence of long pulses, but for a few of one sample: the level is one that it holds."""
     rng = np.random.default_rng(3)
     x = np.repeat(rng.choice([-0.12, 0.12], 400), 15)
     for k in (1007, 2515, 4003):
