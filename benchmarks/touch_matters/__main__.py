@@ -1,6 +1,6 @@
 """Train every row of sensors with paired seeds on the task by fingertips, and judge each policy in three worlds.
 
-    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..] [seeds=1,2,3,4,5]
+    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..] [seeds=11,12,13,14,15]
         [gpus=0,1,..] [each=1] [iterations=600] [seconds=S] [episodes=512] [bench_episodes=32] [cap=120] [save=25]
         [judged=training,wide,bench|none] [at=ITERATION] [any other setting of train.py]
     python -m benchmarks.touch_matters.analysis out=out/touch_matters
@@ -33,7 +33,7 @@ from benchmarks.touch_matters import rows
 from benchmarks.touch_matters.judge import checkpoints
 from dexsim.errors import UserError
 
-OWN = {"out": "out/touch_matters", "rows": "paper", "seeds": "1,2,3,4,5", "gpus": "null", "each": "1",
+OWN = {"out": "out/touch_matters", "rows": "paper", "seeds": "11,12,13,14,15", "gpus": "null", "each": "1",
        "iterations": "600", "seconds": "null", "episodes": "512", "bench_episodes": "32", "cap": "120", "save": "25",
        "judged": "training,wide,bench", "states": "false", "at": "null"}  # fmt: skip
 
