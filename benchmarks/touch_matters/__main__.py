@@ -1,8 +1,9 @@
 """Train every row of sensors with paired seeds on the task by fingertips, and judge each policy in three worlds.
 
-    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..] [seeds=11,12,13,14,15]
-        [gpus=0,1,..] [each=1] [iterations=600] [seconds=S] [episodes=512] [bench_episodes=32] [cap=120] [save=25]
-        [judged=training,wide,bench|none] [at=ITERATION] [any other setting of train.py]
+    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..]
+        [seeds=11,12,13,14,15] [gpus=0,1,..] [each=1] [iterations=600] [seconds=S] [episodes=512] [bench_episodes=32]
+        [cap=120] [save=25] [judged=training,wide,bench|none] [at=ITERATION]
+        [any other setting of train.py]
     python -m benchmarks.touch_matters.analysis out=out/touch_matters
 
 `each` trainings share a GPU. `seconds` after the start trainings are ended, saved and judged; all rows are judged at
