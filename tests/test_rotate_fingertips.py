@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from dexsim.tasks.rotate_fingertips import PALMS
 from dexsim.tasks.stable_grasps import FINGERTIPS, GraspSet
 
 torch.set_num_threads(1)
+CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "rotate_fingertips.pt"
 STILL = ("randomize.push.weights=0",)
 CLEAR = (
     "task.sensors.camera_rotation=0", "task.sensors.camera_position=0", "randomize.camera.tilt=0",
@@ -260,3 +262,11 @@ def test_bits_say_only_whether():
 def test_bad_settings_are_named(setting):
     with pytest.raises(UserError, match=setting.partition("=")[0].replace("randomize.", "")):
         make(setting, worlds=2)
+
+
+def test_the_included_policy_is_not_exported_to_a_loop_without_a_camera(tmp_path):
+    from dexsim.export import export
+
+    with pytest.raises(UserError, match="camera and arm the deployed loop does not read"):
+        export(str(CHECKPOINT), tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
