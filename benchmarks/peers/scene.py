@@ -18,6 +18,7 @@ import numpy as np
 from dexsim.actuator.columns import NAMES
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.tasks.env import OBJECT, HandEnv, _solver_options
 
@@ -39,11 +40,8 @@ CLOSING, TIMED = 50, 60  # control steps: into the grasp, then timed
 
 
 def targets() -> tuple[np.ndarray, np.ndarray]:
-    """Start pose and closed targets [12] (rad), from the grasp task's settings."""
-    from dexsim.cli import start as start_up
-
-    pose = start_up.for_train(["task=grasp", "device=cpu"], CONFIGS).cfg["task"]["initial"]["pose"]
-    start = np.array([pose[j] for j in xhand.JOINTS])
+    """Start pose and closed targets [12] (rad): the open hand, and its fingers bent."""
+    start = np.array(load_hand("xhand").pose("open"))
     low, high = np.array(xhand.joint_limits()).T
     still = np.isin(xhand.JOINTS, STILL)
     return start, np.clip(np.where(still, start, start + CLOSE), low, high)
@@ -74,7 +72,7 @@ def write(env: HandEnv, folder: Path) -> Path:
         joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
     both = hand.copy()
     size, pose = env.objects.size[0].cpu().numpy(), env.object_pose[0].cpu().numpy()
-    pose[:3] = [*env.task["initial"]["object_xy"], float(env.objects.radius[0]) + 0.05]
+    pose[:3] = [*env.centre0.flatten()[:2].tolist(), float(env.objects.radius[0]) + 0.05]
     g = ids["object_box"]
     box = mujoco.MjSpec()
     for spec in (box, both):
