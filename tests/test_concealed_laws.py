@@ -409,6 +409,7 @@ def test_the_first_law_is_what_it_was_before_there_was_a_second(quick, tmp_path)
     assert position[:, 0].sum() == pytest.approx(BEFORE["positions"], abs=2e-3) and len(position) == BEFORE["samples"]
 
 
+@pytest.mark.slow
 def test_every_second_law_can_be_made_and_told(quick, tmp_path, monkeypatch):
     """Each through the generator: finite sizes, the names of the catalogue, an own size that stays in proportion."""
     monkeypatch.setattr(generate, "SECONDS", 0.4)

@@ -17,11 +17,13 @@ def kills(*args: str) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 def test_recordings_survive():
     done = kills("count=4", "kinds=write", "seed=1")
     assert done.returncode == 0 and '"kills": 4, "lost": 0' in done.stdout, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_what_is_lost_is_told():
     """A writer that does not write beside its place is found out."""
     spoiled = (
