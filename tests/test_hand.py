@@ -205,3 +205,13 @@ def test_written_and_read_again(tmp_path):
     schema.write(file, folder / "hand.yaml")
     assert schema.read(folder / "hand.yaml") == file
     assert load_hand(folder).file.guessed == ["palm.normal"]
+
+
+def test_a_hand_goes_to_another_process():
+    """The simulated hand in real time runs in a process of its own, and is handed the hand."""
+    import pickle
+
+    left = load_hand("xhand", mirror=True, scale=1.1)
+    again = pickle.loads(pickle.dumps(left))
+    assert (again.mirror, again.scale, again.joints) == (True, 1.1, left.joints)
+    assert again.compiled.nq == left.compiled.nq and (again.limits == left.limits).all()
