@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -34,13 +33,6 @@ class Finger:
     pad: Pad | None
 
 
-def _again(folder: str, mirror: bool, scale: float) -> Hand:
-    """The hand of a folder, in a process that was handed one."""
-    from dexsim.hand.load import load_hand
-
-    return load_hand(folder, mirror, scale)
-
-
 @dataclass(frozen=True)
 class Hand:
     """A hand, checked against its model. Joints [J] in the order on the wire, fingers [F] in the file's.
@@ -64,10 +56,6 @@ class Hand:
     span: float
     force: float | str | None
     _spec: mujoco.MjSpec = field(repr=False)
-
-    def __reduce__(self) -> tuple[Callable[..., Hand], tuple[str, bool, float]]:
-        """To another process a hand goes as its folder: MuJoCo's models being edited cannot be pickled."""
-        return _again, (str(self.folder), self.mirror, self.scale)
 
     def spec(self) -> mujoco.MjSpec:
         """A fresh model of the hand alone: world frame = palm frame, no actuators, sensors or lights."""

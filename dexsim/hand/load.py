@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 from functools import lru_cache
 from pathlib import Path
@@ -185,3 +186,11 @@ def _poses(file: HandFile, limits: np.ndarray, where: str) -> None:
                 raise UserError(
                     f"{where}: poses.{which}.{j} ({pose[j]:g}): the model's range is [{low:.4g}, {high:.4g}] rad"
                 )
+
+
+def _reduced(hand: Hand) -> tuple[object, tuple[str, bool, float]]:
+    """To another process a hand goes as its folder: MuJoCo's models being edited cannot be pickled."""
+    return load_hand, (str(hand.folder), hand.mirror, hand.scale)
+
+
+copyreg.pickle(Hand, _reduced)  # type: ignore[arg-type]
