@@ -228,7 +228,7 @@ MUTATIONS = (
         "dexsim/gap/rules.py",
         '0.12,\n        "share of the squared error on presses left out',
         '0.0,\n        "share of the squared error on presses left out',
-        "tests/test_gap_rules.py::test_a_touch_effect_must_remove_a_least_share",
+        "tests/test_gap_rules_touch.py::test_a_touch_effect_must_remove_a_least_share",
     ),
     _constant(
         "inverse dynamics name what removes nothing",

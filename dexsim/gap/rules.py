@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 
 
-def _rule(value: float, means: str, source: str, test: str = "") -> float:
-    """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py ("": none holds it)."""
+def _rule(value: float, means: str, source: str, test: str) -> float:
+    """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py (touch:
+    tests/test_gap_rules_touch.py)."""
     return field(default=value, metadata={"means": means, "source": source, "test": test})
 
 
@@ -48,13 +49,13 @@ class SearchRules:
         0.03,
         "share of its misfit without any effect that a signal counts as noise at least, beside another",
         "by judgement",
-        "",
+        "test_neither_signal_drowns_the_other",
     )
     restless: float = _rule(
         10.0,
         "x the noise of a resting torque: what changes from sample to sample counts as noise up to as much",
         "by judgement",
-        "",
+        "test_a_resting_torque_counts_as_restless_up_to_so_much",
     )
     second: float = _rule(
         0.02,
@@ -72,7 +73,7 @@ class SearchRules:
         0.03,
         "share of the squared error that an effect must save in the scan to be tried whatever its price",
         "by judgement: a third of what it must remove in the end",
-        "",
+        "test_what_saves_much_in_hindsight_is_tried_whatever_its_price",
     )
     rough: float = _rule(
         3.0,
@@ -84,7 +85,7 @@ class SearchRules:
         0.02,
         "of the loss: nearer than this, fits without each condition decide",
         "by judgement: twice what a fit ends within",
-        "",
+        "test_where_two_fits_are_close_fits_of_their_own_do_not_decide",
     )
     alike: float = _rule(
         0.06,
@@ -96,9 +97,14 @@ class SearchRules:
         0.11,
         "share of the squared error that an effect must remove where the error is within the noise without it",
         "set above `least` on benchmarks.planted: there is less to tell effects by",
-        "",
+        "test_within_the_noise_an_effect_must_be_clear",
     )
-    most: int = _rule(4, "effects on one joint", "by judgement: more of them can imitate anything", "")
+    most: int = _rule(
+        4,
+        "effects on one joint",
+        "by judgement: more of them can imitate anything",
+        "test_a_joint_has_at_most_so_many_effects",
+    )
 
 
 @dataclass(frozen=True)
@@ -273,9 +279,9 @@ class JudgeRules:
     )
     clear: float = _rule(
         1.5,
-        "x the noise squared that windows keep after the fit, from which on what it depends on is said",
+        "x the noise that windows keep after the fit, from which on what it depends on is said",
         "by judgement",
-        "",
+        "test_what_the_rest_depends_on_is_said_where_much_is_left",
     )
     apart: float = _rule(
         1.3,
@@ -300,7 +306,7 @@ class JudgeRules:
         1.5,
         "x the noise floor: a joint that keeps as much is offered a stand-in torque",
         "by judgement",
-        "",
+        "test_a_stand_in_is_offered_where_much_is_left",
     )
     standin: float = _rule(
         0.10,
@@ -330,44 +336,49 @@ class TouchRules:
         1.2,
         "x the noise: an error within it needs no effect",
         "by judgement",
-        "",
+        "test_within_the_noise_no_touch_effect_is_looked_for",
     )
-    most: int = _rule(4, "effects on one pad", "by judgement: more of them can imitate anything", "")
+    most: int = _rule(
+        4,
+        "effects on one pad",
+        "by judgement: more of them can imitate anything",
+        "test_a_pad_has_at_most_so_many_effects",
+    )
     map_price: float = _rule(
         1.5,
         "x the squared error that a gain for every taxel must stay below to be taken before one number",
         "by judgement: 120 numbers follow noise, too",
-        "",
+        "test_a_gain_for_every_taxel_has_a_price",
     )
     map_better: float = _rule(
         0.7,
         "x the squared error of one gain for the pad: a gain for every taxel must leave less to be tried",
         "by judgement",
-        "",
+        "test_a_gain_for_every_taxel_must_follow_clearly_better_than_one",
     )
     close: float = _rule(
         0.03,
         "of the loss on presses left out: nearer than this, what follows the fitted presses better is taken",
         "by judgement: half of what tells rivals apart",
-        "",
+        "test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken",
     )
     told_apart: float = _rule(
         0.03,
         "of the loss on presses left out: a rival that loses by as much has 1/e of the weight",
         "by judgement",
-        "",
+        "test_touch_rivals_are_told_apart_by_what_they_lose",
     )
     set_share: float = _rule(
         0.12,
         "share of the bootstraps: a rival of the same class with as much belongs to the set",
         "by judgement",
-        "",
+        "test_a_touch_rival_of_the_same_class_makes_a_set",
     )
     earned: float = _rule(
         0.2,
         "of what keeps all confidence: an effect that earns no more on what was kept out is not claimed",
         "2 % of the error: within what the plant is off by",
-        "",
+        "test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed",
     )
     agree: int = _rule(
         5,
@@ -385,7 +396,7 @@ class TouchRules:
         0.35,
         "x its own place's squared error: what each of two exchanged taxels must leave in the other's place",
         "by judgement: neighbours feel alike",
-        "",
+        "test_exchanged_taxels_fit_in_the_place_of_each_other",
     )
     short: float = _rule(
         3.0,
@@ -394,26 +405,34 @@ class TouchRules:
         "test_a_pad_must_be_touched_for_a_while",
     )
     plant: float = _rule(
-        0.02, "of a reading: finer than that the plant is not to be trusted", "by judgement", ""
+        0.02,
+        "of a reading: finer than that the plant is not to be trusted",
+        "by judgement",
+        "test_a_plant_of_touch_is_trusted_to_so_much_of_a_reading",
     )
     law: float = _rule(
         0.1,
         "of a size that hangs on how a force spreads over taxels: what that law may be off by",
         "by judgement",
-        "",
+        "test_a_size_that_hangs_on_the_spread_of_a_force_is_as_wide_as_its_law",
     )
     timing: float = _rule(
         3e-3,
         "s by which a reading's time is uncertain",
         "by judgement: between two positions of the joints the contact is a guess",
-        "",
+        "test_the_time_of_a_reading_is_uncertain",
     )
-    gain_prior: float = _rule(0.3, "standard deviation of a taxel's gain, before anything is seen", "by judgement", "")
+    gain_prior: float = _rule(
+        0.3,
+        "standard deviation of a taxel's gain, before anything is seen",
+        "by judgement",
+        "test_the_gain_of_a_taxel_is_believed_to_be_one",
+    )
     structured: float = _rule(
         2.0,
         "x the noise, of what was fitted and of what was kept out: what is left has structure",
         "by judgement",
-        "",
+        "test_what_is_left_of_a_pad_has_structure",
     )
 
 

@@ -1,0 +1,250 @@
+"""The figures that decide about touch: each rule is held from both sides, by made-up readings and losses (moved by
+tests/test_gap_rules.py)."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS
+from dexsim.gap.touch import fit as pad_fit
+from dexsim.gap.touch import judge, locate
+from dexsim.gap.touch import search as pad_search
+from dexsim.gap.touch.diagnosis import Pad, Touch
+from dexsim.gap.touch.fit import PadFit, TouchTrial
+from dexsim.gap.touch.judge import PadAnswer
+from dexsim.gap.touch.plant import PARAMS
+from dexsim.gap.touch.search import PadSearch
+
+
+class Felt(PadSearch):
+    """A search of one pad whose trials say themselves what they lose on the presses left out."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng(0)
+
+    def cross(self, trial):
+        return np.full(20, trial)
+
+
+def test_a_touch_effect_must_remove_a_least_share():
+    assert not Felt()._earns(0.9, 1.0) and Felt()._earns(0.86, 1.0)
+
+
+def test_a_touch_effect_must_help_in_nearly_all_bootstraps():
+    search = Felt()
+    for useless, earns in ((0.02, True), (0.045, False)):
+        search._boot = lambda x, useless=useless: np.sort(np.linspace(0, 1, 1000)) - useless
+        assert search._earns(0.5, 1.0) is earns, useless
+
+
+def rest(gains, width=0.05):
+    """What is said of taxels that felt nothing, the others' gains [n] being these."""
+    count = len(gains)
+    pad = SimpleNamespace(
+        silent={}, runs=[SimpleNamespace(z=np.ones((3, count)))], gain_width=lambda t: np.full(count, width)
+    )
+    return PadAnswer._rest(SimpleNamespace(search=pad, best=SimpleNamespace(gains=np.array(gains), order=None)))
+
+
+def test_taxels_that_agree_speak_for_the_rest():
+    assert rest([0.8] * 5) is not None and rest([0.8] * 4) is None
+    assert rest([0.91] * 12) is not None and rest([0.93] * 12) is None
+    assert rest([0.8] * 9) is not None and rest([0.8] * 3) is None
+
+
+def test_a_pad_must_be_touched_for_a_while():
+    for seconds, judged_ in ((2.9, False), (3.1, True)):
+        touch = Touch([], None, set())
+        t = np.arange(0.0, seconds, 0.01)
+        touch.pads = [Pad(1, [SimpleNamespace(recording="a", t=t, z=np.ones((len(t), 4)))])]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("dexsim.gap.touch.diagnosis.PadSearch", lambda *_: "search")
+            touch.model()
+        assert (touch.pads[0].search == "search") is judged_, seconds
+
+
+class Choosing(PadSearch):
+    """A search of one pad that is offered some effects, whose losses are given."""
+
+    def __init__(self, losses, offered=()):
+        """losses: of a reading, by what is left out and where it was fitted, from the effects of a hypothesis."""
+        self.losses, self.offered = losses, [TOUCH_EFFECTS[e] for e in offered]
+        self.rng, self.train, self.scale_known, self.runs = (
+            np.random.default_rng(0), np.ones(100, bool), False, [SimpleNamespace(pad=1)])  # fmt: skip
+
+    def fit(self, ids, values, where=None, gains=None, order=None, evaluations=60, still=()):
+        out, here = self.losses(ids)
+        return TouchTrial(ids, values, gains, order, left_out=np.full(20, 5.0 * out), res=np.full(100, np.sqrt(here)))
+
+    def cross(self, trial):
+        return trial.left_out
+
+    def scan(self, current, most=4):
+        return [e for e in self.offered if e.id not in current.ids]
+
+    def _possible(self, current, effect):
+        return effect in self.offered and effect.id not in current.ids
+
+    def _try(self, current, effect):
+        gains = np.ones(4) if effect.by_taxel else None
+        return self.fit((*current.ids, effect.id), {}, gains=gains) if self._possible(current, effect) else None
+
+    def _drop(self, current, trials):
+        return current
+
+    def _rivals(self, current, e, trials):
+        return [], 1.0
+
+
+def chosen(losses, *offered):
+    return Choosing(losses, offered).run().best.ids
+
+
+def test_within_the_noise_no_touch_effect_is_looked_for():
+    for left, found in ((1.38, ()), (1.5, ("tactile_delay",))):  # squared
+        assert chosen(lambda ids, left=left: (0.5 if ids else left,) * 2, "tactile_delay") == found, left
+
+
+def test_a_pad_has_at_most_so_many_effects():
+    offered = [e.id for e in TOUCH_CATALOGUE if not e.by_taxel]
+    assert len(chosen(lambda ids: (1e6 * 0.5 ** len(ids),) * 2, *offered)) == 4 < len(offered)
+
+
+def test_a_gain_for_every_taxel_has_a_price():
+    for one, found in ((1.4, ("tactile_delay",)), (1.6, ("tactile_gain",))):
+        loss = lambda ids, one=one: ({(): 10.0, ("tactile_delay",): one}.get(ids, 1.0),) * 2  # noqa: E731
+        pair = chosen(loss, "tactile_delay", "tactile_gain")
+        assert pair[:1] == found, one
+
+
+def test_of_touch_effects_that_are_close_the_one_that_follows_better_is_taken():
+    for other, found in ((1.02, "thermal"), (1.04, "tactile_delay")):
+        loss = lambda ids, other=other: {(): (10.0, 10.0), ("tactile_delay",): (1.0, 2.0)}.get(ids, (other, 1.0))  # noqa: E731
+        assert chosen(loss, "tactile_delay", "thermal")[0] == found, other
+
+
+class Mapped(PadSearch):
+    """A search of one pad that has a gain for every taxel, and one for the pad, to choose from."""
+
+    def __init__(self, left):
+        self.left, self.train, self.scale_known, self.allowed, self.shear = left, np.ones(50, bool), True, None, False
+
+    def fit(self, ids, values, where=None, gains=None, order=None, evaluations=60, still=()):
+        return TouchTrial(ids, dict(values), gains, order, res=np.ones(50))
+
+    def residual(self, values, gains=None, order=None):
+        return np.full(50, np.sqrt(self.left))
+
+    def gain_map(self, trial, where):
+        return np.ones(4)
+
+    def _possible(self, current, effect):
+        return True
+
+    def _swaps(self, values):
+        return None
+
+    def _common(self, current, evaluations):
+        return self.fit((*current.ids, "tactile_gain"), {})
+
+
+def test_a_gain_for_every_taxel_must_follow_clearly_better_than_one():
+    gain = next(e for e in TOUCH_CATALOGUE if e.by_taxel)
+    for left, mapped in ((0.65, True), (0.75, False)):  # x what one gain leaves
+        assert (Mapped(left)._try(TouchTrial((), {}), gain).gains is not None) is mapped, left
+
+
+def test_touch_rivals_are_told_apart_by_what_they_lose():
+    search = Choosing(lambda ids: ((1.0 if "tactile_delay" in ids else 50.0 if not ids else 1.03), 1.0))
+    current, rival, base = (search.fit(ids, {}) for ids in (("tactile_delay",), ("thermal",), ()))
+    search.without, search.scan = lambda *_: base, lambda *_: [TOUCH_EFFECTS["thermal"]]
+    search._try = lambda *_: None
+    rows, own = PadSearch._rivals(search, current, "tactile_delay", {frozenset(("thermal",)): rival})
+    assert [name for name, _ in rows] == ["thermal"] and rows[0][1] / own == pytest.approx(np.exp(-1), rel=0.01)
+
+
+def claimed(after=0.5, share=0.0):
+    """The finding of a pad's gain that leaves so much of 1 N on what was kept out, its like having a share of the
+    draws."""
+    left = lambda _, trial, stage: (after if trial == "best" else 1.0, None, None)  # noqa: E731
+    best = SimpleNamespace(ids=("tactile_gain",))
+    answer = SimpleNamespace(search=SimpleNamespace(load=False), best=best, none="none", name="thumb", pad=0, notes=[],
+                             outcome=SimpleNamespace(rivals={"tactile_gain": [("contact_stiffness", share)]},
+                                                     confidence={"tactile_gain": 1.0}),
+                             _parameters=lambda e: ([], {}))  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "held_out", lambda s, trial, stage: left(s, "best" if trial is best else trial, stage))
+        patch.setattr(locate, "when", lambda *_: [])
+        return PadAnswer._finding(answer, "tactile_gain")
+
+
+def test_a_touch_rival_of_the_same_class_makes_a_set():
+    for share, together in ((0.11, False), (0.13, True)):
+        assert (len(claimed(share=share)["indistinguishable"]) == 2) is together, share
+
+
+def test_a_touch_effect_that_earns_next_to_nothing_is_not_claimed():
+    assert claimed(after=0.981) is None and claimed(after=0.979) is not None
+
+
+def test_exchanged_taxels_fit_in_the_place_of_each_other():
+    """Each reading is a mix of what both places predict; `own`: its part that its own place does."""
+    place = np.eye(3, 30)  # at different times
+    for own, found in ((0.635, True), (0.622, False)):
+        other = 1 - own  # what is left in the other's place: (other / own)^2 = 0.33 and 0.37 of what its own leaves
+        z = np.stack([other * place[0] + own * place[1], own * place[0] + other * place[1], place[2]])
+        search = SimpleNamespace(runs=[SimpleNamespace(z=z.T)], noise=0.01)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pad_search, "readings", lambda *_: place.T)
+            order = PadSearch._swaps(search, {})
+        assert (order is not None and order.tolist() == [1, 0, 2]) is found, own
+
+
+def sigma_of(z, t):
+    """The noise [N] that the fit gives readings z [S, 1] at times t [S], a sensor without noise or counts."""
+    run = SimpleNamespace(t=t, z=z, lsb=0.0, full=np.zeros(z.shape, bool), recording="a")
+    pad = SimpleNamespace(runs=[run], base={}, silent={}, noise=1e-9, load=False, shear=False)
+    pad._sample = lambda *given: PadFit._sample(pad, *given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pad_fit, "readings", lambda r, *_: r.z)
+        return PadFit._samples(pad, set())[0].sigma[:, 0]
+
+
+def test_a_plant_of_touch_is_trusted_to_so_much_of_a_reading():
+    t = np.arange(50) * 0.01
+    assert sigma_of(np.full((50, 1), 10.0), t) == pytest.approx(0.2)
+
+
+def test_the_time_of_a_reading_is_uncertain():
+    t = np.arange(50) * 1e-4
+    assert sigma_of(100.0 * t[:, None], t) == pytest.approx(0.3, rel=1e-3)  # 100 N/s, up to 0.5 N
+
+
+def test_a_size_that_hangs_on_the_spread_of_a_force_is_as_wide_as_its_law():
+    pad = SimpleNamespace(train=np.ones(20, bool), block=np.arange(20), folds=[], doubt=1.0, warm=1.0, scale_known=True)
+    fitted = TouchTrial((), {"stiffness": 1.0}, keys=("stiffness",), jac=np.ones((20, 1)), res=np.zeros(20))
+    pad.fit, pad.cross, pad._rounding = lambda *_: fitted, lambda _: None, lambda _: np.zeros(1)
+    pad._bounds = lambda key: (PARAMS[key].low, PARAMS[key].high)
+    low, high = PadFit.intervals(pad, fitted)["stiffness"]
+    assert (high - low) / 2 == pytest.approx(1.645 * 0.1, rel=1e-6)
+
+
+def test_the_gain_of_a_taxel_is_believed_to_be_one():
+    """A taxel whose readings of 0 weigh as much as what is believed before."""
+    count, sigma = 40, 0.3 * np.sqrt(0.1 * 40)  # a tenth of them counts as independent
+    sample = SimpleNamespace(stage="taxels", mask=np.ones((count, 1), bool), sigma=np.full((count, 1), sigma),
+                             run=SimpleNamespace(z=np.zeros((count, 1))))  # fmt: skip
+    pad = SimpleNamespace(runs=[sample.run], samples=[sample])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pad_fit, "readings", lambda r, *_: np.ones_like(r.z))
+        assert PadFit.gain_map(pad, TouchTrial((), {}), np.ones(count, bool)) == pytest.approx(0.5)
+
+
+def test_what_is_left_of_a_pad_has_structure():
+    for loss, left, structure in ((4.2, 2.1, True), (3.8, 2.1, False), (4.2, 1.9, False)):
+        search = SimpleNamespace(cross=lambda _, loss=loss: np.full(10, loss), train=np.ones(10, bool))
+        answer = SimpleNamespace(search=search, best=None, left=left, floor=1.0)
+        assert PadAnswer.structured(answer) is structure, (loss, left)
