@@ -530,6 +530,17 @@ def run(settings):
     return d
 
 
+def test_a_page_that_cannot_be_drawn_does_not_lose_the_answer(answer, tmp_path, monkeypatch, capsys):
+    def broken(d):
+        raise KeyError("<b>")
+
+    monkeypatch.setattr("dexsim.gap.report.page.page", broken)
+    written = save(answer[0], tmp_path / "out")
+    assert "report.html could not be drawn" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["findings"]
+    assert "&lt;b&gt;" in written[-1].read_text() and "<b>" not in written[-1].read_text()
+
+
 @pytest.mark.parametrize("what", ["no commands", "no states", "one sample", "all nan", "no motion", "other joints"])
 def test_unusable_recordings_are_a_verdict(rig, tmp_path, what):
     def change(r):

@@ -18,6 +18,7 @@ from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
 from dexsim.gap.judge.joint import JointAnswer, stretched
 from dexsim.gap.locate import bins
+from dexsim.gap.report import sections
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses
 from dexsim.gap.search.search import JointSearch
@@ -483,6 +484,7 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
     floor = conclude.Noise(3.0, "repeats", {"a": 3.0, "b": 3.0})
     for left, same in ((1.2, False), (2.0, True)):
         assert (floor.at_most({"a": left}) is floor) is same, left
+    assert floor.at_most({"a": 1.2}).lowered == ("a",) and floor.at_most({"a": 1.2}).how in sections.FLOORS
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
 

@@ -25,11 +25,13 @@ from dexsim.recording.mechanism import Mechanism
 
 @dataclass
 class Noise:
-    """The noise floor of the position error: over all joints [rad or m], where it comes from, and of each joint."""
+    """The noise floor of the position error: over all joints [rad or m], where it comes from (repeats, split or
+    quantum), and of each joint; lowered: the joints whose floor is what a finding left instead."""
 
     floor: float
     how: str
     joints: dict[str, float]
+    lowered: tuple[str, ...] = ()
 
     def at_most(self, left: dict[str, float]) -> Noise:
         """The floor, where repeats differ by what was found (a drive that warms up between them): then what is left
@@ -39,7 +41,7 @@ class Noise:
             return self
         joints = self.joints | lower
         floor = float(np.sqrt(np.mean(np.square(list(joints.values())))))
-        return Noise(min(floor, self.floor), f"{self.how}; of {', '.join(lower)} what is left, which is less", joints)
+        return Noise(min(floor, self.floor), self.how, joints, tuple(lower))
 
 
 def assemble(
@@ -74,6 +76,10 @@ def assemble(
     d.spots = bins.control([x for a in answers for x in a.spots])
     refuted = _take_back(d, answers, findings)
     noise = noise.at_most({a.case.joint: rms(a.after) for a in answers if a.found and a.case.joint not in refuted})
+    if noise.lowered:
+        notes.append(
+            f"noise floor of {', '.join(noise.lowered)}: what is left; recordings of the same commands differ by more"
+        )
     data["noise_floor"] = {
         "position_rad": float(noise.floor),
         "how": noise.how,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import html
 import json
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,8 +24,6 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
     """Writes diagnosis.json, details.json, report.html, servo.yaml and, where there is something in them, model.xml and
     tactile.yaml, all of them or none; returns what was written. Raises UserError where one would go over a file that is
     not ours."""
-    from dexsim.gap.report.page import page
-
     d.notes = grouped(d.notes)
     names = []
     with outputs.staged(out) as stage:
@@ -51,11 +51,22 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
         )
         for name, value in data.items():
             (stage / name).write_text(json.dumps(plain(value), indent=1, allow_nan=False), encoding="utf-8")
-        (stage / "report.html").write_text(page(d), encoding="utf-8")
+        (stage / "report.html").write_text(_page(d), encoding="utf-8")
         names = [*data, *names]
     if (d.data["next_recording"] or {}).get("commands"):
         names.append(d.data["next_recording"]["commands"])
     return [out / name for name in (*names, "report.html")]
+
+
+def _page(d: Diagnosis) -> str:
+    """The page. It is drawn from an answer that may have taken an hour: a fault in the drawing must not lose that."""
+    from dexsim.gap.report.page import page
+
+    try:
+        return page(d)
+    except Exception:
+        print("report.html could not be drawn and holds the reason (please report it); the answer is in diagnosis.json")
+        return f"<!doctype html><title>no report</title><pre>{html.escape(traceback.format_exc())}</pre>\n"
 
 
 RESULTS = (
