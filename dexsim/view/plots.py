@@ -45,7 +45,10 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
     names = [n for n in names if any(math.isfinite(v) for v in columns[n])]
     across = min(4, max(1, len(names)))
     down = max(1, math.ceil(len(names) / across))
-    figure = Figure(figsize=(3.6 * across, 2.5 * down), layout="constrained")
+    width, height = 3.6 * across, 2.5 * down
+    figure = Figure(figsize=(width, height))  # margins by hand: a layout engine takes seconds for some thirty axes
+    top = 0.65 if title else 0.35  # inches
+    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.15 / width, 1 - top / height, wspace=0.25, hspace=0.38)
     steps = columns.get("steps", [])
     for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, names):
         points = [(x, y) for x, y in zip(steps, columns[name]) if math.isfinite(y)]
@@ -54,13 +57,16 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
         axes.plot(x, smooth(y, max(1, len(y) // 20)), color=BLUE, linewidth=1.6)
         axes.set_title(TITLES.get(name, name), fontsize=9)
         axes.tick_params(labelsize=7)
+        axes.locator_params(nbins=5)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.offsetText.set_fontsize(7)
         axes.grid(alpha=0.25)
     for axes in figure.axes[len(names):]:
         axes.set_axis_off()
     for axes in figure.axes[max(0, len(names) - across): len(names)]:
         axes.set_xlabel("environment steps", fontsize=8)
     if title:
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle(title, fontsize=10, y=1 - 0.12 / height, va="top")
     figure.savefig(path, dpi=110)
     return path
 
