@@ -24,6 +24,7 @@ from dexsim.actuator.kernel import (
 )
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
+from dexsim.sim.launches import Launches
 
 FIELDS = ("dof_damping", "dof_frictionloss", "dof_armature")  # per-world model fields that the engine must declare
 
@@ -148,6 +149,7 @@ class Servo:
         self._send, self._reset, self._sum = send_kernel(real), reset_kernel(real, extended), given_kernel(real)
         self._period = 1.0 / table.control_rate if table.control_rate else 0.0
         self._shape = (n, j)
+        self._launch = Launches(device)
         self._wp = engine.wp
         self._fields = {name: engine.wp_field(name) for name in FIELDS}
         self._drives = drives(real)()
@@ -208,13 +210,16 @@ class Servo:
         if stamp is not None:
             self._stamp_t.copy_(self._as_tensor(stamp).expand_as(self._stamp_t))
             time = self._stamp
-        self._launch(self._send, self.queue, self._period, self._mask, time, self._target, self._state)
+        name = "send" if stamp is None else "send stamped"
+        args = (self.queue, self._period, self._mask, time, self._target, self._state)
+        self._launch(name, self._send, self._shape, args)
 
     def reset(self, mask: torch.Tensor | None, q: torch.Tensor) -> None:
         """Puts the drives of the masked worlds [N] bool (None: all) at rest, targets q [N, J] (rad) held since ever."""
         self._target_t.copy_(q)
         self._set_mask(mask)
-        self._launch(self._reset, self.queue, self._mask, self._target, self._state, self._torque)
+        args = (self.queue, self._mask, self._target, self._state, self._torque)
+        self._launch("reset", self._reset, self._shape, args)
 
     # -- the step ------------------------------------------------------------
 
@@ -222,13 +227,8 @@ class Servo:
         """Launches the servo for one physics step: the engine's `before_each` (capturable; one launch, two where a
         supply sags)."""
         if "sag" in self.features:
-            wp.launch(
-                self._sum,
-                dim=self._shape[0],
-                inputs=[self._shape[1], self._torque, self._given],
-                device=self.engine.device,
-            )
-        self._launch(self._servo, self.engine.dt, self.queue, self._drives)
+            self._launch("given", self._sum, self._shape[0], (self._shape[1], self._torque, self._given))
+        self._launch("servo", self._servo, self._shape, (self.engine.dt, self.queue, self._drives))
 
     # -- what an observer reads ------------------------------------------------------------
 
@@ -296,9 +296,6 @@ class Servo:
             self._mask_t.fill_(True)
         else:
             self._mask_t.copy_(mask)
-
-    def _launch(self, kernel, *args) -> None:
-        wp.launch(kernel, dim=self._shape, inputs=list(args), device=self.engine.device)
 
 
 def _check_drags(table: ServoTable, joints: Sequence[str], nominal: Any) -> None:

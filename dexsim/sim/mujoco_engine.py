@@ -13,6 +13,7 @@ import warp as wp
 from dexsim.errors import UserError
 from dexsim.sim import mujoco_kernels as kernels
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
+from dexsim.sim.launches import Launches
 
 _SLOTS, _MANY_SLOTS = 12, 64
 """Contacts of one pair that are summed; more are counted, and fail in `check_overflow`. The many where a model has more
@@ -51,6 +52,7 @@ class MujocoEngine(Engine):
                  real: type = wp.float64):
         super().__init__(model, worlds, "cpu", fields, pairs)
         self.real = real
+        self._launch = Launches("cpu")
         # A diverged world must keep its NaN, to be seen and reset by the environment like on the other engine. And geoms
         # that move by world are not where the compiler's bounding volumes have them: test every pair of two bodies.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_MIDPHASE
@@ -146,17 +148,17 @@ class MujocoEngine(Engine):
     def _kinematics(self) -> None:
         """Poses of the present qpos. The batch offers whole stages only, and each of its calls waits for all its threads."""
         args = [self._tree, self.wp.qpos, self._pos, self._quat, self.wp.xpos, self.wp.xmat]
-        wp.launch(kernels.poses, dim=self.n, inputs=args, device="cpu")
+        self._launch("poses", kernels.poses, self.n, args)
 
     def _contacts(self) -> None:
         if not self.pairs:
             return
         args = [*self._contact_args, self._slots, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
-        wp.launch(kernels.read_contacts, dim=(self.n, len(self.pairs)), inputs=args, device="cpu")
+        self._launch("contacts", kernels.read_contacts, (self.n, len(self.pairs)), args)
         sound = self.t.flags.numpy() == 0
         self._peak[0] = max(self._peak[0], self._ncon.reshape(-1).max(initial=0, where=sound))
         self._peak[1] = max(self._peak[1], self._nefc.reshape(-1).max(initial=0, where=sound))
 
     def _check(self) -> None:
         args = [self.wp.qpos, self.wp.qvel, FLAG_NAN, self.wp.flags]
-        wp.launch(kernels.check_worlds, dim=self.n, inputs=args, device="cpu")
+        self._launch("check", kernels.check_worlds, self.n, args)

@@ -1,0 +1,28 @@
+"""Kernel launches that are repeated with the same arguments: packed once. Packing takes several times as long as the
+kernel of a few worlds on a CPU, and a simulation launches the same few kernels in every physics step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+
+class Launches:
+    """The launches of one owner, by name. What a name stands for must not change: the same kernel, shape, numbers and
+    arrays (whose contents may). On a GPU, where a graph repeats a step, each is an ordinary launch."""
+
+    def __init__(self, device: Any):
+        self._device = wp.get_device(device)
+        self._packed: dict[str, tuple[Any, Sequence[Any]]] = {}
+
+    def __call__(self, name: str, kernel: Any, dim: int | tuple[int, ...], inputs: Sequence[Any]) -> None:
+        """Launches `kernel` over `dim` threads."""
+        if not self._device.is_cpu:
+            wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
+            return
+        if name not in self._packed:  # kept with its inputs: it points to their memory
+            command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
+            self._packed[name] = command, inputs
+        self._packed[name][0].launch()
