@@ -122,7 +122,7 @@ class Servo:
         self._target_t, self._stamp_t, self._mask_t = (wp.to_torch(a) for a in (self._target, self._stamp, self._mask))
         as_tensor = lambda x: torch.as_tensor(x, dtype=self.params.dtype, device=self.params.device)  # noqa: E731
         self._as_tensor = as_tensor
-        self._reported_q = torch.as_tensor(reported_q, device=self.params.device)
+        self.reported_q = torch.as_tensor(reported_q, device=self.params.device)  # [J] in qpos
         self._reported_dof = torch.as_tensor(reported_dof, device=self.params.device)
 
         self.nominal = as_tensor(nominal)
@@ -261,11 +261,16 @@ class Servo:
             q = q + (reported - self.measured(q)) / self.column("position_scale")
         return q
 
+    @property
+    def at_rotor(self) -> bool:
+        """Whether some encoder reports a rotor before a play: `position` is then more than `measured` of the joints."""
+        return self._position_motor is not None and "play" in self.features
+
     def _turned(self) -> tuple[torch.Tensor, torch.Tensor]:
         """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a
         play."""
-        q, v = self.engine.t.qpos[:, self._reported_q], self.engine.t.qvel[:, self._reported_dof]
-        if self._position_motor is None or "play" not in self.features:
+        q, v = self.engine.t.qpos[:, self.reported_q], self.engine.t.qvel[:, self._reported_dof]
+        if not self.at_rotor:
             return q, v
         rotor, a, b, fresh = (self.state[:, :, self.slots[name]] for name in ("rotor", "line_a", "line_b", "fresh"))
         w = torch.where(fresh != 0, v, a + b * v)

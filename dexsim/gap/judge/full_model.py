@@ -9,8 +9,9 @@ batch.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -266,7 +267,8 @@ def _batch(
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     N = len(worlds)
-    engine = make_engine(spec, N, device, engine, fields=FIELDS)
+    # one thread: a step of some worlds is shorter than the way to another thread and back
+    engine = make_engine(spec, N, device, engine, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in worlds])
     table = copy.deepcopy(worlds[0].table)
     table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
@@ -301,44 +303,98 @@ def _batch(
     steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
     given = torch.zeros_like(seen) if torque else None
-    warm = (
-        [i for i, w in enumerate(worlds) if w.warmth is not None]
-        if "warmth" in varied or "rare" in servo.features
-        else []
-    )
-    sent = [0] * N
-    freed = [None if w.enabled is None else np.ones(len(joints), bool) for w in worlds]
-    for k in range(steps):
-        t = k * timestep
-        while True:  # the next command of each world that has one within this step, in turns
-            mask, stamp = np.zeros(N, bool), np.zeros(N)
-            for i, w in enumerate(worlds):
-                while sent[i] < len(w.stamps) and w.stamps[sent[i]] < t + timestep:
-                    row = w.targets[sent[i]]
-                    new = np.where(np.isfinite(row), row, now[i])
-                    sent[i] += 1
-                    if (new != now[i]).any() or "controller" in servo.features:  # a target sent again has no speed
-                        now[i], mask[i], stamp[i] = new, True, w.stamps[sent[i] - 1]
-                        break
-            if not mask.any():
+    heated = "warmth" in varied or "rare" in servo.features
+    changes = Changes(servo, worlds, now, steps, timestep, up, heated)
+    step = itertools.count()
+    if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
+        turned = None if servo.at_rotor else torch.zeros(steps, *engine.t.qpos.shape, dtype=real)
+
+        def before_each() -> None:
+            k = next(step)
+            changes.before(k)
+            if turned is None:
+                seen[k].copy_(servo.position())
+            else:
+                turned[k].copy_(engine.t.qpos)
+            servo.before_each()
+            if given is not None:
+                given[k].copy_(servo.torque)
+
+        engine.step(steps, before_each)
+        if turned is not None:
+            seen = servo.measured(turned[:, :, servo.reported_q])
+    else:  # a step is a graph of launches
+        for k in step:
+            if k == steps:
                 break
-            servo.send(up(now), up(mask, torch.bool), up(stamp))
-        for i, w in enumerate(worlds):
-            if freed[i] is not None:
-                on = w.enabled[1][max(int(np.searchsorted(w.enabled[0], t, side="right")) - 1, 0)] > 0.5
-                if (on != freed[i]).any():
-                    freed[i] = on
-                    servo.state[i, :, servo.slots["enabled"]] = up(on)
-        if warm and k % max(1, round(WARM_EVERY / timestep)) == 0:
-            for i in warm:
-                at, heat = worlds[i].warmth
-                servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(t, at, x) for x in heat.T])
-        seen[k].copy_(servo.position())
-        engine.step(1, servo.before_each)
-        if given is not None:
-            given[k].copy_(servo.torque)
+            changes.before(k)
+            seen[k].copy_(servo.position())
+            engine.step(1, servo.before_each)
+            if given is not None:
+                given[k].copy_(servo.torque)
     q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
     return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+
+class Changes:
+    """What the worlds are told in which step: targets, drives that are freed, temperatures. servo: theirs; now [N, J]:
+    targets in force; up: an array as a tensor beside the servo's; heated: whether temperatures matter to the drives."""
+
+    def __init__(
+        self,
+        servo: Servo,
+        worlds: Sequence[World],
+        now: np.ndarray,
+        steps: int,
+        timestep: float,
+        up: Callable[..., torch.Tensor],
+        heated: bool,
+    ):
+        self._servo, self._worlds, self._now, self._timestep, self._up = servo, worlds, now, timestep, up
+        self._sent: dict[int, list[list[tuple[int, np.ndarray, float]]]] = {}
+        self._freed: dict[int, list[tuple[int, np.ndarray]]] = {}
+        begins = timestep * np.arange(steps)
+        for i, w in enumerate(worlds):
+            self._sends(i, w, begins + timestep)
+            if w.enabled is not None:
+                row = np.maximum(np.searchsorted(w.enabled[0], begins, side="right") - 1, 0)
+                on = w.enabled[1][row] > 0.5
+                before = np.vstack([np.ones((1, on.shape[1]), bool), on[:-1]])
+                for k in np.flatnonzero((on != before).any(1)):
+                    self._freed.setdefault(int(k), []).append((i, on[k]))
+        self._warm = [i for i, w in enumerate(worlds) if heated and w.warmth is not None]
+        self._renewed = max(1, round(WARM_EVERY / timestep))
+
+    def _sends(self, i: int, w: World, ends: np.ndarray) -> None:
+        """World i's targets by the step within which they are stamped; several of one step follow each other."""
+        at = np.searchsorted(ends, np.maximum.accumulate(w.stamps), side="right") if len(w.stamps) else []
+        last, turn, step = self._now[i], 0, -1
+        for k, row, stamp in zip(at, w.targets, w.stamps, strict=True):
+            if k == len(ends):
+                break
+            new = np.where(np.isfinite(row), row, last)
+            if not (new != last).any() and "controller" not in self._servo.features:
+                continue  # a target sent again has no speed
+            turn, step, last = turn + 1 if k == step else 0, k, new
+            turns = self._sent.setdefault(int(k), [])
+            if turn == len(turns):
+                turns.append([])
+            turns[turn].append((i, new, float(stamp)))
+
+    def before(self, k: int) -> None:
+        """Tells the worlds what is new in step k."""
+        servo, up = self._servo, self._up
+        for turn in self._sent.get(k, ()):
+            mask, stamp = np.zeros(len(self._now), bool), np.zeros(len(self._now))
+            for i, new, at in turn:
+                self._now[i], mask[i], stamp[i] = new, True, at
+            servo.send(up(self._now), up(mask, torch.bool), up(stamp))
+        for i, on in self._freed.get(k, ()):
+            servo.state[i, :, servo.slots["enabled"]] = up(on)
+        if self._warm and k % self._renewed == 0:
+            for i in self._warm:
+                at, heat = self._worlds[i].warmth
+                servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(k * self._timestep, at, x) for x in heat.T])
 
 
 def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: Sequence[int]) -> np.ndarray:
