@@ -16,8 +16,11 @@ from scipy.spatial import ConvexHull
 
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
+from dexsim.hand.places import places
 from dexsim.import_hand import command, folder, geometry, moves, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
+from dexsim.tactile.layout import hand_layout
+from dexsim.tasks.reach import Reach
 from tests import hands
 
 
@@ -96,7 +99,32 @@ def test_fingertips_approach_each_other_and_no_link_is_in_another(claw):
         if name == "cupped":
             assert (at[:, 2] > 0.012).all()  # before the palm, which is 12 mm thick from its frame on
     assert gaps[1] < 0.6 * gaps[0] and facing[1] > 0.5
-    assert hand.span == pytest.approx(gaps[0], abs=0.01)
+    assert hand.span == pytest.approx(0.085, abs=1e-3) and hand.span < gaps[0]  # its fingers are 45 and 40 mm long
+
+
+def test_fingertips_are_laid_against_the_sides_of_a_cube(claw):
+    hand = load_hand(claw)
+    reach, middle = Reach(hand, np.random.default_rng(0)), hand_layout(hand).centre()
+    edge, yaw = 0.55 * hand.span, 1.3
+    centre = places(hand).catch + [0.0, 0.0, edge / 2]
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    model, found = hand.compiled, 0
+    for k, finger in enumerate(hand.fingers):
+        rows = reach.fitting(k, centre, yaw, edge)
+        found += len(rows) > 0
+        for row in rows[:3]:
+            data = mujoco.MjData(model)
+            for j, angle in zip(finger.joints, reach.q[k][row], strict=True):
+                data.joint(hand.joints[j]).qpos[0] = angle
+            mujoco.mj_kinematics(model, data)
+            body = data.body(finger.body)
+            pad, out = body.xpos + body.xmat.reshape(3, 3) @ middle[k], body.xmat.reshape(3, 3) @ finger.normal
+            at = (pad - centre) @ turn
+            face = int(np.abs(at[:2]).argmax())
+            assert abs(at[face]) == pytest.approx(edge / 2, abs=0.011) and abs(at[2]) < edge / 2
+            assert -np.sign(at[face]) * (out @ turn)[face] > 0.5  # the pad looks at the face
+    assert found >= 2
+    assert not len(reach.fitting(0, centre + [0.0, 0.0, 5 * hand.span], yaw, edge))
 
 
 def test_shapes_are_capsules_and_cores_with_the_rubbers_margin(claw):

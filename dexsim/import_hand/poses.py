@@ -153,13 +153,17 @@ def opened(s: Search, closed: np.ndarray) -> np.ndarray:
 
 
 def span(s: Search, open_: np.ndarray, closed: np.ndarray) -> float:
-    """Largest distance [m] of an opposing fingertip to the mean of the others' on the way from open to cupped."""
+    """How wide a thing [m] the hand can grasp: as wide as the fingers that press against the opposing ones are long
+    (the xHand's reach 98 mm, its span is 100), but no wider than the fingertips come apart from open to cupped.
+
+    The gap of the open pose alone says little: a LEAP opens to twice the width that its fingers reach around.
+    """
     others = [k for k in range(len(s.motions)) if k not in s.thumbs]
     widest = 0.0
     for share in np.linspace(0, 1, 11):
         tips = s.tips(open_ + share * (closed - open_))[0]
         widest = max(widest, float(np.linalg.norm(tips[s.thumbs] - tips[others].mean(0), axis=1).max()))
-    return widest
+    return min(s.reach, widest)
 
 
 def near_the_palm(m: mujoco.MjModel, tree: Tree) -> list[tuple[str, str]]:

@@ -1,14 +1,15 @@
 """Finds held poses that rotation episodes start from: `dexsim stable-grasps out=poses.npz count=2000`.
 
-A cube falls into a hand whose fingers stand at random, half bent angles. What has come to rest, lies about flat and is
-touched by fingertips is started again from exactly the saved state, in a world with other mass, friction and drives,
-and must lie still for `HOLD` seconds. The saved set is checked again by tests/test_rotate.py.
+A cube falls into an open hand, whose fingers close until their tips lie against its sides. What has come to rest, lies
+about flat and is touched by fingertips is started again from exactly the saved state, in a world with other mass,
+friction and drives, and must lie still for `HOLD` seconds. The saved set is checked again by tests/test_rotate.py.
 """
 
 from __future__ import annotations
 
 import os
 
+import numpy as np
 import torch
 
 from dexsim import rotation
@@ -16,6 +17,7 @@ from dexsim.errors import UserError
 from dexsim.hand import Hand
 from dexsim.hand.places import approach
 from dexsim.tasks.env import UNIT_SPAN, hand_of
+from dexsim.tasks.reach import Reach
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet, held_file
 
@@ -25,19 +27,22 @@ TILT = 0.26  # rad, largest tilt of a start
 TIPS = 2  # fingertips that touch a start, at least
 SIZES = (0.045, 0.06)  # m, edges of cubes for a hand of UNIT_SPAN
 AROUND = 0.03  # m: the cube's centre lies within it of the place where it fell
-# How the fingers close: to the hand's cupped pose, give or take (rad, ours), the fingers beside the opposing one alike.
-# On the xHand they curl around the face away from the wrist, the thumb lies at the side of the index finger.
+# How fingers close that do not reach the cube's sides: to the hand's cupped pose, give or take (rad, ours), those
+# beside the opposing one alike.
 OPPOSING, SIDEWAYS, ALIKE = 0.45, 0.15, 0.25
 SPREAD = 0.15  # rad, by which those fingers differ from a common bend
 CENTRE_X, CENTRE_Y = 0.0125, 0.015  # m, either side of the hand's `catch`, where the cube is let go
+PLACES = 8  # of a cube that are tried: where most fingers reach its sides it is let fall
 CLEARANCE = 0.01  # m, of its lowest point over the palm
 LAND, CLOSE, SPEED, LEAD = 0.4, 2.0, 1.5, 0.08  # s, s, rad/s, rad: the fingers close until their tips touch
 TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses on
 
 
-def candidates(env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator) -> GraspSet:
+def candidates(
+    env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator, reach: Reach
+) -> GraspSet:
     """n open hands, each with a cube (edges of sizes [m]) above its palm and the joint angles (`target`) that it will
-    close to."""
+    close to: fingertips against the cube's sides where they can, about the cupped pose where they cannot."""
     hand: Hand = env.hand
     J, sign = len(hand.joints), torch.as_tensor(hand.closing, dtype=torch.float32)
     u, common = 2 * torch.rand(n, J, generator=rng) - 1, 2 * torch.rand(n, 8, generator=rng) - 1
@@ -52,12 +57,13 @@ def candidates(env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Ge
                 target[:, j] += sign[j] * (ALIKE * together + SPREAD * u[:, j])
             else:
                 target[:, j] += SIDEWAYS * u[:, j]
-    limits = torch.as_tensor(hand.limits, dtype=torch.float32)
-    target = torch.maximum(torch.minimum(target, limits[:, 1]), limits[:, 0])
     edge = sizes[0] + (sizes[1] - sizes[0]) * torch.rand(n, generator=rng)
     aside = torch.tensor([CENTRE_X, CENTRE_Y]) * (2 * torch.rand(n, 2, generator=rng) - 1)
     catch = torch.as_tensor(env.places.catch, dtype=torch.float32)
     yaw = 2 * torch.pi * torch.rand(n, generator=rng)
+    _against(reach, target, edge, aside, yaw, catch, env.unit, rng)
+    limits = torch.as_tensor(hand.limits, dtype=torch.float32)
+    target = torch.maximum(torch.minimum(target, limits[:, 1]), limits[:, 0])
     zero = torch.zeros(n)
     quat = torch.stack([(yaw / 2).cos(), zero, zero, (yaw / 2).sin()], 1)
     base = [hand.fingers[k].flexion[0] for k in hand.others]
@@ -66,6 +72,30 @@ def candidates(env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Ge
         catch[:2] + env.unit * aside, (catch[2] + env.unit * CLEARANCE + edge / 2)[:, None], quat
     ], 1)  # fmt: skip
     return GraspSet(edge, opened, target, pose)
+
+
+def _against(
+    reach: Reach, target: torch.Tensor, edge: torch.Tensor, aside: torch.Tensor, yaw: torch.Tensor,
+    catch: torch.Tensor, unit: float, rng: torch.Generator,
+) -> None:  # fmt: skip
+    """Write into target [n, J] the angles of fingers that can lie against the sides of their cube. Of PLACES of it
+    (aside [n, 2], yaw [n], written too) that is taken which most fingers reach, an opposing one among them."""
+    hand = reach.hand
+    for i in range(len(target)):
+        found: dict[int, np.ndarray] = {}
+        best = -1
+        for k in range(PLACES):
+            where = aside[i] if not k else torch.tensor([CENTRE_X, CENTRE_Y]) * (2 * torch.rand(2, generator=rng) - 1)
+            turned = float(yaw[i] if not k else 2 * torch.pi * torch.rand((), generator=rng))
+            centre = np.append(catch[:2] + unit * where, catch[2] + edge[i] / 2)
+            rows = {f: reach.fitting(f, centre, turned, float(edge[i])) for f in range(len(hand.fingers))}
+            rows = {f: r for f, r in rows.items() if len(r)}
+            good = len(rows) if rows.keys() & set(hand.opposing) and rows.keys() & set(hand.others) else 0
+            if good > best:
+                best, found, aside[i], yaw[i] = good, rows, where, turned
+        for f, r in found.items():
+            row = r[int(torch.randint(len(r), (), generator=rng))]
+            target[i, list(hand.fingers[f].joints)] = torch.as_tensor(reach.q[f][row], dtype=torch.float32)
 
 
 def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
@@ -157,10 +187,11 @@ def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, 
     """At least `count` held poses, made on the CPU by C MuJoCo. sizes: edges of the cubes [m]. Raises UserError."""
     rng = torch.Generator().manual_seed(seed)
     env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=_waiting(cfg, worlds, sizes))
+    reach = Reach(env.hand, np.random.default_rng(seed))
     found: list[GraspSet] = []
     total = tried = 0
     while total < count:
-        rest, fit = settle(env, candidates(env, worlds, sizes, rng))
+        rest, fit = settle(env, candidates(env, worlds, sizes, rng, reach))
         tried += worlds
         for _ in range(2):  # two draws of mass, friction and drives
             fit &= holds(env, rest)
