@@ -9,13 +9,16 @@ import json
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import yaml
 
 from benchmarks.concealed import __main__ as command
-from benchmarks.concealed import baselines, effects, generate, page, plant, score, touch
+from benchmarks.concealed import baselines, effects, generate, page, plant, rigs, score, touch
+from dexsim.hand import load_hand
 from dexsim.recording import read
+from tests.made_hand import made_hand
 
 SMOOTH = {"coulomb": 0.0, "viscous": 0.0, "kp": 0.0, "kd": 0.0}
 BOB = plant.pendulum(0.1)
@@ -319,6 +322,27 @@ def test_plan_is_fixed_by_its_seed_and_takes_every_effect_in_turn():
     assert all(p["shape"] == "one" for p in generate.plan({"effect": 60}, 7, one_joint=True))
     with pytest.raises(ValueError, match="no group"):
         generate.plan({"nothing": 1}, 7)
+
+
+def test_another_hand_is_believed_as_its_own_model_has_it(tmp_path):
+    """The written rig.xml weighs and throws its joints about as the hand's model does."""
+    hand = load_hand(made_hand(tmp_path / "made"), mirror=True)
+    d = rigs.draw(np.random.default_rng(0), "hand", hand.identity)
+    rigs.files(tmp_path, d)
+    one, other = mujoco.MjModel.from_xml_path(str(tmp_path / "rig.xml")), hand.spec().compile()
+    q = np.random.default_rng(1).uniform(*hand.limits.T)
+    bias = []
+    for model in (one, other):
+        data = mujoco.MjData(model)
+        for name, angle in zip(hand.joints, q, strict=True):
+            data.joint(name).qpos, data.joint(name).qvel = angle, 2.0 * np.cos(9 * angle)
+        mujoco.mj_forward(model, data)
+        bias.append([data.joint(name).qfrc_bias[0] for name in hand.joints])
+    np.testing.assert_allclose(bias[0], bias[1], rtol=1e-3, atol=1e-4 * np.abs(bias[1]).max())
+    assert set(yaml.safe_load((tmp_path / "servo.yaml").read_text())["joints"]) == set(hand.joints)
+    assert d.hand == hand.robot != "xhand_right"
+    large = generate.plan({"large": 5}, 3)
+    assert [(e["shape"], e["tier"], len(e["kinds"])) for e in large] == [("hand", "easy", 1)] * 5
 
 
 def test_size_is_what_was_asked(tmp_path, monkeypatch):

@@ -1,16 +1,18 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
     python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [laws=two] [out=out/concealed] [jobs=1]
-    [limit=900] [budget=0] [until=0]
+    [limit=900] [budget=0] [until=0] [hand=xhand] [mirror=false]
     python -m benchmarks.concealed ci=true                    # twelve cases of one to three joints
     python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight
 
 mix: number of cases by group (see `generate.plan`); seed: a number, or `source`: read off the sources of dexsim, so
-that no change of the tool can have been made with its cases in view; laws: `two` draws which law an effect follows
-where it has two (`laws.py`), `one` takes the first; limit: seconds a diagnosis may take, handed to it as `limit=` (half
-as much again ends it); budget: seconds after which no further diagnosis is begun, until: after which those under way
-are stopped and left out too (0: none). Resumable: what is finished is not run again. Writes hashes.txt before any
-diagnosis, results.json and table.txt to out=/seed_N (seed_N_one with laws=one); prints the table and one JSON line.
+that no change of the tool can have been made with its cases in view; hand, mirror: whose cases those of the groups hand
+and large are (a folder, or a hand that comes with dexsim; its mirror image); laws: `two` draws which law an effect
+follows where it has two (`laws.py`), `one` takes the first; limit: seconds a diagnosis may take, handed to it as
+`limit=` (half as much again ends it); budget: seconds after which no further diagnosis is begun, until: after which
+those under way are stopped and left out too (0: none). Resumable: what is finished is not run again. Writes hashes.txt
+before any diagnosis, results.json and table.txt to out=/seed_N (seed_N_one with laws=one, seed_N_NAME of another hand);
+prints the table and one JSON line.
 """
 
 from __future__ import annotations
@@ -29,10 +31,12 @@ from benchmarks.concealed import baselines, generate, laws, score
 from benchmarks.foreign import seed_of_sources
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
-            "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False}
+            "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False,
+            "hand": "xhand", "mirror": False}
 CI = {"effect": 6, "none": 2, "pair": 1, "outside": 1, "decoy": 2}
 
 
@@ -48,7 +52,7 @@ def parse(argv: list[str]) -> dict:
             if not all(group in generate.MIX and number.isdigit() for group, number in pairs):
                 raise UserError(f"mix={text}: must read like effect:14,none:4 with groups of {', '.join(generate.MIX)}")
             given[key] = {group: int(number) for group, number in pairs}
-        elif key == "out":
+        elif key in ("out", "hand"):
             given[key] = text
         elif key == "laws":
             if text not in laws.LAWS:
@@ -139,8 +143,13 @@ def main(argv: list[str]) -> dict:
     """Runs the benchmark; returns what the JSON line says."""
     s = parse(argv)
     begun = time.perf_counter()
-    root = Path(s["out"]).expanduser().resolve() / f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}"
+    whose = None if s["hand"] == "xhand" and not s["mirror"] else load_hand(s["hand"], s["mirror"])
+    name = f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}{'_' + whose.robot if whose else ''}"
+    root = Path(s["out"]).expanduser().resolve() / name
     plan = generate.plan(s["mix"], s["seed"], s["one_joint"])
+    for entry in plan:
+        if whose is not None and entry["shape"] == "hand":
+            entry["hand"] = whose.identity
     jobs = [(entry, n, s["seed"], root, s["laws"]) for n, entry in enumerate(plan)]
     # the hand's first: they take longest, and the run's end would cut them off. Else in the order of the plan, which is
     # drawn: where the budget ends the run, what was done is a fair sample of each

@@ -2,7 +2,8 @@
 apart.
 
 A case folder holds what `diagnose` sees: `a.mcap`, `b.mcap`, `c.mcap` (to fit), `d.mcap` (held out), `rig.xml`,
-`servo.yaml` (none for the xHand). The truth goes to another folder; its SHA-256 with a random salt is published first.
+`servo.yaml` (none for the right xHand). The truth goes to another folder; its SHA-256 with a random salt is published
+first.
 
 Size of an effect: d = the held-out change that it makes in its joint, with gains, mass, inertia and friction refitted
 by up to 5 % to hide it; f = the floor: measurement noise and what another friction law leaves of the same rig. sqrt(d^2
@@ -33,7 +34,7 @@ REFIT = ("kp", "kd", "mass", "rotor", "coulomb", "viscous", "torque_limit", "no_
 BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
 DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
-MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0}
+MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0, "large": 0}
 SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
 
@@ -41,10 +42,10 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
     """What each case holds: {group, kinds, tier, shape, number in group}, in an order that is itself drawn.
 
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
-    noise doubled), pair (two effects), outside (the catalogue), decoy, hand (the xHand: of every six two with nothing
-    missing, three with an effect, one with effects at two joints), touch (a fingertip under a ball: of every four one
-    with nothing missing). Effects, tiers and shapes take turns; one_joint: only rigs of one joint. Raises ValueError
-    for a group that there is not.
+    noise doubled), pair (two effects), outside (the catalogue), decoy, hand (a hand: of every six two with nothing
+    missing, three with an effect, one with effects at two joints), large (a hand, always one large effect), touch (a
+    fingertip under a ball: of every four one with nothing missing). Effects, tiers and shapes take turns; one_joint:
+    only rigs of one joint. Raises ValueError for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
     effects, tiers = [str(e) for e in rng.permutation(list(BY_EFFECT))], ("easy", "medium", "hard")
@@ -57,7 +58,7 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
         for k in range(count):
             entry = {"group": group, "kinds": [], "tier": "none", "shape": "one", "joints": []}
             turn = k // len(effects)
-            if group in ("effect", "hand", "decoy"):
+            if group in ("effect", "hand", "decoy", "large"):
                 names = BY_EFFECT[effects[k % len(effects)]]
                 kind = names[turn % len(names)]
                 several = not one_joint and (KINDS[kind].joints > 1 or (k + turn) % 5 in (1, 3))
@@ -72,6 +73,8 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
                 )
                 if k % 6 == 5:
                     entry["kinds"].append(BY_EFFECT[effects[(k + len(effects) // 3) % len(effects)]][0])
+            elif group == "large":
+                entry |= {"shape": "hand", "tier": "easy"}
             elif group == "touch":
                 names = list(touch_cases.KINDS)
                 hidden = k % 4 > 0
@@ -246,9 +249,9 @@ def _over(count: int) -> np.ndarray:
     return np.arange(count) / count
 
 
-def metadata(effort: bool, hand: bool) -> dict[str, str]:
+def metadata(effort: bool, hand: str) -> dict[str, str]:
     """What every recording states: nothing of it depends on the effect."""
-    return {"source": "real", "robot": "xhand_right" if hand else "rig", "gravity": "0 0 -9.81",
+    return {"source": "real", "robot": hand or "rig", "gravity": "0 0 -9.81",
             "effort_is": "torque_Nm" if effort else "none",
             "effort_sign": "+1"}  # fmt: skip
 
@@ -264,7 +267,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     which: "two" draws the law of each effect that has two, "one" takes the first (see `laws`)."""
     rng = np.random.default_rng([seed, 2, number])
     name = hashlib.sha256(f"{seed}/{number}".encode()).hexdigest()[:8]
-    d = rigs.draw(rng, entry["shape"])
+    d = rigs.draw(rng, entry["shape"], entry.get("hand"))
     group, decoy = entry["group"], entry.get("decoy", "")
     command = motions(rng, d, decoy == "poor")
     warm = rng.permutation(np.linspace(25.0, rng.uniform(45.0, 65.0), len(RECORDINGS)))
@@ -351,7 +354,7 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
             }
         ]
     tier = entry["tier"]
-    if group in ("effect", "hand", "pair", "outside") and kinds:
+    if group in ("effect", "hand", "large", "pair", "outside") and kinds:
         tier = min((tier_of(f["ratio"]) for f in facts), key=("silent", "hard", "medium", "easy").index)
     answer = {"name": name, "group": group, "decoy": decoy, "bad": bad, "asked_tier": entry["tier"], "tier": tier,
               "shape": d.shape, "joints": len(d.rig.names),
@@ -433,7 +436,7 @@ def _record(
             angle[joint] = np.degrees(angle[joint])
         elif bad == "wrap":  # a signed register read as unsigned
             torque[joint] = np.where(torque[joint] < 0, torque[joint] + 6.5536, torque[joint])
-        with Writer(where / f"{letter}.mcap", d.rig.names, metadata(effort, d.shape == "hand"), START_NS) as w:
+        with Writer(where / f"{letter}.mcap", d.rig.names, metadata(effort, d.hand), START_NS) as w:
             sent = np.arange(0, command.shape[2], 10)
             order = (
                 [(i * 1e-3, 0, i) for i in sent]

@@ -1,4 +1,4 @@
-"""The concealed rigs: pendulums on a bench, arms, a finger, the xHand; what is true of each, and what is believed.
+"""The concealed rigs: pendulums on a bench, arms, a finger, a hand; what is true of each, and what is believed.
 
 Every nominal quantity is a few percent off: gains, limits, masses, rotors, frictions, each drawn by joint.
 """
@@ -24,7 +24,7 @@ COLUMNS = {"kp": "kp", "kd": "kd", "torque_limit": "torque_limit", "no_load_spee
 class Drawn:
     """A rig as it is and as it is believed to be. true, believed: parameters [J]; unit [J]: a typical torque, N.m; low,
     high [J]: where its joints may be sent, rad; voltage: whether the loop gives a duty; motor_side: whether it reads
-    the motor."""
+    the motor; hand: what recordings of a hand call it, reach [J, 2] rad: the ranges of its joints."""
 
     rig: Rig
     shape: str
@@ -36,6 +36,8 @@ class Drawn:
     high: np.ndarray
     voltage: bool
     motor_side: bool
+    hand: str = ""
+    reach: np.ndarray | None = None
 
     @property
     def joints(self) -> int:
@@ -58,10 +60,11 @@ def _chain(rng: np.random.Generator, axes: list[str], start: float) -> Rig:
                np.tile(0.4 * RADIUS**2 * np.eye(3), (1, n, 1, 1)), np.array([0, 0, -9.81]))  # fmt: skip
 
 
-def draw(rng: np.random.Generator, shape: str) -> Drawn:
-    """A rig of a shape. Raises ValueError for a shape that there is not."""
+def draw(rng: np.random.Generator, shape: str, hand: dict | None = None) -> Drawn:
+    """A rig of a shape. hand: which, as `dexsim.hand.Hand.identity` says it (None: the right xHand). Raises ValueError
+    for a shape that there is not."""
     if shape == "hand":
-        return _hand(rng)
+        return _hand(rng, hand)
     if shape in ("one", "bench2", "bench4"):
         n = {"one": 1, "bench2": 2, "bench4": 4}[shape]
         rig = pendulum(radius=RADIUS, names=tuple(f"joint{i}" for i in range(n)),
@@ -124,14 +127,19 @@ def _finish(rng, rig, shape, b, unit, inertia, low, high, voltage, motor_side) -
     return Drawn(rig, shape, true, b, unit, inertia, low, high, voltage, motor_side)
 
 
-def _hand(rng: np.random.Generator) -> Drawn:
-    """The right xHand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the
-    palm."""
+def _hand(rng: np.random.Generator, which: dict | None) -> Drawn:
+    """A hand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the palm."""
     import mujoco
 
-    from dexsim.recording.mechanism import mechanism
+    from dexsim.actuator.table import ServoTable
+    from dexsim.hand import load_hand
+    from dexsim.recording.mechanism import Mechanism, mechanism
 
-    m = mechanism(None, None)
+    if which is None:
+        m = mechanism(None, None)
+    else:
+        hand = load_hand(which["hand"], which["hand_mirror"], which["hand_scale"])
+        m = Mechanism(hand.spec(), hand.joints, ServoTable.load(hand.servo_path), hand.robot)
     model = m.spec.compile()
     chains: list[list[int]] = []
     for b in range(1, model.nbody):
@@ -181,31 +189,54 @@ def _hand(rng: np.random.Generator) -> Drawn:
                   model.jnt_range[:, 1] - 0.15 * span, False, False)
     out.true["delay"] = column("delay")
     out.believed["delay"] = column("delay")
+    out.hand, out.reach = m.robot, model.jnt_range.copy()
     return out
 
 
 def files(where: Path, d: Drawn) -> list[str]:
-    """Writes rig.xml and servo.yaml as they are believed; returns the settings that hand them to `diagnose.py`."""
-    if d.shape == "hand":
+    """Writes rig.xml and servo.yaml as they are believed (none for the right xHand, which `diagnose` knows); returns
+    the settings that hand them to `diagnose.py`."""
+    if d.hand == "xhand_right":
         return []
     g, rig, b = (lambda x: "%.5g" % x), d.rig, d.believed
     pos = lambda v: " ".join(g(x) for x in v)  # noqa: E731
     C, D = rig.com.shape[:2]
     lines = ['<mujoco model="rig">', '  <compiler angle="radian"/>', "  <worldbody>"]
     for c in range(C):
+        depth = 0
         for k in range(D):
-            j = next(i for i, at in enumerate(rig.place) if tuple(at) == (c, k))
-            lines += [f'<body name="link{j}" pos="{pos(rig.offset[c, k])}">',
+            j = next((i for i, at in enumerate(rig.place) if tuple(at) == (c, k)), None)
+            if j is None:  # a finger of fewer joints than the longest
+                continue
+            depth += 1
+            turn, low, high, inertia = "", -3.0, 3.0, ""
+            if d.reach is not None:
+                w = rig.spread[c, k] * b["mass"][j]
+                (low, high), turn = d.reach[j], f' quat="{" ".join("%.12g" % x for x in _quaternion(rig.frame[c, k]))}"'
+                parts = (w[0, 0], w[1, 1], w[2, 2], w[0, 1], w[0, 2], w[1, 2])
+                inertia = (f'<inertial pos="{pos(rig.com[c, k])}" mass="{g(b["mass"][j])}"'
+                           f' fullinertia="{" ".join("%.9g" % x for x in parts)}"/>')  # fmt: skip
+            lines += [f'<body name="link{j}" pos="{pos(rig.offset[c, k])}"{turn}>{inertia}',
                       f'<joint name="{rig.names[j]}" type="hinge" axis="{pos(rig.axis[c, k])}"'
-                      f' armature="{g(b["rotor"][j])}" range="-3 3"/>',
-                      f'<geom name="bob{j}" type="sphere" size="{RADIUS}" pos="{pos(rig.com[c, k])}"'
-                      f' mass="{g(b["mass"][j])}" contype="0" conaffinity="0"/>']  # fmt: skip
-        lines += ["</body>"] * D
+                      f' armature="{g(b["rotor"][j])}" range="{g(low)} {g(high)}"/>']  # fmt: skip
+            if d.reach is None:
+                lines += [f'<geom name="bob{j}" type="sphere" size="{RADIUS}" pos="{pos(rig.com[c, k])}"'
+                          f' mass="{g(b["mass"][j])}" contype="0" conaffinity="0"/>']  # fmt: skip
+        lines += ["</body>"] * depth
     lines += ["  </worldbody>", "</mujoco>", ""]
     (where / "rig.xml").write_text("\n".join(lines), encoding="utf-8")
+    delay = {"delay": float(g(b["delay"][0]))} if "delay" in b else {}
     servo = {"drive": "voltage" if d.voltage else "torque",
-             "joints": {name: {ours: float(g(b[k][j])) for k, ours in COLUMNS.items()} for j,
+             "joints": {name: {ours: float(g(b[k][j])) for k, ours in COLUMNS.items()} | delay for j,
                         name in enumerate(rig.names)}, "loop_rate": 1000,
              "loop_encoder": "motor" if d.motor_side else "joint", "position_encoder": "joint"}  # fmt: skip
     (where / "servo.yaml").write_text(yaml.safe_dump(servo, sort_keys=False), encoding="utf-8")
     return [f"model={where / 'rig.xml'}", f"servo={where / 'servo.yaml'}"]
+
+
+def _quaternion(turn: np.ndarray) -> np.ndarray:
+    import mujoco
+
+    out = np.zeros(4)
+    mujoco.mju_mat2Quat(out, turn.reshape(-1))
+    return out

@@ -154,7 +154,7 @@ def one(truth: dict, d: dict) -> dict:
         return _holds(f, e["effect"]) and (not f["where"]["joints"] or any(j in f["where"]["joints"] for j in ends(e)))
 
     group = truth["group"]
-    inside = group in ("effect", "pair") or (group in ("hand", "touch") and effects)
+    inside = group in ("effect", "pair") or (group in ("hand", "large", "touch") and effects)
     out["wrong_sure"] = any(
         f["effect"] not in true_ids or not any(f["effect"] == e["effect"] and right_here(f, e) for e in effects)
         for f in confident
@@ -263,7 +263,7 @@ def table(results: list[dict]) -> dict[str, dict]:
     def f1(line: str, counts: list) -> None:
         put(line, middle(counts, lambda x: _f1(*np.sum(np.asarray(x), 0))))
 
-    hidden = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "touch")]
+    hidden = [r for r in results if "right" in r and r["group"] in ("effect", "hand", "large", "touch")]
     for tier in TIERS:
         put(f"right effect first, {tier}", rate([r["right"] for r in hidden if r["tier"] == tier]))
     for tier in TIERS:
@@ -288,12 +288,12 @@ def table(results: list[dict]) -> dict[str, dict]:
     put("  with doubled noise", rate([r["false_alarm"] for r in nothing if r["group"] == "noise"]))
     for least in LEAST:
         put(f"  a name of {least:g} or more", rate([r["alarm"] >= least for r in nothing if "alarm" in r]))
-    hand = [r for r in results if r["group"] == "hand"]
-    put("xHand: right effect first", rate([r["right"] for r in hand if "right" in r]))
+    hand = [r for r in results if r["group"] in ("hand", "large")]
+    put("hand: right effect first", rate([r["right"] for r in hand if "right" in r]))
     put(f"  named alone at {SURE:g} or more", rate([alone_at(r, SURE) for r in hand if "right" in r]))
     f1("  effects at two joints (F1)", [r["f1"] for r in hand if len(r["hidden"]) > 1])
     put("  confident and wrong", rate([r["wrong_sure"] for r in hand]))
-    put("false alarm, xHand", rate([r["false_alarm"] for r in empty if r["group"] == "hand"]))
+    put("false alarm, hand", rate([r["false_alarm"] for r in empty if r["group"] == "hand"]))
     put("touch and contact: right effect first", rate([r["right"] for r in hidden if r["group"] == "touch"]))
     put("  false alarm", rate([r["false_alarm"] for r in empty if r["group"] == "touch"]))
     put("outside the catalogue: not claimed", rate([r["humble"] for r in results if r["group"] == "outside"]))
