@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.tasks import base_path, grasp_eval
 from dexsim.tasks.grasp_eval import HOLD, PUSH_S, SETTLE, STAY_S, TURN_S
@@ -169,3 +170,45 @@ def test_the_hand_is_lifted_and_shaken_instead_of_turned():
     shaking = t >= SETTLE + HOLD + TURN_S + STAY_S
     assert np.abs(g[shaking, :2]).max(0).min() > 5 and np.allclose(g[shaking, 2], -9.81, atol=1e-5)
     assert out["held180"].all()
+
+
+def _path(folder, rows: str, head: str = "t,x,y,z") -> str:
+    (folder / "path.csv").write_text(f"{head}\n{rows}\n")
+    return str(folder / "path.csv")
+
+
+def test_the_hand_is_carried_along_a_path_of_ones_own(tmp_path):
+    """x = 0.1 (1 - cos t), tilted steadily about y: gravity of the frame is what a calculator gives."""
+    t = np.linspace(0.0, 2 * np.pi, 200)
+    rows = "\n".join(f"{s:.9f},{0.1 * (1 - np.cos(s)):.9f},0,0,0,{0.2 * s:.9f},0" for s in t)
+    setting = _path(tmp_path, rows, "t,x,y,z,rx,ry,rz")
+    gravity, seconds = base_path.along(tmp_path / "path.csv")
+    for at in (1.0, 2.5, 4.0):
+        a = np.array([-0.1 * np.cos(at), 0.0, -9.81])  # the world's gravity less the path's acceleration
+        c, s = np.cos(0.2 * at), np.sin(0.2 * at)
+        np.testing.assert_allclose(gravity(at), [c * a[0] - s * a[2], 0.0, s * a[0] + c * a[2]], atol=2e-3)
+    stage = Stage(torch.zeros(N), torch.ones(N, 5, dtype=torch.bool))
+    stage.task = {"evaluation": {"base": setting}}
+    grasp_eval._play(stage, lambda obs: None, False, None, "", 0, N)
+    g = torch.stack(stage.gravity)[:, 0].numpy()
+    assert len(g) == pytest.approx((SETTLE + HOLD + seconds) / DT, abs=1)
+    assert not np.allclose(g[-1], [0, 0, -9.81], atol=1)
+    np.testing.assert_allclose(np.linalg.norm(g[-1]), 9.81, atol=0.15)
+    assert np.allclose(g[DT * np.arange(len(g)) < SETTLE + HOLD], [0, 0, -9.81], atol=1e-5)
+
+
+@pytest.mark.parametrize("rows, head, said", [
+    ("0,0,0,0\n1,0,0,0\n2,0,0,0", "t,x,y,z", "3 rows; at least 4"),
+    ("0,0,0\n1,0,0", "t,x,y", "columns t, x, y; must be t,x,y,z"),
+    ("0,0,0,0\n1,0,0,up\n2,0,0,0\n3,0,0,0", "t,x,y,z", "line 3 has something else than 4 finite numbers"),
+    ("0,0,0,0\n1,0,0,0\n1,0,0,0\n3,0,0,0", "t,x,y,z", "column t must begin at 0, grow"),
+    ("0,0,0,0\n1,0,0,300\n2,0,0,300\n3,0,0,300", "t,x,y,z", "m/s2 at t = .* allowed 100"),
+    ("0,0,0,0,0,0,0\n1,0,0,0,0,3,0\n2,0,0,0,0,0,0\n3,0,0,0,0,0,0", "t,x,y,z,rx,ry,rz", "rad/s at t = .* allowed 2.5"),
+])  # fmt: skip
+def test_a_path_that_is_none_is_refused(tmp_path, rows, head, said):
+    with pytest.raises(UserError, match=said):
+        base_path.of(_path(tmp_path, rows, head))
+    with pytest.raises(UserError, match="must be turn, lift, or a path"):
+        base_path.of("jump")
+    with pytest.raises(UserError, match="does not exist"):
+        base_path.of(str(tmp_path / "none.csv"))

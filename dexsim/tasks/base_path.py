@@ -2,14 +2,32 @@
 
 In a frame that is carried along without turning, a motion with acceleration a is the same as gravity g - a (d'Alembert;
 exact for every body, whatever touches what). So the hand stays where it is in every engine, and gravity moves: a lift
-and a shake cost nothing and need no extra joints. A turn of the base is gravity that turns (`grasp_eval`), slowly
-enough that the turn itself adds nothing.
+and a shake cost nothing and need no extra joints. A turn of the base is gravity that turns, slowly enough that the turn
+itself adds nothing.
+
+A path of one's own is a CSV file with columns t [s], x, y, z [m, of the palm] and optionally rx, ry, rz [rad, rotation
+vector from the start], along the axes that the palm frame has at the start: x along the fingers, z up.
 """
 
 from __future__ import annotations
 
-import numpy as np
+import csv
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from dexsim import files
+from dexsim.errors import UserError
+
+STAGES = (1.75, 1.75)  # s: to turn, lift or shake, and to stay
+GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s2, the palm up
+LEAST_ROWS, MOST_S = 4, 60.0
+MOST_ACCELERATION, MOST_SPIN = 100.0, 2.5  # m/s2, rad/s: a faster turn throws things outwards, which gravity cannot say
 LIFT, LIFT_S = 0.3, 0.75  # m up along the palm's normal, s: minimum jerk
 REST_S = 1.0  # s
 SHAKE, SHAKE_HZ, SHAKES = 0.02, 3.0, 2  # m either way, 1/s, periods along the fingers, then across them
@@ -31,3 +49,82 @@ def shaken(t: float) -> np.ndarray:
     if 0.0 <= t < 2 * span:
         out[0 if t < span else 1] = SHAKE * w**2 * np.cos(w * t)
     return out
+
+
+@dataclass(frozen=True)
+class Base:
+    """What the hand's base goes through in two stages. held: what the shares held to the end of each are called;
+    stages: s; gravity: [3] m/s2 in the palm frame, t s after the first begins, None where each episode is turned about
+    an axis of its own."""
+
+    held: tuple[str, str]
+    stages: tuple[float, float] = STAGES
+    gravity: Callable[[float], np.ndarray] | None = None
+
+
+def of(setting: str) -> Base:
+    """turn, lift, or a path's CSV file. Raises UserError."""
+    if setting == "turn":
+        return Base(("hold_rate_turned_90", "hold_rate_turned_180"))
+    if setting == "lift":
+        return Base(
+            ("hold_rate_lifted", "hold_rate_shaken"),
+            gravity=lambda t: GRAVITY - lifted(t) - shaken(t - STAGES[0]),
+        )
+    if not str(setting).lower().endswith(".csv"):
+        raise UserError(f"task.evaluation.base={setting}: must be turn, lift, or a path: a .csv file of t,x,y,z")
+    gravity, seconds = along(Path(setting).expanduser())
+    return Base(("hold_rate_path_half", "hold_rate_path"), (seconds / 2, seconds / 2), gravity)
+
+
+def along(path: Path) -> tuple[Callable[[float], np.ndarray], float]:
+    """(gravity [3] m/s2 in the frame of a palm that is carried along a file's path, by time [s]; how long the path is
+    [s]). Cubic splines, at rest at both ends. Raises UserError."""
+    t, x, turn = _read(path)
+    where = f"task.evaluation.base={path}"
+    place = CubicSpline(t, x, bc_type="clamped")
+    turned = RotationSpline(t, Rotation.from_rotvec(turn))
+    fine = np.linspace(0.0, t[-1], 2000)
+    fastest, spin = np.linalg.norm(place(fine, 2), axis=1), np.linalg.norm(turned(fine, 1), axis=1)
+    for values, most, unit in ((fastest, MOST_ACCELERATION, "m/s2"), (spin, MOST_SPIN, "rad/s")):
+        k = int(values.argmax())
+        if values[k] > most:
+            raise UserError(
+                f"{where}: {values[k]:.3g} {unit} at t = {fine[k]:.2f} s; allowed {most:g}: is t in s and the rest in"
+                " m and rad? else take more time"
+            )
+
+    def gravity(at: float) -> np.ndarray:
+        if not 0.0 <= at <= t[-1]:
+            return turned(min(max(at, 0.0), t[-1])).inv().apply(GRAVITY)
+        return turned(at).inv().apply(GRAVITY - place(at, 2))
+
+    return gravity, float(t[-1])
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [K], places [K, 3], rotation vectors [K, 3]."""
+    where = f"task.evaluation.base={path}"
+    rows = csv.DictReader(io.StringIO(files.text(path, files.MAX_YAML, "path of the base")))
+    known, have = ("t", "x", "y", "z", "rx", "ry", "rz"), [str(c).strip() for c in rows.fieldnames or ()]
+    if have not in ([*known], [*known[:4]]):
+        raise UserError(
+            f"{where}: columns {', '.join(have) or 'none'}; must be t,x,y,z or t,x,y,z,rx,ry,rz (s, m, rad)"
+        )
+    values = []
+    for k, row in enumerate(rows):
+        try:
+            values.append([float(v) for v in row.values()])
+            good = len(values[-1]) == len(have) and bool(np.isfinite(values[-1]).all())
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise UserError(f"{where}: line {k + 2} has something else than {len(have)} finite numbers")
+    if len(values) < LEAST_ROWS:
+        raise UserError(f"{where}: {len(values)} rows; at least {LEAST_ROWS}")
+    table = np.array(values)
+    t = table[:, 0]
+    if t[0] != 0 or (np.diff(t) <= 0).any() or t[-1] > MOST_S:
+        raise UserError(f"{where}: column t must begin at 0, grow with every row, and end by {MOST_S:g} s")
+    x = table[:, 1:4]
+    return t, x, table[:, 4:] if len(have) > 4 else np.zeros_like(x)

@@ -17,7 +17,7 @@ from dexsim.deploy import observations
 from dexsim.errors import UserError
 from dexsim.hand.places import approach
 from dexsim.tactile.clearance import Clearance
-from dexsim.tasks import terms
+from dexsim.tasks import base_path, terms
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
 from dexsim.tasks.servos import ServoRandomizer
@@ -101,6 +101,7 @@ class GraspEnv(HandEnv):
             )
         if t["critic"] not in ("paper", "privileged"):
             raise UserError(f"task.critic={t['critic']}: must be paper or privileged")
+        base_path.of((t.get("evaluation") or {}).get("base", "turn"))  # refused now, not after the training
         self.gravity0 = torch.tensor([0.0, 0.0, -9.81], device=dev)
         where, xy, beside = self.places, t["initial"]["object_xy"], t["reward"]["centre_y"]
         self.centre0 = torch.tensor(where.catch[:2].tolist() if xy is None else xy, device=dev)

@@ -5,7 +5,7 @@ it must stay within `RADIUS` of that place, touched at every control step by an 
 second episode a push of twice the object's weight acts for half a second within the hold, in a random direction. Then
 the hand is turned by 90 and by 180 degrees about a random axis of the palm plane: gravity turns in the palm frame,
 slowly enough that the turn itself adds nothing. With task.evaluation.base=lift the hand is lifted and then shaken
-instead (`tasks/base_path.py`), the palm up.
+instead, the palm up, with a .csv file it is carried along a path (`tasks/base_path.py`).
 
 The command is constant in an episode, uniform in [0, 1] over episodes.
 """
@@ -16,17 +16,15 @@ import numpy as np
 import torch
 
 from dexsim import intervals
-from dexsim.errors import UserError
 from dexsim.tasks import base_path
 
 SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
-TURN_S, STAY_S = 0.75, 1.0
+TURN_S, STAY_S = 0.75, 1.0  # together base_path.STAGES
 BINS = 10
 SHARE_S = 0.5  # s before the hold, over which it is measured what carries the object
 SHARES = 5
 RESAMPLES = 1000  # of the bootstrap
-_END = SETTLE + HOLD + 2 * (TURN_S + STAY_S)
 
 
 @torch.inference_mode()
@@ -77,8 +75,8 @@ def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: s
 
 def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episodes: int) -> dict:
     """One episode in every world."""
-    n, dev, dt, lift = env.num_envs, env.device, env.dt, _lifts(env)
-    steps = int(round(_END / dt))
+    n, dev, dt, base = env.num_envs, env.device, env.dt, _base(env)
+    steps = int(round((SETTLE + HOLD + sum(base.stages)) / dt))
     training_length, env.max_episode_length = env.max_episode_length, steps + 2
     env.pushes = False
     env.fixed_command = torch.rand(n, generator=env.rng, device=dev)
@@ -109,7 +107,8 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         t = k * dt
         pushing = pushed & (t >= push_at) & (t < push_at + PUSH_S)
         env.outside_force.copy_(torch.where(pushing[:, None], push_force, torch.zeros_like(push_force)))
-        env.engine.field("opt.gravity").copy_(_carried(down, t) if lift else 9.81 * _turned(down, axis, _angle(t)))
+        turned = 9.81 * _turned(down, axis, _angle(t))
+        env.engine.field("opt.gravity").copy_(turned if base.gravity is None else _carried(base, down, t))
         obs, _, dones, _ = env.step(policy(obs))
         alive &= ~dones.bool()
         p = env.object_pose[:, :3]
@@ -136,7 +135,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
                 # turned: still near the place it settled in
                 if k == int(round((SETTLE + HOLD) / dt)) + 1:
                     held90, held180 = held.clone(), held.clone()
-                if t <= SETTLE + HOLD + TURN_S + STAY_S:
+                if t <= SETTLE + HOLD + base.stages[0]:
                     held90 &= good
                 held180 &= good
         if shown:
@@ -177,18 +176,15 @@ def _angle(t: float) -> float:
     return np.pi / 2 * (np.clip((t - first) / TURN_S, 0, 1) + np.clip((t - second) / TURN_S, 0, 1))
 
 
-def _lifts(env) -> bool:
-    """Whether the base is lifted and shaken, not turned; checkpoints from before cannot say."""
-    base = (env.task.get("evaluation") or {}).get("base", "turn")
-    if base not in ("turn", "lift"):
-        raise UserError(f"task.evaluation.base={base}: must be turn or lift")
-    return base == "lift"
+def _base(env) -> base_path.Base:
+    """What the base goes through after the hold; checkpoints from before cannot say."""
+    return base_path.of((env.task.get("evaluation") or {}).get("base", "turn"))
 
 
-def _carried(down: torch.Tensor, t: float) -> torch.Tensor:
-    """Gravity [N, 3] m/s2 of a hand that is lifted after the hold, then shaken."""
-    a = base_path.lifted(t - SETTLE - HOLD) + base_path.shaken(t - SETTLE - HOLD - TURN_S - STAY_S)
-    return 9.81 * down - torch.as_tensor(a, dtype=down.dtype, device=down.device)
+def _carried(base: base_path.Base, down: torch.Tensor, t: float) -> torch.Tensor:
+    """Gravity [N, 3] m/s2 of a hand whose base moves after the hold."""
+    g = base.gravity(t - SETTLE - HOLD) if t > SETTLE + HOLD else base_path.GRAVITY
+    return torch.as_tensor(g, dtype=down.dtype, device=down.device).expand_as(down)
 
 
 def _turned(v: torch.Tensor, axis: torch.Tensor, angle: float) -> torch.Tensor:
@@ -231,9 +227,7 @@ def _metrics(r: dict, k: dict, env) -> dict:
         "hold_rate_kept_out_shapes": _rate(k["held"], k["pushed"].astype(bool) & able_k),
         "hold_rate_kept_out_shapes_unpushed": _rate(k["held"], ~k["pushed"].astype(bool) & (k["command"] >= 0.1)),
         "hold_rate_all": float(held.mean()),
-        **dict(zip(("hold_rate_lifted", "hold_rate_shaken") if _lifts(env) else
-                   ("hold_rate_turned_90", "hold_rate_turned_180"),
-                   (_rate(r["held90"], carried), _rate(r["held180"], carried)), strict=True)),
+        **dict(zip(_base(env).held, (_rate(r["held90"], carried), _rate(r["held180"], carried)), strict=True)),
         "force_command_correlation": _corr(r["command"][held], total[held]),
         "force_max_N": float(f_max),
         # why episodes were not held: they overlap; dropped includes the turned part
