@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -19,32 +20,35 @@ def test_commands_are_found():
     assert {"step", "engines", "planted", "concealed", "loop", "reproduce"} <= set(COMMANDS)
 
 
-@pytest.mark.slow  # a new interpreter each
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_the_command_and_ends_well(name):
-    done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{name}", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+def ends_well(done, name):
     assert done.returncode == 0, done.stderr
     assert f"benchmarks.{name}" in done.stdout
     assert "train.py [key=value" not in done.stdout  # its own, not that of the command behind it
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_the_command_and_ends_well(name):
+    ends_well(forked.run(f"benchmarks.{name}", "--help"), name)
+
+
+@pytest.mark.slow
+def test_help_from_a_shell():
+    command = [sys.executable, "-m", "benchmarks.planted", "--help"]
+    ends_well(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120), "planted")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["benchmarks.loop.worlds", "benchmarks.reproduce.pack", "dexsim.tasks.reality"])
 def test_help_of_what_writes_files(module):
-    done = subprocess.run(
-        [sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    done = forked.run(module, "--help")
     assert done.returncode == 0 and module in done.stdout, done.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["planted", "concealed"])
 def test_a_wrong_setting_is_one_line_and_status_2(name):
-    done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{name}", "case=3"], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    done = forked.run(f"benchmarks.{name}", "case=3")
     assert done.returncode == 2
     assert (
         done.stderr.strip().startswith("error: 'case=3' is not a setting")

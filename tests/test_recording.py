@@ -116,6 +116,7 @@ def test_messages_are_decoded_to_what_mcap_ros2_decodes(kind):
     }[kind]
     theirs = generate_dynamic(kind, DEFINITIONS[kind])[kind]
     ours = ros2.decoder(kind, "ros2msg", DEFINITIONS[kind])
+    assert ours is ros2.decoder(kind, "ros2msg", DEFINITIONS[kind])  # parsed once
     for data in (made, bytes(serialize_dynamic(kind, DEFINITIONS[kind])[kind](theirs(made)))):
         assert plain(ours(data)) == plain(theirs(data))
     with pytest.raises(Exception, match=".+"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
@@ -25,6 +26,7 @@ class BadDefinition(ValueError):
     """A message definition that is not read; the text says why."""
 
 
+@lru_cache(maxsize=64)  # a definition takes longer to read than a short recording's messages
 def decoder(name: str, encoding: str, text: str) -> Callable[[bytes], Any]:
     """A function from the bytes of a message (CDR) to an object with its fields; arrays of numbers are NumPy's.
 

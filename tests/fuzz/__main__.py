@@ -1,5 +1,5 @@
-"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [out=FOLDER]`: damaged files
-without end.
+"""`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [processes=1] [out=FOLDER]`:
+damaged files without end.
 
 Each case has a limit of 20 s of processor time and 2 GiB of memory. What breaks is kept in out= (out/fuzz) with its
 seed; `python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke.
@@ -20,6 +20,8 @@ import time
 import traceback
 import warnings
 from collections import Counter
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from . import corpus, mutate, targets
@@ -58,7 +60,7 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
 
 
-def work(kinds: list[str], first: int, count: int, out: Path, folder: Path, send) -> None:
+def work(kinds: list[str], first: int, count: int, files: dict[str, list[Path]], out: Path, send) -> None:
     """A batch in a process of its own: a crash ends this one alone."""
     warnings.simplefilter("ignore")
     used = (
@@ -67,77 +69,105 @@ def work(kinds: list[str], first: int, count: int, out: Path, folder: Path, send
         else 0
     )
     resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, used + BYTES))
-    files = corpus.build(folder / "corpus")
-    cases = folder / "case"
-    cases.mkdir(exist_ok=True)
-    for seed in range(first, first + count):
-        kind = kinds[seed % len(kinds)]
-        send.send((seed, kind, "began", ""))
-        what, text, path = one(kind, seed, files, cases)
-        if what not in ("fine", "refused"):
-            out.mkdir(parents=True, exist_ok=True)
-            left = next((p for p in cases.iterdir()), path)
-            if left.is_file():
-                shutil.copyfile(left, out / f"{kind}_{seed}{path.suffix}")
-        send.send((seed, kind, what, text))
+    with tempfile.TemporaryDirectory() as folder:
+        cases = Path(folder)
+        for seed in range(first, first + count):
+            kind = kinds[seed % len(kinds)]
+            send.send((seed, kind, "began", ""))
+            what, text, path = one(kind, seed, files, cases)
+            if what not in ("fine", "refused"):
+                out.mkdir(parents=True, exist_ok=True)
+                left = next((p for p in cases.iterdir()), path)
+                if left.is_file():
+                    shutil.copyfile(left, out / f"{kind}_{seed}{path.suffix}")
+            send.send((seed, kind, what, text))
     send.close()
+
+
+@dataclass
+class Batch:
+    """Cases of which a process works off one after the other. last: the seed after its last."""
+
+    worker: multiprocessing.process.BaseProcess
+    last: int
+    begun: tuple[int, str] | None = None  # the case under way: seed, kind
+
+
+class Run:
+    """Batches in some processes at a time, and what came of their cases."""
+
+    def __init__(self, kinds: list[str], seed: int, most: int, out: Path, files: dict[str, list[Path]]):
+        self.kinds, self.next, self.end, self.out, self.files = kinds, seed, seed + most, out, files
+        self.counts: Counter[str] = Counter()
+        self.broken: dict[str, list[str]] = {}
+        self._batches: dict[Connection, Batch] = {}
+
+    def go(self, processes: int, until: float) -> None:
+        """Until the seeds or the time (of `time.monotonic`) are over; batches under way are finished."""
+        while True:
+            while len(self._batches) < processes and self.next < self.end and time.monotonic() < until:
+                last = min(self.next + BATCH, self.end)
+                self._start(self.next, last)
+                self.next = last
+            if not self._batches:
+                return
+            for receive in wait(list(self._batches)):
+                self._hear(receive)
+
+    def _start(self, first: int, last: int) -> None:
+        receive, send = multiprocessing.Pipe(False)
+        worker = multiprocessing.get_context("fork").Process(
+            target=work, args=(self.kinds, first, last - first, self.files, self.out, send)
+        )
+        worker.start()
+        send.close()
+        self._batches[receive] = Batch(worker, last)
+
+    def _hear(self, receive: Connection) -> None:
+        """One message of a batch, or its end."""
+        batch = self._batches[receive]
+        try:
+            seed, kind, what, text = receive.recv()
+        except EOFError:
+            del self._batches[receive]
+            batch.worker.join()
+            if batch.begun is not None:  # it died in a case; the others of its batch follow
+                seed, kind = batch.begun
+                ended = batch.worker.exitcode
+                self._break("crash", kind, seed, f"ended its process with {ended}", f"crash {ended}")
+                if seed + 1 < batch.last:
+                    self._start(seed + 1, batch.last)
+            return
+        batch.begun = (seed, kind) if what == "began" else None
+        if text or what.startswith("over"):
+            self._break(what, kind, seed, f"{what}\n{text}", (text.strip().splitlines() or [what])[-1])
+        elif what != "began":
+            self.counts[what] += 1
+
+    def _break(self, what: str, kind: str, seed: int, said: str, line: str) -> None:
+        self.counts[what] += 1
+        if line not in self.broken:
+            print(f"{kind} from={seed}: {said}", flush=True)
+        self.broken.setdefault(line, []).append(f"{kind} {seed}")
 
 
 def main(argv: list[str]) -> int:
     given = dict(a.split("=", 1) for a in argv if "=" in a)
-    if set(given) - {"minutes", "cases", "kind", "from", "out"} or any("=" not in a for a in argv):
+    if set(given) - {"minutes", "cases", "kind", "from", "processes", "out"} or any("=" not in a for a in argv):
         print(__doc__)
         return 2
     kinds = given.get("kind", ",".join(targets.TARGETS)).split(",")
     kinds = CI if kinds == ["ci"] else kinds
-    end = time.monotonic() + 60 * float(given.get("minutes", 60))
-    most, seed = int(given.get("cases", 10**12)), int(given.get("from", 0))
-    out = Path(given.get("out", "out/fuzz"))
-    counts: Counter[str] = Counter()
-    broken: dict[str, list[str]] = {}
+    until = time.monotonic() + 60 * float(given.get("minutes", 60))
     with tempfile.TemporaryDirectory() as folder:
-        while time.monotonic() < end and sum(counts.values()) < most:
-            receive, send = multiprocessing.Pipe(False)
-            count = min(BATCH, most - sum(counts.values()))
-            worker = multiprocessing.get_context("fork").Process(
-                target=work, args=(kinds, seed, count, out, Path(folder), send)
-            )
-            worker.start()
-            send.close()
-            begun = None
-            try:
-                while True:
-                    begun_seed, kind, what, text = receive.recv()
-                    begun = (begun_seed, kind) if what == "began" else None
-                    if what == "began":
-                        continue
-                    counts[what] += 1
-                    if text or what.startswith("over"):
-                        line = (text.strip().splitlines() or [what])[-1]
-                        if line not in broken:
-                            print(f"{kind} from={begun_seed}: {what}\n{text}", flush=True)
-                        broken.setdefault(line, []).append(f"{kind} {begun_seed}")
-                    seed = begun_seed + 1
-            except EOFError:
-                pass
-            worker.join()
-            if begun is not None:  # it died in a case
-                counts["crash"] += 1
-                print(f"{begun[1]} from={begun[0]}: ended its process with {worker.exitcode}", flush=True)
-                broken.setdefault(f"crash {worker.exitcode}", []).append(f"{begun[1]} {begun[0]}")
-                seed = begun[0] + 1
-    print(
-        json.dumps(
-            {
-                "cases": sum(counts.values()),
-                **{
-                    k: counts[k] for k in ("fine", "refused", "traceback", "message", "over 20 s", "over 2 GB", "crash")
-                },
-                "next": seed,
-            }
-        )
-    )
-    return int(bool(broken))
+        files = corpus.build(Path(folder))  # once, and with it what reading them needs is loaded before the forks
+        run = Run(kinds, int(given.get("from", 0)), int(given.get("cases", 10**12)), Path(given.get("out", "out/fuzz")),
+                  files)  # fmt: skip
+        run.go(int(given.get("processes", 1)), until)
+    names = ("fine", "refused", "traceback", "message", "over 20 s", "over 2 GB", "crash")
+    said = {"cases": sum(run.counts.values()), **{k: run.counts[k] for k in names}, "next": run.next}
+    print(json.dumps(said))
+    return int(bool(run.broken))
 
 
 if __name__ == "__main__":

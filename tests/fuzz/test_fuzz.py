@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import time
 import warnings
 
 import pytest
@@ -10,6 +12,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from . import __main__ as program
 from . import corpus, mutate, strategies, targets
 
 SHORT = settings(
@@ -96,3 +99,21 @@ def test_any_name_of_a_column(text):
     from dexsim.recording.columns import _role
 
     assert _role(text) is None or len(_role(text)) == 4
+
+
+def test_a_crash_ends_its_case_alone(tmp_path, monkeypatch, capfd):
+    """Of eight cases in batches of four one ends its process and one raises: six are fine, and each is said."""
+
+    def one(kind, seed, files, folder):
+        if seed == 1:
+            os._exit(7)
+        return ("traceback" if seed == 5 else "fine"), "KeyError: 'x'" * (seed == 5), folder / "case"
+
+    monkeypatch.setattr(program, "one", one)
+    monkeypatch.setattr(program, "BATCH", 4)
+    run = program.Run(["config"], 0, 8, tmp_path, {})
+    run.go(2, time.monotonic() + 60)
+    assert run.counts == {"fine": 6, "crash": 1, "traceback": 1} and run.next == 8
+    assert run.broken == {"crash 7": ["config 1"], "KeyError: 'x'": ["config 5"]}
+    said = capfd.readouterr().out
+    assert "config from=1: ended its process with 7" in said and "config from=5: traceback" in said
