@@ -224,6 +224,26 @@ def test_an_evaluation_keeps_its_trials():
     assert 0 <= m["touched_by_others"] <= 1
 
 
+def test_a_trials_facts_are_of_its_own_episode():
+    """Whatever ends begins anew at once, with another palm, mass and friction: a trial keeps those it was played in."""
+    env = make("task.evaluation.cap_s=1.5", worlds=12)
+    first: dict = {}
+
+    def let_go(obs):
+        first.update({} if first else {k: v.clone() for k, v in env.trial_facts().items()})
+        return -torch.ones(12, 12)
+
+    trials = env.evaluate(let_go, episodes=12, seed=3)["metrics"]["trials"]
+    over = [i for i, t in enumerate(trials) if t[2] != "capped"]
+    assert len(over) >= 6 and any(env.palm[i] != first["palm"][i] for i in over)
+    assert (env.objects.mass[over] != first["mass"][over]).all()
+    for i, (_, _, _, palm, edge, mass, friction, _) in enumerate(trials):
+        assert PALMS.index(palm) == first["palm"][i]
+        assert [edge, mass, friction] == pytest.approx(
+            [float(first[k][i]) for k in ("edge", "mass", "friction")], abs=6e-4
+        )
+
+
 # -- fewer taxels ------------------------------------------------------------------------------------------------------
 
 

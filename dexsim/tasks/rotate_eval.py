@@ -106,7 +106,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     count, last_step = torch.zeros(n, dtype=torch.long, device=dev), torch.zeros(n, dtype=torch.long, device=dev)
     end_step = torch.full((n,), steps, dtype=torch.long, device=dev)
     how = torch.full((n,), len(env.ENDS), dtype=torch.long, device=dev)
-    facts = {k: v.cpu().numpy() for k, v in env.trial_facts().items()}
+    facts = {k: v.clone().cpu().numpy() for k, v in env.trial_facts().items()}  # the next episode writes over them
     sums: dict[str, torch.Tensor] = {}
     shown = list(range(min(SHOWN, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]
