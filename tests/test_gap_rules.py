@@ -96,6 +96,19 @@ def test_a_further_effect_must_matter_beside_the_first():
     assert not search._earns(new, old)
 
 
+def test_a_size_at_its_bound_must_do_far_better_than_another():
+    search = Made()
+    search.case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0}))
+    p = param("scale", "position_scale", "set", 0.7, 1.4, 1.0)
+    member = Member(EFFECTS["position_scale"], Variant((p,), ((1.1,),)))
+    for x, loss, wins in ((0.7, 13.0, False), (0.7, 20.0, True), (0.8, 13.0, True)):
+        there = trial(10.0, (member,))
+        there.fit = SimpleNamespace(x=np.array([x]))
+        other = trial(loss, (member,))
+        other.fit = SimpleNamespace(x=np.array([0.9]))
+        assert (search._score(there) < search._score(other)) is wins, (x, loss)
+
+
 def row(share, price, effect="lag"):
     p = param("time_constant", effect, "set", 0.0, 1.0)
     return share, price, Member(EFFECTS[effect], Variant((p,), ((0.1,),))), np.array([0.1])
@@ -179,6 +192,7 @@ class Selecting(Made):
     _begun_again = lambda self, current, trials: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
+    _dear = lambda self, trial: 1.0  # noqa: E731
 
 
 def test_a_joint_has_at_most_so_many_effects():

@@ -39,6 +39,13 @@ class SearchRules:
         "by judgement: the plant itself is trusted to about as much",
         "test_intervals_hold_what_no_residual_shows",
     )
+    bounded: float = _rule(
+        1.5,
+        "x its loss: what a hypothesis counts for whose size stopped at the end of what is physical",
+        "by judgement; an inertia half as large again was taken for a reading scaled by 0.7, the least that is tried, "
+        "which follows it a tenth better since it scales the friction too",
+        "test_a_size_at_its_bound_must_do_far_better_than_another",
+    )
     off: float = _rule(
         0.025,
         "relative: what a refitted belief may be off by whatever the residuals say",

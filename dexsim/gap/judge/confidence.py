@@ -15,11 +15,9 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.plant.case import BELIEF, Case
-from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.rules import JUDGE
+from dexsim.gap.search.bounds import SHAPES, neutral_of
 
-# parameters that say what an effect is like, not how large it is
-SHAPES = ("v_s", "per_turn", "phase", "rebound", "rotor")
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 
 
@@ -53,16 +51,6 @@ class Evidence:
         return asdict(self)
 
 
-def neutral_of(param, case: Case) -> float:
-    """Value of a parameter at which its effect is not there."""
-    if param.mode == "add":
-        return 0.0
-    if param.mode == "factor":
-        return 1.0
-    name = param.columns[0]
-    return float(case.scales.nominal.get(name, NEUTRAL[INDEX[name]]))
-
-
 def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> bool:
     """Whether the 90 % intervals of all of an effect's sizes hold the value at which nothing is missing, as far as it
     is believed."""
@@ -80,21 +68,6 @@ def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case
         if not begins and not low - give <= zero <= high + give:
             return False
     return bool(sizes)
-
-
-def at_bound(params: Sequence, values: dict[str, float], case: Case) -> str:
-    """Key of a parameter that stopped at a bound of what is physical; empty where none did."""
-    for p in params:
-        if p.key in ("phase", "rebound", "rotor"):
-            continue
-        zero = neutral_of(p, case)
-        for bound in (p.low, p.high):
-            away = abs(bound - zero)
-            # a fit comes to rest a little before a bound; where an effect begins near one, it may be as small
-            room = (0.01 if away > 0.25 * p.span else 1e-3) * p.span
-            if away > room and abs(values[p.key] - bound) <= room:
-                return p.key
-    return ""
 
 
 def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case) -> str:

@@ -16,7 +16,7 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
 from dexsim.gap.result import Curve
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import jitter
+from dexsim.gap.search import bounds, jitter
 from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
@@ -229,7 +229,7 @@ class JointAnswer:
             evidence.reasons.append(small)
         if mm.id in self.search.unasked:
             evidence.reasons.append("the search ended before all that it may be confused with was tried in its place")
-        stopped = confidence.at_bound(mm.variant.params, raw, case)
+        stopped = bounds.at_bound(mm.variant.params, raw, case)
         if stopped:
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
         elif far := confidence.beyond(mm.variant.params, self._fitted(mm, self.bounds)[1], case):

@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
+from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.beliefs import refitted, unknown
@@ -24,6 +25,8 @@ EXTREMES = (
     "load",
     "position error",
 )  # regime variables whose largest values are never thinned out
+TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
+WAKE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
 MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 
 
@@ -124,7 +127,7 @@ class JointHypotheses:
         if params:
             span = np.array([p.span for p in params])
             trace = np.sqrt((f.jacobian**2).mean(0)) * span
-            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > 0.02]
+            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > TRACE]
         keep = [i for i, p in enumerate(params) if p in self.nuisances]
         x = f.x[keep]
         # large residuals are effects still to be named: the knee follows them down
@@ -192,15 +195,35 @@ class JointHypotheses:
         self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
     ) -> Trial:
         """The draft refitted on long windows. quick: fewer steps, and beliefs are not asked back home."""
-        params, slopes = short.params, slopes_of(like.fit) if like is not None else None
+        woken, at = self._woken(members, short)
+        params, slopes = [*short.params, *woken], slopes_of(like.fit) if like is not None else None
+        x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
         with self._fix(members):
-            a = self.fitter.fit(
-                params, x0=short.x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True
-            )
+            a = self.fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
             if like is not None and not quick and a.loss > like.fit.loss:
                 b = self.fitter.fit(params, x0=x0, iterations=7, tolerance=5e-3, slopes=slopes, lazy=True)
                 a = b if b.loss < a.loss else a
         return Trial(members, a)
+
+    def _woken(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
+        """Beliefs that left no trace without any effect and leave one with these, and what is believed of them [n]: a
+        drive that turns out to be slow may reach a limit that nothing was known of. Without them a hypothesis that
+        imitates another by such a belief would be the only one that may."""
+        taken = {c for p in short.params for c in p.columns}
+        asleep = [p for p in self.all_nuisances if not taken & set(p.columns)]
+        if not asleep:
+            return [], np.zeros(0)
+        base = self.case.plant.base()[0]
+        at = np.array([{"factor": 1.0, "add": 0.0}.get(p.mode, base[INDEX[p.columns[0]]]) for p in asleep])
+        params, n = [*short.params, *asleep], len(short.params)
+        x = np.repeat(np.concatenate([short.x, at])[None], len(asleep) + 1, 0)
+        for i, p in enumerate(asleep):
+            x[i + 1, n + i] += WAKE * p.span * (1.0 if at[i] < 0.5 * (p.low + p.high) else -1.0)
+        with self._fix(members):
+            r = self.scan_fitter.residuals(params, x)
+        trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / WAKE
+        awake = trace > TRACE
+        return [p for p, on in zip(asleep, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:
         """The trial looked for nearby, and with its beliefs asked back home."""

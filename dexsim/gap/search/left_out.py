@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.bounds import SHAPES, at_bound
 from dexsim.gap.search.fit import Fitter, disbelief, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, subset
 from dexsim.gap.search.trial import Trial, dear_of
@@ -22,8 +23,20 @@ class JointLosses(JointHypotheses):
         return (
             float(self._left(trial).sum())
             * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
-            * dear_of(trial)
+            * self._dear(trial)
         )
+
+    def _dear(self, trial: Trial) -> float:
+        """Factor on the losses of a hypothesis that can imitate simpler ones, or whose size stopped at the end of what
+        is physical: the data would have it where it cannot be."""
+        at, begin = dear_of(trial), 0
+        for m in trial.members:
+            fitted = trial.fit.x[begin : begin + len(m.variant.params)]
+            begin += len(m.variant.params)
+            values = {p.key: x for p, x in zip(m.variant.params, fitted, strict=True) if p.key not in SHAPES}
+            if at_bound([p for p in m.variant.params if p.key in values], values, self.case):
+                at *= SEARCH.bounded
+        return at
 
     def _left(self, trial: Trial) -> np.ndarray:
         """Losses by block [B] on what was left out, and what the beliefs had to give for them, spread over the

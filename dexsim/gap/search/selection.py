@@ -12,7 +12,7 @@ from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import slopes_of
 from dexsim.gap.search.left_out import BOOTSTRAPS
 from dexsim.gap.search.scan import JointScan, expand_one
-from dexsim.gap.search.trial import Member, Outcome, Trial, dear_of, fits_beside
+from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs back home
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
@@ -326,7 +326,7 @@ class JointSelection(JointScan):
                 if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
                     self.cross(trial)
                     others.append(trial)
-            table = np.stack([mine * dear_of(current), *[self._left(t) * dear_of(t) for t in others], lost])
+            table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
             n = table.shape[1]
             size = min(4, n)
             starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
