@@ -10,6 +10,7 @@ import pytest
 from dexsim.gap.judge import confidence, errors
 from dexsim.gap.judge.joint import JointAnswer
 from dexsim.gap.rules import JUDGE
+from dexsim.gap.search import bounds
 
 ROWS = 400
 
@@ -61,3 +62,25 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
     assert (judged(answer)["confidence"] <= JUDGE.hinted) is hint
     reasons = answer.evidence[0].reasons
     assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)
+
+
+@pytest.mark.parametrize(("narrow", "wide", "doubted"), [(False, False, 0), (False, True, 1), (True, True, 1)])
+def test_a_name_is_doubted_by_the_interval_that_is_reported(monkeypatch, narrow, wide, doubted):
+    """Which of the two intervals, the fit's and the reported one, holds the size at which nothing is missing."""
+    answer = Judged(1.0, 0.1)
+    answer.widest, answer.bounds = narrow, wide
+    answer._fitted = lambda mm, bounds: ({}, bounds)
+    answer.case = SimpleNamespace(joint="j", sigma=1e-3, quantum=0.0)
+    answer.before = answer.after
+    answer.outcome = SimpleNamespace(confidence={}, folds={})
+    answer.search = SimpleNamespace(unasked=set(), r=SimpleNamespace(sigma_torque=1.0))
+    answer.member.variant.params = []
+    answer.member.effect.doubts, answer.member.effect.of_pose = lambda *_: [], lambda *_: False
+    monkeypatch.setattr(confidence, "holds_nothing", lambda params, spread, case: spread)
+    for name in ("too_small", "unresolved"):
+        monkeypatch.setattr(confidence, name, lambda *_: "")
+    monkeypatch.setattr(bounds, "at_bound", lambda *_: "")
+    monkeypatch.setattr(confidence, "beyond", lambda *_: "")
+    evidence = JointAnswer._weighed(answer, answer.member, {}, narrow, 1.0, 0.1, False)
+    assert len(evidence.reasons) == doubted and all("nothing is missing" in r for r in evidence.reasons)
+    assert evidence.confidence < 0.8 or not doubted

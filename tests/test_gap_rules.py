@@ -18,9 +18,11 @@ from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
 from dexsim.gap.judge.joint import JointAnswer, stretched
 from dexsim.gap.locate import bins
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.report import sections
+from dexsim.gap.search import selection
 from dexsim.gap.search.fit import Fitted
-from dexsim.gap.search.hypotheses import JointHypotheses
+from dexsim.gap.search.hypotheses import JointHypotheses, thin
 from dexsim.gap.search.search import JointSearch
 from dexsim.gap.search.time_limit import Deadline
 from dexsim.gap.search.trial import Member, Trial
@@ -193,6 +195,7 @@ class Selecting(Made):
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
     _dear = lambda self, trial: 1.0  # noqa: E731
+    plain = lambda self: None  # noqa: E731
 
 
 def test_a_joint_has_at_most_so_many_effects():
@@ -200,6 +203,44 @@ def test_a_joint_has_at_most_so_many_effects():
     search = Selecting(lambda ids: (1e6 * 0.5 ** len(ids),) * 2, *offered)
     search._shortlist = lambda scan, *_: scan
     assert len(search.run().best.ids) == 4
+
+
+class Plainly(Selecting):
+    """A selection whose scan offers nothing, beside a plain model that differs from what is believed by friction of
+    both kinds; `fits` are the hypotheses that were tried, with the sizes they began at."""
+
+    def __init__(self, losses, values):
+        super().__init__(losses)
+        nominal = {"coulomb_friction": 0.1, "viscous_friction": 0.0, "delay": 0.01}
+        self.case.scales, self.wide, self.allowed, self.fits = SimpleNamespace(nominal=nominal), set(), None, []
+        unit = SimpleNamespace(loss=lambda r: np.array([self.losses(())[1]]), evaluate=lambda params, x: np.zeros(3))
+        self.scan_fitter, self._fix = unit, lambda members: nullcontext()
+        self.values = [(param(c, c, "set", 0.0, 1.0), x) for c, x in zip(nominal, values, strict=True)]
+
+    def plain(self):
+        return [p for p, _ in self.values], np.array([x for _, x in self.values])
+
+    def _narrow(self, variant):
+        mode = "add" if variant.params[0].columns == ("delay",) else "set"
+        return Variant((param("size", variant.params[0].columns[0], mode, -0.5, 1.0),), ((0.0,),))
+
+    def draft(self, members, x, like):
+        self.fits.append((tuple(m.id for m in members), tuple(np.round(x, 6))))
+        return super().draft(members, x, like)
+
+
+@pytest.mark.parametrize("left, found", [(0.5, True), (0.95, False)])
+def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
+    def effect(name, column):
+        variant = SimpleNamespace(refines=False, params=[SimpleNamespace(columns=(column,))])
+        return SimpleNamespace(id=name, variants=lambda scales: [variant])
+
+    monkeypatch.setattr(selection, "EFFECTS", {e: effect(e, c[0]) for e, c in selection.PLAIN.items()})
+    monkeypatch.setattr(selection, "fits_beside", lambda a, b: True)
+    search = Plainly(lambda ids: (10 * left,) * 2 if len(ids) > 1 else (10.0,) * 2, (0.3, 0.2, 0.01))
+    best = search.run().best
+    assert search.fits == [(("coulomb_friction", "viscous_friction"), (0.3, 0.2))]  # the delay is as believed
+    assert best.ids == (("coulomb_friction", "viscous_friction") if found else ())
 
 
 def test_what_saves_much_in_hindsight_is_tried_whatever_its_price():
@@ -455,6 +496,7 @@ def test_a_stand_in_must_take_a_least_share_off():
                 residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None
             ) is offered, after
 
+
 def test_what_the_rest_depends_on_is_said_where_much_is_left():
     for left, said in ((1.45, False), (1.55, True)):  # x the noise
         windows = SimpleNamespace(n=30, sample_row=np.arange(30))
@@ -503,3 +545,21 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
 
 
 TESTS = vars(test_gap_rules_touch) | globals()
+
+
+def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():
+    """Of 40 windows of four runs: the one that saturates is kept, and of the run that is fastest all along three."""
+    count, rows = 40, 10
+    sample_window = np.repeat(np.arange(count), rows)
+    run = np.arange(count) // 10
+    window = np.zeros((count, 5), int)
+    window[:, 1] = window[:, 4] = rows
+    n = count * rows
+    windows = Windows(window, np.zeros((count, rows)), np.arange(n), np.zeros(n), sample_window, np.arange(n), run)
+    speed = np.where(run[sample_window] == 1, 10.0, 1.0) + 1e-3 * sample_window
+    saturation = (sample_window == 27).astype(float)
+    case = SimpleNamespace(plant=SimpleNamespace(dt=0.2), regimes={"saturation": saturation, "speed": speed})
+    kept = thin(windows, case, budget=24.0)
+    first = kept.sample_row[np.searchsorted(kept.sample_window, np.arange(len(kept.window)))] // rows
+    assert len(first) == 12 and 27 in first
+    assert np.bincount(run[first], minlength=4).max() <= 5, np.bincount(run[first])

@@ -262,11 +262,11 @@ class Drives(Steps):
 
     def judge(self) -> None:
         """The answers on what was kept out, and what a plain model of each joint leaves of it."""
-        p, seed = self.parts, self.w.settings.seed
+        p = self.parts
         for a in self.answers:
             a.judge(self.w.m)
         fits = (
-            baseline.fit(case, p.train, p.test, p.span_train, p.span_test, seed, search.whole)
+            baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
             for case, search, _ in self.outcomes
             if case.moved
         )

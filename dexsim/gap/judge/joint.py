@@ -219,6 +219,11 @@ class JointAnswer:
         nothing = confidence.holds_nothing(mm.variant.params, spread, case)
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
+        elif confidence.holds_nothing(mm.variant.params, self._fitted(mm, self.bounds)[1], case):
+            evidence.reasons.append(
+                "its interval, as wide as what is left and the laws it may follow make it, holds the size at which "
+                "nothing is missing"
+            )
         small = (
             ""
             if effort_only

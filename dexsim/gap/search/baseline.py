@@ -19,6 +19,7 @@ from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param, expand
 from dexsim.gap.search.fit import Fitter, Residuals
+from dexsim.gap.search.hypotheses import subset
 from dexsim.gap.search.recorded_motion import forbids, room_for_friction
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
@@ -117,24 +118,13 @@ def plain_model(case: Case, train: Sequence[int]) -> list[Param]:
     return out
 
 
-def fit(
-    case: Case,
-    train: Sequence[int],
-    test: Sequence[int],
-    span_train: dict | None = None,
-    span_test: dict | None = None,
-    seed: int = 0,
-    whole: Any = None,
-) -> Baseline | None:
-    """The plain model of a joint, fitted on runs `train` and judged on `test` (span_*: part of each run, s). whole: the
-    plant on which free runs are judged (None: the case's own). None where there is nothing to fit or to judge."""
-    from dexsim.gap.judge.errors import free_run
-    from dexsim.gap.search.search import subset
-
-    windows = case.plant.windows(WINDOW, list(train), span=span_train)
-    judged = replace(case, plant=whole or case.plant)
-    kept = judged.plant.windows(None, list(test), span=span_test)
-    if not len(windows.window) or not len(kept.window):
+def fitted(
+    case: Case, train: Sequence[int], span: dict | None = None, seed: int = 0
+) -> tuple[list[Param], np.ndarray] | None:
+    """The plain model of a joint, fitted on runs `train` (span: part of each run, s): its parameters and their values
+    [P]. None where there is nothing to fit."""
+    windows = case.plant.windows(WINDOW, list(train), span=span)
+    if not len(windows.window):
         return None
     pick = np.zeros(len(windows.window), bool)
     pick[np.unique(np.linspace(0, len(pick) - 1, WINDOWS).astype(int))] = True
@@ -144,10 +134,28 @@ def fit(
         subset(windows, pick),
         Residuals(case.sigma, sigma_q0=0.7 * case.sigma, sigma_v0=max(case.sigma / 0.02, 0.02 * case.scales.speed)),
     )
-    x = _fitted(fitter, params, np.random.default_rng(seed))
-    measured = judged.plant.q[kept.sample_row]
-    before = (measured - free_run(judged, [], np.zeros(0), kept, underway=True)[0]) ** 2
-    after = (measured - free_run(judged, params, x, kept, underway=True)[0]) ** 2
+    return params, _fitted(fitter, params, np.random.default_rng(seed))
+
+
+def judged(
+    case: Case,
+    plain: tuple[list[Param], np.ndarray] | None,
+    test: Sequence[int],
+    span: dict | None = None,
+    whole: Any = None,
+) -> Baseline | None:
+    """The plain model of a joint (`fitted`) on runs `test` (span: part of each run, s). whole: the plant on which free
+    runs are judged (None: the case's own). None where nothing was fitted or there is nothing to judge."""
+    from dexsim.gap.judge.errors import free_run
+
+    here = replace(case, plant=whole or case.plant)
+    kept = here.plant.windows(None, list(test), span=span)
+    if plain is None or not len(kept.window):
+        return None
+    params, x = plain
+    measured = here.plant.q[kept.sample_row]
+    before = (measured - free_run(here, [], np.zeros(0), kept, underway=True)[0]) ** 2
+    after = (measured - free_run(here, params, x, kept, underway=True)[0]) ** 2
     value = {
         p.key: float(v * case.scales.nominal[p.key] if p.mode == "factor" else v)
         for p, v in zip(params, x, strict=True)
@@ -158,7 +166,7 @@ def fit(
         if v >= p.high - 1e-3 * p.span or (v <= p.low + 1e-3 * p.span and p.low > 0)
     )
     rms = lambda e: float(np.sqrt(np.mean(e)))  # noqa: E731
-    block = (judged.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * judged.plant.run_of[kept.sample_row]
+    block = (here.plant.t[kept.sample_row] / BLOCK).astype(int) + 100_000 * here.plant.run_of[kept.sample_row]
     return Baseline(case.joint, value, rms(before), rms(after), before, after, block, case.scales.slide, stopped)
 
 

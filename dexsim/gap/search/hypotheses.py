@@ -18,6 +18,7 @@ from dexsim.gap.search.trial import Fixed, Member, Trial, named
 
 SHORT, LONG = 1.0, 2.0  # s: windows of the scan and of the comparisons
 SCAN_BUDGET, BUDGET = 30.0, 48.0  # s of a joint's recordings that the scan, and the comparisons, simulate
+SHARE, MOST = 0.16, 2.0  # of recordings that are longer as much is simulated, up to so many times the budget
 EXTREMES = (
     "saturation",
     "speed",
@@ -25,6 +26,7 @@ EXTREMES = (
     "load",
     "position error",
 )  # regime variables whose largest values are never thinned out
+EXTREME, OF_RUN = 12, 3  # windows
 TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
 WAKE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
 MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
@@ -47,7 +49,7 @@ class JointHypotheses:
         deadline: Deadline | None = None,
     ):
         self.case, self.train, self.span = case, train, span
-        self.rng = np.random.default_rng(seed)
+        self.seed, self.rng = seed, np.random.default_rng(seed)
         self.allowed = allowed
         self.deadline = deadline or Deadline()
         self.unasked: set[str] = set()  # effects whose likenesses the deadline left untried
@@ -276,15 +278,18 @@ def restlessness(r: np.ndarray, window: np.ndarray) -> float:
 
 
 def thin(w: Windows, case: Case, budget: float) -> Windows:
-    """At most `budget` seconds of windows: more would say little more. Half of them are those in which a regime
-    variable is most extreme (a limit that is reached in one recording of ten must not be thinned out), the others are
-    spread evenly."""
+    """At most `budget` seconds of windows, of long recordings `SHARE` up to `MOST` times that: more would say little
+    more. Half of them, but no more than `EXTREME`, are those in which a regime variable is most extreme (a limit that
+    is reached in one recording of ten must not be thinned out), at most `OF_RUN` of one recording (the fast end of one
+    sweep would outweigh all else); the others are spread evenly."""
     count, seconds = len(w.window), float(w.window[:, 1].sum()) * case.plant.dt
+    budget = min(max(budget, SHARE * seconds * budget / BUDGET), MOST * budget)
     if seconds <= budget:
         return w
     most = max(int(count * budget / seconds), 8)
     size = np.maximum(np.bincount(w.sample_window, minlength=count), 1)
     chosen: list[int] = []
+    of_run = np.zeros(int(w.run.max()) + 1, int)
     orders = [
         np.argsort(-np.bincount(w.sample_window, np.abs(case.regimes[name][w.sample_row]), count) / size, kind="stable")
         for name in EXTREMES
@@ -292,8 +297,10 @@ def thin(w: Windows, case: Case, budget: float) -> Windows:
     ]
     for k in range(count):
         for order in orders:
-            if len(chosen) < most // 2 and order[k] not in chosen:
+            run = w.run[order[k]]
+            if len(chosen) < min(most // 2, EXTREME) and of_run[run] < OF_RUN and order[k] not in chosen:
                 chosen.append(int(order[k]))
+                of_run[run] += 1
     rest = np.setdiff1d(np.arange(count), chosen)
     keep = np.zeros(count, bool)
     keep[chosen] = True

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import confusable
+from dexsim.gap.effects.catalogue import EFFECTS, confusable
+from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX
+from dexsim.gap.plant.param import Param
 from dexsim.gap.rules import SEARCH
+from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import slopes_of
 from dexsim.gap.search.left_out import BOOTSTRAPS
 from dexsim.gap.search.scan import JointScan, expand_one
@@ -16,6 +20,15 @@ from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs back home
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
+
+
+PLAIN = {  # effects by which the plain model differs from what is believed, and the columns that it fits of them
+    "coulomb_friction": ("coulomb_friction",),
+    "viscous_friction": ("viscous_friction",),
+    "command_delay": ("delay",),
+    "torque_limit": ("torque_limit",),
+    "gain_mismatch": ("kp", "kd"),
+}
 
 
 class JointSelection(JointScan):
@@ -125,6 +138,7 @@ class JointSelection(JointScan):
             current, level = best, trials
             if len(current.members) > 1 and not self.deadline.over():
                 current, level = self._swap(current, pool, level)
+        current = self._from_plain(current)
         if not self.deadline.over():
             current = self._lawful(self._refine(self._drop(current)))
         self._on(0.1)
@@ -140,6 +154,7 @@ class JointSelection(JointScan):
             final = self.rivals(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
+            price.setdefault(m.id, 0.0)
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
 
     def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
@@ -174,6 +189,48 @@ class JointSelection(JointScan):
             if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best) and not self._shrunk(new):
                 best = new
         return best
+
+    def plain(self) -> tuple[list[Param], np.ndarray] | None:
+        """The plain model of this joint (`baseline.fitted`), fitted once."""
+        if not hasattr(self, "_plain"):
+            self._plain = baseline.fitted(self.case, self.train, self.span, self.seed)
+        return self._plain
+
+    def _from_plain(self, current: Trial) -> Trial:
+        """The effects by which a plain least squares differs from what is believed, all at once and from its figures,
+        where they follow better: of several that are missing together each alone may look like another. Those that do
+        not earn their place are let go. `current` where they do not."""
+        enough = self._left(current).sum() / len(self.blocks) < SEARCH.enough**2
+        if enough or self.deadline.over() or (plain := self.plain()) is None:
+            return current
+        at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
+        members, starts = [], []
+        for effect, columns in PLAIN.items():
+            moved = [c for c in columns if c in at and c not in self.wide and _differs(*at[c], self.case)]
+            if not moved or (self.allowed is not None and effect not in self.allowed):
+                continue
+            variants = [v for v in EFFECTS[effect].variants(self.case.scales) if not v.refines]
+            variant = self._narrow(variants[0]) if variants else None
+            if variant is None or any(not fits_beside(Member(EFFECTS[effect], variant), m) for m in members):
+                continue
+            values = [
+                _value(p, *at[p.columns[0]], self.case) if p.columns[0] in at else v
+                for p, v in zip(variant.params, variant.starts[0], strict=True)
+            ]
+            members.append(Member(EFFECTS[effect], variant))
+            starts.append(np.array(values))
+        if len(members) < 2:
+            return current
+        with self._fix(current.members):
+            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
+        like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
+        draft = self.draft(tuple(members), np.concatenate(starts), like)
+        if draft[2].loss > (1 - SEARCH.least) * short:
+            return current
+        trial = self.thorough(self.finish(*draft, current))
+        if not self._earns(trial, current, further=False):
+            return current
+        return self._drop(trial)
 
     def _pair(self, current: Trial, listed) -> Trial | None:
         best = None
@@ -349,3 +406,18 @@ class JointSelection(JointScan):
         none = self.start()
         self.none_loss = self._left(none)
         return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
+
+
+def _value(p: Param, plain: Param, x: float, case: Case) -> float:
+    """The value of an effect's parameter `p` that writes to its column what the plain model's `plain` does at `x`."""
+    nominal = case.scales.nominal[p.columns[0]]
+    absolute = x * nominal if plain.mode == "factor" else x
+    value = absolute / nominal if p.mode == "factor" else absolute - nominal if p.mode == "add" else absolute
+    return float(np.clip(value, p.low, p.high))
+
+
+def _differs(plain: Param, x: float, case: Case) -> bool:
+    """Whether the plain model's figure is another than what is believed, as far as that is believed."""
+    nominal = case.scales.nominal[plain.columns[0]]
+    unit = nominal if plain.mode == "factor" else 1.0
+    return abs(x * unit - nominal) > max(BELIEF * abs(nominal), 0.01 * plain.span * unit)
