@@ -85,7 +85,7 @@ def moved(case, seconds: float = 6.0, seed: int = 0, **true: float) -> Run:
 def fitted():
     true = {"kp": 3.9, "kd": 0.16, "coulomb_friction": 0.08, "viscous_friction": 0.0, "delay": 0.02}
     case = case_of(*(moved(None, seed=k, **true) for k in (0, 1)))
-    return case, true, baseline.fit(case, [0], [1])
+    return case, true, baseline.judged(case, baseline.fitted(case, [0]), [1])
 
 
 def test_the_plain_model_follows_what_it_can_state(fitted):

@@ -233,9 +233,11 @@ class Plainly(Selecting):
 def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
     def effect(name, column):
         variant = SimpleNamespace(refines=False, params=[SimpleNamespace(columns=(column,))])
-        return SimpleNamespace(id=name, variants=lambda scales: [variant])
+        return SimpleNamespace(id=name, plain=(column,), variants=lambda scales: [variant])
 
-    monkeypatch.setattr(selection, "EFFECTS", {e: effect(e, c[0]) for e, c in selection.PLAIN.items()})
+    fitted = [effect(e.id, e.plain[0]) for e in selection.CATALOGUE if e.plain]
+    assert {e.id for e in fitted} >= {"coulomb_friction", "viscous_friction", "command_delay", "torque_limit"}
+    monkeypatch.setattr(selection, "CATALOGUE", fitted)
     monkeypatch.setattr(selection, "fits_beside", lambda a, b: True)
     search = Plainly(lambda ids: (10 * left,) * 2 if len(ids) > 1 else (10.0,) * 2, (0.3, 0.2, 0.01))
     best = search.run().best

@@ -20,6 +20,7 @@ class CoulombFriction(Effect):
     words = "has more (or less) dry friction than believed"
     shows = "at reversals and low speed"
     experiment = "slow triangles in both directions at constant load"
+    plain = ("coulomb_friction",)
     classes = ("friction or play", "friction and load")
     motions = ("triangles", "steps")
     fitted_anyway = {"coulomb_friction": "torque"}

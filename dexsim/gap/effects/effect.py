@@ -110,6 +110,7 @@ class Effect:
     fitted_anyway: ClassVar[dict[str, str]] = {}  # servo column that may be unknown -> the parameter that it is
     demo: ClassVar[dict[str, float]] = {}  # servo columns of a drive that hides it, for `demo=`
     demo_on_motor: ClassVar[bool] = False  # hidden behind a loop whose encoder sits on the motor
+    plain: ClassVar[tuple[str, ...]] = ()  # servo columns of it that the plain model (`search.baseline`) fits
     misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints

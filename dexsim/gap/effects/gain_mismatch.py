@@ -20,6 +20,7 @@ class GainMismatch(Effect):
     words = "runs on other gains than believed"
     shows = "with the size of the error"
     experiment = "steps of several sizes against a known load"
+    plain = ("kp", "kd")
     classes = ("with speed", "static load", "loop")
     motions = ("steps", "holds")
 

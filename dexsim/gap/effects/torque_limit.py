@@ -20,6 +20,7 @@ class TorqueLimit(Effect):
     words = "gives less torque than believed when it saturates"
     shows = "at saturation"
     experiment = "large steps against a load"
+    plain = ("torque_limit",)
 
     def variants(self, s: Scales) -> list[Variant]:
         believed = s.nominal["torque_limit"]

@@ -20,6 +20,7 @@ class ViscousFriction(Effect):
     words = "has friction that grows with speed"
     shows = "at high speed"
     experiment = "constant speeds from slow to fast"
+    plain = ("viscous_friction",)
     classes = ("with speed",)
     motions = ("ladder",)
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from dexsim.gap.effects.catalogue import EFFECTS, confusable
+from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.plant.param import Param
@@ -20,15 +20,6 @@ from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs back home
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
-
-
-PLAIN = {  # effects by which the plain model differs from what is believed, and the columns that it fits of them
-    "coulomb_friction": ("coulomb_friction",),
-    "viscous_friction": ("viscous_friction",),
-    "command_delay": ("delay",),
-    "torque_limit": ("torque_limit",),
-    "gain_mismatch": ("kp", "kd"),
-}
 
 
 class JointSelection(JointScan):
@@ -205,19 +196,19 @@ class JointSelection(JointScan):
             return current
         at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
         members, starts = [], []
-        for effect, columns in PLAIN.items():
-            moved = [c for c in columns if c in at and c not in self.wide and _differs(*at[c], self.case)]
-            if not moved or (self.allowed is not None and effect not in self.allowed):
+        for effect in CATALOGUE:
+            moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
+            if not moved or (self.allowed is not None and effect.id not in self.allowed):
                 continue
-            variants = [v for v in EFFECTS[effect].variants(self.case.scales) if not v.refines]
+            variants = [v for v in effect.variants(self.case.scales) if not v.refines]
             variant = self._narrow(variants[0]) if variants else None
-            if variant is None or any(not fits_beside(Member(EFFECTS[effect], variant), m) for m in members):
+            if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
                 continue
             values = [
                 _value(p, *at[p.columns[0]], self.case) if p.columns[0] in at else v
                 for p, v in zip(variant.params, variant.starts[0], strict=True)
             ]
-            members.append(Member(EFFECTS[effect], variant))
+            members.append(Member(effect, variant))
             starts.append(np.array(values))
         if len(members) < 2:
             return current
