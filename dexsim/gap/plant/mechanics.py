@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import mujoco
+import mujoco.batch
 import numpy as np
 
 from dexsim.errors import UserError
@@ -12,6 +14,7 @@ from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 
 # Hz at which the model is evaluated (along a sharpened motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0
+TOGETHER = 64  # samples of a motion that are evaluated in one call
 
 
 @dataclass
@@ -79,48 +82,19 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
     dadr = np.array([model.jnt_dofadr[i] for i in ids])
     known, motion = (run.fine[0], run.fine[1:]) if run.fine else (run.t, (run.qs, run.vs, run.as_))
     q, v, a = (np.stack([np.interp(times, known, x[:, j]) for j in range(x.shape[1])], 1) for x in motion)
-    data = mujoco.MjData(model)
-    flags = model.opt.disableflags
-    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(
-        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    )
-    J, nv = len(joints), model.nv
+    J = len(joints)
     bodies = np.array([model.jnt_bodyid[i] for i in ids])
     leaves = np.array([leaf_of(model, b) for b in bodies])
-    axis = np.empty((n, J, 3))
-    anchor = np.empty((n, J, 3))
-    com = np.empty((n, J, 3))
-    point = np.empty((n, J, 3))
-    total = np.empty((n, J))
-    diag = np.empty((n, J))
-    bias = np.empty((n, J))
-    passive = np.empty((n, J))
-    own = np.empty((n, J, 3))
-    turn = np.empty((n, J, 3, 3))
-    places = _places(model, data, ids, leaves)
-    full = np.zeros((nv, nv))
-    acc = np.zeros(nv)
-    gravity = np.array(model.opt.gravity)
-    model.opt.gravity[:] = 0.0  # gravity comes in by its own columns
-    try:
-        for i in range(n):
-            data.qpos[qadr] = q[i]
-            data.qvel[dadr] = v[i]
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            mujoco.mj_fullM(model, data, full)
-            acc[dadr] = a[i]
-            total[i] = (full @ acc)[dadr]
-            diag[i] = full[dadr, dadr]
-            bias[i] = data.qfrc_bias[dadr]
-            passive[i] = data.qfrc_spring[dadr]
-            axis[i], anchor[i] = data.xaxis[ids], data.xanchor[ids]
-            com[i], point[i] = data.subtree_com[bodies], data.xipos[leaves]
-            own[i] = data.xipos[bodies]
-            turn[i] = data.xmat[leaves].reshape(J, 3, 3)
-    finally:
-        model.opt.gravity[:] = gravity
-        model.opt.disableflags = flags
+    places = _places(model, mujoco.MjData(model), ids, leaves)
+    seen = _evaluated(model, qadr, dadr, q, v)
+    full = _full(model, seen["M"])
+    acc = np.zeros((n, model.nv, 1))
+    acc[:, dadr, 0] = a
+    total, diag = (full @ acc)[:, dadr, 0], full[:, dadr, dadr]
+    bias, passive = seen["qfrc_bias"][:, dadr], seen["qfrc_spring"][:, dadr]
+    axis, anchor = seen["xaxis"][:, ids], seen["xanchor"][:, ids]
+    com, point, own = seen["subtree_com"][:, bodies], seen["xipos"][:, leaves], seen["xipos"][:, bodies]
+    turn = seen["xmat"][:, leaves].reshape(n, J, 3, 3)
     rest = total - diag * a + bias - passive
     mass = model.body_subtreemass[bodies]
     slide = np.array([int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for i in ids])
@@ -178,6 +152,41 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
             )
         )
     return times, out, constants
+
+
+def _evaluated(
+    model: mujoco.MjModel, qadr: np.ndarray, dadr: np.ndarray, q: np.ndarray, v: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What MuJoCo makes of positions and speeds [n, J] of some joints, the others at rest: its fields [n, ...] by name,
+    contacts, constraints and gravity (which comes in by columns of its own) left out."""
+    names = ("M", "qfrc_bias", "qfrc_spring", "xaxis", "xanchor", "subtree_com", "xipos", "xmat")
+    model, n = copy.copy(model), len(q)
+    bit = mujoco.mjtDisableBit
+    for flag in (bit.mjDSBL_CONTACT, bit.mjDSBL_CONSTRAINT, bit.mjDSBL_SENSOR):
+        model.opt.disableflags |= int(flag)
+    model.opt.gravity[:] = 0.0
+    batch = mujoco.batch.Batch(model, min(n, TOGETHER), 1)
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    fields = {name: batch.bind(name) for name in names}
+    out = {name: np.empty((n, *x.shape[1:])) for name, x in fields.items()}
+    for first in range(0, n, len(qpos)):
+        part = slice(first, min(first + len(qpos), n))
+        count = part.stop - first
+        qpos[:count, qadr], qvel[:count, dadr] = q[part], v[part]
+        batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        for name, x in fields.items():
+            out[name][part] = x[:count]
+    return out
+
+
+def _full(model: mujoco.MjModel, sparse: np.ndarray) -> np.ndarray:
+    """Inertia matrices [n, nv, nv] of MuJoCo's sparse ones, their lower triangles by rows."""
+    rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+    columns = np.concatenate([model.M_colind[at : at + k] for at, k in zip(model.M_rowadr, model.M_rownnz, strict=True)])
+    full = np.zeros((len(sparse), model.nv, model.nv))
+    full[:, rows, columns] = sparse
+    full[:, columns, rows] = sparse
+    return full
 
 
 def _places(model: mujoco.MjModel, data: mujoco.MjData, ids, leaves) -> np.ndarray:
