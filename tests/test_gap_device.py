@@ -11,11 +11,11 @@ from test_gap import demo, plant_run
 from dexsim.errors import UserError
 from dexsim.gap import command
 from dexsim.gap.plant import batch as plants
+from dexsim.gap.plant import side_by_side
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.search import parallel
-from dexsim.gap.search.parallel import lanes
-from dexsim.gap.search.parallel import together as side_by_side
+from dexsim.gap.search.parallel import lanes, together
 
 GPU = wp.get_cuda_device_count() > 0
 
@@ -59,6 +59,7 @@ def test_the_gpus_way_of_launching_gives_the_same_numbers(guesses, monkeypatch):
     monkeypatch.setattr(plants, "_LANE", plants.threading.local())
     windows = plant.windows(1.0)
     for count in (9, 3, 9):  # buffers are used again, larger and smaller
+        windows.known.clear()
         q, torque = plant.simulate(params[:count], windows, inits[:count])
         assert np.array_equal(q, expected[0][:count]) and np.array_equal(torque, expected[1][:count])
 
@@ -86,16 +87,16 @@ def test_joints_side_by_side_come_back_in_order(monkeypatch):
         return k * k
 
     names = ["a", "b", "c"]
-    assert side_by_side(names, work, "cuda", lambda *x: seen.append(x)) == [0, 1, 4]
+    assert together(names, work, "cuda", lambda *x: seen.append(x)) == [0, 1, 4]
     assert seen[-1] == (3, 3, "") and sorted({x[2] for x in seen[:-1]}) == names
     done = [x[0] for x in seen]
     # each begins, and is half done
     assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])
     with pytest.raises(ZeroDivisionError):
-        side_by_side(names, lambda k, tell: 1 // 0, "cuda")
+        together(names, lambda k, tell: 1 // 0, "cuda")
     for given, cores in (("1", 1), ("4", 2), ("64", parallel.MOST_CPU), ("12", 6)):
         monkeypatch.setenv("OMP_NUM_THREADS", given)
-        assert lanes("cpu", 20) == max(1, min(cores, int(given) // plants.THREADS))
+        assert lanes("cpu", 20) == max(1, min(cores, int(given) // parallel.CORES))
     assert lanes("cpu", 1) == 1 and lanes("cuda", 20) == parallel.MOST_GPU
 
 
@@ -111,3 +112,76 @@ def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):
     assert command.available("cuda:2") == "cpu" and "it has 2" in capsys.readouterr().out
     with pytest.raises(UserError, match="cuda:0"):
         command.available("cuda:x")
+
+
+def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
+    """Cut between windows or between guesses, whatever their number: each is simulated once, bit for bit as in one
+    launch."""
+    plant, params, inits = guesses
+    monkeypatch.setattr(side_by_side, "WORTH", 1)
+    monkeypatch.setattr(side_by_side, "cores", lambda: 1)
+    expected = {length: plant.simulate(params, plant.windows(length), inits) for length in (1.0, None)}
+    for cores in (2, 3, 5):
+        monkeypatch.setattr(side_by_side, "cores", lambda cores=cores: cores)
+        for length, (q, torque) in expected.items():
+            windows = plant.windows(length)
+            for count in (9, 2, 1):
+                windows.known.clear()
+                got = plant.simulate(params[:count], windows, inits[:count])
+                assert np.array_equal(got[0], q[:count]) and np.array_equal(got[1], torque[:count])
+    steps = np.array([100, 100, 400])
+    for cores in (1, 2, 3, 8):
+        monkeypatch.setattr(side_by_side, "cores", lambda cores=cores: cores)
+        for guesses_ in (1, 2, 7):
+            done = np.zeros((3, guesses_), int)
+            parts = side_by_side.parts(steps, guesses_)
+            for w, g in parts:
+                done[w, g] += 1
+            assert (done == 1).all() and len(parts) <= cores
+    with side_by_side.shared_by(4):
+        assert len(side_by_side.parts(steps, 8)) == 2
+
+
+def test_a_fault_in_a_part_is_not_lost(monkeypatch):
+    def work(windows: slice, guesses: slice) -> None:
+        if guesses.start:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        side_by_side.run(work, [(slice(0, 1), slice(0, 1)), (slice(0, 1), slice(1, 2))])
+
+
+def test_what_was_simulated_is_known_and_nothing_else_is(guesses):
+    plant, params, inits = guesses
+    windows = plant.windows(1.0)
+    launched: list[int] = []
+    simulated = plants.JointPlant._simulated
+
+    class Counted(plants.JointPlant):
+        def _simulated(self, params, *rest):
+            launched.append(len(params))
+            return simulated(self, params, *rest)
+
+    plant.__class__ = Counted
+    try:
+        first = plant.simulate(params[:4], windows, inits[:4])
+        order = [2, 5, 0, 2, 5]
+        again = plant.simulate(params[order], windows, inits[order])
+        fresh = plant.simulate(params[order], plant.windows(1.0), inits[order])
+        assert launched == [4, 1, 3]  # of the second only one is new, however often it is asked for
+        assert all(np.array_equal(a, b) for a, b in zip(again, fresh, strict=True))
+        again[0][:] = 0.0  # what was handed out is the caller's
+        assert np.array_equal(plant.simulate(params[2:3], windows, inits[2:3])[0][0], first[0][2])
+        del launched[:]
+        plant.simulate(params[:1], windows, inits[1:2])  # another initial state,
+        plant.simulate(params[:1], windows, inits[:1], open_stage=1)  # another stage,
+        plant.set_series(plant.series.copy())  # or other recorded series
+        plant.simulate(params[:1], windows, inits[:1])
+        assert launched == [1, 1, 1]
+        del launched[:]
+        windows.known._room = 16 * windows.n * 2
+        for k in (0, 1, 2, 2, 1, 0):
+            plant.simulate(params[k : k + 1], windows, inits[k : k + 1])
+        assert launched == [1, 1, 1]  # 0 is known already; of three the two latest are kept
+    finally:
+        plant.__class__ = plants.JointPlant

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 
 from dexsim.gap.plant import kernel as pk
+from dexsim.gap.plant import side_by_side
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
+from dexsim.gap.plant.known import Known
 from dexsim.gap.plant.mechanics import JointConstants
 
-THREADS = 2  # CPU launches release the interpreter: two run side by side
 # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there
 # are
 BLOCK = 32
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
+_VERSIONS = itertools.count()  # of plants: what one simulated is not what another would
 
 
 class Lane:
@@ -78,7 +81,7 @@ class Windows:
     """W stretches of recordings, to be simulated apart. Everything a launch needs, samples of all windows in a row.
 
     window [W, 8], window_t [W]: see the kernel; sample_step, sample_part [n]; of each sample: its window [n], its row
-    in the joint's measurements [n]. run [W]: which run a window is of.
+    in the joint's measurements [n]. run [W]: which run a window is of. known: what was simulated in them before.
     """
 
     window: np.ndarray
@@ -89,6 +92,7 @@ class Windows:
     sample_row: np.ndarray
     run: np.ndarray
     device: dict | None = None
+    known: Known = field(default_factory=Known)
 
     @property
     def n(self) -> int:
@@ -155,7 +159,7 @@ class JointPlant:
         self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
                            c.low, c.high, stiff, c.slide, 0)
         self.contact_stiffness = stiff
-        self._d = {}
+        self._d, self._version = {}, next(_VERSIONS)
         self._ready = True
 
     @property
@@ -165,12 +169,12 @@ class JointPlant:
 
     def set_series(self, series: np.ndarray) -> None:
         """Other series [G, E] in the place of those that were added."""
-        self.series, self._d = series, {}
+        self.series, self._d, self._version = series, {}, next(_VERSIONS)
 
     def refined(self, times: int) -> JointPlant:
         """The same joint in steps `times` as short, the series between their samples on straight lines."""
         out = copy.copy(self)
-        out.dt, out._d = self.dt / times, {}
+        out.dt, out._d, out._version = self.dt / times, {}, next(_VERSIONS)
         parts, out._grid = [], [0]
         for a, b in zip(self._grid[:-1], self._grid[1:], strict=True):
             at = np.arange((b - a - 1) * times + 1)
@@ -258,9 +262,21 @@ class JointPlant:
 
         params [H, R, C]: plant parameters by run; inits [H, 2]: added to the initial position and velocity.
         """
-        H, n = len(params), windows.n
         if inits is None:
-            inits = np.zeros((H, 2))
+            inits = np.zeros((len(params), 2))
+        # what an answer depends on beside the windows and what does not change of a plant
+        common = f"{self._version} {open_stage}".encode()
+        told = params[:, np.unique(windows.run)]
+        keys = [common + p.tobytes() + i.tobytes() for p, i in zip(told, np.asarray(inits, float), strict=True)]
+        return windows.known.answers(
+            keys, lambda which: self._simulated(params[which], windows, inits[which], open_stage)
+        )
+
+    def _simulated(
+        self, params: np.ndarray, windows: Windows, inits: np.ndarray, open_stage: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`simulate`, whatever is known."""
+        H, n = len(params), windows.n
         q, torque = np.empty((H, n)), np.empty((H, n))
         # one launch a set of runs that shares its parameters: a guess is a row, so rows are (guess, distinct run)
         groups: dict[bytes, list[int]] = {}
@@ -270,10 +286,10 @@ class JointPlant:
         consts[pk.C_OPEN] = open_stage
         if self._on_cpu(H * len(windows.window)):
             for group in groups.values():
-                keep, count, rest = self._inputs(windows, tuple(group), "cpu")
+                keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
                 out = [wp.array(x, dtype=wp.float64, device="cpu", copy=False) for x in (oq, ot)]
-                self._split(H, count, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out))
+                self._split(H, steps, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out))
                 q[:, keep], torque[:, keep] = oq, ot
             return q, torque
         with _GPU:
@@ -285,14 +301,14 @@ class JointPlant:
                 )
                 at, parts = 0, []
                 for group, guess in zip(groups.values(), guesses, strict=True):
-                    keep, count, rest = self._inputs(windows, tuple(group), self.device)
+                    keep, steps, rest = self._inputs(windows, tuple(group), self.device)
                     size = H * len(keep)
                     oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
                     given = recorded(guess, moves, constants, *rest, oq, ot)
                     wp.launch(
                         pk.plant_kernel(),
-                        dim=(count, H),
-                        inputs=[0, self.dt, given],
+                        dim=(len(steps), H),
+                        inputs=[0, 0, self.dt, given],
                         device=self.device,
                         block_dim=BLOCK,
                     )
@@ -309,9 +325,11 @@ class JointPlant:
     def _on_cpu(self, threads: int) -> bool:
         return self.device == "cpu" or threads <= FEW
 
-    def _inputs(self, windows: Windows, group: tuple[int, ...], device: str) -> tuple[np.ndarray, int, list[wp.array]]:
-        """(samples of the windows that are of these runs, number of windows, the kernel's arrays of them), made once a
-        device."""
+    def _inputs(
+        self, windows: Windows, group: tuple[int, ...], device: str
+    ) -> tuple[np.ndarray, np.ndarray, list[wp.array]]:
+        """(samples of the windows that are of these runs, steps of each window, the kernel's arrays of them), made once
+        a device."""
         if windows.device is None:
             windows.device = {}
         if device not in self._d:
@@ -327,7 +345,7 @@ class JointPlant:
             w[:, 3] = np.concatenate([[0], np.cumsum(w[:-1, 4])])
             windows.device[key] = (
                 np.flatnonzero(keep),
-                len(pick),
+                w[:, 1],
                 [
                     _up(w, wp.int32, device),
                     _up(windows.window_t[pick], device=device),
@@ -335,24 +353,22 @@ class JointPlant:
                     _up(windows.sample_part[keep], device=device),
                 ],
             )
-        keep, count, arrays = windows.device[key]
-        return keep, count, [*self._d[device], *arrays]
+        keep, steps, arrays = windows.device[key]
+        return keep, steps, [*self._d[device], *arrays]
 
-    def _split(self, H: int, count: int, given: pk.Recorded) -> None:
-        """H guesses on the CPU, in two halves side by side."""
+    def _split(self, H: int, steps: np.ndarray, given: pk.Recorded) -> None:
+        """H guesses in windows of `steps` [W] on the CPU, in parts side by side."""
         kernel = pk.plant_kernel()
 
-        def launch(first: int, number: int) -> None:
-            wp.launch(kernel, dim=(count, number), inputs=[first, self.dt, given], device="cpu")
+        def launch(windows: slice, guesses: slice) -> None:
+            wp.launch(
+                kernel,
+                dim=(windows.stop - windows.start, guesses.stop - guesses.start),
+                inputs=[windows.start, guesses.start, self.dt, given],
+                device="cpu",
+            )
 
-        if H > 1 and THREADS > 1:
-            half = (H + 1) // 2
-            helper = threading.Thread(target=launch, args=(half, H - half))
-            helper.start()
-            launch(0, half)
-            helper.join()
-        else:
-            launch(0, H)
+        side_by_side.run(launch, side_by_side.parts(steps, H))
 
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""

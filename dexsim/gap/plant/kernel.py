@@ -804,12 +804,13 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
 
 @cache
 def plant_kernel():
-    """The kernel: one thread a guess and window. first: number of the launch's first guess; dt: step of the grid
-    [s]."""
+    """The kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and guess;
+    dt: step of the grid [s]."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plant(first: int, dt: f64, c: Recorded):
-        w, hh = wp.tid()  # guesses of one window side by side: what was recorded in it stays in the cache
+    def plant(first_window: int, first: int, dt: f64, c: Recorded):
+        ww, hh = wp.tid()  # guesses of one window side by side: what was recorded in it stays in the cache
+        w = first_window + ww
         h = first + hh
         g0 = c.window[w, 0]
         warm = c.window[w, 2]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from dexsim.gap.plant.batch import THREADS
+from dexsim.gap.plant import side_by_side
 
 T = TypeVar("T")
 MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
+CORES = 2  # of a CPU that a search has at least: one simulates while the other also computes
 # s that a lane may keep the interpreter while another waits for it after a launch (Python: 5 ms, as long as a launch of
 # few guesses)
 SWITCH = 2e-4
@@ -20,18 +20,10 @@ SWITCH = 2e-4
 
 def lanes(device: str, jobs: int) -> int:
     """How many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's launch
-    hides. On a CPU one for every `THREADS` cores (OMP_NUM_THREADS, where it is set, counts as the cores)."""
+    hides. On a CPU one for every `CORES` of its cores."""
     if device != "cpu":
         return max(1, min(jobs, MOST_GPU))
-    given = os.environ.get("OMP_NUM_THREADS", "")
-    cores = (
-        int(given)
-        if given.isdigit() and int(given) > 0
-        else len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
-    return max(1, min(jobs, MOST_CPU, cores // THREADS))
+    return max(1, min(jobs, MOST_CPU, side_by_side.cores() // CORES))
 
 
 def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
@@ -60,7 +52,8 @@ def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]]
         pool, switch = ThreadPoolExecutor(at_once), sys.getswitchinterval()
         sys.setswitchinterval(SWITCH)
         try:
-            out = list(pool.map(one, range(len(names))))
+            with side_by_side.shared_by(at_once):
+                out = list(pool.map(one, range(len(names))))
         finally:
             pool.shutdown(cancel_futures=True)  # what has begun ends, nothing else begins
             sys.setswitchinterval(switch)

@@ -1,0 +1,71 @@
+"""The cores of a CPU: shared by searches that run at a time, each launch of one in parts side by side. (CPU launches
+release the interpreter.)"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from functools import cache
+
+import numpy as np
+
+WORTH = 20_000  # steps of guesses that a part has at least: about 2 ms, beside the tenth of one that a launch takes
+
+_searches = 1
+
+
+def cores() -> int:
+    """Cores that this process may use (OMP_NUM_THREADS, where it is set, counts as the cores)."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    if given.isdigit() and int(given) > 0:
+        return int(given)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def shared_by(searches: int) -> Iterator[None]:
+    """So many searches run at a time: each launch has its share of the cores."""
+    global _searches
+    before, _searches = _searches, searches
+    try:
+        yield
+    finally:
+        _searches = before
+
+
+def parts(steps: np.ndarray, guesses: int) -> list[tuple[slice, slice]]:
+    """What of windows of `steps` [W], and which of the guesses, each thread of a launch simulates: cut between windows,
+    or between guesses where that is more even."""
+    total = int(steps.sum()) * guesses
+    count = max(min(cores() // _searches, total // WORTH), 1)
+    every, everyone = slice(0, len(steps)), slice(0, guesses)
+    if count == 1:
+        return [(every, everyone)]
+    middles, whole = np.cumsum(steps) - 0.5 * steps, float(steps.sum())
+    cut = np.unique(np.r_[0, np.searchsorted(middles, whole * np.arange(1, count) / count), len(steps)])
+    longest = max(int(steps[a:b].sum()) for a, b in zip(cut[:-1], cut[1:], strict=True)) * guesses
+    if longest <= -(-guesses // count) * whole:
+        return [(slice(int(a), int(b)), everyone) for a, b in zip(cut[:-1], cut[1:], strict=True)]
+    cut = np.unique(np.round(np.linspace(0, guesses, count + 1)).astype(int))
+    return [(every, slice(int(a), int(b))) for a, b in zip(cut[:-1], cut[1:], strict=True)]
+
+
+def run(work: Callable[[slice, slice], None], split: Sequence[tuple[slice, slice]]) -> None:
+    """work(windows, guesses) of each part, side by side."""
+    others = [_pool().submit(work, *part) for part in split[1:]]
+    try:
+        work(*split[0])
+    finally:
+        wait(others)  # they write to memory of the caller's
+    for done in others:
+        done.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores(), thread_name_prefix="plant")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has none of its parent's threads
