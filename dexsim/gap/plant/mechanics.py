@@ -182,7 +182,9 @@ def _evaluated(
 def _full(model: mujoco.MjModel, sparse: np.ndarray) -> np.ndarray:
     """Inertia matrices [n, nv, nv] of MuJoCo's sparse ones, their lower triangles by rows."""
     rows = np.repeat(np.arange(model.nv), model.M_rownnz)
-    columns = np.concatenate([model.M_colind[at : at + k] for at, k in zip(model.M_rowadr, model.M_rownnz, strict=True)])
+    columns = np.concatenate(
+        [model.M_colind[at : at + k] for at, k in zip(model.M_rowadr, model.M_rownnz, strict=True)]
+    )
     full = np.zeros((len(sparse), model.nv, model.nv))
     full[:, rows, columns] = sparse
     full[:, columns, rows] = sparse
