@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -31,7 +32,7 @@ class Motion:
     straight: np.ndarray
 
 
-@dataclass
+@dataclass(frozen=True)
 class Palm:
     """In the frame of the palm's body: position [3] m, forward [3], normal [3] unit and at right angles."""
 
@@ -39,7 +40,7 @@ class Palm:
     forward: np.ndarray
     normal: np.ndarray
 
-    @property
+    @cached_property
     def matrix(self) -> np.ndarray:
         """Columns: the palm frame's x, y, z."""
         return np.stack([self.forward, np.cross(self.normal, self.forward), self.normal], 1)

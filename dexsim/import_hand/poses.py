@@ -36,6 +36,7 @@ class Search:
         self.reach = float(np.mean([x.reach for k, x in enumerate(self.motions) if k not in self.thumbs]))
         self.rest = np.clip(stretched(self.m, self.motions), self.m.jnt_range[:, 0], self.m.jnt_range[:, 1])
         self.span = np.ptp(self.m.jnt_range, axis=1)
+        self.names = [self.m.body(b).name for b in range(self.m.nbody)]
 
     def tips(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Tips' positions and normals [F, 3] in the palm frame."""
@@ -56,10 +57,10 @@ class Search:
         mujoco.mj_comPos(m, d)
         mujoco.mj_collision(m, d)
         worst: dict[tuple[str, str], float] = {}
-        for c in d.contact[: d.ncon]:
-            a, b = sorted(int(m.geom_bodyid[g]) for g in c.geom)
-            pair = (m.body(a).name, m.body(b).name)
-            worst[pair] = max(worst.get(pair, 0.0), -float(c.dist))
+        bodies = np.sort(m.geom_bodyid[d.contact.geom], axis=1)
+        for (a, b), dist in zip(bodies.tolist(), d.contact.dist.tolist(), strict=True):
+            pair = (self.names[a], self.names[b])
+            worst[pair] = max(worst.get(pair, 0.0), -dist)
         return [(a, b, depth) for (a, b), depth in worst.items() if depth > 0]
 
 
@@ -109,7 +110,7 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
         out.append(np.array([4 * min(height - 0.05, 0.0), 0.25 * max(height, 0.0)]))
         out.append(0.15 * (centre[1:2] - roots[:, 1].mean()) / radius)
         deep = np.array(sorted((d for _, _, d in s.overlaps(q)), reverse=True)[:6])
-        out.append(np.pad(200 * deep, (0, 6 - len(deep))))
+        out += [200 * deep, np.zeros(6 - len(deep))]
         return np.concatenate(out)
 
     best, cost = None, np.inf

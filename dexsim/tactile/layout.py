@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -142,11 +143,17 @@ class TaxelLayout:
 
 def gap_to_hull(point: np.ndarray, normal: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Distance [n] along each normal from points [n, 3] to the convex hull of corners [V, 3]: negative from outside."""
+    return _gap(*(np.ascontiguousarray(x, dtype=float).tobytes() for x in (point, normal, corners))).copy()
+
+
+@lru_cache(maxsize=32)  # asked for by every environment of a process, of the same hand's tips
+def _gap(point: bytes, normal: bytes, corners: bytes) -> np.ndarray:
     from scipy.spatial import ConvexHull
 
-    planes = ConvexHull(corners).equations
-    along = normal @ planes[:, :3].T
-    gap = -(point @ planes[:, :3].T + planes[:, 3])
+    p, n, c = (np.frombuffer(x).reshape(-1, 3) for x in (point, normal, corners))
+    planes = ConvexHull(c).equations
+    along = n @ planes[:, :3].T
+    gap = -(p @ planes[:, :3].T + planes[:, 3])
     return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
 
 
