@@ -152,29 +152,35 @@ def test_meter_sums_over_ranks():
 
 # --- two processes
 
-def test_two_ranks_learn_one_policy(configs, tmp_path):
-    status, out, err = finish(torchrun(configs, tmp_path, "report", "iterations=3", "out=run"))
+@pytest.fixture(scope="module")
+def learned(configs, tmp_path_factory):
+    """A folder in which two ranks trained into run/, and what they printed."""
+    folder = tmp_path_factory.mktemp("learned")
+    status, out, err = finish(torchrun(configs, folder, "report", "iterations=3", "out=run"))
     assert status == 0, err
-    a, b = (json.loads((tmp_path / "report" / f"{k}.json").read_text()) for k in (0, 1))
+    return folder, out
+
+
+@pytest.mark.slow
+def test_two_ranks_learn_one_policy(learned):
+    folder, out = learned
+    a, b = (json.loads((folder / "report" / f"{k}.json").read_text()) for k in (0, 1))
     assert a["before"] != b["before"] and a["first_x"] != b["first_x"] and a["x"] != b["x"]  # seeds of their own
     assert a["after"] == b["after"] and a["rate"] == b["rate"]  # one policy, its normalization included
     assert a["steps"] == b["steps"] == 3 * 24 * 4 * 2
     assert out.count("compiling kernels") == 1 and "2, 4 worlds each" in out and out.count("learned from") == 1
-    with open(tmp_path / "run" / "progress.csv") as file:
+    with open(folder / "run" / "progress.csv") as file:
         rows = list(csv.DictReader(file))
     assert [int(r["steps"]) for r in rows] == [192, 384, 576]
-    assert len(list((tmp_path / "run").glob("events.*"))) == 1 and sorted(p.name for p in tmp_path.iterdir()) == [
-        "report",
-        "run",
-    ]
-    assert checkpoint.load(tmp_path / "run" / "last.pt")["config"]["seed"] == 1
+    assert len(list((folder / "run").glob("events.*"))) == 1
+    assert sorted(p.name for p in folder.iterdir()) == ["report", "run"]
+    assert checkpoint.load(folder / "run" / "last.pt")["config"]["seed"] == 1
 
 
 @pytest.mark.slow
-def test_two_ranks_resume(configs, tmp_path):
-    status, out, err = finish(torchrun(configs, tmp_path, "plain", "iterations=3", "out=run"))
-    assert status == 0, err
-    status, out, err = finish(torchrun(configs, tmp_path, "report", "resume=run/last.pt", "iterations=5", "out=again"))
+def test_two_ranks_resume(configs, learned, tmp_path):
+    last = learned[0] / "run" / "last.pt"
+    status, out, err = finish(torchrun(configs, tmp_path, "report", f"resume={last}", "iterations=5", "out=again"))
     assert status == 0, err
     c, d = (json.loads((tmp_path / "report" / f"{k}.json").read_text()) for k in (0, 1))
     assert c["from"] == d["from"] == 3 and c["steps"] == 5 * 24 * 4 * 2 and c["after"] == d["after"]
@@ -196,11 +202,10 @@ def test_a_killed_rank_ends_the_run(configs, tmp_path, lost, by):
         f"rank {lost} is gone" in lines[0]
         and "torchrun --nproc_per_node=2 -m dexsim train resume=run/last.pt" in lines[0]
     )
-    saved = checkpoint.load(tmp_path / "run" / "last.pt")
-    status, out, err = finish(
-        torchrun(configs, tmp_path, "plain", "resume=run/last.pt", f"iterations={saved['iteration'] + 1}", "out=again")
-    )
-    assert status == 0 and checkpoint.load(tmp_path / "again" / "last.pt")["iteration"] == saved["iteration"] + 1
+    saved = checkpoint.load(tmp_path / "run" / "last.pt")  # whole: a training goes on from it
+    goes_on = (f"resume={tmp_path / 'run' / 'last.pt'}", f"iterations={saved['iteration'] + 1}")
+    assert shell.call("train", configs, *goes_on, f"out={tmp_path / 'again'}") == 0
+    assert checkpoint.load(tmp_path / "again" / "last.pt")["iteration"] == saved["iteration"] + 1
 
 
 @pytest.mark.slow
