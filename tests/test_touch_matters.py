@@ -55,6 +55,36 @@ def test_one_pair_is_refused():
         analysis.paired([np.ones(3)], [np.ones(3)], np.random.default_rng(0))
 
 
+def test_a_correction_over_several_orderings_is_holms():
+    """Worked by hand: 0.01 x 4, 0.02 x 3, 0.03 x 2, and 0.035 x 1 raised to the one before it."""
+    p = {"a": 0.03, "b": 0.01, "c": 0.035, "d": 0.02}
+    assert analysis.holm(p) == pytest.approx({"b": 0.04, "d": 0.06, "a": 0.06, "c": 0.06})
+    assert analysis.holm({"a": 0.9, "b": 0.8}) == {"b": 1.0, "a": 1.0}
+
+
+def test_p_and_interval_of_pairs_say_the_same():
+    """At p = 0.05 Student's interval ends at 0."""
+    each = np.array([1.0, 2.0, 4.0, -1.0, 3.0])
+    at = each - analysis.over_seeds(each)[0]
+    assert analysis.over_seeds(at)[0] == pytest.approx(0, abs=1e-12) and analysis.against_zero(at) == pytest.approx(
+        0.05
+    )
+    assert analysis.against_zero(np.ones(3)) == 0 and analysis.against_zero(np.zeros(3)) == 1
+
+
+def test_a_row_of_other_seeds_is_compared_without_pairs(tmp_path):
+    for seed, n in ((11, 30), (12, 34), (13, 32)):
+        judged(tmp_path, "full", seed, "training", [n] * 4)
+    for seed, n in ((1, 24), (2, 36)):
+        judged(tmp_path, "bits", seed, "training", [n] * 4)
+    data = analysis.summary(analysis.read(tmp_path))
+    assert data["differences"] == {}
+    low, high = data["unpaired"]["training"]["bits"]["interval"]
+    # Welch's: errors 2/sqrt(3) and 6, 1.074 degrees of freedom (Welch and Satterthwaite), t = 10.80
+    assert (low + high) / 2 == pytest.approx(2.0) and high - low == pytest.approx(2 * 6.110 * 10.80, rel=0.01)
+    assert "not paired" in analysis.markdown(data)
+
+
 def judged(folder, row, seed, world, successes):
     folder = folder / row / f"seed{seed}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +104,8 @@ def test_the_page_is_made_of_what_was_judged(tmp_path):
     analysis.main([f"out={tmp_path}"])
     text = (tmp_path / "touch_matters.md").read_text()
     line = next(x for x in text.splitlines() if x.startswith("| no touch at all"))
-    assert "| 13.0 |" in line and "+20.0 (+20.0 to +20.0), holds" in line
+    assert "| 13.0 (11.0-15.0) |" in line and "+20.0 (+20.0 to +20.0), holds" in line
+    assert "`no_touch` p = 0, `no_force` p =" in text and "Not trained: `plain_centre`" in text
     assert "undecided" in next(x for x in text.splitlines() if x.startswith("| no contact force"))
     assert (tmp_path / "touch_matters.png").stat().st_size > 10_000
     with pytest.raises(UserError, match="nothing judged"):
