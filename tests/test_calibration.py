@@ -15,11 +15,15 @@ from dexsim.calibration import command, current, line, presses, rubber, simulate
 from dexsim.calibration.file import Calibration, save
 from dexsim.calibration.line import Levels
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.recording.realistic import CURRENT_PER_TORQUE, realistic
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
 from dexsim.recording.writer import write
 from dexsim.tactile.reference import mooney_rivlin_force
+from tests.made_hand import made_hand
+
+HAND = load_hand("xhand")
 
 torch.set_num_threads(1)
 
@@ -89,7 +93,7 @@ def test_hysteresis_is_the_width_of_the_loop():
 @pytest.fixture(scope="module")
 def pressed():
     """A simulated press of a second and a first joint of one finger."""
-    return {j: simulate.press_recording(j) for j in ("mid_joint2", "mid_joint1")}
+    return {j: simulate.press_recording(HAND, j) for j in ("mid_joint2", "mid_joint1")}
 
 
 @pytest.mark.parametrize("joint, within", [("mid_joint1", 0.04), ("mid_joint2", 0.12)])
@@ -98,16 +102,15 @@ def test_simulated_force_over_torque_is_one_over_the_lever_arm(pressed, joint, w
     and the millimetres by which it lies beside the taxel count more for the short arm."""
     import mujoco
 
-    found = presses.levels_of(pressed[joint])
+    found = presses.levels_of(pressed[joint], HAND)
     assert set(found) == {"mid_joint1", "mid_joint2"}, "the finger's joints press, and no other's"
     f = line.fit(found[joint], "N.m")
     model = xhand.hand_spec().compile()
     data = mujoco.MjData(model)
-    for name, q in simulate.POSE.items():
+    for name, q in zip(HAND.joints, HAND.pose("open"), strict=True):
         data.qpos[model.joint(name).qposadr[0]] = q
     mujoco.mj_forward(model, data)
-    _, arms = simulate._site(xhand.hand_spec(), joint, "mid")
-    ball, _ = simulate._site(xhand.hand_spec(), joint, "mid")
+    ball, arms = simulate._site(HAND, HAND.joints.index(joint), 2)
     body = model.body(xhand.TIP_BODIES[2]).id
     table = xhand.taxel_table("mid")
     point = table["position"] @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
@@ -127,8 +130,8 @@ def test_realistic_presses_give_the_current_per_torque_back(pressed, tmp_path):
         folder.mkdir()
         for k, (joint, r) in enumerate(pressed.items()):
             write(folder / f"{joint}.mcap", realistic(r, seed=k) if change else r)
-    a = current.half(current.files_of(str(real), "real"), "current_A")
-    b = current.half(current.files_of(str(sim), "sim"), "torque_Nm")
+    a = current.half(current.files_of(str(real), "real"), "current_A", HAND)
+    b = current.half(current.files_of(str(sim), "sim"), "torque_Nm", HAND)
     joints = current.combine(a, b)
     for joint in pressed:
         c = joints[joint]["current_per_torque"]
@@ -144,10 +147,10 @@ def test_a_lost_sign_is_refused_and_the_wrong_kind_named(pressed, tmp_path):
     r = realistic(pressed["mid_joint1"])
     write(tmp_path / "a.mcap", replace(r, meta=r.meta | {"effort_sign": "0"}))
     with pytest.raises(UserError, match="effort_sign"):
-        current.half([tmp_path / "a.mcap"], "current_A")
+        current.half([tmp_path / "a.mcap"], "current_A", HAND)
     write(tmp_path / "b.mcap", r)
     with pytest.raises(UserError, match="expected torque_Nm"):
-        current.half([tmp_path / "b.mcap"], "torque_Nm")
+        current.half([tmp_path / "b.mcap"], "torque_Nm", HAND)
     with pytest.raises(UserError, match="no recording there"):
         current.files_of(str(tmp_path / "nothing"), "real")
 
@@ -175,7 +178,7 @@ def pushed(alpha=3.0, seed=0) -> Recording:
 
 
 def test_presses_from_outside_are_found_without_commands():
-    found = presses.levels_of(pushed())
+    found = presses.levels_of(pushed(), HAND)
     assert (
         {"ring_joint1", "ring_joint2"} <= set(found) and "mid_joint1" not in found and "thumb_bend_joint" not in found
     )
@@ -260,7 +263,7 @@ def rolled(n=150, seed=0, gains=None, dead=(), swapped=(), lsb=0.1, noise=0.3):
 
 def test_a_healthy_pad_has_no_findings():
     x, load = rolled()
-    p = taxels.inspect(x, load)
+    p = taxels.inspect(x, load, rows=12)
     assert not p.dead and not p.swapped and not p.unseen
     assert p.scale == pytest.approx(0.1, rel=0.05) and 0.5 < p.threshold <= 1.0
     assert p.held_out <= p.held_out_equal and p.hysteresis < 0.03
@@ -270,14 +273,14 @@ def test_a_healthy_pad_has_no_findings():
 @pytest.mark.parametrize("with_load", [True, False])
 def test_dead_and_swapped_taxels_are_found_exactly(with_load):
     x, load = rolled(dead=(17, 18, 77), swapped=((5, 60), (30, 31)), seed=2)
-    p = taxels.inspect(x, load if with_load else None)
+    p = taxels.inspect(x, load if with_load else None, rows=12)
     assert p.dead == [17, 18, 77] and sorted(p.swapped) == [(5, 60), (30, 31)]
 
 
 def test_gains_are_found_and_tell_held_out_loads_better():
     gains = np.exp(0.2 * np.random.default_rng(5).standard_normal(120))
     x, load = rolled(n=300, gains=gains, seed=1)
-    p = taxels.inspect(x, load)
+    p = taxels.inspect(x, load, rows=12)
     assert np.corrcoef(p.gain, gains)[0, 1] > 0.9 and p.held_out < p.held_out_equal
 
 
@@ -285,7 +288,7 @@ def test_gains_are_found_and_tell_held_out_loads_better():
 def pads():
     """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp
     edges."""
-    return simulate.delivered(simulate.rolled_recording(160, seed=3, frames=12), 3)
+    return simulate.delivered(simulate.rolled_recording(HAND, 160, seed=3, frames=12), 3)
 
 
 def of_pad(r, f):
@@ -298,10 +301,10 @@ def of_pad(r, f):
 def test_healthy_simulated_pads_have_no_findings(pads):
     """Beyond a contact's edge a healthy taxel feels nothing, and is not called dead for it."""
     for f in range(5):
-        p = taxels.inspect(*of_pad(pads, f))
+        p = taxels.inspect(*of_pad(pads, f), rows=12)
         assert not p.dead and not p.swapped and len(p.unseen) <= 5, xhand.FINGERS[f]
         assert p.scale == pytest.approx(0.1, rel=0.02) and p.held_out < 0.05 and p.hysteresis < 0.01
-        assert taxels.inspect(of_pad(pads, f)[0], None).dead == []
+        assert taxels.inspect(of_pad(pads, f)[0], None, rows=12).dead == []
 
 
 def test_faults_of_a_simulated_pad_are_found(pads):
@@ -311,27 +314,27 @@ def test_faults_of_a_simulated_pad_are_found(pads):
     x = np.round(x / gains)
     x[:, [20, 90]] = x[:, [90, 20]]
     x[:, [53, 54, 77]] = 0
-    p = taxels.inspect(x, load)
+    p = taxels.inspect(x, load, rows=12)
     assert set(p.dead) <= {53, 54, 77} and set(p.dead) | set(p.unseen) >= {53, 54, 77} and len(p.dead) >= 2, (
         "silent, and nothing else is dead"
     )
     assert p.swapped == [(20, 90)] and p.held_out < 0.95 * p.held_out_equal
     x, load = of_pad(pads, 2)  # a pad without dead taxels, whose neighbours make up for what they miss
-    p = taxels.inspect(np.round(x / gains), load)
+    p = taxels.inspect(np.round(x / gains), load, rows=12)
     rest = np.setdiff1d(np.arange(120), p.unseen)
     assert np.corrcoef(p.gain[rest], gains[rest])[0, 1] > 0.7 and p.held_out < 0.5 * p.held_out_equal
 
 
 def test_an_untouched_pad_says_so():
     x = (np.random.default_rng(0).random((500, 120)) < 0.01).astype(float)
-    p = taxels.inspect(x)
+    p = taxels.inspect(x, rows=12)
     assert len(p.unseen) == 120 and not p.dead and "nothing pressed it" in p.notes[0]
 
 
 def test_hysteresis_of_a_pad_that_lags():
     x, load = rolled(noise=0.0, lsb=0.001)
     shifted = x * (0.9 + 0.2 * (np.gradient(load) < 0))[:, None]
-    assert taxels.inspect(shifted, load).hysteresis > 0.06 > taxels.inspect(x, load).hysteresis
+    assert taxels.inspect(shifted, load, rows=12).hysteresis > 0.06 > taxels.inspect(x, load, rows=12).hysteresis
 
 
 # -- the file
@@ -452,6 +455,33 @@ def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
     assert content["touch"]["lsb"] == pytest.approx(0.1, rel=0.06)
     c = Calibration.load(out / "calibration.yaml")
     assert c.current_per_torque[6] == pytest.approx(2.7, rel=0.03)
+
+
+def test_another_hand_is_calibrated_from_its_own_presses(tmp_path, capsys):
+    """Three fingers, a thumb last, another lattice: force over torque is one over the lever arm, taxels are told."""
+    folder = made_hand(tmp_path / "made")
+    hand = load_hand(folder, mirror=True)
+    finger = hand.fingers[hand.others[0]]
+    joint = hand.joints[finger.flexion[-1]]
+    arguments = [f"hand={folder}", "hand_mirror=true", "simulate=true", f"joints={joint}", "levels=5"]
+    assert command.main([*arguments, f"out={tmp_path / 'o'}"], CONFIGS) == 0
+    content = yaml.safe_load((tmp_path / "o" / "calibration.yaml").read_text())
+    _, arms = simulate._site(hand, finger.flexion[-1], hand.others[0])
+    assert content["robot"] == hand.robot and content["joints"][joint]["sim"]["linear"]
+    slope = content["joints"][joint]["sim"]["slope"]["value"]
+    assert slope == pytest.approx(1 / abs(arms[finger.flexion[-1]]), rel=0.15)
+    assert Calibration.load(tmp_path / "o" / "calibration.yaml", hand=hand).hand.robot == hand.robot
+    rolled = simulate.delivered(simulate.rolled_recording(hand, 60, seed=1, frames=12), 1)
+    write(tmp_path / "rolled.mcap", rolled)
+    assert command.main([*arguments[:2], f"touch={tmp_path / 'rolled.mcap'}", f"out={tmp_path / 't'}"], CONFIGS) == 0
+    touch = yaml.safe_load((tmp_path / "t" / "calibration.yaml").read_text())["touch"]
+    assert touch["lsb"] == pytest.approx(0.1, rel=0.05) and set(touch["gain"]) == set(hand.finger_names)
+    with pytest.raises(UserError, match=r"/tactile has 3 pads of .* hand=xhand has 5 of 120"):
+        command.main([f"touch={tmp_path / 'rolled.mcap'}", f"out={tmp_path / 'x'}"], CONFIGS)
+    with pytest.raises(UserError, match="has no touch pads"):
+        bare = made_hand(tmp_path / "bare", pads=False)
+        command.main([f"hand={bare}", "simulate=true", f"out={tmp_path / 'x'}"], CONFIGS)
+    assert not (tmp_path / "x" / "calibration.yaml").exists()
 
 
 @pytest.mark.parametrize(

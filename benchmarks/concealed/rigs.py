@@ -131,15 +131,13 @@ def _hand(rng: np.random.Generator, which: dict | None) -> Drawn:
     """A hand by the numbers of its description (lengths, masses, axes), held still, gravity along -z of the palm."""
     import mujoco
 
-    from dexsim.actuator.table import ServoTable
     from dexsim.hand import load_hand
-    from dexsim.recording.mechanism import Mechanism, mechanism
+    from dexsim.recording.mechanism import mechanism, of_hand
 
     if which is None:
         m = mechanism(None, None)
     else:
-        hand = load_hand(which["hand"], which["hand_mirror"], which["hand_scale"])
-        m = Mechanism(hand.spec(), hand.joints, ServoTable.load(hand.servo_path), hand.robot)
+        m = of_hand(load_hand(which["hand"], which["hand_mirror"], which["hand_scale"]))
     model = m.spec.compile()
     chains: list[list[int]] = []
     for b in range(1, model.nbody):

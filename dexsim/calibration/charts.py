@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dexsim.assets import xhand
 from dexsim.calibration.current import Half
 from dexsim.calibration.rubber import Rubber, Stiffness, stress
 from dexsim.calibration.taxels import Pad
@@ -15,8 +14,13 @@ from dexsim.calibration.taxels import Pad
 
 def lines(half: Half, path: Path, title: str) -> Path:
     """Force over effort of every joint: loading, unloading, the line and the paper's line through zero."""
-    figure = Figure(figsize=(14, 9), layout="constrained")
-    for ax, joint in zip(figure.subplots(3, 4).flat, xhand.JOINTS, strict=True):
+    across = min(4, len(half.joints))
+    down = -(-len(half.joints) // across)
+    figure = Figure(figsize=(3.5 * across, 3 * down), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).flat
+    for ax in axes[len(half.joints) :]:
+        ax.set_visible(False)
+    for ax, joint in zip(axes, half.joints, strict=False):
         ax.set_title(joint, fontsize=9)
         levels, f = half.levels.get(joint), half.fits.get(joint)
         if f is None:
@@ -87,14 +91,14 @@ def pads(found: dict[str, Pad], path: Path) -> Path:
     """Gain maps of the pads, dead and swapped taxels marked; columns across, rows from the joint to the tip."""
     figure = Figure(figsize=(3.2 * len(found), 4.2), layout="constrained")
     for ax, (finger, pad) in zip(np.atleast_1d(figure.subplots(1, len(found))), found.items(), strict=True):
-        gain = np.ones(xhand.TAXELS_PER_FINGER) if pad.gain is None else pad.gain.copy()
+        gain = np.ones(len(pad.bias)) if pad.gain is None else pad.gain.copy()
         gain[pad.unseen] = np.nan
-        image = ax.imshow(gain.reshape(xhand.COLUMNS, xhand.ROWS).T, origin="lower", vmin=0, vmax=2, cmap="coolwarm")
+        image = ax.imshow(gain.reshape(-1, pad.rows).T, origin="lower", vmin=0, vmax=2, cmap="coolwarm")
         for k in pad.dead:
-            ax.text(*divmod(k, xhand.ROWS), "x", ha="center", va="center", color="black")
+            ax.text(*divmod(k, pad.rows), "x", ha="center", va="center", color="black")
         for n, pair in enumerate(pad.swapped):
             for k in pair:
-                ax.text(*divmod(k, xhand.ROWS), chr(ord("a") + n % 26), ha="center", va="center", color="black")
+                ax.text(*divmod(k, pad.rows), chr(ord("a") + n % 26), ha="center", va="center", color="black")
         ax.set_title(
             f"{finger}: held out {100 * pad.held_out:.1f} % ({100 * pad.held_out_equal:.1f} % equal gains)", fontsize=7
         )

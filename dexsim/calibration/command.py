@@ -5,13 +5,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
 from dexsim.console import program
 from dexsim.errors import UserError
+
+if TYPE_CHECKING:
+    from dexsim.hand import Hand
 
 LINEAR_R2 = 0.97  # a press curve under this is not called linear
 RESULTS = ("calibration.yaml", "real.png", "sim.png", "taxels.png", "press.png", "rubber.png")
@@ -38,21 +41,26 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     """Everything that the settings ask for."""
     from dexsim import outputs
     from dexsim.calibration import simulate
+    from dexsim.hand import load_hand
     from dexsim.sim.quiet import quiet_warp
 
+    hand = load_hand(s["hand"], s["hand_mirror"])
     out = Path(str(s["out"])).expanduser()
     given = [Path(p.strip()) for k in ("real", "sim", "touch", "curve") if s[k] for p in str(s[k]).split(",")]
     made_here = [PRESSES["touch"]] * s["simulate_touch"] + [PRESSES["real" if s["realistic"] else "sim"]] * s[
         "simulate"
     ]
     outputs.claim(out, "out=", (*RESULTS, *made_here), given)
-    report: dict[str, Any] = {"schema": 1, "robot": "xhand_right", "normalization": s["normalization"], "source": {}}
+    report: dict[str, Any] = {"schema": 1, "robot": hand.robot, "normalization": s["normalization"], "source": {}}
     if s["simulate"]:
         quiet_warp("cpu")
-        joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else list(simulate.xhand.JOINTS)
+        every = [j for j, f in zip(hand.joints, hand.finger_of_joint, strict=True) if f >= 0]
+        joints = [j.strip() for j in s["joints"].split(",")] if s["joints"] else every
         name = "presses_realistic" if s["realistic"] else "presses_sim"
         with outputs.staged(out) as stage:
-            made = simulate.make(stage / name, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"]))
+            made = simulate.make(
+                stage / name, hand, joints, s["servo"], int(s["levels"]), s["realistic"], int(s["seed"])
+            )
         made = [out / p.relative_to(stage) for p in made]
         key = "real" if s["realistic"] else "sim"
         if s[key] is None:
@@ -60,17 +68,17 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     if s["simulate_touch"]:
         quiet_warp("cpu")
         with outputs.staged(out) as stage:
-            made = simulate.make_rolled(stage / "pads", True, int(s["seed"]), s["faults"])
+            made = simulate.make_rolled(stage / "pads", hand, True, int(s["seed"]), s["faults"])
         s["touch"] = s["touch"] or str(out / made.relative_to(stage))
     with outputs.staged(out) as stage:
-        assumed = _fits(s, meta, stage, report)
+        assumed = _fits(s, meta, stage, report, hand)
     for text in assumed:
         print(f"note     {text}")
     print(f"yaml     {out / 'calibration.yaml'}")
     return 0
 
 
-def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any]) -> list[str]:
+def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any], hand: Hand) -> list[str]:
     """All fits and their plots, calibration.yaml; returns what is assumed in it."""
     from dexsim.calibration import charts, current
     from dexsim.calibration.file import Calibration, save
@@ -79,7 +87,9 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
     for key, effort_is, symbol in (("real", "current_A", "alpha"), ("sim", "torque_Nm", "beta")):
         if not s[key]:
             continue
-        half = current.half(current.files_of(s[key], key), effort_is, meta if key == "real" else None, int(s["seed"]))
+        half = current.half(
+            current.files_of(s[key], key), effort_is, hand, meta if key == "real" else None, int(s["seed"])
+        )
         report["source"][key] = s[key] if len(s[key]) < 200 else str(Path(s[key].split(",")[0]).parent)
         _print_half(half, key, symbol)
         title = f"{key}: fingertip force over {'motor current' if key == 'real' else 'joint torque'}"
@@ -98,13 +108,13 @@ def _fits(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, 
     if real and real.lsb:  # alpha is in the newtons that these counts were taken for
         touch["lsb"] = real.lsb
     if s["touch"]:
-        touch |= _touch(s, meta, out, report)
+        touch |= _touch(s, meta, out, hand)
     if s["curve"]:
         touch |= _curve(s, out)
     if touch:
         report["touch"] = touch
-    save(out / "calibration.yaml", report)
-    return Calibration.from_dict(report).assumed
+    save(out / "calibration.yaml", report, hand)
+    return Calibration.from_dict(report, hand=hand).assumed
 
 
 def _moved(path: Path) -> Path:
@@ -113,11 +123,10 @@ def _moved(path: Path) -> Path:
 
 
 def _print_half(half: Any, key: str, symbol: str) -> None:
-    from dexsim.assets import xhand
     from dexsim.console.tables import table
 
     rows = []
-    for joint in xhand.JOINTS:
+    for joint in half.joints:
         f = half.fits.get(joint)
         if f is None:
             rows.append((joint, "-", "-", "-", "-", "-", "-", half.left_out.get(joint, "")))
@@ -173,12 +182,18 @@ def _print_ratio(joints: dict[str, Any]) -> None:
     )
 
 
-def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str, Any]) -> dict[str, Any]:
+def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, hand: Hand) -> dict[str, Any]:
     """Threshold, dead and swapped taxels, gains of every pad."""
-    from dexsim.assets import xhand
     from dexsim.calibration import charts, current, taxels
+    from dexsim.calibration.simulate import pads_of
     from dexsim.recording.reader import read
 
+    layout = pads_of(hand)
+    if not layout.rows:
+        raise UserError(
+            f"touch={s['touch']}: the pads of hand={hand.name} form no lattice (rows: 0 in hand.yaml): which taxels lie"
+            " side by side is not known, and their faults cannot be told"
+        )
     readings: list[np.ndarray] = []
     loads: list[np.ndarray] = []
     unit, lsb, measured = "count", None, True
@@ -186,6 +201,11 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
         r = read(path, meta=meta, audit=False)
         if r.tactile is None:
             raise UserError(f"{path}: has no /tactile")
+        if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):
+            raise UserError(
+                f"{path}: /tactile has {r.tactile.value.shape[1]} pads of {r.tactile.value.shape[2]} taxels; hand="
+                f"{hand.name} has {layout.pads} of {layout.taxels}"
+            )
         unit = r.meta["tactile_unit"]
         lsb = r.tactile_lsb
         readings.append(r.tactile.value[..., 2] * r.tactile_axis_sign[2])
@@ -199,10 +219,14 @@ def _touch(s: dict[str, Any], meta: dict[str, str], out: Path, report: dict[str,
     found: dict[str, Any] = {}
     pressed = np.abs(values).sum(2)
     winner = pressed.argmax(1)
-    for f, finger in enumerate(xhand.FINGERS):
+    for f, finger in enumerate(hand.finger_names):
         # a load cell tells of the pad that is pressed; others are at rest then
         mine = (winner == f) | (pressed.max(1) <= np.percentile(pressed.max(1), 10))
-        found[finger] = taxels.inspect(values[mine, f], load[mine] if measured and (winner == f).sum() > 50 else None)
+        found[finger] = taxels.inspect(
+            values[mine, f, : layout.count[f]],
+            load[mine] if measured and (winner == f).sum() > 50 else None,
+            rows=layout.rows,
+        )
     result: dict[str, Any] = {"dead": {}, "swapped": {}, "gain": {}, "bias": {}, "hysteresis": {}}
     scales = [p.scale for p in found.values() if p.scale]
     count = lsb if lsb is not None else (float(np.mean(scales)) if scales else None)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.calibration.line import Levels, LineFit, fit
 from dexsim.calibration.presses import levels_of
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 from dexsim.recording.reader import read
 
 UNIT = {"current_A": "A", "torque_Nm": "N.m"}
@@ -26,10 +26,11 @@ UNIT = {"current_A": "A", "torque_Nm": "N.m"}
 
 @dataclass
 class Half:
-    """The presses of one side: by joint its levels, its line and the file. unit of the effort. left_out: joint ->
-    why."""
+    """The presses of one side: by joint its levels, its line and the file. unit of the effort; joints: the hand's;
+    left_out: joint -> why."""
 
     unit: str
+    joints: tuple[str, ...]
     levels: dict[str, Levels] = field(default_factory=dict)
     fits: dict[str, LineFit] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
@@ -58,10 +59,12 @@ def files_of(where: str | Sequence[str], key: str) -> list[Path]:
     return out
 
 
-def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = None, seed: int = 0) -> Half:
+def half(
+    paths: Sequence[Path], effort_is: str, hand: Hand, meta: dict[str, str] | None = None, seed: int = 0
+) -> Half:
     """Read presses and fit each joint: from the recording that was made for it (notes say `press: joint=NAME`), else
     from the one in which it works hardest. Raises UserError if none shows a press."""
-    out = Half(UNIT[effort_is])
+    out = Half(UNIT[effort_is], hand.joints)
     score: dict[str, tuple[bool, float]] = {}
     for path in paths:
         r = read(path, meta=meta)
@@ -75,8 +78,8 @@ def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = No
                 out.notes.append(f"{path.name}: {f.severity}: {f.kind} {f.topic} {f.joint} {f.text}".replace("  ", " "))
         if r.meta["tactile_unit"] == "count":
             out.lsb = r.tactile_lsb
-        made_for = re.search(r"press: joint=(\w+)", r.meta.get("notes", ""))
-        for joint, levels in levels_of(r).items():
+        made_for = re.search(r"press: joint=([^;\s]+)", r.meta.get("notes", ""))
+        for joint, levels in levels_of(r, hand).items():
             rank = (made_for is not None and made_for[1] == joint, float(np.ptp(levels.effort)))
             if joint not in score or rank > score[joint]:
                 score[joint] = rank
@@ -87,7 +90,7 @@ def half(paths: Sequence[Path], effort_is: str, meta: dict[str, str] | None = No
             " at"
             " several levels while a fingertip presses with more than 0.3 N"
         )
-    for joint in xhand.JOINTS:
+    for joint in hand.joints:
         if joint not in out.levels:
             out.left_out[joint] = "no press of it in the recordings"
             continue
@@ -103,7 +106,7 @@ def combine(real: Half | None, sim: Half | None) -> dict[str, dict[str, Any]]:
     """By joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per N.m) with
     intervals, normalizations and reasons."""
     out: dict[str, dict[str, Any]] = {}
-    for joint in xhand.JOINTS:
+    for joint in (real or sim).joints if real or sim else ():
         entry: dict[str, Any] = {}
         for name, symbol, side in (("real", "alpha", real), ("sim", "beta", sim)):
             if side is None:

@@ -209,9 +209,10 @@ class Calibration:
         return out | {"touch": touch}
 
 
-def save(path: str | Path, content: dict[str, Any]) -> None:
-    """Write a calibration file, replacing the old one only once the new one is whole; it must load."""
-    Calibration.from_dict(content, str(path))
+def save(path: str | Path, content: dict[str, Any], hand: Hand | None = None) -> None:
+    """Write a calibration file, replacing the old one only once the new one is whole; it must load. hand: whose (the
+    xHand)."""
+    Calibration.from_dict(content, str(path), hand=hand)
     path = Path(path)
     part = path.with_name(f".{path.name}.tmp")
     try:

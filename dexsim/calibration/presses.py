@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.calibration.line import Levels
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 from dexsim.recording.schema import Recording, Series
 
 HOLD_S, SETTLE = 0.2, 0.5
@@ -16,14 +16,8 @@ MOVED = 5e-3  # rad between levels that tells a pressing joint from a holding on
 CONTACT = 0.3  # N under which nothing is touched
 
 
-def finger_of(joint: str) -> int:
-    """Index of the finger that a joint moves."""
-    j = xhand.JOINTS.index(joint)
-    return next(i for i, f in enumerate(xhand.FINGERS) if j in xhand.JOINTS_OF_FINGER[f])
-
-
 def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
-    """(normal force [T, 5] N of each fingertip, whether a taxel stood at its largest count [T, 5])."""
+    """(normal force [T, F] N of each fingertip, whether a taxel stood at its largest count [T, F])."""
     if recording.tactile is None:
         raise UserError(f"{recording.path}: has no /tactile: force cannot be calibrated without the fingertips' force")
     newtons = recording.tactile_newtons()
@@ -33,7 +27,7 @@ def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
     return Series(newtons.t, newtons.value[..., 2].sum(-1)), full
 
 
-def levels_of(recording: Recording) -> dict[str, Levels]:
+def levels_of(recording: Recording, hand: Hand) -> dict[str, Levels]:
     """Steady presses by joint. A joint presses where its command steps from level to level; where no command moves
     (the fingertip is pressed from outside), every joint of the finger that is touched counts.
 
@@ -43,20 +37,26 @@ def levels_of(recording: Recording) -> dict[str, Levels]:
     if effort is None:
         raise UserError(f"{recording.path}: has no effort in /joint_states: neither current nor torque to calibrate")
     force, full = finger_force(recording)
-    joints = [j for j in recording.joints if j in xhand.JOINTS]
+    if force.value.shape[1] != len(hand.fingers):
+        raise UserError(
+            f"{recording.path}: /tactile has {force.value.shape[1]} pads, hand={hand.name} has"
+            f" {len(hand.fingers)} fingers"
+        )
+    finger = dict(zip(hand.joints, hand.finger_of_joint, strict=True))
+    joints = [j for j in recording.joints if finger.get(j, -1) >= 0]  # a wrist presses with no fingertip
     out: dict[str, Levels] = {}
     column = {j: recording.joints.index(j) for j in joints}
     lost = [j for j in joints if np.isnan(effort.value[:, column[j]]).all()]
     if len(lost) == len(joints):
         raise UserError(
-            f"{recording.path}: the effort's sign is not known; state meta.effort_sign=-1 (the xHand's current)"
+            f"{recording.path}: the effort's sign is not known; state meta.effort_sign=+1 or -1"
         )
     holds = _holds(recording)
     moving = {j: _pressing(recording, column[j], holds) for j in joints if j not in lost}
     if any(len(w) >= 3 for w in moving.values()):
         for joint, windows in moving.items():
             if len(windows) >= 3:
-                levels = _collect(recording, effort, force, full, joint, column[joint], windows)
+                levels = _collect(recording, effort, force, full, finger[joint], column[joint], windows)
                 if levels is not None:
                     out[joint] = levels
         return out
@@ -64,11 +64,10 @@ def levels_of(recording: Recording) -> dict[str, Levels]:
     for joint in joints:
         if joint in lost:
             continue
-        f = finger_of(joint)
-        touched = [w for w in windows if force.value[w[0] : w[1], f].mean() > CONTACT]
+        touched = [w for w in windows if force.value[w[0] : w[1], finger[joint]].mean() > CONTACT]
         times = [(force.t[a], force.t[b - 1], float("nan")) for a, b in touched]
         if len(times) >= 3:
-            levels = _collect(recording, effort, force, full, joint, column[joint], times)
+            levels = _collect(recording, effort, force, full, finger[joint], column[joint], times)
             if levels is not None:
                 out[joint] = levels
     return out
@@ -123,12 +122,13 @@ def _collect(
     effort: Series,
     force: Series,
     full: np.ndarray,
-    joint: str,
+    f: int,
     column: int,
     windows: list[tuple[float, float, float]],
 ) -> Levels | None:
-    """Means over the settled part of each window; rows without contact are counted and left out."""
-    f, position = finger_of(joint), recording.states.position
+    """Means of a joint (column) and its finger f over the settled part of each window; rows without contact are counted
+    and left out."""
+    position = recording.states.position
     rows, free, before = [], 0, None
     commanded = [w[2] for w in windows]
     known = np.isfinite(commanded).all()

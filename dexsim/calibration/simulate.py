@@ -9,25 +9,32 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim.assets import xhand
-from dexsim.calibration.presses import finger_of
 from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.hand.skin import tip_skins
 from dexsim.recording import mechanism
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
 from dexsim.sim import ContactPair
+from dexsim.tactile.layout import TaxelLayout, hand_layout
 
 RADIUS = 0.012  # m, of the ball
 STIFFNESS = 7000.0  # N/m of a fingertip, as in training
-PLANTED_DEAD, PLANTED_SWAP = (42, 43, 77), (30, 66)
+PLANTED_DEAD, PLANTED_SWAP = (0.35, 0.36, 0.64), (0.25, 0.55)
+"""Faults that are planted in a pad, as shares of its taxels."""
 GAP = 0.0015  # m between skin and ball at the start
 RAMP_S, HOLD_S, RATE = 0.2, 0.4, 100.0
-POSE = {"thumb_bend_joint": 0.9, "thumb_rota_joint1": 0.3, "thumb_rota_joint2": 0.4, "index_bend_joint": 0.0,
-        **{j: 0.4 for j in ("index_joint1", "mid_joint1", "ring_joint1", "pinky_joint1")},
-        **{j: 0.4 for j in ("index_joint2", "mid_joint2", "ring_joint2", "pinky_joint2")}}  # fmt: skip
-"""rad: half bent, so that every joint can turn further."""
+
+
+def pads_of(hand: Hand) -> TaxelLayout:
+    """A hand's taxels. Raises UserError for one without touch."""
+    layout = hand_layout(hand)
+    if layout is None:
+        raise UserError(f"hand={hand.name}: has no touch pads, and without the fingertips' force none is calibrated")
+    return layout
 
 
 def press_recording(
+    hand: Hand,
     joint: str,
     servo: dict | str | Path | None = None,
     levels: int = 8,
@@ -35,32 +42,36 @@ def press_recording(
     stiffness: float = STIFFNESS,
     timestep: float = 0.002,
 ) -> Recording:
-    """One joint presses: up a ladder of `levels` torques to the share `most` of its torque limit (less where another
-    joint of the finger could not hold against it), and down again; torque in N.m, touch in N. The finger's other joints
-    lean in by what they carry (arm times force over kp), so that the finger stands still and every lever arm stays what
-    it is."""
-    if joint not in xhand.JOINTS:
-        raise UserError(f"joints={joint}: no such joint; joints: {', '.join(xhand.JOINTS)}")
-    m = mechanism.mechanism(None, servo, gravity=[0.0, 0.0, -9.81])
-    f = finger_of(joint)
-    finger, j = xhand.FINGERS[f], xhand.JOINTS.index(joint)
-    place, arms = _site(m.spec, joint, finger)
+    """One joint presses, from the hand's open pose: up a ladder of `levels` torques to the share `most` of its torque
+    limit (less where another joint of the finger could not hold against it), and down again; torque in N.m, touch in N.
+    The finger's other joints lean in by what they carry (arm times force over kp), so that the finger stands still and
+    every lever arm stays what it is."""
+    fingers = dict(zip(hand.joints, hand.finger_of_joint, strict=True))
+    if fingers.get(joint, -1) < 0:
+        raise UserError(
+            f"joints={joint}: no joint of a finger; those are: {', '.join(x for x, f in fingers.items() if f >= 0)}"
+        )
+    m = mechanism.of_hand(hand, servo, gravity=[0.0, 0.0, -9.81])
+    f, j = fingers[joint], hand.joints.index(joint)
+    finger = hand.fingers[f]
+    place, arms = _site(hand, j, f)
     body = m.spec.worldbody.add_body(name="anvil", pos=list(place))
     body.add_geom(name="anvil", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], contype=0, conaffinity=0)
-    _pair(m.spec, f"tip_{finger}", stiffness)
+    for geom in finger.geoms:
+        _pair(m.spec, geom, stiffness)
     limit, kp = m.column("torque_limit"), m.column("kp")
     friction = m.column("coulomb_friction")
     top = most * limit[j]
-    for other in xhand.JOINTS_OF_FINGER[finger]:
+    for other in finger.joints:
         if other != j and abs(arms[other]) > 1e-4:  # what this joint can hold, as torque of the pressing one
             top = min(top, 0.8 * limit[other] * abs(arms[j]) / abs(arms[other]))
-    low, high = xhand.joint_limits()[j]
-    reach = GAP / abs(arms[j])
+    low, high = hand.limits[j]
+    reach = GAP / arms[j]
     force = top / abs(arms[j]) * np.concatenate([np.arange(1, levels + 1), np.arange(levels - 1, 0, -1)]) / levels
-    pose = np.array([POSE[x] for x in xhand.JOINTS])
+    pose = hand.pose("open")
     goals = np.tile(pose, (len(force), 1))
     goals[:, j] += reach
-    for other in xhand.JOINTS_OF_FINGER[finger]:  # every joint leans in by what it will carry, so that none gives way
+    for other in finger.joints:  # every joint leans in by what it will carry, so that none gives way
         goals[:, other] += force * arms[other] / kp[other]
     if goals[:, j].max() > high + 1.0 or goals[:, j].min() < low - 1.0:
         raise UserError(
@@ -71,19 +82,20 @@ def press_recording(
     run = mechanism.drive(
         m,
         commands,
-        xhand.JOINTS,
+        hand.joints,
         float(commands.t[-1]),
         pose,
         timestep,
         frame_s=0.01,
-        pairs=[ContactPair("press", ("geom", f"tip_{finger}"), ("geom", "anvil"))],
+        pairs=[ContactPair("press", ("body", finger.body), ("geom", "anvil"))],
     )
-    out = mechanism.recorded(run, m, commands, xhand.JOINTS)
+    out = mechanism.recorded(run, m, commands, hand.joints)
     times = np.minimum((np.arange(len(run.qpos)) + 1) * run.frame_s, run.t[-1])
-    out.tactile = Series(times, _taxels(run, finger, place), TACTILE)
+    out.tactile = Series(times, _taxels(hand, run, f, place), TACTILE)
     out.meta |= {
         "tactile_unit": "N",
         "tactile_lsb": "1",
+        "tactile_layout": hand.robot,
         "notes": f"press: joint={joint}; ball of {RADIUS * 1e3:g} mm; friction {friction[j]:g} N.m",
     }
     return out
@@ -91,7 +103,8 @@ def press_recording(
 
 def make(
     out: str | Path,
-    joints: Sequence[str] = xhand.JOINTS,
+    hand: Hand,
+    joints: Sequence[str],
     servo: dict | str | Path | None = None,
     levels: int = 8,
     realistic: bool = False,
@@ -107,7 +120,7 @@ def make(
     out = folders.make(Path(out).expanduser(), "out=")
     paths = []
     for k, joint in enumerate(joints):
-        recording = press_recording(joint, servo, levels)
+        recording = press_recording(hand, joint, servo, levels)
         if realistic:
             recording = as_hardware(recording, seed + k)
         path = out / f"press_{joint}.mcap"
@@ -117,65 +130,64 @@ def make(
     return paths
 
 
-def rolled_recording(presses: int = 240, seed: int = 0, frames: int = 16) -> Recording:
+def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int = 16) -> Recording:
     """A ball pressed all over every fingertip, one after the other, on a load cell: /tactile [N] and /external_force
     [N], the hand at rest. Each of `presses` places a finger is pressed to 2..8 N and let go within `frames` samples,
     and followed by a rest."""
     import torch
 
     from dexsim.assets.objects import library
-    from dexsim.tactile.layout import xhand_layout
     from dexsim.tactile.posed import PosedEngine
     from dexsim.tactile.shapes import ShapeSet
     from dexsim.tactile.tactile import Tactile
 
     rng = np.random.default_rng(seed)
     rest = 6
-    n, pairs = len(xhand.FINGERS) * presses * (frames + rest), [f"tip_{x}" for x in xhand.FINGERS]
-    centre, force = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, 5))
+    layout, F, pairs = pads_of(hand), len(hand.fingers), [f"tip_{x}" for x in hand.finger_names]
+    n = F * presses * (frames + rest)
+    centre, force = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros((n, F))
     row = 0
-    for f, finger in enumerate(xhand.FINGERS):
-        table = xhand.taxel_table(finger)
+    for f in range(F):
         for _ in range(presses):
-            k = int(rng.integers(xhand.TAXELS_PER_FINGER))
-            point = table["position"][k] + 1e-3 * rng.uniform(-1, 1, 3)
+            k = int(rng.integers(layout.count[f]))
+            point = layout.point[f, k] + 1e-3 * rng.uniform(-1, 1, 3)
             size = rng.uniform(2.0, 8.0) * np.sin(np.pi * (np.arange(frames) + 0.5) / frames) ** 2
             force[row : row + frames, f] = size
-            centre[row : row + frames] = point + np.outer(RADIUS - size / STIFFNESS, table["normal"][k])
+            centre[row : row + frames] = point + np.outer(RADIUS - size / STIFFNESS, layout.normal[f, k])
             row += frames + rest
-    posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
+    posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
     touch = Tactile(
         posed,
-        xhand_layout(),
+        layout,
         ShapeSet([library()["sphere"]], "cpu"),
         "anvil",
         {"raw": True, "others": False},
         pairs=pairs,
-        tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
+        tips=tip_skins(hand),
     )
-    posed.t.xpos[:, :5] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(5)])  # the pads, far apart
+    posed.t.xpos[:, :F] = torch.tensor([[10.0 * (f + 1), 0.0, 0.0] for f in range(F)])  # the pads, far apart
     posed.t.xmat[:] = torch.eye(3)
     active = force.argmax(1)
     away = 10.0 * (active[:, None] + 1) * [[1.0, 0, 0]]
     at = centre + np.where(force.max(1, keepdims=True) > 0, away, 0)
-    posed.t.xpos[:, 5] = torch.as_tensor(at, dtype=torch.float32)
-    posed.t.pair_normal[:, :5] = torch.as_tensor(force, dtype=torch.float32)
+    posed.t.xpos[:, F] = torch.as_tensor(at, dtype=torch.float32)
+    posed.t.pair_normal[:, :F] = torch.as_tensor(force, dtype=torch.float32)
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
-    felt = np.zeros((n, 5, xhand.TAXELS_PER_FINGER, 3))
+    felt = np.zeros((n, F, layout.taxels, 3))
     felt[..., 2] = touch.raw.numpy()
     t = np.arange(n) * 2 / RATE
     load = np.zeros((n, 6))
     load[:, 2] = felt[..., 2].sum((1, 2))  # what the pad bears (a press beyond its rim meets no taxel)
-    pose = np.tile([POSE[x] for x in xhand.JOINTS], (n, 1))
+    pose = np.tile(hand.pose("open"), (n, 1))
     notes = f"ball of {RADIUS * 1e3:g} mm pressed all over each fingertip, seed {seed}"
-    meta = DEFAULTS | {"source": "sim", "robot": "xhand_right", "joint_names": ",".join(xhand.JOINTS),
-                       "effort_is": "torque_Nm",
+    meta = DEFAULTS | {"source": "sim", "robot": hand.robot, "joint_names": ",".join(hand.joints),
+                       "effort_is": "torque_Nm", "tactile_layout": hand.robot,
                        "effort_sign": "+1", "tactile_unit": "N", "tactile_lsb": "1", "notes": notes}  # fmt: skip
     series = lambda x, topic: Series(t, x, topic, t.copy())  # noqa: E731
     states = States(series(pose, STATES), None, series(0 * pose, STATES))
-    return Recording(Path("rolled.mcap"), meta, xhand.JOINTS, Series.empty(COMMANDS, 12), states,
+    return Recording(Path("rolled.mcap"), meta, hand.joints, Series.empty(COMMANDS, len(hand.joints)), states,
                      tactile=Series(t, felt, TACTILE),
                      external_force=Series(t, load, EXTERNAL_FORCE, t.copy(), "load_cell"),
                      start_ns=1_000_000_000)  # fmt: skip
@@ -195,22 +207,26 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
 
 
 def make_rolled(
-    out: str | Path, realistic: bool = True, seed: int = 0, faults: bool = False, say: Callable[[str], None] = print
-) -> Path:
-    """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on the index
-    finger, as a rehearsal; what was planted is said."""
+    out: str | Path, hand: Hand, realistic: bool = True, seed: int = 0, faults: bool = False,
+    say: Callable[[str], None] = print,
+) -> Path:  # fmt: skip
+    """Write rolled.mcap. faults: with gains that differ by 15 %, three dead taxels and a swapped pair on one finger, as
+    a rehearsal; what was planted is said."""
     from dexsim.console import folders
     from dexsim.recording.writer import write
 
-    recording = rolled_recording(seed=seed)
+    recording = rolled_recording(hand, seed=seed)
     if faults:
         rng = np.random.default_rng([seed, 1])
         z = recording.tactile.value[..., 2]
-        z /= np.exp(0.15 * rng.standard_normal((5, xhand.TAXELS_PER_FINGER)))
-        z[:, 1, list(PLANTED_DEAD)] = 0.0
-        z[:, 1, list(PLANTED_SWAP)] = z[:, 1, list(PLANTED_SWAP[::-1])]
+        z /= np.exp(0.15 * rng.standard_normal(z.shape[1:]))
+        f = hand.others[0]
+        dead, swap = ([int(x * pads_of(hand).count[f]) for x in planted] for planted in (PLANTED_DEAD, PLANTED_SWAP))
+        z[:, f, dead] = 0.0
+        z[:, f, swap] = z[:, f, swap[::-1]]
         say(
-            f"planted  index finger: dead {list(PLANTED_DEAD)}, swapped {PLANTED_SWAP}; every pad: gains of 15 % spread"
+            f"planted  {hand.finger_names[f]} finger: dead {dead}, swapped {tuple(swap)}; every pad: gains of 15 %"
+            " spread"
         )
     if realistic:
         recording = delivered(recording, seed)
@@ -221,7 +237,7 @@ def make_rolled(
 
 
 def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Series:
-    """Commands [T, 12] at RATE: ramps of RAMP_S between levels [L, 12] held for HOLD_S. touch: (joint, its angle at
+    """Commands [T, J] at RATE: ramps of RAMP_S between levels [L, J] held for HOLD_S. touch: (joint, its angle at
     contact), reached first."""
     first = pose.copy()
     first[touch[0]] = touch[1]
@@ -234,29 +250,32 @@ def _ladder(pose: np.ndarray, goals: np.ndarray, touch: tuple[int, float]) -> Se
     return Series(times, value, COMMANDS, times.copy())
 
 
-def _site(spec: mujoco.MjSpec, joint: str, finger: str) -> tuple[np.ndarray, dict[int, float]]:
-    """Where the ball goes: against the taxel whose normal lies most along the joint's motion there. Returns its centre
-    [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
-    model = spec.compile()
+def _site(hand: Hand, joint: int, finger: int) -> tuple[np.ndarray, dict[int, float]]:
+    """Where the ball goes: against the taxel whose normal lies most along the motion there of a joint that closes.
+    Returns its centre [3] m and the lever arms [m] of the finger's joints about the contact's normal."""
+    model = hand.compiled
     data = mujoco.MjData(model)
-    for name, q in POSE.items():
-        data.qpos[model.joint(name).qposadr[0]] = q
+    data.qpos[[model.joint(name).qposadr[0] for name in hand.joints]] = hand.pose("open")
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    body = data.body(xhand.TIP_BODIES[xhand.FINGERS.index(finger)])
-    rot, table = body.xmat.reshape(3, 3), xhand.taxel_table(finger)
-    point, normal = table["position"] @ rot.T + body.xpos, table["normal"] @ rot.T
+    layout, count = pads_of(hand), pads_of(hand).count[finger]
+    body = data.body(hand.tip_bodies[finger])
+    rot = body.xmat.reshape(3, 3)
+    point = layout.point[finger, :count] @ rot.T + body.xpos
+    normal = layout.normal[finger, :count] @ rot.T
 
-    def motion(name: str) -> np.ndarray:
-        i = model.joint(name).id
+    def motion(j: int) -> np.ndarray:
+        i = model.joint(hand.joints[j]).id
         return np.cross(data.xaxis[i], point - data.xanchor[i])
 
-    way = motion(joint)
+    way = motion(joint) * (hand.closing[joint] or 1.0)
     size = np.linalg.norm(way, axis=1)
-    row = np.arange(len(point)) % xhand.ROWS
-    good = (way * normal).sum(1) / size - 10.0 * ((row < 3) | (row > 8))
+    good = (way * normal).sum(1) / size
+    if layout.rows:  # away from both ends of the pad
+        row = np.arange(count) % layout.rows
+        good = good - 10.0 * ((row < layout.rows // 4) | (row > 2 * layout.rows // 3))
     k = int(good.argmax())
-    arms = {i: float(motion(xhand.JOINTS[i])[k] @ normal[k]) for i in xhand.JOINTS_OF_FINGER[finger]}
+    arms = {i: float(motion(i)[k] @ normal[k]) for i in hand.fingers[finger].joints}
     return point[k] + normal[k] * (RADIUS + GAP), arms
 
 
@@ -266,7 +285,7 @@ def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
     d = 0.95
     k = stiffness * (1 - d) * model.body_invweight0[model.geom(tip).bodyid[0], 0]
     spec.add_pair(
-        name="press",
+        name=f"press_{tip}",
         geomname1=tip,
         geomname2="anvil",
         condim=3,
@@ -276,40 +295,39 @@ def _pair(spec: mujoco.MjSpec, tip: str, stiffness: float) -> None:
     )
 
 
-def _taxels(run: mechanism.Run, finger: str, place: np.ndarray) -> np.ndarray:
-    """Taxel forces [F, 5, 120, 3] N of each frame: the physics' contact force, spread by the touch model."""
+def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> np.ndarray:
+    """Taxel forces [T, F, K, 3] N of each frame: the physics' contact force, spread by the touch model."""
     import torch
 
     from dexsim.assets.objects import library
-    from dexsim.tactile.layout import xhand_layout
     from dexsim.tactile.posed import PosedEngine
     from dexsim.tactile.shapes import ShapeSet
     from dexsim.tactile.tactile import Tactile
 
-    n, pairs = len(run.qpos), [f"tip_{x}" for x in xhand.FINGERS]
-    posed = PosedEngine(n, [*xhand.TIP_BODIES, "anvil"], pairs)
+    n, F, layout, pairs = len(run.qpos), len(hand.fingers), pads_of(hand), [f"tip_{x}" for x in hand.finger_names]
+    posed = PosedEngine(n, [*hand.tip_bodies, "anvil"], pairs)
     shape = library()["sphere"]
     touch = Tactile(
         posed,
-        xhand_layout(),
+        layout,
         ShapeSet([shape], "cpu"),
         "anvil",
         {"raw": True, "others": False},
         pairs=pairs,
-        tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
+        tips=tip_skins(hand),
     )
     data = mujoco.MjData(run.model)
-    ids = [run.model.body(b).id for b in xhand.TIP_BODIES]
+    ids = [run.model.body(b).id for b in hand.tip_bodies]
     for w in range(n):
         data.qpos[:] = run.qpos[w]
         mujoco.mj_kinematics(run.model, data)
-        posed.t.xpos[w, :5] = torch.as_tensor(data.xpos[ids], dtype=torch.float32)
-        posed.t.xmat[w, :5] = torch.as_tensor(data.xmat[ids].reshape(5, 3, 3), dtype=torch.float32)
-    posed.t.xpos[:, 5] = torch.as_tensor(place, dtype=torch.float32)
-    posed.t.pair_normal[:, xhand.FINGERS.index(finger)] = torch.as_tensor(run.pair_normal[:, 0], dtype=torch.float32)
+        posed.t.xpos[w, :F] = torch.as_tensor(data.xpos[ids], dtype=torch.float32)
+        posed.t.xmat[w, :F] = torch.as_tensor(data.xmat[ids].reshape(F, 3, 3), dtype=torch.float32)
+    posed.t.xpos[:, F] = torch.as_tensor(place, dtype=torch.float32)
+    posed.t.pair_normal[:, finger] = torch.as_tensor(run.pair_normal[:, 0], dtype=torch.float32)
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
-    out = np.zeros((n, 5, xhand.TAXELS_PER_FINGER, 3))
+    out = np.zeros((n, F, layout.taxels, 3))
     out[..., 2] = touch.raw.numpy()
     return out

@@ -1,7 +1,7 @@
 """The state of a fingertip's taxels from recordings in which it is pressed all over: threshold, dead and swapped ones,
 gains.
 
-Readings of one pad are [T, 120]; taxel k = column * 12 + row, neighbours are those beside it in column or row.
+Readings of one pad are [T, K]; taxel k = column * rows + row, neighbours are those beside it in column or row.
 """
 
 from __future__ import annotations
@@ -11,13 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexsim.assets import xhand
-
-COLUMNS, ROWS = xhand.COLUMNS, xhand.ROWS
 AT_ONCE = 6  # taxels that answer together where something presses; noise wakes fewer
 
 
-def neighbours(columns: int = COLUMNS, rows: int = ROWS) -> list[list[int]]:
+def neighbours(columns: int, rows: int) -> list[list[int]]:
     """Taxels beside each taxel of the lattice."""
     out = []
     for k in range(columns * rows):
@@ -34,14 +31,14 @@ def neighbours(columns: int = COLUMNS, rows: int = ROWS) -> list[list[int]]:
 
 @dataclass
 class Pad:
-    """What was found of one pad. threshold: a reading at or under it may be noise (readings' unit); bias [120]; dead,
-    swapped;
-    unseen: taxels that nothing pressed, of which nothing is known; gain [120] or None without a load; held_out: error
-    of the load by these gains on presses that were not fitted, over the mean load (and with equal gains); hysteresis:
-    of force against load. notes: in words."""
+    """What was found of one pad. threshold: a reading at or under it may be noise (readings' unit); bias [K]; rows: of
+    the lattice; dead, swapped; unseen: taxels that nothing pressed, of which nothing is known; gain [K] or None without
+    a load; held_out: error of the load by these gains on presses that were not fitted, over the mean load (and with
+    equal gains); hysteresis: of force against load. notes: in words."""
 
     threshold: float
     bias: np.ndarray
+    rows: int
     dead: list[int] = field(default_factory=list)
     swapped: list[tuple[int, int]] = field(default_factory=list)
     unseen: list[int] = field(default_factory=list)
@@ -53,8 +50,8 @@ class Pad:
     notes: list[str] = field(default_factory=list)
 
 
-def inspect(readings: np.ndarray, load: np.ndarray | None = None) -> Pad:
-    """One pad's readings [T, 120] and, where known, the normal load on it [T] N."""
+def inspect(readings: np.ndarray, load: np.ndarray | None = None, *, rows: int) -> Pad:
+    """One pad's readings [T, K] and, where known, the normal load on it [T] N; rows of its lattice."""
     r = np.asarray(readings, float)
     total = r.sum(1)
     rest = load < 0.02 * load.max() if load is not None and load.max() > 0 else total <= np.percentile(total, 10) + 1e-9
@@ -67,25 +64,27 @@ def inspect(readings: np.ndarray, load: np.ndarray | None = None) -> Pad:
         touched = (clean > max(threshold, 1e-9)).sum(1) >= AT_ONCE
         if touched.sum() < 5:  # never pressed: every frame tells of the noise, not the quietest alone
             threshold = float(np.percentile(np.abs(clean), 99.9))
-    out = Pad(threshold, bias)
+    out = Pad(threshold, bias, rows)
     if touched.sum() < 5:
         out.notes.append("nothing pressed it: only its threshold is known")
         out.unseen = list(range(r.shape[1]))
         return out
-    near = neighbours()
+    near = neighbours(r.shape[1] // rows, rows)
     silent = set(np.flatnonzero(clean.max(0) <= 2 * threshold).tolist())
     out.swapped = _swapped(clean, near, silent)
     order = np.arange(r.shape[1])
     for a, b in out.swapped:
         order[[a, b]] = order[[b, a]]
     clean = clean[:, order]
-    out.dead, out.unseen = _dead(clean, threshold, near)
+    out.dead, out.unseen = _dead(clean, threshold, near, rows)
     if load is not None:
         _gains(out, clean, np.asarray(load, float))
     return out
 
 
-def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[list[int], list[int]]:
+def _dead(
+    clean: np.ndarray, threshold: float, near: list[list[int]], rows: int
+) -> tuple[list[int], list[int]]:
     """(dead, unseen): taxels that stay silent where they must feel something, and silent ones of which the presses do
     not tell.
 
@@ -103,7 +102,7 @@ def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[l
         for k in range(clean.shape[1]):
             between = np.zeros(len(clean))  # the weaker of two opposite sides, in the best of the four directions
             for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
-                sides = [_beside(k, step, way, gone) for way in (1, -1)]
+                sides = [_beside(k, step, way, gone, clean.shape[1] // rows, rows) for way in (1, -1)]
                 if None not in sides:
                     between = np.maximum(between, clean[:, sides].min(1))
             pressed = between > strong
@@ -120,7 +119,7 @@ def _dead(clean: np.ndarray, threshold: float, near: list[list[int]]) -> tuple[l
 
 
 def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray, near: list[list[int]]) -> np.ndarray:
-    """[120]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is
+    """[K]: the chance that a healthy taxel is silent in every press whose strongest taxel lies beside it. A press is
     what lies between two rests, at most 200 frames."""
     on = clean.max(1) > strong
     press = np.cumsum(np.diff(on, prepend=False) & on) * 1000 + np.arange(len(on)) // 200
@@ -142,15 +141,17 @@ def _surprise(clean: np.ndarray, strong: float, floor: float, silent: np.ndarray
     return np.prod((1 - rate) ** trials, axis=1)
 
 
-def _beside(k: int, step: tuple[int, int], way: int, gone: set[int], far: int = 3) -> int | None:
+def _beside(
+    k: int, step: tuple[int, int], way: int, gone: set[int], columns: int, rows: int, far: int = 3
+) -> int | None:
     """The nearest taxel that is not `gone`, at most `far` steps from k; None at the pad's edge."""
-    c, r = divmod(k, ROWS)
+    c, r = divmod(k, rows)
     for n in range(1, far + 1):
         a, b = c + way * n * step[0], r + way * n * step[1]
-        if not (0 <= a < COLUMNS and 0 <= b < ROWS):
+        if not (0 <= a < columns and 0 <= b < rows):
             return None
-        if a * ROWS + b not in gone:
-            return a * ROWS + b
+        if a * rows + b not in gone:
+            return a * rows + b
     return None
 
 
@@ -213,6 +214,7 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
     believed to lie near one: only if it tells the load of presses that were not fitted (five folds of the recording)
     better than equal gains do."""
     live = np.array([k for k in range(clean.shape[1]) if k not in out.dead and k not in out.unseen])
+    columns = clean.shape[1] // out.rows
     pressed = load > 0.05 * load.max()
     x, y = clean[pressed], load[pressed]
     fold = np.arange(len(y)) * 20 // max(1, len(y)) % 5
@@ -233,8 +235,8 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
     def neighbours_and_load(rows: np.ndarray) -> np.ndarray:
         """Neighbours tell what differs from taxel to taxel, the load what changes over the whole pad: a surface of
         degree 3."""
-        local = smooth_gains(x[rows], set(live.tolist()), floor)
-        basis = _surface()[live]
+        local = smooth_gains(x[rows], set(live.tolist()), floor, columns, out.rows)
+        basis = _surface(columns, out.rows)[live]
         seen = (x[rows][:, live] * local[live]) @ basis
         c = np.linalg.lstsq(seen, y[rows], rcond=1e-4)[0]
         broad = np.ones(len(local))
@@ -273,18 +275,18 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
     out.hysteresis = _loop(clean[:, live] @ gain[live], load)
 
 
-def _surface(degree: int = 3) -> np.ndarray:
-    """Polynomials over the lattice [120, B], products of Legendre's in column and row up to a total degree."""
-    c, r = np.divmod(np.arange(COLUMNS * ROWS), ROWS)
+def _surface(columns: int, rows: int, degree: int = 3) -> np.ndarray:
+    """Polynomials over the lattice [K, B], products of Legendre's in column and row up to a total degree."""
+    c, r = np.divmod(np.arange(columns * rows), rows)
     leg = np.polynomial.legendre.legvander
-    a, b = leg(2 * c / (COLUMNS - 1) - 1, degree), leg(2 * r / (ROWS - 1) - 1, degree)
+    a, b = leg(2 * c / max(columns - 1, 1) - 1, degree), leg(2 * r / max(rows - 1, 1) - 1, degree)
     return np.stack([a[:, i] * b[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 
 
 def smooth_gains(
-    readings: np.ndarray, live: set[int], floor: float, prior: float = 0.2, columns: int = COLUMNS, rows: int = ROWS
+    readings: np.ndarray, live: set[int], floor: float, columns: int, rows: int, prior: float = 0.2
 ) -> np.ndarray:
-    """Gains [120] (times a reading: its force) from readings [T, 120] of presses all over, because pressure is smooth.
+    """Gains [K] (times a reading: its force) from readings [T, K] of presses all over, because pressure is smooth.
 
     The logarithm of a round press falls off as a parabola, so a taxel's logarithm lies above the mean of the two taxels
     beside it, in column or row, by the same on average wherever it is; what a taxel differs by beyond that is its gain

@@ -21,7 +21,7 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
-from dexsim.hand import load_hand
+from dexsim.hand import Hand, load_hand
 from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.paths import CONFIGS
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
@@ -63,6 +63,17 @@ class Mechanism:
 def xhand_servo_dict() -> dict[str, Any]:
     """The xHand's nominal servo table: `dexsim/configs/servo/xhand.yaml`."""
     return yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
+
+
+def of_hand(
+    hand: Hand, servo: str | Path | dict | None = None, gravity: Sequence[float] | None = None
+) -> Mechanism:
+    """The mechanism of a hand alone, in its palm frame; servo, gravity as in `mechanism`. Raises UserError."""
+    spec = hand.spec()
+    _hold_friction(spec)
+    if gravity is not None:
+        spec.option.gravity = [float(g) for g in gravity]
+    return Mechanism(spec, hand.joints, _table(hand.servo_path if servo is None else servo), hand.robot)
 
 
 def mechanism(

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import least_squares
 
-from dexsim.calibration.taxels import neighbours
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.plant.case import noise
 from dexsim.gap.rules import TOUCH
-from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
+from dexsim.gap.touch.plant import NEAR, PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
 BLOCK = 0.5  # s
@@ -113,7 +112,7 @@ class PadFit:
         # the object may touch beside where the joints say: neighbours on both sides must feel it
         near = [
             sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside))
-            for beside in neighbours()[: z.shape[1]]
+            for beside in NEAR[: z.shape[1]]
         ]
         pressed &= np.array(near)
         stuck = still & (z[0] > 2 * step)

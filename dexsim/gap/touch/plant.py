@@ -70,11 +70,14 @@ def neutral() -> dict[str, float]:
     return {k: p.neutral for k, p in PARAMS.items()}
 
 
+NEAR = neighbours(xhand.COLUMNS, xhand.ROWS)
+"""Taxels beside each taxel of a pad."""
+
+
 def _beside() -> np.ndarray:
     """[K, K]: a taxel's force shared equally by the taxels beside it (rows: who feels it)."""
-    near = neighbours()
     out = np.zeros((xhand.TAXELS_PER_FINGER, xhand.TAXELS_PER_FINGER))
-    for k, beside in enumerate(near):
+    for k, beside in enumerate(NEAR):
         out[beside, k] = 1.0 / len(beside)
     return out
 
