@@ -1,8 +1,9 @@
 """dexsim's own kernels (sim.collision=hand, sim.solver=hand) beside MuJoCo-Warp's (both mujoco), in one process on one
-device: start, physics, full step, profile, play.
+device: start, physics, full step, profile, peers, play.
 
     python -m benchmarks.collision [out=out/collision.json] [worlds=8192] [steps=40] [rounds=3] [episodes=512]
-                                   [limit_s=330] [parts=measure,solve,variants,play,exact] [any setting of train.py]
+                                   [limit_s=330] [parts=measure,solve,variants,peers,play,exact] [mjlab=PYTHON]
+                                   [any setting of train.py]
 
 The grasp of benchmarks.step is made once, with dexsim's kernels, and handed to the other settings (`narrow`: dexsim's
 contacts, MuJoCo-Warp's solver; `mujoco`: MuJoCo-Warp's of both), so that all step the same worlds.
@@ -12,6 +13,7 @@ contacts, MuJoCo-Warp's solver; `mujoco`: MuJoCo-Warp's of both), so that all st
             step launched one by one and of the recorded parts of the environment's step, Newton iterations, contacts,
             pairs tested and overlapping
   variants  bare physics with dexsim's kernels under other launch sizes and solver options, one at a time
+  peers     bare MuJoCo-Warp, and with `mjlab=` its environment loop, on the same scene (benchmarks.peers gpu)
   solve     accelerations and forces of both solvers from the same constraints
   play      metrics of checkpoints/grasp.pt and rotate.pt under both
   exact     contacts of random poses against C MuJoCo (benchmarks.narrow_phase) on this device
@@ -36,8 +38,10 @@ from warp._src import context
 
 from benchmarks import narrow_phase, tools, trace
 from benchmarks import step as step_benchmark
+from benchmarks.peers import __main__ as peers
 from benchmarks.tape import Tape
 from dexsim.cli import start as start_up
+from dexsim.console import folders
 from dexsim.learning.ppo import load_policy
 from dexsim.paths import CONFIGS
 from dexsim.sim import warp_engine
@@ -49,7 +53,7 @@ SETTINGS = {
     "mujoco": {"collision": "mujoco", "solver": "mujoco"},
 }
 """Whose kernels: dexsim's; dexsim's for contacts only; MuJoCo-Warp's."""
-PARTS = ("measure", "solve", "variants", "play", "exact")
+PARTS = ("measure", "solve", "variants", "peers", "play", "exact")
 SOLVERS: list[dict[str, Any]] = [
     *({"rows": rows} for rows in (32, 48, 96, 160)),
     *({"worlds_per_block": worlds} for worlds in (2, 4)),
@@ -112,13 +116,14 @@ class Run:
                 "limit_s": "330",
                 "parts": ",".join(PARTS),
                 "poses": "20000",
+                "mjlab": "",
             },
         )
         self.begin, self.limit = time.perf_counter(), float(own["limit_s"])
         self.steps, self.rounds, self.episodes, self.poses = (
             tools.numbers(own[k], k)[0] for k in ("steps", "rounds", "episodes", "poses")
         )
-        self.parts = own["parts"].split(",")
+        self.parts, self.mjlab = own["parts"].split(","), own["mjlab"]
         self.path = Path(own["out"])
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.cfg = tools.config([*rest, "sim.engine=warp"])
@@ -324,6 +329,17 @@ class Run:
 
         warp_engine.compile_together(launch_all, self.device)
 
+    def peers(self) -> dict:
+        """Milliseconds of a control step of each (the best of two turns), and over dexsim's full step."""
+        own = {"worlds": str(self.cfg["worlds"]), "device": self.device} | ({"mjlab": self.mjlab} if self.mjlab else {})
+        rows = peers.gpu(own, folders.make((self.path.parent / "peers").resolve(), "out="))
+        failed = {r["name"]: r["error"] for r in rows if "error" in r}
+        best: dict[str, float] = {}
+        for r in rows:
+            if "ms" in r:
+                best[r["name"]] = min(r["ms"], best.get(r["name"], r["ms"]))
+        return {"ms": best, "over_dexsim": peers.ratios(rows), "failed": failed}
+
     def play(self, task: str, setting: str) -> dict:
         worlds = min(self.episodes, 2048)
         argv = [
@@ -361,6 +377,8 @@ def main(argv: list[str]) -> dict:
         run.part(f"kernels {setting}", lambda setting=setting: run.kernels(setting))
     if "solve" in run.parts:
         run.part("solve", run.solve)
+    if "peers" in run.parts:
+        run.part("peers", run.peers, 30)
     if "play" in run.parts:
         for task in ("grasp", "rotate"):
             for setting in ("hand", "mujoco"):

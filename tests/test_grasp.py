@@ -15,7 +15,7 @@ from dexsim.deploy import observations
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.sim.engine import FLAG_NAN
-from dexsim.tasks import grasp_eval, make_env, terms
+from dexsim.tasks import grasp_eval, make_env
 from dexsim.tasks.grasp import privileged
 
 N = 8
@@ -185,16 +185,6 @@ def test_a_new_episode_has_felt_nothing(env):
 # ---------------------------------------------------------------------------------------------------------------
 
 
-def test_tracking_against_hand_computed_values():
-    x = torch.tensor([[2.0, 4.0, 6.0, 4.0, 11.0], [0.1, 4.0, 0.1, 4.0, 4.0]])
-    contact = torch.tensor([[True, True, True, False, True], [True, True, True, True, False]])
-    got = terms.tracking(x, torch.tensor([0.5, 0.5]), x_max=8.0, sigma=0.25, low=0.02, high=1.3, contact=contact)
-    # command 4 N, sigma 2 N, band [0.16, 10.4] N; thumb: band only
-    first = 1.0 + 1.0 + math.exp(-0.5 * (2 / 2) ** 2) + 0.0 + 0.0  # on target; 1 sigma off; no contact; over the band
-    second = 0.0 + 1.0 + 0.0 + 1.0 + 0.0  # thumb under its band; exact; under the band; exact; no contact
-    torch.testing.assert_close(got, torch.tensor([first, second]))
-
-
 def test_low_commands_can_earn():
     r = grasp_cfg()["task"]["reward"]
     assert r["force_low"] < 0.1 and r["torque_low"] < 0.1
@@ -248,6 +238,24 @@ def test_reward_terms_by_hand(posed):
 
     env.object_pose[:, 2] = -1.0
     assert terms_of(env)["termination"] == 1.0
+
+
+def test_tracking_against_hand_computed_values(posed):
+    env, r = posed, posed.task["reward"]
+    kept, f_max = dict(r), env.f_max
+    r |= {"force_sigma": 0.25, "force_low": 0.02, "force_high": 1.3, "contact_threshold": 0.1}
+    env.f_max = 8.0
+    try:
+        # command 4 N, sigma 2 N, band [0.16, 10.4] N; thumb: band only
+        env.tip_force[0] = torch.tensor([2.0, 4.0, 6.0, 0.05, 11.0])
+        env.tip_force[1] = torch.tensor([0.12, 4.0, 0.12, 4.0, 0.05])
+        got = env.rewards()["force"][:2] / env.task["rewards"]["force"]
+    finally:
+        r |= kept
+        env.f_max = f_max
+    first = 1.0 + 1.0 + math.exp(-0.5 * (2 / 2) ** 2) + 0.0 + 0.0  # on target; 1 sigma off; no contact; over the band
+    second = 0.0 + 1.0 + 0.0 + 1.0 + 0.0  # thumb under its band; exact; under the band; exact; no contact
+    torch.testing.assert_close(got, torch.tensor([first, second]))
 
 
 def test_force_and_torque_rewards_need_contact_with_the_object(posed):

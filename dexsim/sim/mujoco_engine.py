@@ -12,6 +12,7 @@ import warp as wp
 
 from dexsim.errors import UserError
 from dexsim.sim import mujoco_kernels as kernels
+from dexsim.sim.begin import Begin
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 from dexsim.sim.launches import Launches
 
@@ -74,6 +75,7 @@ class MujocoEngine(Engine):
         w.flags = wp.zeros(N, dtype=int, device="cpu")
         for name in ("xpos", "xmat", "pair_normal", "pair_force", "flags"):
             setattr(self.t, name, wp.to_torch(getattr(w, name)))
+        self._begin = Begin(self.real, self.wp, self.t, self._warmstart)
         self._overflow, self._most = wp.zeros(N, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
         self.t.overflow = wp.to_torch(self._overflow)
         if P:
@@ -122,16 +124,7 @@ class MujocoEngine(Engine):
         self._kinematics()
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        m, t = mask[:, None], self.t
-        t.qpos.copy_(torch.where(m, qpos.to(t.qpos.dtype), t.qpos))
-        t.qvel.copy_(torch.where(m, qvel.to(t.qvel.dtype), t.qvel))
-        self._warmstart.masked_fill_(m, 0.0)
-        t.qfrc_applied.masked_fill_(m, 0.0)
-        t.time.masked_fill_(mask, 0.0)
-        t.xfrc_applied.masked_fill_(m[..., None], 0.0)
-        t.pair_normal.masked_fill_(m, 0.0)
-        t.pair_force.masked_fill_(m[..., None], 0.0)
-        t.flags.masked_fill_(mask, 0)
+        self._begin(mask, qpos, qvel)
 
     def set_const(self) -> None:
         self.batch.set_const()

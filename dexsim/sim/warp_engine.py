@@ -16,6 +16,7 @@ from dexsim.errors import UserError
 from dexsim.sim import contact
 from dexsim.sim import collision as narrow_phase
 from dexsim.sim import solver as newton
+from dexsim.sim.begin import Begin
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
 from dexsim.sim.warmup import compile_together
 
@@ -103,6 +104,7 @@ class WarpEngine(Engine):
         self.t.overflow = wp.to_torch(self._overflow)
         self.t.xfrc_applied = wp.to_torch(self.d.xfrc_applied)
         self._warmstart = wp.to_torch(self.d.qacc_warmstart)
+        self._begin = Begin(self.real, self.wp, self.t, self._warmstart)
         self._simplex = wp.to_torch(self.narrow.simplex) if self.narrow is not None else None
         self._fields = {}
         for name in set(fields) | set(_DERIVED):
@@ -150,18 +152,7 @@ class WarpEngine(Engine):
         self._run(("refresh",), lambda: mjw.kinematics(self.m, self.d))
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        m = mask[:, None]
-        t = self.t
-        torch.where(m, qpos.to(t.qpos.dtype), t.qpos, out=t.qpos)
-        torch.where(m, qvel.to(t.qvel.dtype), t.qvel, out=t.qvel)
-        # masked_fill, not a product: 0 * NaN is NaN
-        self._warmstart.masked_fill_(m, 0.0)
-        t.qfrc_applied.masked_fill_(m, 0.0)
-        t.time.masked_fill_(mask, 0.0)
-        t.xfrc_applied.masked_fill_(m[..., None], 0.0)
-        t.pair_normal.masked_fill_(m, 0.0)
-        t.pair_force.masked_fill_(m[..., None], 0.0)
-        t.flags.masked_fill_(mask, 0)
+        self._begin(mask, qpos, qvel)
         if self.narrow is not None:
             self._simplex.masked_fill_(mask[:, None, None], -1)
 

@@ -122,6 +122,8 @@ class Tactile:
         self.raw3 = None
         self._m = self.by_pad = None
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
+        low = [[cfg.range(name)[0]] for name in COLUMNS]
+        self._fixed = torch.tensor(low, dtype=torch.float32, device=self.device)  # [C, 1], what is not drawn
         self._row = {name: a.params[i] for i, name in enumerate(COLUMNS)}
         options = {"law": cfg.law, "pads": f, "taxels": t, "objects": o, "feel_others": cfg.feel_others}
         self._kernel = touch_kernel(self.lanes, solver, store, others, **options, registers=registers)
@@ -193,12 +195,12 @@ class Tactile:
 
     def randomize(self, mask: torch.Tensor, generator: torch.Generator | None = None) -> None:
         """Where mask [N] (bool) holds: draw the per-world parameters anew from their configured ranges."""
+        stored = self.params.T  # as the kernels have it
+        torch.where(mask, self._fixed, stored, out=stored)
         for name in self.columns:
             low, high = self.cfg.range(name)
-            col = self.column(name)
-            if low == high:
-                col.masked_fill_(mask, low)
-            else:
+            if low != high:
+                col = self.column(name)
                 draw = low + (high - low) * torch.rand(col.shape, generator=generator, device=col.device)
                 col.copy_(torch.where(mask, draw, col))
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 import copy
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import mujoco
 import torch
+import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
@@ -26,13 +28,12 @@ from dexsim.hand import Hand, load_hand
 from dexsim.hand.places import places
 from dexsim.hand.skin import tip_skins
 from dexsim.sim import ContactPair, make_engine
-from dexsim.sim.engine import FLAG_NAN
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
-from dexsim.tasks import worlds
+from dexsim.tasks import state_kernels, worlds
 from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
@@ -40,6 +41,8 @@ from dexsim.tasks.reality import Reality, present
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
+MOST_GROUPS = 4
+"""Groups of observations that a task may have."""
 UNIT_SPAN = 0.1
 """m, `span` of the hand that the lengths in task settings are for; they are multiplied by span / UNIT_SPAN."""
 UNIT_PALM = 0.025
@@ -165,6 +168,7 @@ class HandEnv(VecEnv):
         self.sampler = Sampler(cfg["randomize"], self.rng, n_worlds, device)
         self._index()
         self._buffers()
+        self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
         self.reset_all()
@@ -235,43 +239,55 @@ class HandEnv(VecEnv):
         if self.keep_final_obs:
             final = {k: torch.nan_to_num(v, 0.0, 0.0, 0.0) for k, v in self.observe(advance=False).items()}
         self._replay("reset", self._reset_done)
-        log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
-        extras = {"time_outs": self.time_out.clone(), "log": log}
+        observations, reward, done, extras = self.results()
         if self.keep_final_obs:
             extras["final_obs"] = TensorDict(final, batch_size=[self.num_envs], device=self.device)
+        return observations, reward, done, extras
+
+    def results(self) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """What `step` returns, copied: the next step writes over the environment's own."""
+        log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
+        extras = {"time_outs": self.time_out.clone(), "log": log}
         return self.get_observations(), self.reward.clone(), self.done.to(torch.long), extras
 
     def _before(self) -> None:
         self.act(self._action_in)
-        self.before_physics()
+        with self._drawn_together("orders"):
+            self.before_physics()
         self._nan_dump.before()
 
     def _after(self) -> None:
         self.episode_length_buf += 1
         self.read_state()
-        ends = self.terminated()
-        terms = self.rewards()
-        reward = torch.stack(list(terms.values()))
-        self._judge(terms, reward)
+        ends, terms = self.terminated(), self.rewards()
+        rates, reward = self._judge(ends, terms)
         self._nan_dump.after(self.nan)
-        ends["nan"] = self.nan
-        dead = torch.stack(list(ends.values())).any(0)
-        self.time_out.copy_((self.episode_length_buf >= self._length_limit) & ~dead)
-        reward = torch.where(self.nan, torch.zeros_like(reward), reward)
-        self.reward.copy_(reward.sum(0))
-        self.done.copy_(dead | self.time_out)
-        self._log(terms, ends, reward)
+        self._log(terms, ends, torch.cat([reward, rates]).mean(1))
 
-    def _judge(self, terms: dict[str, torch.Tensor], reward: torch.Tensor) -> None:
-        """A world of which a reward [T, N] or the last observation is not finite begins anew as one whose state is not;
-        counts by state, term and group for `check`."""
-        wrong = ~reward.isfinite() & ~self.nan
+    def _judge(
+        self, ends: dict[str, torch.Tensor], terms: dict[str, torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Fill `reward`, `done`, `time_out`. A world of which a reward or the last observation is not finite begins
+        anew as one whose state is not; counts by state, term and group for `check`. Returns what ended each world, 1 or
+        0 [E + 2, N] (`nan` and `time_out` last), and its rewards [T, N], 0 where it was not finite."""
         if self._wrong is None:
             self._sources = ("state", *(f"reward {k}" for k in terms), "observations")
             with torch.inference_mode(False):  # it outlives the rollout that happens to come first
                 self._wrong = torch.zeros(len(self._sources), dtype=torch.long, device=self.device)
-        self._wrong += torch.cat([self.nan[None], wrong, self._blind[None]]).sum(1)
-        self.nan |= wrong.any(0) | self._blind
+        reward = torch.stack(list(terms.values()))
+        ended = torch.stack(list(ends.values())) if ends else self.nan[None][:0]
+        rates = torch.empty(len(ends) + 2, self.num_envs, device=self.device)
+        count = self.nan_count.view(1)
+        given = (self._episode_length, self._length_limit.view(1), self._blind[0], ended, reward, self.nan, self._wrong)
+        args = (*given, count, self.reward, self.done, self.time_out, rates)
+        wp.launch(state_kernels.judge, dim=self.num_envs, inputs=[*map(wp.from_torch, args)], device=self.device)
+        return rates, reward
+
+    @contextmanager
+    def _drawn_together(self, name: str) -> Iterator[None]:
+        """On a GPU, all random numbers of a part of the step at once; evaluation draws as ever, whatever the device."""
+        with self.sampler.together(name) if self.graphs and self.draws_together else nullcontext():
+            yield
 
     def _reset_done(self) -> None:
         if self.skip_idle_resets and not bool(self.done.any()):
@@ -303,16 +319,17 @@ class HandEnv(VecEnv):
         """Turn actions [N, J] into targets. `relative`: the target moves by action * scale a step, held within the
         joint limits and within `lead` of the measured angle (a driver can do the same); `absolute`: the action spans
         the joint's range."""
-        a = torch.nan_to_num(actions.to(torch.float32)).clamp(-1.0, 1.0)
-        self.last_action.copy_(self.action)
-        self.action.copy_(a)
         act = self.task["action"]
-        if act["mode"] == "relative":
-            target = self.target + a * act["scale"]
-            target = torch.maximum(torch.minimum(target, self.q + act["lead"]), self.q - act["lead"])
-        else:
-            target = self.q_mid + a * self.q_half
-        self.target.copy_(torch.maximum(torch.minimum(target, self.q_high), self.q_low))
+        wp.launch(
+            state_kernels.act,
+            dim=actions.shape,
+            inputs=[
+                wp.from_torch(actions.to(torch.float32)), act["mode"] == "relative", act.get("scale", 0.0),
+                act.get("lead", 0.0),
+                *self._act_args,
+            ],
+            device=self.device,
+        )  # fmt: skip
         if self.reality is None:
             self.servo.send(self.target)
         else:
@@ -326,10 +343,7 @@ class HandEnv(VecEnv):
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes where mask [N] holds, and refresh the observations of all worlds."""
-        if self.graphs and self.device.startswith("cuda"):  # (evaluation draws as ever, whatever the device)
-            with self.sampler.together("episodes"):
-                self.begin_episodes(mask)
-        else:
+        with self._drawn_together("episodes"):
             self.begin_episodes(mask)
         self.engine.refresh()
         self._clear_touch(mask)
@@ -341,12 +355,15 @@ class HandEnv(VecEnv):
 
     def _observe_all(self) -> None:
         self._blind.zero_()
-        for group, value in self.observe(advance=True).items():
+        with self._drawn_together("observations"):
+            observed = self.observe(advance=True)
+        for row, (group, value) in enumerate(observed.items(), 1):
             if group not in self.obs:
                 self.obs[group] = torch.zeros_like(value)
-            good = value.isfinite().all(1)
-            self._blind |= ~good
-            self.obs[group].copy_(torch.where(good[:, None], value, 0.0))
+            args, dim = [wp.from_torch(value), row, wp.from_torch(self._blind)], value.shape
+            wp.launch(state_kernels.note_not_finite, dim=dim, inputs=args, device=self.device)
+            out = wp.from_torch(self.obs[group])
+            wp.launch(state_kernels.keep_finite, dim=dim, inputs=[*args, out], device=self.device)
 
     def place(
         self,
@@ -360,22 +377,24 @@ class HandEnv(VecEnv):
         [N, 7] (x y z, w x y z) moving at velocity [N, 6] (linear in the palm frame, angular in the object's own)."""
         e, target = self.engine, hand_q if target is None else target
         qpos, qvel = e.t.qpos.clone(), torch.zeros_like(e.t.qvel)
+        at_q, at_v = self._object_at
         qpos[:, self.joint_q] = hand_q.to(qpos.dtype)
-        qpos[:, self.object_q] = object_pose.to(qpos.dtype)
-        qvel[:, self.object_v] = object_velocity.to(qvel.dtype)
+        qpos[:, at_q : at_q + 7] = object_pose.to(qpos.dtype)
+        qvel[:, at_v : at_v + 6] = object_velocity.to(qvel.dtype)
         e.set_state(mask, qpos, qvel)
         self.servo.reset(mask, target)
         self.touch.reset(mask)
-        self.target.copy_(torch.where(mask[:, None], target, self.target))
+        torch.where(mask[:, None], target, self.target, out=self.target)
 
     def _clear_touch(self, mask: torch.Tensor) -> None:
         """Where mask [N] holds, nothing is touched: no force, centres at the pads' centres (poses are refreshed)."""
-        t, touch = self.engine.t, self.touch
-        centre = t.xpos[:, self.tip_body] + (t.xmat[:, self.tip_body] @ self.pad_centre[None, :, :, None])[..., 0]
-        for force in (touch.force, touch.force_clean, touch.force_other):
-            force.masked_fill_(mask[:, None], 0.0)
-        for known in (touch.centre, touch.centre_clean):
-            known.copy_(torch.where(mask[:, None, None], centre, known))
+        touch, state = self.touch, self.engine.wp
+        wp.launch(
+            state_kernels.clear_touch,
+            dim=touch.force.shape,
+            inputs=[wp.from_torch(mask), state.xpos, state.xmat, *self._touch_args],
+            device=self.device,
+        )
         for raw in (touch.raw, touch.raw_clean, touch.raw3):
             if raw is not None:
                 raw.masked_fill_(mask.view(-1, *(1,) * (raw.dim() - 1)), 0.0)
@@ -385,33 +404,13 @@ class HandEnv(VecEnv):
     def read_state(self) -> None:
         """Copy what terms use from the engine, in palm-frame float32; NaN worlds read as zeros, flagged in `nan`
         [N]."""
-        t = self.engine.t
-        self.nan.copy_((t.flags & FLAG_NAN) != 0)
-        ok = ~self.nan[:, None]
-
-        def clean(x: torch.Tensor) -> torch.Tensor:
-            return torch.where(ok, x, 0.0).to(torch.float32)
-
-        self.q.copy_(clean(t.qpos[:, self.joint_q]))
-        self.qd.copy_(clean(t.qvel[:, self.joint_v]))
-        self.object_pose.copy_(clean(t.qpos[:, self.object_q]))
-        self.object_velocity.copy_(clean(t.qvel[:, self.object_v]))
-        self.torque.copy_(clean(self.servo.torque))
+        wp.launch(self._read, dim=self._read_dim, inputs=self._read_args, device=self.device)
         if self.servo.misread:  # what a hand's own sensors say is all that a policy will know of them
-            self.q.copy_(clean(self.servo.position()))
-            self.qd.copy_(clean(self.servo.velocity()))
+            ok = ~self.nan[:, None]
+            for own, reported in ((self.q, self.servo.position()), (self.qd, self.servo.velocity())):
+                own.copy_(torch.where(ok, reported, 0.0))
         if self.reality is not None:
             self.reality.read(self)
-        normal = clean(t.pair_normal)
-        F = self.fingers
-        self.tip_force.copy_(normal[:, 0:F])
-        self.finger_force.copy_(normal[:, F : 2 * F])
-        self.palm_force.copy_(normal[:, 2 * F])
-        self.self_force.copy_(normal[:, 2 * F + 1 :])
-        pos = t.xpos[:, self.tip_body]
-        rot = t.xmat[:, self.tip_body]
-        tip = pos + (rot @ self.tip_offset[None, :, :, None])[..., 0]
-        self.tips.copy_(clean(tip.reshape(self.num_envs, 3 * F)).reshape(self.num_envs, F, 3))
 
     def _index(self) -> None:
         e, dev, hand = self.engine, self.device, self.hand
@@ -424,6 +423,7 @@ class HandEnv(VecEnv):
         j = e.joint("object_free")
         self.object_q = long(range(mjm.jnt_qposadr[j], mjm.jnt_qposadr[j] + 7))
         self.object_v = long(range(mjm.jnt_dofadr[j], mjm.jnt_dofadr[j] + 6))
+        self._object_at = int(mjm.jnt_qposadr[j]), int(mjm.jnt_dofadr[j])
         limits = torch.as_tensor(hand.limits, dtype=torch.float32, device=dev)
         self.q_low, self.q_high = limits[:, 0], limits[:, 1]
         self.q_mid, self.q_half = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
@@ -449,7 +449,8 @@ class HandEnv(VecEnv):
         self.tips = zeros(F, 3)
         self.nan, self.done, self.time_out = zeros(dtype=torch.bool), zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.reward = zeros()
-        self._blind = zeros(dtype=torch.bool)  # worlds of which an observation was not finite
+        # worlds of which an observation was not finite: of any group, then of each
+        self._blind = torch.zeros(1 + MOST_GROUPS, n, dtype=torch.bool, device=dev)
         self._wrong: torch.Tensor | None = None  # world-steps that were not finite since the last `check`, by source
         self._sources: tuple[str, ...] = ()
         self._steps_since = 0
@@ -457,6 +458,7 @@ class HandEnv(VecEnv):
         self._log_names: tuple[str, ...] = ()
         self._log_values: torch.Tensor | None = None
         self.graphs, self.keep_final_obs = True, False
+        self.draws_together = self.device.startswith("cuda")  # what a new episode draws; on a CPU it saves nothing
         # Where states live on the CPU anyway, asking costs nothing, and a reset of no world is an eighth of a step.
         # (The random numbers that it would draw are then not drawn. Warp on a CPU does as it does on CUDA.)
         self.skip_idle_resets = self.engine.kind == "mujoco"
@@ -465,19 +467,39 @@ class HandEnv(VecEnv):
         self.obs: dict[str, torch.Tensor] = {}
         self.nan_count = torch.zeros((), dtype=torch.long, device=dev)
 
+    def _kernels(self) -> None:
+        """What `read_state` and `_clear_touch` launch."""
+        e, state = self.engine, self.engine.wp
+        places = [wp.from_torch(x.to(torch.int32)) for x in (self.joint_q, self.joint_v, self.tip_body)]
+        joint_q, joint_v, tip_body = places
+        self._read = state_kernels.read_kernel(e.real)
+        self._read_dim = self.num_envs, self.num_actions + state_kernels.OBJECT_NUMBERS + self.fingers + 1
+        out = [self.nan, self.q, self.qd, self.torque, self.object_pose, self.object_velocity, self.tip_force]
+        out += [self.finger_force, self.self_force, self.palm_force]
+        self._read_args = [
+            state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
+            state.xmat, joint_q, joint_v, *self._object_at, tip_body,
+            wp.from_torch(self.tip_offset, dtype=wp.vec3), *map(wp.from_torch, out),
+            wp.from_torch(self.tips, dtype=wp.vec3),
+        ]  # fmt: skip
+        own = (self.q, self.q_low, self.q_high, self.q_mid, self.q_half, self.action, self.last_action, self.target)
+        self._act_args = [wp.from_torch(x) for x in own]
+        touch = self.touch
+        self._touch_args = [
+            tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
+            *map(wp.from_torch, (touch.force, touch.force_clean, touch.force_other)),
+            *(wp.from_torch(x, dtype=wp.vec3) for x in (touch.centre, touch.centre_clean)),
+        ]  # fmt: skip
+
     # -- bookkeeping
     # -----------------------------------------------------------------------------------------------------------
-    def _log(self, terms: dict, ends: dict, reward: torch.Tensor) -> None:
-        self.nan_count += self.nan.sum()
-        rates = torch.stack([*ends.values(), self.time_out]).float().mean(1)
+    def _log(self, terms: dict, ends: dict, means: torch.Tensor) -> None:
+        """means: of the reward terms, of how worlds ended, over all worlds."""
         metrics = self.metrics()
-        values = (
-            torch.cat([reward.mean(1), rates, torch.stack(list(metrics.values()))])
-            if metrics
-            else torch.cat([reward.mean(1), rates])
-        )
+        values = torch.cat([means, torch.stack(list(metrics.values()))]) if metrics else means
         if self._log_values is None:
-            self._log_names = (*(f"reward/{k}" for k in terms), *(f"end/{k}" for k in (*ends, "time_out")), *metrics)
+            ended = [f"end/{k}" for k in (*ends, "nan", "time_out")]
+            self._log_names = (*(f"reward/{k}" for k in terms), *ended, *metrics)
             with torch.inference_mode(False):  # it outlives the rollout that happens to come first
                 self._log_values = torch.zeros(values.shape, device=self.device)
         self._log_values.copy_(values)

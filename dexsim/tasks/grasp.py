@@ -8,19 +8,25 @@ configs/task/grasp.yaml.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import torch
+import warp as wp
 
-from dexsim import rotation
 from dexsim.assets.objects import library
 from dexsim.deploy import observations
 from dexsim.errors import UserError
 from dexsim.hand.places import approach
 from dexsim.tactile.clearance import Clearance
-from dexsim.tasks import base_path, terms
+from dexsim.tasks import base_path, grasp_rewards
+from dexsim.tasks import grasp_kernels as kernels
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.press import fingertip_press
 from dexsim.tasks.servos import ServoRandomizer
+from dexsim.tasks.structs import filled
 
 CENTRE_LENGTH = 0.03
 """Sideways distance [m] of the object from the middle of the fingers that costs the whole weight of the reward
@@ -107,7 +113,6 @@ class GraspEnv(HandEnv):
         self.centre0 = torch.tensor(where.catch[:2].tolist() if xy is None else xy, device=dev)
         self.reach = torch.tensor(where.middle.tolist(), device=dev)  # the middle of the grasp
         self.beside = float(where.beside[1]) if beside is None else beside
-        self.across = torch.tensor([0.0, 1.0, 0.0], device=dev)
         h = 0.5**0.5  # rotations that bring the body's x, y or z axis to palm y
         to_y = torch.tensor([[h, 0.0, 0.0, h], [1.0, 0.0, 0.0, 0.0], [h, -h, 0.0, 0.0]], device=dev)
         self.lay = to_y[torch.tensor([int(v.shape.extents.argmax()) for v in self.scene.variants], device=dev)]
@@ -127,6 +132,50 @@ class GraspEnv(HandEnv):
         self.outside_force = zeros(3)  # N on the object's body frame, on top of the random pushes (evaluation)
         self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
         self.pushes = True
+        self._for_kernels(zeros)
+
+    def _for_kernels(self, zeros: Callable[..., torch.Tensor]) -> None:
+        """Memory that the kernels share with this (`grasp_kernels.py`, `grasp_rewards.py`)."""
+        t, J, F = self.task, self.num_actions, self.fingers
+        self.start = SimpleNamespace(hand=zeros(J), pose=zeros(7), velocity=zeros(6))  # of episodes that begin now
+        self.sensed = SimpleNamespace(joint_position=zeros(J), joint_torque=zeros(J), tip=zeros(F, 3), seen=zeros())
+        self._dropped = zeros(dtype=torch.bool)
+        self._measured = torch.zeros(len(grasp_rewards.METRICS) + 1, self.num_envs, device=self.device)
+        names = ("command", "command_left", "push", "push_left", "push_wait")
+        self._orders = filled(kernels.Orders, **{name: getattr(self, name) for name in names})
+        names = ("first_xy", "z_history", "z_delay", "z_seen", "torque_bias")
+        self._begun = filled(
+            kernels.Begun, **vars(self.start), **{name: getattr(self, name) for name in names}
+        )
+        low, high = (round(x / self.dt) for x in t["sensors"]["vision_delay"])
+        self._place = filled(
+            kernels.Place, unit=self.unit, rise=self.rise, xy=wp.vec2(*self.centre0.tolist()), pose=self.pose0,
+            low=self.q_low.contiguous(), high=self.q_high.contiguous(), lay=self.lay, delay_low=low, delay_high=high,
+        )  # fmt: skip
+        names = ("q", "qd", "torque", "action", "last_action", "tip_force", "self_force", "object_pose")
+        names += ("object_velocity", "command", "episode_length")
+        own = {name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in names}
+        self._state = filled(grasp_rewards.State, clearance=self.clearance.distance, **own)
+        hand = ("opposing", "others", "roots", "root_closes", "tau_max", "inner", "inner_closes", "outer", "q_mid")
+        tables = {name: getattr(self, name) for name in hand}
+        tables = {k: v if v.is_floating_point() else v.to(torch.int32) for k, v in tables.items()}
+        self._hand_shape = tables | {"middle": wp.vec3(*self.reach.tolist())}
+        self._xfrc = wp.from_torch(self.engine.t.xfrc_applied)
+
+    def _shape(self) -> Any:
+        """Forms of rewards and terminations as the settings have them now."""
+        r, end, u = self.task["reward"], self.task["termination"], self.unit
+        names = ("force_sigma", "force_low", "force_high", "torque_sigma", "torque_low", "torque_high")
+        return filled(
+            grasp_rewards.Shape, **{name: float(r[name]) for name in names}, f_max=self.f_max,
+            contact=r["contact_threshold"], reach_length=u * r["reach_length"], beside=self.beside,
+            centre_length=u * CENTRE_LENGTH, distance=u * end["distance"], below=u * end["below"] + self.rise,
+            **self._hand_shape,
+        )  # fmt: skip
+
+    def _launch(self, kernel: Any, dim: Any, *args: Any) -> None:
+        inputs = [wp.from_torch(x) if isinstance(x, torch.Tensor) else x for x in args]
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
     def feel(self) -> None:
         super().feel()
@@ -141,7 +190,7 @@ class GraspEnv(HandEnv):
     # -- episodes
     # ------------------------------------------------------------------------------------------------------------
     def begin_episodes(self, mask: torch.Tensor) -> None:
-        s, t = self.sampler, self.task
+        s = self.sampler
         pick = torch.searchsorted(self._cumulative, s.uniform()).clamp(max=len(self._cumulative) - 1)
         scale = self.unit * s.draw("object.scale")[:, None] * s.draw("object.aspect", 3)
         self.objects.write(
@@ -159,53 +208,46 @@ class GraspEnv(HandEnv):
         self.touch.randomize(mask, self.rng)
         self.servo_random.draw(mask)
         gravity = self.engine.field("opt.gravity")
-        gravity.copy_(torch.where(mask[:, None], self.gravity0.to(gravity.dtype), gravity))
+        torch.where(mask[:, None], self.gravity0.to(gravity.dtype), gravity, out=gravity)
 
-        hand = self.pose0 + s.draw("initial.joint", self.num_actions)
-        hand = torch.maximum(torch.minimum(hand, self.q_high), self.q_low)
-        # the drop: the lowest point of the object starts `drop` above the palm
-        xy = self.centre0 + self.unit * s.draw("initial.object_xy", 2)
-        z = self.objects.radius + self.unit * s.draw("initial.drop") + self.rise
-        pose = torch.cat([xy, z[:, None], self._orientation()], 1)
-        velocity = torch.cat(
-            [s.draw("initial.velocity_xy", 2), s.draw("initial.velocity_z")[:, None], s.draw("initial.spin", 3)], 1
+        fall = filled(
+            kernels.Fall,
+            joint=s.draw("initial.joint", self.num_actions),
+            object_xy=s.draw("initial.object_xy", 2),
+            drop=s.draw("initial.drop"),
+            roll=s.uniform(),
+            tilt_axis=s.normal(3),
+            tilt=s.draw("initial.tilt"),
+            velocity_xy=s.draw("initial.velocity_xy", 2),
+            velocity_z=s.draw("initial.velocity_z"),
+            spin=s.draw("initial.spin", 3),
+            vision_xy=s.draw("sensors.vision_xy", 2),
+            delay=s.uniform(),
+            torque_bias=s.draw("sensors.torque_bias", self.num_actions),
         )
-        self.place(mask, hand, pose, velocity)
-        self.first_xy.copy_(torch.where(mask[:, None], xy + s.draw("sensors.vision_xy", 2), self.first_xy))
-        self.z_history.copy_(torch.where(mask[:, None], z[:, None].expand_as(self.z_history), self.z_history))
-        low, high = (round(x / self.dt) for x in t["sensors"]["vision_delay"])
-        delay = (low + (high - low + 1) * s.uniform()).long().clamp(low, high)
-        self.z_delay.copy_(torch.where(mask, delay, self.z_delay))
-        self.z_seen.copy_(torch.where(mask, z, self.z_seen))
-        bias = s.draw("sensors.torque_bias", self.num_actions)
-        self.torque_bias.copy_(torch.where(mask[:, None], bias, self.torque_bias))
-        self._new_command(mask)
-        self._new_push(mask)
+        orders, o = self._draw_orders(), self.objects
+        args = (self._place, fall, *orders, o.variant, o.radius, o.mass, self._begun, self._orders)
+        self._launch(kernels.begin, self.num_envs, mask, *args)
+        self.place(mask, self.start.hand, self.start.pose, self.start.velocity)
 
-    def _orientation(self) -> torch.Tensor:
-        """Random orientations [N, 4]: the object's longest axis lies across the fingers (palm y) up to a tilt of
-        `initial.tilt` rad about a random axis; about its longest axis it is turned at random. A tilt of pi is any
-        orientation."""
-        s = self.sampler
-        lay = self.lay[self.objects.variant]
-        roll = rotation.about(self.across.expand(self.num_envs, 3), 2 * torch.pi * s.uniform())
-        tilt = rotation.about(s.direction(), s.draw("initial.tilt"))
-        return rotation.multiply(tilt, rotation.multiply(roll, lay))
-
-    def _new_command(self, mask: torch.Tensor) -> None:
-        c, s = self.task["command"], self.sampler
-        value = c["low"] + (c["high"] - c["low"]) * s.uniform() if self.fixed_command is None else self.fixed_command
-        self.command.copy_(torch.where(mask, value, self.command))
-        hold = c["hold_s"][0] + (c["hold_s"][1] - c["hold_s"][0]) * s.uniform()
-        self.command_left.copy_(torch.where(mask, hold, self.command_left))
-
-    def _new_push(self, mask: torch.Tensor) -> None:
-        """A push in a random direction, of a multiple of the object's weight, after a random wait."""
-        s = self.sampler
-        size = s.draw("push.weights") * self.objects.mass * 9.81
-        self.push.copy_(torch.where(mask[:, None], s.direction() * size[:, None], self.push))
-        self.push_left.copy_(torch.where(mask, s.draw("push.duration"), self.push_left))
-        self.push_wait.copy_(torch.where(mask, s.draw("push.wait"), self.push_wait))
+    def _draw_orders(self) -> tuple[Any, Any]:
+        """A new command and push for every world, as the kernels take them: how a command is drawn, and what was."""
+        c, s, fixed = self.task["command"], self.sampler, self.fixed_command
+        (first, last), low = c["hold_s"], c["low"]
+        how = filled(
+            kernels.CommandRange, fixed=fixed is not None, low=low, span=c["high"] - low, hold_low=first,
+            hold_span=last - first,
+        )  # fmt: skip
+        drawn = filled(
+            kernels.Draws,
+            value=s.uniform() if fixed is None else fixed,
+            hold=s.uniform(),
+            weights=s.draw("push.weights"),
+            direction=s.normal(3),
+            duration=s.draw("push.duration"),
+            wait=s.draw("push.wait"),
+        )
+        return how, drawn
 
     def memory(self) -> dict:
         names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen")
@@ -213,100 +255,64 @@ class GraspEnv(HandEnv):
         return super().memory() | own | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
 
     def before_physics(self) -> None:
-        self.command_left -= self.dt
-        self._new_command(self.command_left <= 0)
-        self.push_wait -= self.dt
-        on = self.push_wait <= 0
-        if not self.pushes:
-            on = torch.zeros_like(on)
-        self.push_left -= self.dt * on
-        over = self.push_left <= 0
-        force = torch.where((on & ~over)[:, None], self.push, torch.zeros_like(self.push)) + self.outside_force
-        self.engine.t.xfrc_applied[:, self.objects.body, :3] = force.to(self.engine.t.xfrc_applied.dtype)
-        self._new_push(over)
+        """The command changes once it was held for long enough; pushes come and go."""
+        o, kernel = self.objects, kernels.orders_kernel(self.engine.real)
+        args = (*self._draw_orders(), o.mass, self.outside_force, self._orders, self._xfrc)
+        self._launch(kernel, self.num_envs, self.dt, self.pushes, o.body, *args)
 
     # -- terminations
     # --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
         """Dropped: the object's centre is below the palm or far from it."""
-        limit = self.task["termination"]
-        p = self.object_pose[:, :3]
-        away = (p - self.reach).norm(dim=1) > self.unit * limit["distance"]
-        # while a world's gravity is turned, "below" means away from the palm
-        return {"dropped": away | (p[:, 2] < self.unit * limit["below"] + self.rise)}
+        self._launch(grasp_rewards.dropped, self.num_envs, self._state, self._shape(), self._dropped)
+        return {"dropped": self._dropped}
 
     # -- rewards
     # ---------------------------------------------------------------------------------------------------------------
     def rewards(self) -> dict[str, torch.Tensor]:
-        w, r = self.task["rewards"], self.task["reward"]
-        force, contact = self.tip_force, self.tip_force > r["contact_threshold"]
-        torque = self.torque[:, self.roots] * self.root_closes
-        opposed, pressed = contact[:, self.opposing].any(1), contact[:, self.others]
-        aside = force[:, self.others] / self.f_max - self.command[:, None]
-        out = {
-            # R_force and R_torque: sum over fingers of R_i * contact_i (paper, eqs. for R_force, R_torque)
-            "force": w["force"]
-            * terms.tracking(
-                force, self.command, self.f_max, r["force_sigma"], r["force_low"], r["force_high"], contact
-            ),
-            "torque": w["torque"]
-            * terms.tracking(
-                torque / self.tau_max, self.command, 1.0, r["torque_sigma"], r["torque_low"], r["torque_high"], contact
-            ),
-            # R_diff: variance of the first joints of the fingers beside the opposing one
-            "diff": w["diff"] * (self.q[:, self.inner] * self.inner_closes).var(dim=1, unbiased=False),
-            # R_outter: distance of the second joints from their mid-range, not squared
-            "outer": w["outer"] * (self.q[:, self.outer] - self.q_mid[self.outer]).norm(dim=1),
-            "termination": w["termination"] * self._ended(),
-            "action": w["action"] * (self.action - self.last_action).square().sum(1),  # R_action
-            "velocity": w["velocity"] * self.qd.square().sum(1),  # R_vel
-            # ours: touching with thumb and fingers at all, and keeping the object where the hand can hold it
-            "grip": w["grip"] * opposed * pressed.float().mean(1),
-            "force_near": w["force_near"] * (1 - aside.abs()).clamp(min=0).mean(1),
-            # a finger that does not touch has nothing else that says which way the object lies
-            "reach": w["reach"]
-            * torch.exp(
-                -self.clearance.distance[:, self.others].clamp(min=0) / (self.unit * r["reach_length"])
-            ).mean(1),
-            "self": w["self"] * (self.self_force.sum(1) / self.f_max).clamp(max=5.0),
-            "still": w["still"] * (self.object_velocity[:, :3].norm(dim=1).clamp(max=1.0)),
-        }
-        if "worst" in w:  # checkpoints from before have neither of the two
-            # the mean hides one finger that presses on nothing
-            out["worst"] = w["worst"] * (1 - aside.abs().amax(1)).clamp(min=0)
-            # an object that lies to one side is out of the reach of the outer fingers
-            out["centre"] = w["centre"] * (
-                (self.object_pose[:, 1] - self.beside).abs() / (self.unit * CENTRE_LENGTH)
-            ).clamp(max=2.0)
-        self._measure(opposed, pressed)
-        return out
-
-    def _ended(self) -> torch.Tensor:
-        return self.terminated()["dropped"].float()
+        w, names = self.task["rewards"], grasp_rewards.TERMS
+        rows = len(names) + len(grasp_rewards.METRICS) + 1
+        out = torch.empty(rows, self.num_envs, device=self.device)
+        weights = grasp_rewards.Weights(*(float(w.get(name, 0.0)) for name in names))
+        self._launch(grasp_rewards.rewards, self.num_envs, weights, self.dt, self._state, self._shape(), out)
+        self._measured = out[len(names) :]
+        # checkpoints from before lack some
+        return {name: term for name, term in zip(names, out, strict=False) if name in w}
 
     # -- observations
     # ----------------------------------------------------------------------------------------------------------
     def observe(self, advance: bool) -> dict[str, torch.Tensor]:
-        s, sense, J = self.sampler, self.task["sensors"], self.num_actions
-        z = self.object_pose[:, 2]
+        s, size, J, F, sensed = self.sampler, self.task["sensors"], self.num_actions, self.fingers, self.sensed
+        height = s.normal() if advance else self.z_seen  # without a step no picture is taken
+        noise = filled(
+            kernels.Noise,
+            joint_size=size["joint_noise"],
+            torque_size=size["torque_noise"],
+            tip_size=size["tip_noise"],
+            height_size=size["vision_z_noise"],
+            joint=s.normal(J),
+            torque=s.normal(J),
+            tip=s.normal(3 * F),
+            height=height,
+        )
+        tips, seen_tips = (wp.from_torch(x, dtype=wp.vec3) for x in (self.tips, sensed.tip))
+        args = (self.q, self.torque, self.effort, self.torque_bias, tips, self.object_pose[:, 2:3], self.z_delay)
+        out = (self.z_history, sensed.joint_position, sensed.joint_torque, seen_tips, sensed.seen)
+        self._launch(kernels.sense, (self.num_envs, J + F + 1), advance, noise, *args, *out)
         if advance:
-            self.z_history.copy_(torch.cat([z[:, None], self.z_history[:, :-1]], 1))
-            seen = self.z_history.gather(1, self.z_delay[:, None])[:, 0] + sense["vision_z_noise"] * s.normal()
-            self.vz_seen.copy_(observations.height_speed(seen, self.z_seen, self.dt))
-            self.z_seen.copy_(seen)
-        fresh = self.episode_length_buf == 0
-        vz = torch.where(fresh, torch.zeros_like(z), self.vz_seen)
+            self.vz_seen.copy_(observations.height_speed(sensed.seen, self.z_seen, self.dt))
+            self.z_seen.copy_(sensed.seen)
         torque_max = self.effort
         actor = observations.build(
             observations.Signals(
-                joint_position=self.q + sense["joint_noise"] * s.normal(J),
-                joint_torque=self.torque / torque_max + self.torque_bias + sense["torque_noise"] * s.normal(J),
+                joint_position=sensed.joint_position,
+                joint_torque=sensed.joint_torque,
                 object_xy=self.first_xy,
                 object_z=self.z_seen,
-                object_vz=vz,
+                object_vz=self.vz_seen.masked_fill(self.episode_length_buf == 0, 0.0),
                 touch_force=self.touch.force[:, : self.pads],
                 touch_centre=self.touch.centre[:, : self.pads],
-                fingertip=self.tips + sense["tip_noise"] * s.normal(3 * self.fingers).reshape(self.tips.shape),
+                fingertip=sensed.tip,
                 command=self.command,
             ),
             self.f_max,
@@ -319,9 +325,8 @@ class GraspEnv(HandEnv):
         ]  # fmt: skip
         if self.task["critic"] == "privileged":
             critic += self._privileged()
-        ok = ~self.nan[:, None]
         return {
-            "actor": torch.where(ok, actor, torch.zeros_like(actor)),
+            "actor": torch.where(self.nan[:, None], 0.0, actor),
             "critic": torch.nan_to_num(torch.cat(critic, 1)),
         }
 
@@ -344,24 +349,11 @@ class GraspEnv(HandEnv):
 
     # -- what the log shows
     # ------------------------------------------------------------------------------------------------------
-    def _measure(self, opposed: torch.Tensor, pressed: torch.Tensor) -> None:
-        late = self.episode_length_buf * self.dt > 2.0
-        count = late.sum().clamp(min=1)
-
-        def mean(x):
-            return (x * late).sum() / count
-
-        self._metrics = {
-            "task/held": mean((opposed & pressed.any(1)).float()),
-            "task/force_error": mean(
-                (self.tip_force[:, self.others] - self.command[:, None] * self.f_max).abs().mean(1)
-            ),
-            "task/fingers_touching": mean(pressed.float().sum(1)),
-            "task/force_other": mean(self.self_force.sum(1)),
-        }
-
     def metrics(self) -> dict[str, torch.Tensor]:
-        return self._metrics
+        """Means over the worlds that are late enough in their episode."""
+        sums = self._measured.sum(1)
+        means = (sums[:-1] / sums[-1].clamp(min=1)).unbind()
+        return {f"task/{name}": mean for name, mean in zip(grasp_rewards.METRICS, means, strict=True)}
 
     def describe(self) -> dict:
         """Tables for the first screen."""

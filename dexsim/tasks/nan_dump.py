@@ -90,8 +90,7 @@ class NanDump:
 
     def before(self) -> None:
         """Targets are sent and forces set; physics is next."""
-        for k, v in self._live.items():
-            self._before[k].copy_(v)
+        torch._foreach_copy_(list(self._before.values()), list(self._live.values()))
 
     def after(self, nan: torch.Tensor) -> None:
         """nan [N]: worlds that are not finite. Keeps one of them, unless one is kept that is not written yet."""

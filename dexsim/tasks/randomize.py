@@ -8,18 +8,36 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+import warp as wp
 
 from dexsim.errors import UserError
 
 Request = tuple[str, tuple[int, ...]]
 """What is drawn (a range's name, or UNIFORM or NORMAL) and its shape by world."""
 UNIFORM, NORMAL = "[0, 1)", "N(0, 1)"
+_PLAIN, _LINEAR, _LOG = 0, 1, 2
+
+
+@wp.kernel(enable_backward=False)
+def _spread(
+    kind: wp.array(dtype=int), table: wp.array2d(dtype=float), width: wp.array(dtype=float), u: wp.array2d(dtype=float)
+):
+    """Numbers in [0, 1) [R, N] to their ranges: (low, high - low) or, of a logarithmic one, (low, high / low)."""
+    r, w = wp.tid()
+    if kind[r] == wp.static(_PLAIN):
+        return
+    share = 0.5 + width[0] * (u[r, w] - 0.5)
+    if kind[r] == wp.static(_LINEAR):
+        u[r, w] = table[r, 0] + share * table[r, 1]
+    else:
+        u[r, w] = table[r, 0] * wp.pow(table[r, 1], share)
 
 
 class Plan:
     """Draws a list of requests at once: one call of the generator for all uniform numbers, one for all normal ones."""
 
     def __init__(self, sampler: Sampler, requests: list[Request]):
+        wp.init()
         self.requests, self._sampler = requests, sampler
         size = {i: max(1, math.prod(shape)) for i, (_, shape) in enumerate(requests)}
         log = {i: sampler.ranges[name][2] for i, (name, _) in enumerate(requests) if name in sampler.ranges}
@@ -30,26 +48,23 @@ class Plan:
             [i for i, (name, _) in enumerate(requests) if name == NORMAL],
         ]
         self._rows = [[(i, size[i]) for i in group] for group in groups]
-        self._count = [sum(n for _, n in rows) for rows in self._rows]
-
-        def column(group: int, value) -> torch.Tensor:
-            numbers = [value(*sampler.ranges[requests[i][0]][:2]) for i, n in self._rows[group] for _ in range(n)]
-            return torch.tensor(numbers, dtype=torch.float32, device=sampler.device)[:, None]
-
-        self._low, self._span = column(1, lambda low, high: low), column(1, lambda low, high: high - low)
-        self._least, self._ratio = column(2, lambda low, high: low), column(2, lambda low, high: high / low)
+        plain, linear, log_uniform, self._normal = (sum(n for _, n in rows) for rows in self._rows)
+        self._uniform = plain + linear + log_uniform
+        ends = [sampler.ranges[requests[i][0]] for rows in self._rows[1:3] for i, n in rows for _ in range(n)]
+        table = [(0.0, 1.0)] * plain + [(low, high / low if is_log else high - low) for low, high, is_log in ends]
+        kinds = [_PLAIN] * plain + [_LINEAR] * linear + [_LOG] * log_uniform
+        dev = sampler.device
+        self._table = torch.tensor(table, dtype=torch.float32).reshape(-1, 2).to(dev)
+        self._kinds = torch.tensor(kinds, dtype=torch.int32).to(dev)
 
     def draw(self) -> list[torch.Tensor]:
         """[N, *shape] of each request, in order."""
-        s, (plain, linear, log, normal) = self._sampler, self._count
-        u = torch.rand(plain + linear + log, s.n, generator=s.rng, device=s.device)
-        share = 0.5 + s.width * (u[plain:] - 0.5)
-        drawn = (
-            u[:plain],
-            torch.addcmul(self._low, share[:linear], self._span),
-            self._least * self._ratio ** share[linear:],
-            torch.randn(normal, s.n, generator=s.rng, device=s.device),
-        )
+        s = self._sampler
+        u = torch.rand(self._uniform, s.n, generator=s.rng, device=s.device)
+        args = [wp.from_torch(x) for x in (self._kinds, self._table, s.width.reshape(1), u)]
+        wp.launch(_spread, dim=u.shape, inputs=args, device=str(u.device))
+        drawn = [*u.split([sum(n for _, n in rows) for rows in self._rows[:3]])]
+        drawn.append(torch.randn(self._normal, s.n, generator=s.rng, device=s.device))
         out: dict[int, torch.Tensor] = {}
         for rows, values in zip(self._rows, drawn, strict=True):
             at = 0

@@ -1,9 +1,12 @@
 """Servo randomization: every joint of every world draws new drive parameters at each episode (paper, "Actuator Model
 Randomization"), always from the table's nominal."""
 
-from __future__ import annotations
+# No `from __future__ import annotations`: Warp resolves these annotations from the closure.
+
+from functools import cache
 
 import torch
+import warp as wp
 
 from dexsim.actuator.columns import INDEX, column, simulated
 from dexsim.actuator.servo import Servo
@@ -14,6 +17,53 @@ RELATIVE = ("kp", "kd", "torque_limit", "no_load_speed", "efficiency", "coulomb_
 """Columns whose range multiplies the nominal; the range of every other column is added to it."""
 
 
+LANES = 64
+"""Threads that share a world's columns."""
+
+
+@cache
+def _kernel(real):
+    @wp.kernel(module="unique", enable_backward=False)
+    def draw(
+        mask: wp.array(dtype=wp.bool),
+        drawn: wp.array3d(dtype=float),  # [D, N, J] of the ranges
+        u: wp.array3d(dtype=float),  # [N, J, .] in [0, 1), of the intervals
+        source: wp.array(dtype=int),  # [C] the column's place in drawn, -1: in none
+        times: wp.array(dtype=wp.bool),  # [C] what is drawn is a factor
+        place: wp.array(dtype=int),  # [C] the column's place in u, -1: in none
+        nominal: wp.array2d(dtype=real),
+        fitted: wp.array2d(dtype=wp.bool),
+        low: wp.array2d(dtype=real),
+        high: wp.array2d(dtype=real),
+        # out
+        params: wp.array3d(dtype=real),
+    ):
+        w, lane = wp.tid()
+        if not mask[w]:
+            return
+        columns = params.shape[2]
+        i = lane
+        while i < params.shape[1] * columns:
+            j = i / columns
+            c = i % columns
+            value = nominal[j, c]
+            if source[c] >= 0:
+                r = real(drawn[source[c], w, j])
+                if times[c]:
+                    value = value * r
+                else:
+                    value = value + r
+            if fitted[j, c]:
+                share = real(0.0)
+                if place[c] >= 0:
+                    share = real(u[w, j, place[c]])
+                value = low[j, c] + share * (high[j, c] - low[j, c])
+            params[w, j, c] = value
+            i += wp.static(LANES)
+
+    return draw
+
+
 class ServoRandomizer:
     """Draws servo parameters [N, J, C] where a mask holds.
 
@@ -22,6 +72,7 @@ class ServoRandomizer:
     """
 
     def __init__(self, servo: Servo, sampler: Sampler):
+        wp.init()
         self.servo, self.sampler = servo, sampler
         low, high = servo.table.bounds(servo.joints)
         unknown = servo.table.unknown(servo.joints)
@@ -34,6 +85,14 @@ class ServoRandomizer:
         self.columns = [name.removeprefix("servo.") for name in sampler.ranges if name.startswith("servo.")]
         for name in self.columns:
             self._check(name)
+        source, place = (torch.full((servo.params.shape[2],), -1, dtype=torch.int32) for _ in range(2))
+        times = torch.zeros(len(source), dtype=torch.bool)
+        for k, name in enumerate(self.columns):
+            source[INDEX[name]], times[INDEX[name]] = k, name in RELATIVE
+        place[self.simulated.cpu()] = torch.arange(len(self.simulated), dtype=torch.int32)
+        own = (source.to(dev), times.to(dev), place.to(dev), servo.nominal, fitted, self.low, self.high, servo.params)
+        self._args = [wp.from_torch(x) for x in own]
+        self._kernel = _kernel(wp.float64 if dtype == torch.float64 else wp.float32)
 
     def _check(self, name: str) -> None:
         """Raise UserError unless every value that a range can give is one that the servo can have."""
@@ -56,15 +115,13 @@ class ServoRandomizer:
 
     def draw(self, mask: torch.Tensor) -> None:
         """New parameters in the worlds that mask [N] selects; others keep theirs."""
-        s, J = self.servo, self.servo.params.shape[1]
-        new = s.nominal.expand_as(s.params).clone()
-        for name in self.columns:
-            c = INDEX[name]
-            r = self.sampler.draw(f"servo.{name}", J).to(new.dtype)
-            new[..., c] = new[..., c] * r if name in RELATIVE else new[..., c] + r
-        u = torch.zeros_like(new)
-        u[..., self.simulated] = self.sampler.uniform(J, len(self.simulated)).to(new.dtype)
-        # infinite bounds (an absent limit) have no width: their product with u would be NaN
-        width = torch.where(self.fitted, self.high - self.low, torch.zeros_like(self.low))
-        new = torch.where(self.fitted, self.low + u * width, new)
-        s.params.copy_(torch.where(mask[:, None, None], new, s.params))
+        n, joints, columns = self.servo.params.shape
+        drawn = [self.sampler.draw(f"servo.{name}", joints) for name in self.columns]
+        u = self.sampler.uniform(joints, len(self.simulated))
+        drawn = torch.stack(drawn) if drawn else u[None, :, :, 0]
+        wp.launch(
+            self._kernel,
+            dim=(n, min(LANES, joints * columns)),
+            inputs=[wp.from_torch(x) for x in (mask, drawn, u)] + self._args,
+            device=str(self.servo.params.device),
+        )

@@ -1,0 +1,300 @@
+"""The grasp task's rewards and what its log shows, one Warp kernel over all worlds: a function a term, weights apart.
+
+Each function is the term of one world without its weight (`rewards` in configs/task/grasp.yaml). R_force, R_torque,
+R_diff, R_outter, R_action and R_vel are the paper's ("Force-Adaptive Grasping", the equations of these names). A term
+can as well be written in torch: `GraspEnv.rewards` returns them all by name.
+"""
+
+# No `from __future__ import annotations`: Warp resolves these annotations from the closure.
+
+import warp as wp
+
+TERMS = (
+    "force", "torque", "diff", "outer", "termination", "action", "velocity", "grip", "force_near", "reach", "self",
+    "still", "worst", "centre",
+)  # fmt: skip
+METRICS = ("held", "force_error", "fingers_touching", "force_other")
+"""What follows the terms: what the log shows of worlds that are `LATE`, 0 in others; then whether they are."""
+LATE = 2.0
+"""s of an episode after which a grasp should hold."""
+Weights = wp.types.vector(length=len(TERMS), dtype=float)
+
+
+@wp.struct
+class Shape:
+    """Forms of the terms (`reward` in the task's settings), and what of the hand they need."""
+
+    f_max: float  # N, F_max
+    contact: float  # N, from which a finger touches
+    force_sigma: float  # these as fractions of F_max or of the largest torque
+    force_low: float
+    force_high: float
+    torque_sigma: float
+    torque_low: float
+    torque_high: float
+    reach_length: float  # m
+    beside: float  # m, palm y of the fingers' middle
+    centre_length: float  # m
+    middle: wp.vec3  # m, of the grasp
+    distance: float  # m from it, from where the object is dropped
+    below: float  # m, palm z
+    opposing: wp.array(dtype=int)  # fingers that press against the others
+    others: wp.array(dtype=int)
+    roots: wp.array(dtype=int)  # [F] joint whose torque closes each finger
+    root_closes: wp.array(dtype=float)  # [F] its way
+    tau_max: wp.array(dtype=float)  # [F] N.m
+    inner: wp.array(dtype=int)  # first joints of `others`
+    inner_closes: wp.array(dtype=float)
+    outer: wp.array(dtype=int)  # second joints of `others`
+    q_mid: wp.array(dtype=float)  # [J] rad
+
+
+@wp.struct
+class State:
+    """N worlds after a control step: the environment's own memory, see `HandEnv`."""
+
+    q: wp.array2d(dtype=float)
+    qd: wp.array2d(dtype=float)
+    torque: wp.array2d(dtype=float)
+    action: wp.array2d(dtype=float)
+    last_action: wp.array2d(dtype=float)
+    tip_force: wp.array2d(dtype=float)
+    self_force: wp.array2d(dtype=float)
+    clearance: wp.array2d(dtype=float)  # m from each pad to the object
+    object_pose: wp.array2d(dtype=float)
+    object_velocity: wp.array2d(dtype=float)
+    command: wp.array(dtype=float)
+    episode_length: wp.array(dtype=wp.int64)
+
+
+# wp.min and wp.max would hide a number that is not finite, and a world with one must begin anew
+@wp.func
+def at_least(x: float, low: float):
+    return wp.where(x < low, low, x)
+
+
+@wp.func
+def at_most(x: float, high: float):
+    return wp.where(x > high, high, x)
+
+
+@wp.func
+def touches(f: int, w: int, s: State, shape: Shape):
+    return s.tip_force[w, f] > shape.contact
+
+
+@wp.func
+def tracking(x: float, command: float, x_max: float, sigma: float, low: float, high: float, finger: int):
+    """R_i of a finger that touches (R_force, R_torque): exp(-(x - command x_max)^2 / (2 (sigma x_max)^2)) within [low
+    x_max, high x_max]; of the thumb, finger 0, the band alone. The paper prints tau_thumb in the fingers' torque band;
+    we take it for tau_i."""
+    if not (x >= low * x_max and x <= high * x_max):
+        return float(0.0)
+    if finger == 0:
+        return float(1.0)
+    error = (x - command * x_max) / (sigma * x_max)
+    return wp.exp(-0.5 * error * error)
+
+
+@wp.func
+def force(w: int, s: State, shape: Shape):
+    """R_force: sum over the fingers that touch of R_i at their force."""
+    total = float(0.0)
+    for f in range(s.tip_force.shape[1]):
+        if touches(f, w, s, shape):
+            total += tracking(s.tip_force[w, f], s.command[w], shape.f_max, shape.force_sigma, shape.force_low,
+                              shape.force_high, f)  # fmt: skip
+    return total
+
+
+@wp.func
+def torque(w: int, s: State, shape: Shape):
+    """R_torque: the same at the torque of their first joints, over its maximum."""
+    total = float(0.0)
+    for f in range(s.tip_force.shape[1]):
+        if touches(f, w, s, shape):
+            x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
+            total += tracking(x, s.command[w], 1.0, shape.torque_sigma, shape.torque_low, shape.torque_high, f)
+    return total
+
+
+@wp.func
+def diff(w: int, s: State, shape: Shape):
+    """R_diff: variance of the first joints [rad^2] of the fingers beside the opposing one."""
+    n = shape.inner.shape[0]
+    mean = float(0.0)
+    for i in range(n):
+        mean += s.q[w, shape.inner[i]] * shape.inner_closes[i]
+    mean = mean / float(n)
+    total = float(0.0)
+    for i in range(n):
+        off = s.q[w, shape.inner[i]] * shape.inner_closes[i] - mean
+        total += off * off
+    return total / float(n)
+
+
+@wp.func
+def outer(w: int, s: State, shape: Shape):
+    """R_outter: distance of the second joints [rad] from their mid-range, not squared."""
+    total = float(0.0)
+    for i in range(shape.outer.shape[0]):
+        j = shape.outer[i]
+        off = s.q[w, j] - shape.q_mid[j]
+        total += off * off
+    return wp.sqrt(total)
+
+
+@wp.func
+def is_dropped(w: int, s: State, shape: Shape):
+    """The object's centre is below the palm or far from it. While a world's gravity is turned, "below" means away from
+    the palm."""
+    p = wp.vec3(s.object_pose[w, 0], s.object_pose[w, 1], s.object_pose[w, 2])
+    return wp.length(p - shape.middle) > shape.distance or p[2] < shape.below
+
+
+@wp.func
+def action(w: int, s: State):
+    """R_action: squared change of the action."""
+    total = float(0.0)
+    for j in range(s.action.shape[1]):
+        off = s.action[w, j] - s.last_action[w, j]
+        total += off * off
+    return total
+
+
+@wp.func
+def velocity(w: int, s: State):
+    """R_vel: squared joint speeds [rad^2/s^2]."""
+    total = float(0.0)
+    for j in range(s.qd.shape[1]):
+        total += s.qd[w, j] * s.qd[w, j]
+    return total
+
+
+@wp.func
+def opposed(w: int, s: State, shape: Shape):
+    """Whether an opposing finger touches."""
+    found = bool(False)
+    for i in range(shape.opposing.shape[0]):
+        if touches(shape.opposing[i], w, s, shape):
+            found = True
+    return found
+
+
+@wp.func
+def pressed(w: int, s: State, shape: Shape):
+    """How many of the others touch."""
+    count = float(0.0)
+    for i in range(shape.others.shape[0]):
+        if touches(shape.others[i], w, s, shape):
+            count += 1.0
+    return count
+
+
+@wp.func
+def aside(i: int, w: int, s: State, shape: Shape):
+    """How far the force of the i-th of the others is from the command, as a fraction of F_max."""
+    return wp.abs(s.tip_force[w, shape.others[i]] / shape.f_max - s.command[w])
+
+
+@wp.func
+def force_near(w: int, s: State, shape: Shape):
+    """Ours, dense where R_force is flat: 1 - |F_i - F_cmd F_max| / F_max, not below 0, mean of the others."""
+    total = float(0.0)
+    for i in range(shape.others.shape[0]):
+        total += at_least(1.0 - aside(i, w, s, shape), 0.0)
+    return total / float(shape.others.shape[0])
+
+
+@wp.func
+def worst(w: int, s: State, shape: Shape):
+    """Ours: `force_near` of the finger that is furthest off; the mean hides one that presses on nothing."""
+    furthest = float(0.0)
+    for i in range(shape.others.shape[0]):
+        off = aside(i, w, s, shape)
+        if off > furthest or wp.isnan(off):
+            furthest = off
+    return at_least(1.0 - furthest, 0.0)
+
+
+@wp.func
+def reach(w: int, s: State, shape: Shape):
+    """Ours: pads near the object, mean of the others. A finger that does not touch has nothing else that says which way
+    the object lies."""
+    total = float(0.0)
+    for i in range(shape.others.shape[0]):
+        total += wp.exp(-at_least(s.clearance[w, shape.others[i]], 0.0) / shape.reach_length)
+    return total / float(shape.others.shape[0])
+
+
+@wp.func
+def on_itself(w: int, s: State):
+    """N, sum of what the fingers press on the hand with."""
+    total = float(0.0)
+    for f in range(s.self_force.shape[1]):
+        total += s.self_force[w, f]
+    return total
+
+
+@wp.func
+def still(w: int, s: State):
+    """Ours: speed of the object [m/s], at most 1."""
+    v = wp.vec3(s.object_velocity[w, 0], s.object_velocity[w, 1], s.object_velocity[w, 2])
+    return at_most(wp.length(v), 1.0)
+
+
+@wp.func
+def centre(w: int, s: State, shape: Shape):
+    """Ours: how far the object lies to one side, out of reach of the outer fingers; at most 2."""
+    return at_most(wp.abs(s.object_pose[w, 1] - shape.beside) / shape.centre_length, 2.0)
+
+
+@wp.func
+def force_error(w: int, s: State, shape: Shape):
+    """N, mean distance of the others' force from the command."""
+    total = float(0.0)
+    for i in range(shape.others.shape[0]):
+        total += wp.abs(s.tip_force[w, shape.others[i]] - s.command[w] * shape.f_max)
+    return total / float(shape.others.shape[0])
+
+
+@wp.kernel(enable_backward=False)
+def dropped(s: State, shape: Shape, out: wp.array(dtype=wp.bool)):
+    w = wp.tid()
+    out[w] = is_dropped(w, s, shape)
+
+
+@wp.kernel(enable_backward=False)
+def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.array2d(dtype=float)):
+    """out [T + M, N]: TERMS, weighted, then METRICS and whether they count. period: s of a control step."""
+    w = wp.tid()
+    fingers = pressed(w, s, shape)
+    thumb = opposed(w, s, shape)
+    squeeze = on_itself(w, s)
+    value = Weights()
+    value[0] = force(w, s, shape)
+    value[1] = torque(w, s, shape)
+    value[2] = diff(w, s, shape)
+    value[3] = outer(w, s, shape)
+    value[4] = wp.where(is_dropped(w, s, shape), float(1.0), float(0.0))
+    value[5] = action(w, s)
+    value[6] = velocity(w, s)
+    value[7] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
+    value[8] = force_near(w, s, shape)
+    value[9] = reach(w, s, shape)
+    value[10] = at_most(squeeze / shape.f_max, 5.0)
+    value[11] = still(w, s)
+    value[12] = worst(w, s, shape)
+    value[13] = centre(w, s, shape)
+    for k in range(wp.static(len(TERMS))):
+        out[k, w] = weight[k] * value[k]
+
+    late = float(0.0)
+    if float(s.episode_length[w]) * period > wp.static(LATE):
+        late = 1.0
+    at = wp.static(len(TERMS))
+    out[at, w] = wp.where(thumb and fingers > 0.0, late, float(0.0))
+    out[at + 1, w] = late * force_error(w, s, shape)
+    out[at + 2, w] = late * fingers
+    out[at + 3, w] = late * squeeze
+    out[at + 4, w] = late

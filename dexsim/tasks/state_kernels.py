@@ -1,0 +1,204 @@
+"""What an environment copies from its engine and touch, each as one Warp kernel."""
+
+# No `from __future__ import annotations`: Warp resolves these annotations from the closure.
+
+from functools import cache
+
+import warp as wp
+
+from dexsim.sim.engine import FLAG_NAN
+
+OBJECT_NUMBERS = 13
+"""Of a free body: position, quaternion, linear and angular velocity."""
+
+
+@cache
+def read_kernel(real):
+    """Joints, object, contact forces and fingertips of N worlds as float32; of a world that is not finite, zeros."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def read(
+        flags: wp.array(dtype=int),
+        qpos: wp.array2d(dtype=real),
+        qvel: wp.array2d(dtype=real),
+        motor: wp.array2d(dtype=real),
+        pair_normal: wp.array2d(dtype=float),
+        xpos: wp.array2d(dtype=wp.vec3),
+        xmat: wp.array2d(dtype=wp.mat33),
+        joint_q: wp.array(dtype=int),
+        joint_v: wp.array(dtype=int),
+        object_q: int,  # its first address in qpos
+        object_v: int,
+        tip_body: wp.array(dtype=int),
+        tip_offset: wp.array(dtype=wp.vec3),
+        # out
+        nan: wp.array(dtype=wp.bool),
+        q: wp.array2d(dtype=float),
+        qd: wp.array2d(dtype=float),
+        torque: wp.array2d(dtype=float),
+        object_pose: wp.array2d(dtype=float),
+        object_velocity: wp.array2d(dtype=float),
+        tip_force: wp.array2d(dtype=float),
+        finger_force: wp.array2d(dtype=float),
+        self_force: wp.array2d(dtype=float),
+        palm_force: wp.array(dtype=float),
+        tips: wp.array2d(dtype=wp.vec3),
+    ):
+        w, k = wp.tid()
+        bad = (flags[w] & wp.static(FLAG_NAN)) != 0
+        joints = joint_q.shape[0]
+        if k < joints:  # a joint
+            q[w, k] = wp.where(bad, float(0.0), float(qpos[w, joint_q[k]]))
+            qd[w, k] = wp.where(bad, float(0.0), float(qvel[w, joint_v[k]]))
+            torque[w, k] = wp.where(bad, float(0.0), float(motor[w, k]))
+            return
+        i = k - joints
+        if i < 7:  # a number of the object
+            object_pose[w, i] = wp.where(bad, float(0.0), float(qpos[w, object_q + i]))
+            return
+        if i < wp.static(OBJECT_NUMBERS):
+            object_velocity[w, i - 7] = wp.where(bad, float(0.0), float(qvel[w, object_v + i - 7]))
+            return
+        f = i - wp.static(OBJECT_NUMBERS)
+        fingers = tip_body.shape[0]
+        if f < fingers:
+            tip_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, f])
+            finger_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, fingers + f])
+            self_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers + 1 + f])
+            b = tip_body[f]
+            tips[w, f] = wp.where(bad, wp.vec3(0.0, 0.0, 0.0), xpos[w, b] + xmat[w, b] * tip_offset[f])
+            return
+        palm_force[w] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers])
+        nan[w] = bad
+
+    return read
+
+
+@wp.kernel(enable_backward=False)
+def clear_touch(
+    mask: wp.array(dtype=wp.bool),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    tip_body: wp.array(dtype=int),
+    pad_centre: wp.array(dtype=wp.vec3),
+    # out
+    force: wp.array2d(dtype=float),
+    force_clean: wp.array2d(dtype=float),
+    force_other: wp.array2d(dtype=float),
+    centre: wp.array2d(dtype=wp.vec3),
+    centre_clean: wp.array2d(dtype=wp.vec3),
+):
+    """Nothing is felt in the masked worlds, centres are the pads' own."""
+    w, f = wp.tid()
+    if mask[w]:
+        force[w, f] = float(0.0)
+        force_clean[w, f] = float(0.0)
+        force_other[w, f] = float(0.0)
+        b = tip_body[f]
+        here = xpos[w, b] + xmat[w, b] * pad_centre[f]
+        centre[w, f] = here
+        centre_clean[w, f] = here
+
+
+@wp.kernel(enable_backward=False)
+def act(
+    given: wp.array2d(dtype=float),
+    relative: bool,
+    scale: float,  # rad a control step; relative only
+    lead: float,  # rad that a target may be ahead of the measured angle; relative only
+    q: wp.array2d(dtype=float),
+    low: wp.array(dtype=float),
+    high: wp.array(dtype=float),
+    middle: wp.array(dtype=float),
+    half: wp.array(dtype=float),
+    # in and out
+    action: wp.array2d(dtype=float),
+    last_action: wp.array2d(dtype=float),
+    target: wp.array2d(dtype=float),
+):
+    """Actions to targets, see `HandEnv.act`; what is not a number is 0."""
+    w, j = wp.tid()
+    a = given[w, j]
+    if wp.isnan(a):
+        a = float(0.0)
+    a = wp.clamp(a, -1.0, 1.0)
+    last_action[w, j] = action[w, j]
+    action[w, j] = a
+    t = middle[j] + a * half[j]
+    if relative:
+        t = target[w, j] + a * scale
+        t = wp.max(wp.min(t, q[w, j] + lead), q[w, j] - lead)
+    target[w, j] = wp.max(wp.min(t, high[j]), low[j])
+
+
+@wp.kernel(enable_backward=False)
+def judge(
+    episode_length: wp.array(dtype=wp.int64),
+    limit: wp.array(dtype=wp.int64),
+    blind: wp.array(dtype=wp.bool),
+    ends: wp.array2d(dtype=wp.bool),  # [E, N]
+    # in and out
+    reward: wp.array2d(dtype=float),  # [T, N]
+    nan: wp.array(dtype=wp.bool),
+    wrong: wp.array(dtype=wp.int64),  # [1 + T + 1] world-steps: of states, of each reward, of observations
+    nan_count: wp.array(dtype=wp.int64),
+    # out
+    total: wp.array(dtype=float),
+    done: wp.array(dtype=wp.bool),
+    time_out: wp.array(dtype=wp.bool),
+    rates: wp.array2d(dtype=float),  # [E + 2, N] of each end, of nan and of time_out: 1 or 0
+):
+    """Which worlds end, and what they earned. One whose state, a reward or the last observation is not finite ends as
+    `nan` and earns nothing."""
+    w = wp.tid()
+    terms = reward.shape[0]
+    bad = nan[w]
+    if bad:
+        wp.atomic_add(wrong, 0, wp.int64(1))
+    found = bad
+    total_here = float(0.0)
+    for k in range(terms):
+        r = reward[k, w]
+        total_here += r
+        if not wp.isfinite(r):
+            if not bad:
+                wp.atomic_add(wrong, 1 + k, wp.int64(1))
+            found = True
+    if blind[w]:
+        wp.atomic_add(wrong, 1 + terms, wp.int64(1))
+        found = True
+    if found:
+        wp.atomic_add(nan_count, 0, wp.int64(1))
+        total_here = float(0.0)
+        for k in range(terms):
+            reward[k, w] = float(0.0)
+    nan[w] = found
+    dead = found
+    count = ends.shape[0]
+    for k in range(count):
+        rates[k, w] = wp.where(ends[k, w], float(1.0), float(0.0))
+        dead = dead or ends[k, w]
+    late = episode_length[w] >= limit[0] and not dead
+    rates[count, w] = wp.where(found, float(1.0), float(0.0))
+    rates[count + 1, w] = wp.where(late, float(1.0), float(0.0))
+    total[w] = total_here
+    time_out[w] = late
+    done[w] = dead or late
+
+
+@wp.kernel(enable_backward=False)
+def note_not_finite(value: wp.array2d(dtype=float), row: int, blind: wp.array2d(dtype=wp.bool)):
+    """blind [1 + groups, N]: worlds of which any group, or this one (row), holds a number that is not finite."""
+    w, k = wp.tid()
+    if not wp.isfinite(value[w, k]):
+        blind[0, w] = True
+        blind[row, w] = True
+
+
+@wp.kernel(enable_backward=False)
+def keep_finite(
+    value: wp.array2d(dtype=float), row: int, blind: wp.array2d(dtype=wp.bool), out: wp.array2d(dtype=float)
+):
+    """Copies a group's observations; zeros where they are not finite."""
+    w, k = wp.tid()
+    out[w, k] = wp.where(blind[row, w], float(0.0), value[w, k])

@@ -1,0 +1,35 @@
+"""How many kernels a control step launches beside its physics: on a GPU their number is what the step costs, and one
+line of torch too many is easily written. Counted, not timed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from worlds import task_cfg
+
+from benchmarks import launches
+from dexsim.tasks import make_env
+
+MOST = {"grasp": 110, "rotate": 440}
+"""100 and 432 were counted when this was written."""
+
+
+@pytest.mark.parametrize("task", sorted(MOST))
+def test_a_control_step_launches_few_kernels(task):
+    env = make_env(task_cfg(task=task, worlds=4), 4, "cpu", 0, "warp")
+    found = launches.count(env, torch.zeros(4, env.num_actions))
+    total = sum(sum(part.values()) for part in found.values())
+    lines = sum(found.values(), launches.Counter()).most_common(8)
+    assert all(found[name] for name in launches.PARTS), "a part launches nothing: it was not counted"
+    assert total <= MOST[task], "\n".join(f"{n} {line}" for line, n in lines)
+    env.close()
+
+
+def test_what_is_counted():
+    x = torch.ones(3, 4)
+    with launches.counting() as found:
+        x.T.reshape(2, 6)  # a copy: the transposed is no view of that shape
+        x.view(-1)[2:].unsqueeze(0)
+        torch.empty(5)
+        (x + 1).mul_(2)
+    assert sum(found.values()) == 3
