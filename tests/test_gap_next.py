@@ -12,10 +12,10 @@ from dexsim.gap.effects.catalogue import EFFECTS, members, separating
 from dexsim.gap.effects.confusion import CLASSES
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
-from dexsim.gap.report import next_experiment
+from dexsim.gap.report import next_recording
 from dexsim.gap.search.search import JointSearch, Member
 from dexsim.gap.touch import press_rig
-from dexsim.recording import read
+from dexsim.recording import excitation, read
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -58,12 +58,12 @@ def hypotheses():
 
 def test_the_same_hypothesis_disagrees_nowhere_and_others_do(hypotheses):
     m, search, none, trials = hypotheses
-    same = next_experiment.choose(
+    same = next_recording.choose(
         m, search, trials["coulomb_friction"], trials["coulomb_friction"], kinds=("steps", "triangles")
     )
     assert max(same.scores.values()) < 1e-9
     assert not same.settles and same.text.startswith("none settles it")
-    other = next_experiment.choose(
+    other = next_recording.choose(
         m, search, trials["coulomb_friction"], trials["viscous_friction"], kinds=("steps", "triangles")
     )
     assert other.scores[other.chosen[0]] == max(other.scores.values()) > 1.0
@@ -89,9 +89,9 @@ def test_what_refitted_figures_make_up_for_does_not_count(hypotheses):
     moved = deepcopy(none)
     k = [p.key for p in moved.fit.params].index("kp")
     moved.fit.x[k] = np.clip(moved.fit.x[k] - 0.03, 0.95, 1.05)
-    p = next_experiment.plan(m, ["joint"], ["steps"], repeats=0)
-    gain = next_experiment.disagreement(m, search.case, search, none, moved, p)["steps"]
-    real = next_experiment.disagreement(
+    p = excitation.plan(m, ["joint"], ["steps"], repeats=0)
+    gain = next_recording.disagreement(m, search.case, search, none, moved, p)["steps"]
+    real = next_recording.disagreement(
         m, search.case, search, trials["coulomb_friction"], trials["viscous_friction"], p
     )["steps"]
     assert gain < 0.3 * real

@@ -21,7 +21,7 @@ from dexsim.gap.plant.coupled_motion import again, coupled, sharpen
 from dexsim.gap.read import end_stops, inputs, keep_out, stage_tests
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain
-from dexsim.gap.report.next_experiment import rival_of
+from dexsim.gap.report.next_recording import rival_of
 from dexsim.gap.result import Diagnosis
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import baseline, external_force, torque_told
