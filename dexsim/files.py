@@ -12,6 +12,7 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from dexsim.errors import UserError
 
@@ -69,6 +70,17 @@ def beside(path: Path) -> Iterator[Path]:
         os.replace(part, path)
     finally:
         _remove(part)
+
+
+def picture(figure: Any, path: Path, dpi: float | str = "figure") -> None:
+    """Save a matplotlib figure in the format of the path's ending; it is empty afterwards.
+
+    What was drawn refers to itself in circles and holds the pixels (some 5 MB a figure): Python would keep them until
+    it happens to look for such, which it does the more seldom the more else there is.
+    """
+    with beside(path) as part:
+        figure.savefig(part, dpi=dpi, format=path.suffix[1:])
+    figure.clear()
 
 
 def sweep(folder: Path) -> list[int]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexsim import outputs
+from dexsim import files, outputs
 from dexsim.assets.objects import own
 from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
@@ -149,7 +149,7 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
         aspect="equal", xlabel=f"{'xyz'[u]} [mm]", ylabel=f"{'xyz'[v]} [mm]", title=f"distance to it at {'xyz'[w]} = 0"
     )
     figure.colorbar(drawn, ax=axes, label="mm (inside < 0)", shrink=0.8)
-    figure.savefig(picture)
+    files.picture(figure, picture)
 
 
 if __name__ == "__main__":

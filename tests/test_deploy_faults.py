@@ -4,6 +4,7 @@ report are there."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import os
@@ -469,31 +470,93 @@ def test_a_named_sender_is_the_only_one_from_the_start():
         imu.close()
 
 
-def test_a_flood_of_others_starves_nothing():
-    imu = UdpImu(0)
-    stop = threading.Event()
-    with udp() as friend:
+FLOOD = """import socket, sys, time
+s, at, n = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), ("127.0.0.1", int(sys.argv[1])), 0
+end = time.monotonic() + 30
+while time.monotonic() < end:
+    for _ in range(100):
+        try: s.sendto(sys.argv[2].encode(), at); n += 1
+        except OSError: pass
+    print(n, flush=True)
+"""
+
+
+@contextlib.contextmanager
+def flood(port, line):
+    """Another program that sends a line as fast as it can; gives how many it has sent so far."""
+    child = subprocess.Popen([sys.executable, "-c", FLOOD, str(port), line], stdout=subprocess.PIPE, text=True)
+    sent = [int(child.stdout.readline())]
+    reader = threading.Thread(target=lambda: [sent.append(int(x)) for x in child.stdout], daemon=True)
+    reader.start()
+    try:
+        yield lambda: sent[-1]
+    finally:
+        child.kill()
+        child.wait()
+        reader.join()
+        child.stdout.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "named", "first"),
+    [("0 1 0 0", False, False), ("0 1 0 0", True, True), ("nonsense", False, True), ("nonsense", True, True)],
+    ids=["good lines later", "good lines first, sender named", "bad lines first", "bad lines first, sender named"],
+)
+def test_a_flood_of_others_starves_nothing(line, named, first, capsys):
+    """Another program's lines, from before the first of the right sender's or after it: every turn has a new reading,
+    and none is the stranger's."""
+    with udp() as friend, contextlib.ExitStack() as open_:
+        friend.bind(("127.0.0.1", 0))
+        imu = UdpImu(0, sender_port=friend.getsockname()[1] if named else None)
         at = ("127.0.0.1", imu.port)
-        friend.sendto(b"1 0 0 0", at)
-        assert imu.wait(2.0)
+        stop = threading.Event()
+        sent = open_.enter_context(flood(imu.port, line)) if first else None
+        began = time.monotonic()
 
-        def flood():
-            with udp() as s:
-                while not stop.is_set():
-                    s.sendto(b"0 1 0 0", at)
+        def call():
+            while not stop.wait(0.01):
+                friend.sendto(b"1 0 0 0", at)
 
-        thread = threading.Thread(target=flood)
-        thread.start()
-        try:
-            came = 0
-            for k in range(40):
-                friend.sendto(f"{1 + k * 1e-3} 0 0 0.1".encode(), at)
-                time.sleep(0.005)
-                q, seen = imu.orientation(100.0 + k)
-                came += seen == 100.0 + k
-                assert q[1] == 0
-        finally:
-            stop.set()
-            thread.join()
-        assert came >= 38
+        calling = threading.Thread(target=call)
+        calling.start()
+        found = imu.wait(20.0)
+        waited = time.monotonic() - began
+        stop.set()
+        calling.join()
+        assert found and imu.sender == friend.getsockname()
+        sent = sent or open_.enter_context(flood(imu.port, line))
+        before, turns, fresh, foreign = sent(), 60, 0, 0
+        began = time.monotonic()
+        for k in range(turns):
+            friend.sendto(f"{1 + k * 1e-3} 0 0 0.1".encode(), at)
+            time.sleep(0.005)
+            q, seen = imu.orientation(100.0 + k)
+            fresh += seen == 100.0 + k
+            foreign += q[1] != 0
+        rate = (sent() - before) / (time.monotonic() - began)
     imu.close()
+    with capsys.disabled():
+        how = f"\nflood of {line!r}, {rate:.0f} lines/s, named={named}, first={first}"
+        print(f"{how}: first reading after {waited:.2f} s, {fresh} of {turns} turns with a new one, {foreign} foreign")
+    assert foreign == 0 and fresh >= turns - 3
+
+
+def test_a_flood_of_the_sender_itself_is_read_young():
+    """Lines that say when they were sent, as fast as they can be: what is read is not old."""
+    turned = "cmath.exp(1j * (time.monotonic() % 100) / 40)"
+    line = f"b'%.9f 0 0 %.9f' % ((z := {turned}).real, z.imag)"
+    code = "import cmath\n" + FLOOD.replace("sys.argv[2].encode()", line)
+    imu = UdpImu(0)
+    child = subprocess.Popen([sys.executable, "-c", code, str(imu.port)], stdout=subprocess.DEVNULL)
+    try:
+        assert imu.wait(20.0)
+        ages = []
+        for _ in range(60):
+            time.sleep(0.01)
+            q, _ = imu.orientation(0.0)
+            ages.append((time.monotonic() % 100 - 40 * np.arctan2(q[3], q[0])) % 100)
+    finally:
+        child.kill()
+        child.wait()
+        imu.close()
+    assert np.median(ages) < 0.25, ages

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.soak import __main__ as soak
+from tests.soak import parts
 from tests.soak.watch import Watch, grows, judge
 
 ROOT = Path(__file__).parents[1]
@@ -20,22 +23,31 @@ def rows(leak_mib: float = 0.0, files: int = 0, n: int = 400) -> list[tuple[floa
     rng, t = np.random.default_rng(0), np.arange(n) * 0.5
     heap = 400 + 200 * (1 - np.exp(-t / 5)) + 50 * (t % 3) / 3 + rng.normal(0, 2, n) + leak_mib * t / t[-1]
     opened = 5 + rng.integers(0, 2, n) + np.floor(files * t / t[-1])
-    return [(a, h, h + 300, f, 3, float("nan")) for a, h, f in zip(t, heap, opened, strict=True)]
+    return [(a, h, h + 300, f, 3, float("nan"), a / 10) for a, h, f in zip(t, heap, opened, strict=True)]
 
 
 def test_a_leak_is_told_from_what_comes_and_goes():
     found = judge(rows())
     assert grows(found) == [] and abs(found["heap_mib"]["growth"]) < 10 and "gpu_mib" not in found
     assert found["heap_mib"]["low"] <= found["heap_mib"]["growth"] <= found["heap_mib"]["high"]
+    leak = judge(rows(leak_mib=60))["heap_mib"]  # 60 MiB in 200 s, and 20 things done
+    assert leak["per_hour_low"] < 18 * 60 < leak["per_hour_high"] and abs(leak["per_unit"] - 3.0) < 0.6
     assert grows(judge(rows(leak_mib=60))) == ["heap_mib"] and grows(judge(rows(files=8))) == ["files"]
     assert judge(rows(n=100)) == {}, "too short to judge"
 
 
-def test_a_child_is_watched_until_it_ends():
+def test_a_child_is_watched_until_it_ends(tmp_path):
     hold = "import time; f = [open('/dev/null') for _ in range(40)]; x = bytearray(64 << 20); time.sleep(0.8)"
-    watch = Watch(subprocess.Popen([sys.executable, "-c", hold]), every=0.05)
+    turns = iter([None, None, *range(1000)])
+    watch = Watch(subprocess.Popen([sys.executable, "-c", hold]), every=0.05, done=lambda: next(turns),
+                  path=tmp_path / "x.csv")  # fmt: skip
+    while watch.is_alive() and len(watch.rows) < 3:
+        time.sleep(0.01)
+    assert "\n0" in (tmp_path / "x.csv").read_text(), "rows are written as they come"
     watch.join()
     seen = np.array(watch.rows)
+    written = np.genfromtxt(tmp_path / "x.csv", delimiter=",", names=True)
+    assert list(written["done"]) == list(seen[:, 6]) and np.allclose(written["heap_mib"], seen[:, 1], rtol=1e-4)
     assert len(seen) > 5 and seen[:, 1].max() > 64 and seen[:, 3].max() >= 43 and np.isnan(seen[:, 5]).all()
 
 
@@ -43,14 +55,26 @@ def test_amounts_are_shared_out():
     made = soak.commands(
         soak.SETTINGS | {"training": "1h", "worlds": "100", "processes": "deploy:4", "diagnoses": "0"}, Path("x")
     )
-    assert set(made) == {"training", "deploy0", "deploy1", "deploy2", "deploy3", "envs"}
+    assert set(made) == {"training", "deploy0", "deploy1", "deploy2", "deploy3", "envs", "plays"}
     assert "iterations=72" in made["training"]  # 3600 s of 100 worlds, 24 steps of 21 ms each: 71.4
     assert made["deploy2"][2:4] == ["deploy", "6.0"] and made["envs"][2:4] == ["envs", "1000.0"]
 
 
+def test_how_far_a_part_is_is_known_while_it_runs(tmp_path):
+    s = soak.SETTINGS | {"worlds": "100", "training": "1h"}
+    assert soak.done(s, tmp_path, "training") is None and soak.done(s, tmp_path, "deploy") is None
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "progress.csv").write_text("iteration,steps,reward\n")
+    assert soak.done(s, tmp_path, "training") is None
+    (tmp_path / "run" / "progress.csv").write_text("iteration,steps,reward\n1,2400,0.5\n71,170400,0.7\n72,1728")
+    assert soak.done(s, tmp_path, "training") == pytest.approx(71 * 100 * 24 * 0.021 / 3600)  # 72 is not whole
+    parts.tell(tmp_path, 0.25)
+    assert (tmp_path / "done").read_text() == "0.25"
+
+
 @pytest.mark.slow
 def test_each_part_does_its_work(tmp_path):
-    small = ["training=0.001h", "worlds=2", "deploy=0.002h", "envs=2", "diagnoses=1", f"out={tmp_path}"]
+    small = ["training=0.001h", "worlds=2", "deploy=0.002h", "envs=2", "diagnoses=1", "plays=1", f"out={tmp_path}"]
     done = subprocess.run(
         [sys.executable, "-m", "tests.soak", *small], cwd=ROOT, capture_output=True, text=True, timeout=800
     )
@@ -58,4 +82,8 @@ def test_each_part_does_its_work(tmp_path):
     assert (
         "2 environments made" in done.stdout and "1 diagnoses" in done.stdout and "0.002 h of the loop" in done.stdout
     )
-    assert (tmp_path / "run" / "last.pt").exists() and (tmp_path / "soak.json").exists()
+    assert (tmp_path / "run" / "last.pt").exists() and "1 plays" in done.stdout
+    found = json.loads((tmp_path / "soak.json").read_text())["parts"]
+    assert {k: v["done"] for k, v in found.items() if k != "training"} == pytest.approx(
+        {"deploy": 0.002, "envs": 2, "diagnoses": 1, "plays": 1}, abs=0.002)  # fmt: skip
+    assert found["training"]["done"] >= 0.001

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import recordings
 
-from dexsim.recording import Writer, read, timeline
+from dexsim.recording import Writer, audit_values, read, timeline
 from dexsim.recording.spikes import spiked
 
 T = np.arange(0, 10, 0.01)
@@ -120,3 +120,16 @@ def test_a_recording_of_jumped_stamps_is_read_on_its_true_clock(tmp_path):
     assert {
         f.topic for f in r.findings if f.kind == "time_not_monotonic" and f.count == 12 and "left out" in f.text
     } == {"/joint_states", "/joint_commands"}
+
+
+@pytest.mark.parametrize("quantity", ["position", "command"])
+def test_values_that_no_joint_has_are_said_where_they_are_too_many_for_spikes(quantity):
+    r = recordings.signal()
+    series = r.commands if quantity == "command" else r.states.position
+    at = np.random.default_rng(4).random(len(series.t)) < 0.3
+    series.value = series.value.copy()
+    series.value[at, 0] = -1e300
+    said = [f for f in audit_values.units(r) if "farther than any joint" in f.text]
+    assert [(f.joint, f.topic, f.severity) for f in said] == [(r.joints[0], series.topic, "error")]
+    series.value[:, 0] = np.where(np.arange(len(series.t)) % 50 == 25, 1e300, T[: len(series.t)])
+    assert not [f for f in audit_values.units(r) if "farther than any joint" in f.text], "single ones are spikes"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from dexsim import files
 from dexsim.calibration.current import Half
 from dexsim.calibration.rubber import Rubber, Stiffness, stress
 from dexsim.calibration.taxels import Pad
@@ -51,7 +52,7 @@ def lines(half: Half, path: Path, title: str) -> Path:
         ax.set_ylabel("N", fontsize=8)
         ax.grid(alpha=0.25)
     figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
+    files.picture(figure, path, dpi=110)
     return path
 
 
@@ -66,7 +67,7 @@ def rubber(stretch: np.ndarray, nominal: np.ndarray, fit: Rubber, path: Path) ->
     ax.set(xlabel="stretch", ylabel="nominal stress, MPa")
     ax.legend()
     ax.grid(alpha=0.25)
-    figure.savefig(path, dpi=120)
+    files.picture(figure, path, dpi=120)
     return path
 
 
@@ -83,7 +84,7 @@ def press(depth: np.ndarray, force: np.ndarray, fit: Stiffness, path: Path) -> P
     ax.set(xlabel="depth, mm", ylabel="force, N")
     ax.legend()
     ax.grid(alpha=0.25)
-    figure.savefig(path, dpi=120)
+    files.picture(figure, path, dpi=120)
     return path
 
 
@@ -104,5 +105,5 @@ def pads(found: dict[str, Pad], path: Path) -> Path:
         )
         ax.set(xlabel="column", ylabel="row")
     figure.colorbar(image, ax=figure.axes, shrink=0.6, label="gain (x dead, letters swapped)")
-    figure.savefig(path, dpi=110)
+    files.picture(figure, path, dpi=110)
     return path

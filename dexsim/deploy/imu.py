@@ -8,6 +8,7 @@ may be any: the policy sees only R_object^T R_goal, in which a heading common to
 
 from __future__ import annotations
 
+import select
 import socket
 import time
 from typing import Protocol
@@ -82,10 +83,11 @@ class UdpImu:
         return self._last
 
     def wait(self, seconds: float) -> bool:
-        """Whether a first orientation comes within that time."""
+        """Whether a first orientation comes within that time. What comes is read at once: in a flood of others' lines a
+        queue that is looked at now and then would nearly always be full."""
         limit = time.monotonic() + seconds
-        while self.orientation(time.monotonic()) is None and time.monotonic() < limit:
-            time.sleep(0.02)
+        while self.orientation(time.monotonic()) is None and (left := limit - time.monotonic()) > 0:
+            select.select([self._socket], [], [], left)
         return self._last is not None
 
     def close(self) -> None:

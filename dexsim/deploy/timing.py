@@ -12,7 +12,7 @@ class Timing:
     round."""
 
     def __init__(self, most: int = 400_000):
-        self._rows = np.zeros((most, 3))
+        self._rows = np.full((most, 3), 0.0)  # written now: its pages would come one by one in the run
         self.turns = 0
         self.overruns = 0
 

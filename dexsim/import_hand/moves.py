@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import folder, picture
@@ -216,4 +217,4 @@ def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[st
         axes.imshow(image)
         axes.set(xticks=[], yticks=[])
         axes.set_title(title, fontsize=8)
-    figure.savefig(path)
+    files.picture(figure, path)

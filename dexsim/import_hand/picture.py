@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dexsim import files
 from dexsim.hand import Hand
 from dexsim.tactile.layout import load_layout
 from dexsim.view.stills import Shot, render
@@ -93,7 +94,7 @@ def draw(hand: Hand, path: Path) -> None:
         f" {hand.file.handedness} hand; span {1e3 * hand.span:.0f} mm",
         fontsize=12,
     )
-    figure.savefig(path)
+    files.picture(figure, path)
 
 
 def _frame(axes: Any, shot: Shot, length: float) -> None:

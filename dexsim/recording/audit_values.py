@@ -18,6 +18,8 @@ RATIOS = {
     1000.0: "thousandths",
     65536 / (2 * np.pi): "counts of a 16-bit encoder",
 }
+LARGEST = 1e6
+"""rad (m): no joint gets there; a wheel that turns ten times a second needs four hours."""
 SPEED_RATIOS = {180 / np.pi: "deg/s", 60 / (2 * np.pi): "rpm", 1000.0: "thousandths of rad/s"}
 
 
@@ -434,7 +436,14 @@ def units(r: Recording) -> Iterator[Finding]:
                 continue
             x = series.value[:, j]
             top = float(np.nanmax(np.abs(x)))
-            if joint in limits and top > np.abs(limits[joint]).max() + 0.5:
+            if top > LARGEST and (beyond := (np.abs(x) > LARGEST) & ~spiked(x, name)).any():
+                yield finding(
+                    series,
+                    f"{name} of {joint} is {x[beyond][0]:.4g} in {int(beyond.sum())} of {len(x)} samples, farther than"
+                    " any joint gets",
+                    joint,
+                )
+            elif joint in limits and top > np.abs(limits[joint]).max() + 0.5:
                 guess = "counts?" if is_integer(x) and top > 200 else "degrees?" if top < 400 else "counts?"
                 yield finding(
                     series,

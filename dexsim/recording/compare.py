@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
 
+from dexsim import files  # noqa: E402
 from dexsim.assets import xhand  # noqa: E402
 from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
 from dexsim.recording.schema import Recording  # noqa: E402
@@ -167,4 +168,4 @@ def _finish(figure: Figure, axes: list, count: int, title: str, path: Path) -> N
         ax.set_xlabel("time [s]", fontsize=8)
     axes[0].legend(fontsize=7)
     figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
+    files.picture(figure, path, dpi=110)

@@ -17,6 +17,7 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
 
+from dexsim import files  # noqa: E402
 from dexsim.errors import UserError  # noqa: E402
 
 BLUE, LIGHT = "#1f5fa8", "#9dbfe3"
@@ -67,7 +68,7 @@ def curves(columns: dict[str, list[float]], path: Path, title: str = "") -> Path
         axes.set_xlabel("environment steps", fontsize=8)
     if title:
         figure.suptitle(title, fontsize=10, y=1 - 0.12 / height, va="top")
-    figure.savefig(path, dpi=110)
+    files.picture(figure, path, dpi=110)
     return path
 
 
@@ -93,7 +94,7 @@ def draw(functions: Sequence[Any], folder: Path) -> list[Path]:
         figure = Figure(figsize=(7.0, 4.6), layout="constrained")
         function(figure.subplots())
         path = folder / f"{name}.png"
-        figure.savefig(path, dpi=120)
+        files.picture(figure, path, dpi=120)
         paths.append(path)
     return paths
 

@@ -1,18 +1,20 @@
-"""`python -m tests.soak [training=48h] [deploy=24h] [envs=1000] [diagnoses=200] [worlds=256] [device=cpu]
+"""`python -m tests.soak [training=48h] [deploy=24h] [envs=1000] [diagnoses=200] [plays=30] [worlds=256] [device=cpu]
 [processes=deploy:1,envs:1] [minutes=M] [out=FOLDER]`: long runs in little time, each in a process of its own; do memory
 and handles stay flat?
 
 training: `train.py` for so many hours of simulated time (that of all `worlds` together); deploy: hours of the loop on a
-clock that waits for nobody; envs: environments made, stepped and closed; diagnoses: in one process, with their reports.
-Hours and environments are shared out among so many processes. 0 leaves a part out. minutes: what still runs then is
-ended, and judged as far as it came. Every half second memory, open files and threads of each process are noted (and the
-first GPU's memory, for a training there). Ends with status 1 where something grew or failed. Writes soak.json,
-NAME.csv and NAME.log.
+clock that waits for nobody; envs: environments made, stepped and closed; diagnoses: in one process, with their reports;
+plays: of the included policy, with plots and a recording each. Hours and environments are shared out among so many
+processes. 0 leaves a part out. minutes: what still runs then is ended, and judged as far as it came.
+
+Every half second memory, open files and threads of each process (and the first GPU's memory, for a training there), and
+how much of its work is done, are written to NAME.csv as they come; every ten seconds soak.json is written anew with
+growth, and slopes per hour of wall time and per unit of work, of each part until then. NAME.log: what a part said. Ends
+with status 1 where something grew or failed.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -21,15 +23,25 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from .watch import COLUMNS, Watch, grows, judge
+from .watch import Watch, grows, judge
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = {"training": "48h", "deploy": "24h", "envs": "1000", "diagnoses": "200", "worlds": "256", "device": "cpu",
-            "processes": "deploy:1,envs:1", "minutes": "0", "out": "out/soak"}  # fmt: skip
+SETTINGS = {"training": "48h", "deploy": "24h", "envs": "1000", "diagnoses": "200", "plays": "30", "worlds": "256",
+            "device": "cpu", "processes": "deploy:1,envs:1", "minutes": "0", "out": "out/soak"}  # fmt: skip
 PERIOD, STEPS = 0.021, 24
 """s between actions, and actions of a world between two updates, as `train.py` has them."""
+UNITS = {"training": "h", "deploy": "h", "envs": "environments", "diagnoses": "diagnoses", "plays": "plays"}
+EVERY, PATIENCE = 10.0, 30.0
+"""s between two states of soak.json, and that a part that was asked to end is waited for."""
+
+
+def hours_of(worlds: int, iterations: int) -> float:
+    """Simulated hours of a training, all its worlds together."""
+    return PERIOD * STEPS * worlds * iterations / 3600
 
 
 def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
@@ -41,7 +53,7 @@ def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
         found["training"] = ["train.py", "task=grasp", f"device={s['device']}", f"worlds={s['worlds']}",
                              f"iterations={iterations}", "final_episodes=0", f"out={out / 'run'}"]  # fmt: skip
     shares = dict(part.split(":") for part in s["processes"].split(","))
-    for part in ("deploy", "envs", "diagnoses"):
+    for part in ("deploy", "envs", "diagnoses", "plays"):
         amount, n = float(s[part].rstrip("h")), int(shares.get(part, 1))
         for k in range(n if amount else 0):
             name = f"{part}{k}" if n > 1 else part
@@ -49,9 +61,35 @@ def commands(s: dict[str, str], out: Path) -> dict[str, list[str]]:
     return found
 
 
-def begun(out: Path, name: str) -> Path:
-    """What is there once a part has done its first turn."""
-    return out / "run" / "progress.csv" if name == "training" else out / name / "ready"
+def amounts(s: dict[str, str], name: str) -> tuple[float, str]:
+    """(what a part of this name has to do, its unit)."""
+    part, shares = name.rstrip("0123456789"), dict(x.split(":") for x in s["processes"].split(","))
+    n = int(shares.get(part, 1)) if part != "training" else 1
+    return float(s[part].rstrip("h")) / n, UNITS[part]
+
+
+def done(s: dict[str, str], out: Path, name: str) -> float | None:
+    """How much of its work a part has done, in its unit; None before its first turn."""
+    try:
+        if name != "training":
+            return float((out / name / "done").read_text())
+        with open(out / "run" / "progress.csv", "rb") as file:
+            header = file.readline().decode().strip().split(",")
+            file.seek(max(file.tell(), os.fstat(file.fileno()).st_size - 4096))
+            whole = [x for x in file.read().decode().splitlines() if x.count(",") == len(header) - 1]
+        return hours_of(int(s["worlds"]), int(whole[-1].split(",")[header.index("iteration")])) if whole else None
+    except (OSError, ValueError):
+        return None
+
+
+def state(s: dict[str, str], out: Path, name: str, child: subprocess.Popen, watch: Watch, cut: bool) -> dict[str, Any]:
+    """A part as it is now."""
+    amount, unit = amounts(s, name)
+    found = judge(watch.rows)
+    said = (out / f"{name}.log").read_text(errors="replace").strip().splitlines() or [""]
+    seconds = watch.rows[-1][0] if watch.rows else 0.0
+    return {"status": child.poll(), "ended early": cut, "done": done(s, out, name) or 0.0, "of": amount, "unit": unit,
+            "seconds": seconds, "said": said[-1], "grows": grows(found), **found}  # fmt: skip
 
 
 def main(argv: list[str]) -> int:
@@ -62,7 +100,7 @@ def main(argv: list[str]) -> int:
     s = SETTINGS | given
     out = Path(s["out"])
     out.mkdir(parents=True, exist_ok=True)
-    for old in ("run", *(p.parent.name for p in out.glob("*/ready"))):
+    for old in ("run", *(p.parent.name for p in out.glob("*/done"))):
         shutil.rmtree(out / old, ignore_errors=True)
     env = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
     running: dict[str, tuple[subprocess.Popen, Watch]] = {}
@@ -70,50 +108,44 @@ def main(argv: list[str]) -> int:
         log = open(out / f"{name}.log", "w")
         child = subprocess.Popen([sys.executable, *args], cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT)
         log.close()
-        running[name] = child, Watch(child, name == "training" and s["device"] != "cpu", ready=begun(out, name))
-    end = time.monotonic() + (60 * float(s["minutes"]) or math.inf)
-    cut = set()
-    while any(child.poll() is None for child, _ in running.values()):
+        running[name] = child, Watch(child, name == "training" and s["device"] != "cpu",
+                                     done=partial(done, s, out, name), path=out / f"{name}.csv")  # fmt: skip
+    end, written = time.monotonic() + (60 * float(s["minutes"]) or math.inf), time.monotonic()
+    cut: set[str] = set()
+
+    def write() -> dict[str, dict[str, Any]]:
+        parts = {name: state(s, out, name, child, watch, name in cut) for name, (child, watch) in running.items()}
+        text = json.dumps({"settings": s, "parts": parts}, indent=1)
+        part = out / "soak.json.tmp"
+        part.write_text(text)
+        part.replace(out / "soak.json")
+        return parts
+
+    while alive := {name for name, (child, _) in running.items() if child.poll() is None}:
         time.sleep(0.2)
         if time.monotonic() > end:
-            cut = {name for name, (child, _) in running.items() if child.poll() is None}
-            for name in cut:
-                running[name][0].send_signal(signal.SIGINT)
-            end = math.inf
-    result, bad = {}, []
-    for name, (child, watch) in running.items():
+            for name in alive:
+                running[name][0].send_signal(signal.SIGINT if not cut else signal.SIGKILL)
+            cut, end = cut | alive, time.monotonic() + PATIENCE
+        if time.monotonic() > written + EVERY:
+            write()
+            written = time.monotonic()
+    for _, watch in running.values():
         watch.join()
-        with open(out / f"{name}.csv", "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(COLUMNS)
-            writer.writerows([f"{x:.6g}" for x in row] for row in watch.rows)
-        found = judge(watch.rows)
-        worse = grows(found)
-        said = (out / f"{name}.log").read_text(errors="replace").strip().splitlines() or [""]
-        failed = child.returncode != 0 and name not in cut
-        bad += [name] * bool(worse or failed)
-        result[name] = {
-            "status": child.returncode,
-            "ended early": name in cut,
-            "said": said[-1],
-            "grows": worse,
-            **found,
-        }
-        what = (
-            "FAILED"
-            if failed
-            else f"GROWS ({', '.join(worse)})"
-            if worse
-            else "flat"
-            if found
-            else "too short to judge"
-        )
-        print(f"{name:10s} {what}{', ended early' * (name in cut)}; {said[-1]}")
+    bad = []
+    for name, part in write().items():
+        failed = part["status"] != 0 and name not in cut
+        found = {k: v for k, v in part.items() if isinstance(v, dict)}
+        worse = f"GROWS ({', '.join(part['grows'])})" if part["grows"] else "flat" if found else "too short to judge"
+        bad += [name] * bool(part["grows"] or failed)
+        came = f"{part['done']:.4g} of {part['of']:.4g} {part['unit']} in {part['seconds']:.0f} s"
+        print(f"{name:10s} {'FAILED' if failed else worse}; {came}{', ended early' * (name in cut)}; {part['said']}")
         for column, f in found.items():
             unit = " MiB" if column.endswith("_mib") else ""
-            interval = f"(95 %: {f['low']:+.3g} to {f['high']:+.3g})"
-            print(f"  {column:9s} mean {f['mean']:.6g}, most {f['most']:.6g}, grew {f['growth']:+.3g}{unit} {interval}")
-    (out / "soak.json").write_text(json.dumps({"settings": s, "parts": result}, indent=1))
+            slope = f"{f['per_hour']:+.3g} an hour (95 %: {f['per_hour_low']:+.3g} to {f['per_hour_high']:+.3g})"
+            grew = f"grew {f['growth']:+.3g}{unit} (95 %: {f['low']:+.3g} to {f['high']:+.3g}), {slope}"
+            each = f", {f['per_unit']:+.3g} each of its {part['unit']}" if "per_unit" in f else ""
+            print(f"  {column:9s} mean {f['mean']:.6g}, most {f['most']:.6g}, {grew}{each}")
     return int(bool(bad))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
 import time
@@ -10,8 +12,22 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.soak.watch import look
+
+ROOT = Path(__file__).parents[2]
 NEXT = 7
 """Numbers of worlds and seeds of the environments repeat after as many."""
+
+
+TOLD = 5000
+"""Readings of the loop between two notes of how far it is."""
+
+
+def tell(folder: Path, done: float) -> None:
+    """How much of its work a part has done, in a file `done`, for who watches it."""
+    part = folder / "done.tmp"
+    part.write_text(f"{done:.6g}")
+    part.replace(folder / "done")
 
 
 class Lagging:
@@ -19,10 +35,10 @@ class Lagging:
 
     name = "a hand that lags"
 
-    def __init__(self, clock):
+    def __init__(self, clock, folder: Path | None = None):
         from dexsim.deploy.driver import HandState
 
-        self.clock, self._state = clock, HandState
+        self.clock, self._state, self.folder, self.begun = clock, HandState, folder, clock.now()
         self.q = self.target = np.full(12, 0.05)
         self.sequence, self.rng = 0, np.random.default_rng(0)
 
@@ -34,6 +50,8 @@ class Lagging:
         now = self.clock.now()
         self.q = self.q + (self.target - self.q) * (1 - np.exp(-(now - self.last) / 0.03))
         self.last, self.sequence = now, self.sequence + 1
+        if self.folder is not None and self.sequence % TOLD == 1:
+            tell(self.folder, (now - self.begun) / 3600)
         touch = np.zeros((5, 120, 3), np.float32)
         touch[:, self.sequence % 120, 2] = 3.0
         error = np.zeros(12, int)
@@ -62,13 +80,13 @@ def deploy(hours: float, folder: Path) -> str:
     from dexsim.deploy.vision import FixedPlace
 
     torch.set_num_threads(1)
-    made = export.export(str(Path(__file__).parents[2] / "checkpoints" / "grasp.pt"), folder / "bundle", steps=2)
+    made = export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=2)
     clock = VirtualClock(100.0)
     settings = LoopSettings(seconds=3600 * hours, tor_max=300.0)
     loop = Loop(
-        bundle.load(made), Lagging(clock), FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings, clock
-    )
-    (folder / "ready").touch()
+        bundle.load(made), Lagging(clock, folder), FixedPlace([0.055, 0.0, 0.04]), Calibration.default(), settings,
+        clock,
+    )  # fmt: skip
     report = loop.run()
     if report.ended != "done" or report.not_relaxed:
         raise SystemExit(f"the loop ended: {report.ended} {report.not_relaxed}")
@@ -97,13 +115,13 @@ def envs(count: float, folder: Path) -> str:
         for _ in range(2):
             env.step(torch.zeros(worlds, 12))
         env.close()
-        (folder / "ready").touch()
+        tell(folder, k + 1)
     return f"{int(count)} environments made, stepped and closed"
 
 
 def diagnoses(count: float, folder: Path) -> str:
-    """Diagnoses of four short recordings each, effects hidden in turn, with their reports written; every tenth searches
-    among all effects, the others among three."""
+    """Diagnoses of four short recordings each, effects hidden in turn, with their reports written; every twentieth
+    searches among all effects, the others among three."""
     from dexsim.gap import demo
     from dexsim.gap.diagnosis import diagnose
     from dexsim.gap.report.files import save
@@ -127,13 +145,32 @@ def diagnoses(count: float, folder: Path) -> str:
             str(servo),
             replay="none",
             next_recording=False,
-            allowed=set(hidden) if k % 10 else None,
+            allowed=set(hidden) if k % 20 else None,
         )
         d = diagnose(asked, say=lambda _: None)
         save(d, out)
-        (folder / "ready").touch()
+        tell(folder, k + 1)
         named += any(f["effect"] == effect for f in d.data["findings"])
     return f"{int(count)} diagnoses, the hidden effect among the findings of {named}"
+
+
+def plays(count: float, folder: Path) -> str:
+    """`dexsim play` with the included grasp policy, its plots and a recording each time; prints memory."""
+    from dexsim.cli.main import main
+
+    heaps = []
+    for k in range(int(count)):
+        asked = ["episodes=2", "device=cpu", "video=false", f"seed={k % NEXT}", f"out={folder / 'play'}"]
+        with contextlib.redirect_stdout(io.StringIO()):
+            status = main(["play", f"checkpoint={ROOT / 'checkpoints' / 'grasp.pt'}", *asked,
+                           f"record={folder / 'recordings' / f'{k}.mcap'}"])  # fmt: skip
+        if status:
+            raise SystemExit(f"play {k}: status {status}")
+        tell(folder, k + 1)
+        heap, rss, files, threads = look(os.getpid())
+        heaps.append(heap)
+        print(f"play {k + 1}: heap {heap:.1f} MiB, resident {rss:.1f}, {files} files, {threads} threads", flush=True)
+    return f"{int(count)} plays, heap {heaps[0]:.0f} MiB after the first, {heaps[-1]:.0f} after the last"
 
 
 if __name__ == "__main__":
@@ -141,5 +178,5 @@ if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     where.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    done = {"deploy": deploy, "envs": envs, "diagnoses": diagnoses}[name](amount, where)
+    done = {"deploy": deploy, "envs": envs, "diagnoses": diagnoses, "plays": plays}[name](amount, where)
     print(f"{done}, in {time.monotonic() - began:.0f} s", flush=True)

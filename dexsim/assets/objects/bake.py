@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import files
 from dexsim.assets.objects.baking import pack, shape_from_hulls
 from dexsim.assets.objects.geometry import union_boundary
 from dexsim.assets.objects.shape import Shape
@@ -47,7 +48,7 @@ def contact_sheet(path: str | Path, shapes: dict[str, Shape] | None = None) -> N
         kept = ", kept for evaluation" if shape.held_out else ""
         axes.set_title(f"{shape.name}: {len(shape.hulls)} hull(s), {1e6 * shape.volume:.0f} cm³{kept}", fontsize=8)
     figure.tight_layout()
-    figure.savefig(path)
+    files.picture(figure, path)
 
 
 def main() -> None:
