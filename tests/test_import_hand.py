@@ -5,22 +5,27 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 import trimesh
 import yaml
 from scipy.spatial import ConvexHull
 
+from dexsim.cli import stable_grasps
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.hand.places import places
 from dexsim.import_hand import command, folder, geometry, moves, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
 from dexsim.tactile.layout import hand_layout
+from dexsim.tasks import make_fingertip_grasps
 from dexsim.tasks.reach import Reach
+from dexsim.tasks.stable_grasps import GraspSet
 from tests import hands
 
 
@@ -125,6 +130,35 @@ def test_fingertips_are_laid_against_the_sides_of_a_cube(claw):
             assert -np.sign(at[face]) * (out @ turn)[face] > 0.5  # the pad looks at the face
     assert found >= 2
     assert not len(reach.fitting(0, centre + [0.0, 0.0, 5 * hand.span], yaw, edge))
+
+
+def _briefly(real, *args):
+    """What a search keeps after a moment, whether it holds or not."""
+    out = real(*args)
+    return (out[0], torch.ones_like(out[1])) if isinstance(out, tuple) else torch.ones_like(out)
+
+
+def test_fingertips_alone_take_hold_of_opposite_faces(claw, tmp_path, monkeypatch):
+    """Whatever the hand: an opposing finger on one face, two others on the other, forces that sum to zero."""
+    hand, rng = load_hand(claw), np.random.default_rng(0)
+    pads = make_fingertip_grasps.Pads(hand, rng)
+    sizes = (0.4 * hand.span, 0.6 * hand.span)
+    grasps, share = make_fingertip_grasps.candidates(3, sizes, pads, rng)
+    assert np.abs(share.sum(1).numpy()).max() < 1e-12 and (share[:, 0].norm(dim=1) > 0).all()
+    assert ((share[:, 1:].norm(dim=2) > 0).sum(1) >= 2).all()
+    low, high = hand.limits.T
+    assert ((grasps.hand.numpy() >= low - 1e-5) & (grasps.hand.numpy() <= high + 1e-5)).all()
+    with pytest.raises(UserError, match="no opposing finger and 2 others reach opposite faces"):
+        make_fingertip_grasps.candidates(1, (5 * hand.span, 6 * hand.span), pads, rng)
+    for part in ("settle", "holds"):  # both are physics of seconds; what is around them runs as it is
+        real = getattr(make_fingertip_grasps, part)
+        monkeypatch.setattr(make_fingertip_grasps, part, partial(_briefly, real))
+    monkeypatch.setattr(make_fingertip_grasps, "FIRM", 0.05)
+    for name in ("WEIGHTLESS", "HOLD"):
+        monkeypatch.setattr(make_fingertip_grasps, name, 0.05)
+    asked = ["hold=fingertips", f"hand={claw}", "count=2", "worlds=3", "sim.threads=1", f"out={tmp_path / 'held.npz'}"]
+    assert stable_grasps.main(asked) == 0
+    assert GraspSet.load(tmp_path / "held.npz").hand.shape == (2, len(hand.joints))
 
 
 def test_shapes_are_capsules_and_cores_with_the_rubbers_margin(claw):

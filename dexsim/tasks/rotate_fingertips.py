@@ -57,7 +57,8 @@ class FingertipEnv(RotateEnv):
             edges, hand = [self.unit * x for x in self.sampler.range("object.size")[:2]], self.hand
             if hand.name != "xhand":
                 raise UserError(
-                    f"hand={hand.name}: has no cubes held by fingertips for this task to begin with; give"
+                    f"hand={hand.name}: has no cubes held by fingertips for this task to begin with; make them with"
+                    f" dexsim stable-grasps hold=fingertips hand={hand.folder} out=FILE, and give"
                     " task.initial.poses=FILE"
                 )
             self.grasps = GraspSet.load(FINGERTIPS).derived(hand.mirror, hand.scale).within(*edges).to(dev)
