@@ -200,7 +200,7 @@ class State:  # of the joint
     taken: f64  # share of the dry friction that is taken up
     integral: f64  # the controller's integral term
     since: f64  # s, since it was taken
-    fresh: bool
+    fresh: f64  # 1 before its first step (a bool's padding is copied with it, at the price of a division)
     older: f64  # what the age of its position makes of the torque that the loop asks for
 
 
@@ -222,6 +222,19 @@ class Now:  # what holds in one step of the grid
     drive: f64  # recorded input of the stage after the drive
     enabled: bool
     held: bool  # the recorded motion is held on the joint
+
+
+@wp.struct
+class Pair:  # rotor and link in one step of the grid, where they are two bodies
+    rotor: f64  # kg.m2
+    link: f64
+    stiff: f64  # of the spring between them
+    hardening: f64
+    damping: f64  # of the spring
+    rotor_rate: f64  # inertia over a sub-step
+    link_rate: f64
+    on_rotor: f64  # speed that the motor's torque gives the rotor in a sub-step,
+    on_both: f64  # and both
 
 
 @wp.struct
@@ -436,6 +449,26 @@ def body_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
 
 
 @wp.func
+def pair_now(c: Recorded, h: int, p: Guess, n: Now):
+    """What the sub-steps of rotor and link share: divisions and a root are most of what one costs."""
+    b = Pair()
+    if p.two:
+        b.rotor = wp.clamp(p.rotor, f64(0.03) * n.inertia, f64(0.97) * n.inertia)
+        b.link = n.inertia - b.rotor
+        b.stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
+        b.hardening = c.params[h, P_HARD]
+        if p.soft <= f64(0.0):
+            b.stiff = p.stop
+            b.hardening = f64(0.0)
+        b.damping = transmission_damping(c.params[h, P_REBOUND], b.stiff, b.rotor, b.link, n.inertia)
+        b.rotor_rate = b.rotor / p.dt
+        b.link_rate = b.link / p.dt
+        b.on_rotor = n.efficiency * p.dt / b.rotor
+        b.on_both = n.efficiency * p.dt / n.inertia
+    return b
+
+
+@wp.func
 def turned(gc: f64, gs: f64, dq: f64):
     """gc cos(dq) + gs sin(dq) [N.m]: the model's gravity at dq [rad] from where it was evaluated. Near there, where a
     step mostly is, by Taylor's series, true to 4e-12 and several times as fast."""
@@ -574,38 +607,19 @@ def one_body(x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f
 
 
 @wp.func
-def two_bodies(
-    c: Recorded,
-    h: int,
-    x: State,
-    t: Torque,
-    applied: f64,
-    load: f64,
-    level: f64,
-    stop_d: f64,
-    rotor: f64,
-    dt: f64,
-    p: Guess,
-    n: Now,
-):
+def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level: f64, stop_d: f64, dt: f64, p: Guess,
+               n: Now, b: Pair):  # fmt: skip
     """The step of rotor and link, joined by a spring with a gap: implicit in both speeds, so that no stiffness limits
     the step."""
     zero = f64(0.0)
     begun = x.v
     begun_m = x.vm
-    link = n.inertia - rotor
-    stiff = f64(1.0) / wp.max(p.soft, f64(1.0e-9))
-    hardening = c.params[h, P_HARD]
-    if p.soft <= zero:
-        stiff = p.stop
-        hardening = zero
-    damp = transmission_damping(c.params[h, P_REBOUND], stiff, rotor, link, n.inertia)
     twist = x.qm + dt * x.vm - x.q - dt * x.v
     kh = zero  # slope of the spring at this stretch
     pull = zero
     if wp.abs(twist) >= p.gap2:
-        spring = transmission(x.qm - x.q - wp.sign(twist) * p.gap2, stiff, hardening)
-        kh = spring[1] * dt + damp
+        spring = transmission(x.qm - x.q - wp.sign(twist) * p.gap2, b.stiff, b.hardening)
+        kh = spring[1] * dt + b.damping
         pull = spring[0]
     d_l = n.efficiency * t.on_loop
     d_m = n.efficiency * t.on_drive
@@ -613,12 +627,12 @@ def two_bodies(
         d_m = d_l + d_m
         d_l = zero
     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
-    a11 = rotor / dt + p.viscous * n.friction + kh + d_m
+    a11 = b.rotor_rate + p.viscous * n.friction + kh + d_m
     a12 = -kh + d_l
     a21 = -kh
-    a22 = link / dt + c.consts[C_DAMPING] + kh + stop_d
-    b1 = rotor / dt * x.vm + applied + d_m * x.vm + d_l * x.v - pull
-    b2 = link / dt * x.v - load + pull
+    a22 = b.link_rate + c.consts[C_DAMPING] + kh + stop_d
+    b1 = b.rotor_rate * x.vm + applied + d_m * x.vm + d_l * x.v - pull
+    b2 = b.link_rate * x.v - load + pull
     if n.held:  # link held
         a21 = zero
         a22 = f64(1.0)
@@ -646,7 +660,7 @@ def two_bodies(
     x.vm = x1
     x.qm += dt * x.vm
     if n.held:  # a held link must not let the rotor run past the play
-        wound = wp.abs(x.last) / stiff * f64(2.0)
+        wound = wp.abs(x.last) / b.stiff * f64(2.0)
         x.qm = wp.clamp(x.qm, x.q - p.gap2 - wound, x.q + p.gap2 + wound)
     else:
         x.v = x2
@@ -659,7 +673,7 @@ def two_bodies(
 
 
 @wp.func
-def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
+def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair):
     """The joint after a sub-step. visc: the model's damping and viscous friction [N.m.s/rad]."""
     dt = p.dt
     zero = f64(0.0)
@@ -678,7 +692,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
         if p.loop_motor:
             v_l = v_drive
     shows = shown_rate(q_l, p)
-    if x.fresh or p.speed_lag <= zero:
+    if x.fresh != zero or p.speed_lag <= zero:
         x.v_f = v_l
     else:
         x.v_f += p.filter * (v_l - x.v_f)
@@ -693,17 +707,18 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)
-    rotor = f64(0.0)
     body = n.inertia
+    gain = b.on_both
     if p.two:
-        rotor = wp.clamp(p.rotor, f64(0.03) * n.inertia, f64(0.97) * n.inertia)
         if wp.abs(x.qm - x.q) < p.gap2:
-            body = rotor
+            body = b.rotor
+            gain = b.on_rotor
     else:
         stiffness = n.efficiency * (p.kd + p.kp * dt)
         if p.voltage:
             stiffness = n.efficiency * n.tau0 * (n.supply * (p.kd + p.kp * dt) + f64(1.0) / n.no_load)
         theta = wp.clamp(half + half * ((stiffness + visc) * dt / n.inertia - f64(0.6)), half, f64(1.0))
+        gain = n.efficiency * (theta * dt) / n.inertia
     step = theta * dt
 
     # what the loop asks for, and what the motor gives of it
@@ -716,14 +731,13 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
         limits = torque_limits(n.tau0, speed, v_lim, p.steep)
     asked = wp.vec3d(u[0], u[1], u[2])
     if p.beyond:
-        if x.fresh and p.ki != zero:  # a drive that has been on before: its integral holds the load
+        if x.fresh != zero and p.ki != zero:  # a drive that has been on before: its integral holds the load
             x.integral = load / wp.max(n.efficiency, f64(0.01))
             if p.voltage:
                 x.integral = x.integral / (n.tau0 * n.supply)
         x.integral = wind(x.integral, x.since * p.ki * u[3], u[0] + n.feed + x.integral, limits[0], limits[1])
         x.since = dt
         asked = other_terms(u, n.feed, x.integral, p.ki, rate, shows, step)
-    gain = n.efficiency * step / body
     drift = -load * step / body
     t = Torque()
     if p.voltage:
@@ -738,9 +752,9 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
     t = opened(t, v_drive, p, n)
     if not n.enabled:
         x.integral = zero
-    if x.fresh:
+    if x.fresh != zero:
         x.last = t.now
-        x.fresh = False
+        x.fresh = zero
     before = x.last
     x.last = before + p.lag * (t.now - before)
     t.end = before + p.lag * (t.end - before)
@@ -763,7 +777,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now):
         load += p.stop * (x.q + dt * x.v - p.high)
         stop_d = p.stop * f64(0.02)
     if p.two:
-        x = two_bodies(c, h, x, t, applied, load, level, stop_d, rotor, dt, p, n)
+        x = two_bodies(c, x, t, applied, load, level, stop_d, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
     return x
@@ -781,7 +795,7 @@ def begun(c: Recorded, h: int, g: int, warm: int, p: Guess):
     x.qm = x.q
     x.vm = x.v
     x.v_f = x.v
-    x.fresh = True
+    x.fresh = f64(1.0)
     return x
 
 
@@ -846,11 +860,12 @@ def plant_kernel():
             n = drive_now(c, h, g, p, n)
             n = body_now(c, h, g, p, n)
             visc = c.consts[C_DAMPING] + p.viscous * n.friction
+            b = pair_now(c, h, p, n)
             n_sub = int(ONE_BODY_STEPS)
             if p.two:
                 n_sub = TWO_BODY_STEPS
             for _ in range(n_sub):
-                x = substep(c, h, x, visc, p, n)
+                x = substep(c, h, x, visc, p, n, b)
 
             if not (wp.abs(x.q) < f64(1.0e4)):  # diverged: keep it finite, far off
                 x.q = f64(1.0e4)
