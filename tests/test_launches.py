@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+import warp as wp
 from worlds import task_cfg
 
 from benchmarks import launches
+from dexsim.sim import warmup
 from dexsim.tasks import make_env
 
 MOST = {"grasp": 110, "rotate": 440}
@@ -23,6 +25,26 @@ def test_a_control_step_launches_few_kernels(task):
     assert all(found[name] for name in launches.PARTS), "a part launches nothing: it was not counted"
     assert total <= MOST[task], "\n".join(f"{n} {line}" for line, n in lines)
     env.close()
+
+
+@pytest.mark.parametrize("task", sorted(MOST))
+def test_what_a_step_launches_is_compiled_at_once(task, monkeypatch):
+    """Each module of the tasks' kernels is named before the first step: a GPU compiles one named later by itself."""
+    env = make_env(task_cfg(task=task, worlds=4), 4, "cpu", 0, "warp")
+    named = {module for module, _ in warmup.listed(env._name_kernels)}
+    launched, launch = set(), wp.launch
+
+    def noted(kernel, *args, **kwargs):
+        launched.add(kernel.module)
+        return launch(kernel, *args, **kwargs)
+
+    monkeypatch.setattr(wp, "launch", noted)
+    with launches.as_on_a_gpu(env):
+        for _ in range(3):
+            env.step(torch.zeros(4, env.num_actions))
+    env.close()
+    of_tasks = {m for m in launched if any(k.func.__module__.startswith("dexsim.tasks") for k in m.kernels.values())}
+    assert of_tasks and of_tasks <= named, {m.name for m in of_tasks - named}
 
 
 def test_what_is_counted():

@@ -30,10 +30,11 @@ from dexsim.hand.skin import tip_skins
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
+from dexsim.sim.warmup import compile_together
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
-from dexsim.tasks import state_kernels, worlds
+from dexsim.tasks import nan_dump, object_kernel, randomize, servos, state_kernels, worlds
 from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
@@ -171,6 +172,7 @@ class HandEnv(VecEnv):
         self._kernels()
         self._nan_dump, self.dump_folder = NanDump(self), Path()
         self.setup()
+        compile_together(self._name_kernels, device)
         self.reset_all()
 
     # -- for the task to fill in
@@ -385,6 +387,17 @@ class HandEnv(VecEnv):
         self.servo.reset(mask, target)
         self.touch.reset(mask)
         torch.where(mask[:, None], target, self.target, out=self.target)
+
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of a step beside its physics, one of each module at least; a task adds its own."""
+        real = self.engine.real
+        own = [self._read, state_kernels.act, nan_dump.keep_world]
+        return [*own, object_kernel.write_kernel(real), servos.draw_kernel(real), randomize.spread]
+
+    def _name_kernels(self) -> None:
+        """For `compile_together`, which asks of a launch only which kernel it is of."""
+        for kernel in self.kernels():
+            wp.launch(kernel, dim=1)
 
     def _clear_touch(self, mask: torch.Tensor) -> None:
         """Where mask [N] holds, nothing is touched: no force, centres at the pads' centres (poses are refreshed)."""

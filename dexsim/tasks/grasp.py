@@ -173,6 +173,9 @@ class GraspEnv(HandEnv):
             **self._hand_shape,
         )  # fmt: skip
 
+    def kernels(self) -> list[wp.Kernel]:
+        return [*super().kernels(), kernels.begin, kernels.orders_kernel(self.engine.real), grasp_rewards.rewards]
+
     def _launch(self, kernel: Any, dim: Any, *args: Any) -> None:
         inputs = [wp.from_torch(x) if isinstance(x, torch.Tensor) else x for x in args]
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)

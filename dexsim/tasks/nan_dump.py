@@ -39,7 +39,7 @@ def _copy_word(to: wp.uint64, source: wp.uint64, stride: wp.uint64, world: int, 
 
 
 @wp.kernel(enable_backward=False)
-def _keep(first: wp.array(dtype=int), taken: wp.array(dtype=wp.bool), fields: wp.array2d(dtype=wp.uint64)):
+def keep_world(first: wp.array(dtype=int), taken: wp.array(dtype=wp.bool), fields: wp.array2d(dtype=wp.uint64)):
     """Copies that world's row of every field (address, bytes between worlds, address to copy to, words of a world)."""
     f, lane = wp.tid()
     if first[0] == wp.static(_NONE) or taken[0]:
@@ -98,7 +98,7 @@ class NanDump:
         first, taken = wp.from_torch(self._first), wp.from_torch(self._taken)
         fields = wp.from_torch(self._fields, dtype=wp.uint64)
         wp.launch(_first, dim=len(nan), inputs=[wp.from_torch(nan)], outputs=[first], device=device)
-        wp.launch(_keep, dim=(len(self._fields), _THREADS), inputs=[first, taken, fields], device=device)
+        wp.launch(keep_world, dim=(len(self._fields), _THREADS), inputs=[first, taken, fields], device=device)
         wp.launch(_take, dim=1, inputs=[first, taken], outputs=[wp.from_torch(self._world)], device=device)
 
     def write(self, folder: Path) -> Path | None:
@@ -126,7 +126,7 @@ class NanDump:
 
 
 def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
-    """What `_keep` has to know of a field [N, ...]."""
+    """What `keep_world` has to know of a field [N, ...]."""
     if not source[0].is_contiguous() or source.element_size() % 4:
         raise ValueError(f"NanDump: a world's row of {tuple(source.shape)} {source.dtype} is not words in one piece")
     size = source.element_size()

@@ -19,7 +19,7 @@ _PLAIN, _LINEAR, _LOG = 0, 1, 2
 
 
 @wp.kernel(enable_backward=False)
-def _spread(
+def spread(
     kind: wp.array(dtype=int), table: wp.array2d(dtype=float), width: wp.array(dtype=float), u: wp.array2d(dtype=float)
 ):
     """Numbers in [0, 1) [R, N] to their ranges: (low, high - low) or, of a logarithmic one, (low, high / low)."""
@@ -62,7 +62,7 @@ class Plan:
         s = self._sampler
         u = torch.rand(self._uniform, s.n, generator=s.rng, device=s.device)
         args = [wp.from_torch(x) for x in (self._kinds, self._table, s.width.reshape(1), u)]
-        wp.launch(_spread, dim=u.shape, inputs=args, device=str(u.device))
+        wp.launch(spread, dim=u.shape, inputs=args, device=str(u.device))
         drawn = [*u.split([sum(n for _, n in rows) for rows in self._rows[:3]])]
         drawn.append(torch.randn(self._normal, s.n, generator=s.rng, device=s.device))
         out: dict[int, torch.Tensor] = {}

@@ -22,7 +22,7 @@ LANES = 64
 
 
 @cache
-def _kernel(real):
+def draw_kernel(real):
     @wp.kernel(module="unique", enable_backward=False)
     def draw(
         mask: wp.array(dtype=wp.bool),
@@ -92,7 +92,7 @@ class ServoRandomizer:
         place[self.simulated.cpu()] = torch.arange(len(self.simulated), dtype=torch.int32)
         own = (source.to(dev), times.to(dev), place.to(dev), servo.nominal, fitted, self.low, self.high, servo.params)
         self._args = [wp.from_torch(x) for x in own]
-        self._kernel = _kernel(wp.float64 if dtype == torch.float64 else wp.float32)
+        self._kernel = draw_kernel(wp.float64 if dtype == torch.float64 else wp.float32)
 
     def _check(self, name: str) -> None:
         """Raise UserError unless every value that a range can give is one that the servo can have."""
