@@ -19,7 +19,7 @@ from dexsim.tactile.layout import TaxelLayout, hand_layout
 
 RADIUS = 0.012  # m, of the ball
 STIFFNESS = 7000.0  # N/m of a fingertip, as in training
-PLANTED_DEAD, PLANTED_SWAP = (0.35, 0.36, 0.64), (0.25, 0.55)
+PLANTED_DEAD, PLANTED_SWAP = (0.35, 0.36, 0.645), (0.25, 0.55)
 """Faults that are planted in a pad, as shares of its taxels."""
 GAP = 0.0015  # m between skin and ball at the start
 RAMP_S, HOLD_S, RATE = 0.2, 0.4, 100.0
