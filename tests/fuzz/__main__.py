@@ -1,7 +1,8 @@
 """`python -m tests.fuzz [minutes=60] [cases=N] [kind=recording,servo,...] [from=SEED] [processes=1] [out=FOLDER]`:
 damaged files without end.
 
-Each case has a limit of 20 s of processor time and 2 GiB of memory. What breaks is kept in out= (out/fuzz) with its
+Each case has a limit of 20 s of processor time and 2 GiB of memory; one that is taken must be taken as it stands, or
+something said of it (`silence.py`). What breaks is kept in out= (out/fuzz) with its
 seed; `python -m tests.fuzz kind=servo from=123 cases=1` makes it again. Ends with status 1 where anything broke.
 kind=ci: every third a recording, as continuous integration runs it.
 """
@@ -27,6 +28,7 @@ from pathlib import Path
 from . import corpus, mutate, targets
 
 OTHERS = [k for k in targets.TARGETS if k != "recording"]
+OUTCOMES = ("fine", "refused", "traceback", "message", "silent", "over 20 s", "over 2 GB", "crash")
 SECONDS, BYTES = 20.0, 2 << 30
 BATCH = 200
 CI = [k for a, b in zip(OTHERS[::2], OTHERS[1::2], strict=True) for k in ("recording", a, b)]
@@ -38,7 +40,7 @@ class TooLong(BaseException):
 
 
 def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tuple[str, str, Path]:
-    """(fine, refused, traceback, over 20 s, over 2 GB, message; what, the file) of a case."""
+    """(fine, refused, traceback, over 20 s, over 2 GB, message, silent; what, the file) of a case."""
     mutate.clean(folder)
     path = mutate.case(kind, seed, files, folder)
 
@@ -49,7 +51,9 @@ def one(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> tup
     signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
     try:
         answer = targets.verdict(kind, path)
-        return (answer, "", path) if answer in ("fine", "refused") else ("message", answer, path)
+        if answer in ("fine", "refused"):
+            return answer, "", path
+        return "silent" if answer.startswith("silent: ") else "message", answer, path
     except TooLong:
         return "over 20 s", "", path
     except MemoryError:
@@ -164,8 +168,7 @@ def main(argv: list[str]) -> int:
         run = Run(kinds, int(given.get("from", 0)), int(given.get("cases", 10**12)), Path(given.get("out", "out/fuzz")),
                   files)  # fmt: skip
         run.go(int(given.get("processes", 1)), until)
-    names = ("fine", "refused", "traceback", "message", "over 20 s", "over 2 GB", "crash")
-    said = {"cases": sum(run.counts.values()), **{k: run.counts[k] for k in names}, "next": run.next}
+    said = {"cases": sum(run.counts.values()), **{k: run.counts[k] for k in OUTCOMES}, "next": run.next}
     print(json.dumps(said))
     return int(bool(run.broken))
 

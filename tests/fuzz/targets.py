@@ -4,103 +4,174 @@ from __future__ import annotations
 
 import contextlib
 import io
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
 from dexsim.calibration.file import Calibration
 from dexsim.cli import start
 from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.gap.read import channels, inputs
+from dexsim.gap.read.runs import Run
 from dexsim.paths import CONFIGS
-from dexsim.recording import metadata, read
+from dexsim.recording import metadata, read, write
 from dexsim.recording.mechanism import Mechanism
+from dexsim.recording.schema import COMMANDS, STATES, Recording
 from dexsim.tactile import file as tactile_file
 
-from . import corpus
+from . import corpus, silence
 
 MODEL = """<mujoco><worldbody><body><joint name="a" axis="0 1 0" range="-1 1" limited="true"/>
  <geom size=".02" mass=".1" pos="0 0 -.1"/>
 <body pos="0 0 -.2"><joint name="b" axis="0 1 0"/><geom size=".02" mass=".1" pos="0 0 -.1"/></body></body></worldbody>
  </mujoco>"""
+Told = set[tuple[str, str]]
+"""(topic, kind) of what was said of a recording; topic "" of the whole."""
+_sound: dict[str, Told] = {}
 
 
-def recording(path: Path) -> None:
-    r = read(path)
-    spec = mujoco.MjSpec.from_string(MODEL)
-    m = Mechanism(spec, corpus.JOINTS, ServoTable.from_dict(corpus.SERVO), "rig")
-    try:
-        run = inputs.to_run(read(path, joints=m.joints), m, [])
-    except inputs.Unusable:
-        return
-    model = spec.compile()
-    _, out, blind = channels.inspect([run], model, channels.spoiled([r]))
-    runs = channels.drop([run], out, [], model)
-    if blind:
-        runs, _ = inputs.free_air(runs, [], inputs.merged_spans(blind), [], "", "", (0.0, 0.0), inputs.SHORTEST)
+def recording(path: Path) -> str:
+    used = _used(path)
+    if used is None:
+        return ""
+    r, runs, told = used
     for run in runs:
         run.smooth()
         assert np.isfinite(run.q).all() and np.isfinite(run.cmd).all() and (np.diff(run.t) > 0).all(), (
             "a run that cannot be simulated"
         )
+    return silence.of_recording(path, r, runs, told - _always())
 
 
-def servo(path: Path) -> None:
+def _used(path: Path) -> tuple[Recording, list[Run], Told] | None:
+    """(what was read, the runs that a diagnosis would use, what it would say); None where it uses none, and says so."""
+    r = read(path)
+    spec = mujoco.MjSpec.from_string(MODEL)
+    m = Mechanism(spec, corpus.JOINTS, ServoTable.from_dict(corpus.SERVO), "rig")
+    notes: list[str] = []
+    try:
+        run = inputs.to_run(read(path, joints=m.joints), m, notes)
+    except inputs.Unusable:
+        return None
+    model = spec.compile()
+    found, out, blind = channels.inspect([run], model, channels.spoiled([r]))
+    runs = channels.drop([run], out, notes, model)
+    if blind:
+        runs, _ = inputs.free_air(runs, [], inputs.merged_spans(blind), notes, "", "", (0.0, 0.0), inputs.SHORTEST)
+    told = {(f.topic, f.kind) for f in r.findings if f.severity != "info"}
+    told |= {(topic, "channel") for f in found for topic in f["where"]["topics"]} | {("", "pause") for _ in blind}
+    for word, topic in (("position", STATES), ("command", COMMANDS)):
+        told |= {(topic, n) for n in notes if word in n}
+    return r, runs, told
+
+
+def _always() -> Told:
+    """What is said of a sound recording, too."""
+    if not _sound:
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder) / "sound.mcap", corpus.recording())
+            used = _used(Path(folder) / "sound.mcap")
+        assert used is not None
+        _sound["told"] = used[2]
+    return _sound["told"]
+
+
+def servo(path: Path) -> str:
     table = ServoTable.load(path)
     table.check_joints(corpus.JOINTS)
     for f in (table.nominal, table.bounds, table.unknown, table.current):
         f(corpus.JOINTS)
     for which in ("loop", "position"):
         table.encoder(which, corpus.JOINTS)
-    ServoTable.from_dict(table.to_dict())
+    taken = table.to_dict()
+    ServoTable.from_dict(taken)
+    return silence.of_settings(_said(path), taken)
 
 
-def calibration(path: Path) -> None:
+def calibration(path: Path) -> str:
     c = Calibration.load(path)
     assert np.isfinite(c.torque_norm(np.ones(12))).all() and np.isfinite(c.normal_force(np.ones((5, 120, 3)))).all()
-    Calibration.from_dict(c.to_dict())
+    taken = c.to_dict()
+    Calibration.from_dict(taken)
+    return silence.of_settings(_said(path), taken)
 
 
-def tactile(path: Path) -> None:
-    tactile_file.load(path)
+def tactile(path: Path) -> str:
+    return silence.of_settings(_said(path), tactile_file.load(path))
 
 
-def beside(path: Path) -> None:
+def _said(path: Path) -> Any:
+    return yaml_text.load(path, "what the file says")
+
+
+def beside(path: Path) -> str:
     """As the metadata file beside a recording."""
-    path.rename(path.with_name("case.mcap.yaml"))
+    path = path.rename(path.with_name("case.mcap.yaml"))
     stated, _ = metadata.collect(path.with_name("case.mcap"), {}, {})
     metadata.complete(stated, True, True)
+    said = {key: metadata._text(value) for key, value in (_said(path) or {}).items()}
+    return silence.of_settings(said, stated)
 
 
-def config(path: Path) -> None:
+def config(path: Path) -> str:
     from dexsim.recording.attached import fault
 
     assert "\n" not in fault(path.read_bytes().decode("utf-8", "replace"), "case config")
+    return ""
 
 
-def checkpoint(path: Path) -> None:
+def checkpoint(path: Path) -> str:
     """Loaded, and its settings completed, as play does before it builds anything."""
     start.for_play([f"checkpoint={path}", "device=cpu"], CONFIGS)
+    return ""
 
 
-def manifest(path: Path) -> None:
+def manifest(path: Path) -> str:
     bundle.load(path)
+    return ""
 
 
-def overrides(path: Path) -> None:
+def overrides(path: Path) -> str:
     """The settings of a training, as far as they are checked before anything heavy begins."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     if any(line.lstrip("+~").startswith(("servo_file", "resume", "tactile_file", "model_file")) for line in lines):
-        return
+        return ""
     with contextlib.redirect_stdout(io.StringIO()):
-        start.for_train(lines, CONFIGS)
+        made = start.for_train(lines, CONFIGS)
+    return "" if made is None else _typed(lines, made.cfg)
 
 
-TARGETS: dict[str, Callable[[Path], None]] = {
+def _typed(lines: list[str], cfg: dict[str, Any]) -> str:
+    """The first typed setting that is another in the settings that a training would begin with."""
+    parser, asked = OverridesParser.create(), {}
+    for line in lines:
+        if line.startswith(("~", "+", "--")) or "=" not in line:
+            continue
+        override = parser.parse_override(line)
+        if not override.is_sweep_override():
+            asked[override.key_or_group] = override.value()
+    for key, value in asked.items():
+        here: Any = cfg
+        for part in key.split("."):
+            here = here.get(part) if isinstance(here, dict) else None
+        group = isinstance(here, dict) and not isinstance(value, dict)
+        if group or any(other.startswith(f"{key}.") for other in asked):
+            continue  # a group, or a part of it is typed, too
+        found = silence.of_settings(value, here, key)
+        if found:
+            return found
+    return ""
+
+
+TARGETS: dict[str, Callable[[Path], str]] = {
     "recording": recording,
     "servo": servo,
     "calibration": calibration,
@@ -114,9 +185,10 @@ TARGETS: dict[str, Callable[[Path], None]] = {
 
 
 def verdict(kind: str, path: Path) -> str:
-    """"fine", "refused", or what is wrong with how the file was answered."""
+    """"fine", "refused", or what is wrong with how the file was answered ("silent: ..." where a file was taken for
+    another than it is without a word)."""
     try:
-        TARGETS[kind](path)
+        silent = TARGETS[kind](path)
     except UserError as error:
         text = str(error)
         if "\n" in text:
@@ -126,4 +198,4 @@ def verdict(kind: str, path: Path) -> str:
             if "case" in text or "servo of" in text or kind == "overrides"
             else f"the file is not named: {text[:200]}"
         )
-    return "fine"
+    return f"silent: {silent}" if silent else "fine"

@@ -12,8 +12,10 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dexsim.recording import write
+
 from . import __main__ as program
-from . import corpus, mutate, strategies, targets
+from . import corpus, mutate, silence, strategies, targets
 
 SHORT = settings(
     max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
@@ -84,6 +86,7 @@ FOUND = [
     ("checkpoint", 0),
     ("checkpoint", 1165),
     ("overrides", 1153),
+    ("recording", 70119),
 ]
 """Cases of long runs that once broke something."""
 
@@ -91,6 +94,36 @@ FOUND = [
 @pytest.mark.parametrize(("kind", "seed"), FOUND)
 def test_what_once_broke(kind, seed, files, tmp_path):
     assert targets.verdict(kind, mutate.case(kind, seed, files, tmp_path)) in WELL
+
+
+def test_settings_taken_for_others_are_found():
+    said = {"a": {"kp": 1.5, "kd": [0.01, 0.03]}, "delay": {"value": 2, "low": 1, "high": 3}, "none": None}
+    taken = {"a": {"kp": 1.5, "kd": {"value": 0.02, "low": 0.01, "high": 0.03}}, "delay": [1.0, 3.0]}
+    assert silence.of_settings(said, taken) == ""
+    assert silence.of_settings({"a": {"kp": 9.0}}, {"a": {"kp": 5.0}}) == "a.kp=9.0 was taken for 5.0"
+    assert silence.of_settings({"a": 1, "b": 2}, {"a": 1}) == "b=2 was left out"
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda r: None, ""),
+        (lambda r: r.states.position.value.__setitem__((slice(60, 64), 0), 0.9), "position of a"),  # no single spikes
+        (lambda r: setattr(r.commands, "t", r.commands.t + 0.3), "command of a"),
+        (lambda r: r.states.position.value.__setitem__((slice(60, 150, 10), 0), 2.0), ""),  # spikes: left out, and said
+    ],
+    ids=["sound", "wrong", "late", "spikes"],
+)
+def test_a_recording_used_for_another_is_found(change, found, tmp_path, monkeypatch):
+    """Where the audit is taken away, what is wrong is found out; with it, it is said."""
+    r = corpus.recording(3.0, tactile=False)
+    r.states.position.value[:3] = silence.signal(r.states.position.t[:3] - 0.03)
+    change(r)
+    write(tmp_path / "x.mcap", r)
+    _, runs, told = targets._used(tmp_path / "x.mcap")
+    told -= targets._always()
+    assert silence.of_recording(tmp_path / "x.mcap", r, runs, set()).startswith(found) or found == ""
+    assert (silence.of_recording(tmp_path / "x.mcap", r, runs, told) == "") == (found == "")
 
 
 @given(st.text(max_size=80))
