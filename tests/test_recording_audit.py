@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import recordings
 
-from dexsim.recording import Series, read, write
+from dexsim.recording import Series, audit_time, read, write
 from dexsim.recording.audit import KINDS, audit, table
 from dexsim.recording.command import main
 from dexsim.recording.schema import DUTY
@@ -352,3 +352,13 @@ def test_the_command_line(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "lost_sign" in out and "/joint_states" in out
     assert main(["--help"]) == 0 and "wrap" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3, 1e6])
+def test_times_of_two_units_are_said(unit):
+    r = recordings.signal(3.0)
+    assert not [f for f in audit_time.between_topics(r) if "another unit" in f.text]
+    r.states.position.t = r.states.position.t * unit
+    said = [f for f in audit_time.between_topics(r) if "another unit" in f.text]
+    assert {(f.kind, f.severity) for f in said} == {("clock_skew", "error")}
+    assert r.commands.topic in [f.topic for f in said]

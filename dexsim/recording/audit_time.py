@@ -13,6 +13,8 @@ GAP = 3.5  # periods without a sample
 SKEW_S = 0.010  # s between header.stamp and host time that a transport does not explain
 DRIFT_PPM = 200.0
 LEAD_S = 0.005  # s by which a response may seem to come before its command
+TIME_UNITS = (1e3, 1e6, 1e9)
+"""ms, us and ns in a second."""
 SHIFT_S = 0.2  # s by which one topic's whole span may be shifted against another's
 EPOCH_S = 1e6  # s: stamps this far off count from another zero
 
@@ -172,7 +174,19 @@ def between_topics(r: Recording) -> Iterator[Finding]:
         if other is None or len(other) < 20:
             continue
         first, last = other.t[0] - state.t[0], other.t[-1] - state.t[-1]
-        if (
+        spans = float(other.t[-1] - other.t[0]), float(state.t[-1] - state.t[0])
+        longer = max(spans) / max(min(spans), 1e-12)
+        if any(abs(longer / unit - 1) < 0.2 for unit in TIME_UNITS):
+            yield Finding(
+                "clock_skew",
+                other.topic,
+                float(other.t[0]),
+                len(other),
+                f"spans {spans[0]:.4g} s, {state.topic} {spans[1]:.4g} s: the times of one are of another unit",
+                "error",
+                end=float(other.t[-1]),
+            )
+        elif (
             min(abs(first), abs(last)) > SHIFT_S
             and first * last > 0
             and abs(first - last) < 0.3 * max(abs(first), abs(last))

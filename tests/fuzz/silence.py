@@ -55,7 +55,7 @@ def of_recording(path: Path, r: Recording, runs: list[Run], words: set[tuple[str
             values = np.unique(x[off])
             if len(values) == 1 and abs(values[0]) < POSSIBLE and off.any(1).mean() > 0.1:
                 continue
-            if off.any() and not any(about in (topic, "") for about, _ in words):
+            if off.any() and not any(about in (topic, "") or kind == "clock_skew" for about, kind in words):
                 i, j = (int(v) for v in np.argwhere(off)[0])
                 return (f"{what} of {run.joints[j]} is {x[i, j]:.4g} at {t[i]:.4g} s, and was {true[i, j]:.4g} when it"
                         f" was recorded ({int(off.sum())} such samples); nothing is said of it")  # fmt: skip
@@ -66,6 +66,8 @@ def of_settings(said: Any, taken: Any, path: str = "") -> str:
     """The first value of a file's tree that is not, or is another, in what was taken; "" where all are there."""
     if isinstance(said, Mapping) and isinstance(taken, (list, tuple)):  # a range
         said = [said.get("low"), said.get("high")]
+    if isinstance(said, Mapping) and set(said) == {"value"} and not isinstance(taken, Mapping):
+        said = said["value"]
     if isinstance(taken, Mapping) and isinstance(said, (list, tuple)):
         taken = [taken.get("low"), taken.get("high")]
     if isinstance(said, Mapping):
