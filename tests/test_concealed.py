@@ -447,7 +447,7 @@ def test_scores_by_hand():
 def test_eight_cases_end_to_end_and_resumed(tmp_path, capsys, monkeypatch):
     """Effects, nothing missing, a pair, a decoy, one outside the catalogue: diagnosed by the command; then again from
     the disk."""
-    line = command.main(["ci=true", "seed=2", "jobs=2", "limit=600", f"out={tmp_path}"])
+    line = command.main(["ci=true", "seed=2", "jobs=2", "limit=240", f"out={tmp_path}"])
     assert line["cases"] == sum(command.CI.values()) == 8 and line["failed"] == line["left_out"] == 0
     assert line["lines"]["confident and wrong, all cases"]["value"] <= 0.34
     assert line["lines"]["false alarm, nothing missing"]["value"] <= 0.5

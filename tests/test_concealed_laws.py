@@ -34,26 +34,29 @@ def last(x: np.ndarray) -> np.ndarray:
     return x[..., -300:].mean(-1)
 
 
-def drag(speed: np.ndarray, external: float = 0.0, **values) -> np.ndarray:
-    """[rows] torque that moves rows at steady speeds."""
+def drag(speed: np.ndarray, external=0.0, **values) -> np.ndarray:
+    """[rows] torque that moves rows at steady speeds, pushed by `external` (a number or one a row)."""
     t = np.arange(1500) * 1e-3
-    o = run(len(speed), 1500, (speed[:, None] * t)[:, None], external=external, **(FREE | values))
+    push = np.broadcast_to(external, len(speed))[:, None, None]
+    o = run(len(speed), 1500, (speed[:, None] * t)[:, None], external=push, **(FREE | values))
     return last(o["torque"][:, 0])
 
 
 def test_friction_curves():
-    v = np.array([0.1, 0.2, 0.4, 0.8])
-    for power in (2.0, 1.0):  # at the speed v_s either has 1/e of its peak
-        peak = drag(v, coulomb=0.05, peak=0.1, peak_speed=0.2, peak_power=power) - 0.05
-        assert peak == pytest.approx(0.1 * np.exp(-((v / 0.2) ** power)), abs=1e-3)
-    v = np.array([0.5, 1.5, 4.5])
-    assert drag(v, shear=0.02, shear_speed=1.5) == pytest.approx(0.02 * v / (1 + v / 1.5), rel=0.01)
-    assert drag(v, viscous=0.02) == pytest.approx(0.02 * v, rel=0.01)
-    v = np.array([1.0, 1.0, -1.0, -1.0])
-    power = np.array([1.0, 2 / 3, 1.0, 2 / 3])
-    force = drag(v, -0.4, load=0.2, load_back=0.3, load_power=power, load_unit=0.1) - 0.4
-    bent = np.where(power < 1, 0.1 * 4 ** (2 / 3), 0.4)
-    assert force == pytest.approx(np.where(v > 0, 0.2, -0.3) * bent, rel=0.02)
+    """Five laws in the rows of one run, each absent in the others' rows."""
+    v = [np.array([0.1, 0.2, 0.4, 0.8])] * 2 + [np.array([0.5, 1.5, 4.5])] * 2 + [np.array([1.0, 1.0, -1.0, -1.0])]
+    row = np.repeat(np.arange(5), [len(x) for x in v])
+    power = np.where(row == 4, np.tile([1.0, 2 / 3], 9), 1.0)
+    on = lambda size, *rows: np.where(np.isin(row, rows), size, 0.0)  # noqa: E731
+    force = drag(np.concatenate(v), on(-0.4, 4), coulomb=on(0.05, 0, 1), peak=on(0.1, 0, 1), peak_speed=0.2,
+                 peak_power=np.where(row == 0, 2.0, 1.0), shear=on(0.02, 2), shear_speed=1.5, viscous=on(0.02, 3),
+                 load=on(0.2, 4), load_back=on(0.3, 4), load_power=power, load_unit=0.1)  # fmt: skip
+    for k, power_ in enumerate((2.0, 1.0)):  # at the speed v_s either has 1/e of its peak
+        assert force[row == k] - 0.05 == pytest.approx(0.1 * np.exp(-((v[k] / 0.2) ** power_)), abs=1e-3)
+    assert force[row == 2] == pytest.approx(0.02 * v[2] / (1 + v[2] / 1.5), rel=0.01)
+    assert force[row == 3] == pytest.approx(0.02 * v[3], rel=0.01)
+    bent = np.where(power[row == 4] < 1, 0.1 * 4 ** (2 / 3), 0.4)
+    assert force[row == 4] - 0.4 == pytest.approx(np.where(v[4] > 0, 0.2, -0.3) * bent, rel=0.02)
 
 
 def test_ideal_friction_does_not_give_way_below_its_level():
