@@ -4,16 +4,17 @@ release the interpreter.)"""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
 
 WORTH = 20_000  # steps of guesses that a part has at least: about 2 ms, beside the tenth of one that a launch takes
 
-_searches = 1
+_busy = 0  # parts under way
+_lock = threading.Lock()
 
 
 def cores() -> int:
@@ -24,22 +25,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@contextmanager
-def shared_by(searches: int) -> Iterator[None]:
-    """So many searches run at a time: each launch has its share of the cores."""
-    global _searches
-    before, _searches = _searches, searches
-    try:
-        yield
-    finally:
-        _searches = before
-
-
 def parts(steps: np.ndarray, guesses: int) -> list[tuple[slice, slice]]:
-    """What of windows of `steps` [W], and which of the guesses, each thread of a launch simulates: cut between windows,
-    or between guesses where that is more even."""
+    """What of windows of `steps` [W], and which of the guesses, each thread of a launch simulates: as many parts as
+    cores are free, cut between windows, or between guesses where that is more even."""
     total = int(steps.sum()) * guesses
-    count = max(min(cores() // _searches, total // WORTH), 1)
+    count = max(min(cores() - _busy, total // WORTH), 1)
     every, everyone = slice(0, len(steps)), slice(0, guesses)
     if count == 1:
         return [(every, everyone)]
@@ -54,11 +44,16 @@ def parts(steps: np.ndarray, guesses: int) -> list[tuple[slice, slice]]:
 
 def run(work: Callable[[slice, slice], None], split: Sequence[tuple[slice, slice]]) -> None:
     """work(windows, guesses) of each part, side by side."""
+    global _busy
+    with _lock:
+        _busy += len(split)
     others = [_pool().submit(work, *part) for part in split[1:]]
     try:
         work(*split[0])
     finally:
         wait(others)  # they write to memory of the caller's
+        with _lock:
+            _busy -= len(split)
     for done in others:
         done.result()
 

@@ -12,7 +12,6 @@ from dexsim.gap.plant import side_by_side
 
 T = TypeVar("T")
 MOST_CPU, MOST_GPU = 8, 12  # searches at a time: each takes some hundred MB
-CORES = 2  # of a CPU that a search has at least: one simulates while the other also computes
 # s that a lane may keep the interpreter while another waits for it after a launch (Python: 5 ms, as long as a launch of
 # few guesses)
 SWITCH = 2e-4
@@ -20,10 +19,9 @@ SWITCH = 2e-4
 
 def lanes(device: str, jobs: int) -> int:
     """How many searches run at a time. On a GPU all of them: what one thread computes on the CPU, another's launch
-    hides. On a CPU one for every `CORES` of its cores."""
-    if device != "cpu":
-        return max(1, min(jobs, MOST_GPU))
-    return max(1, min(jobs, MOST_CPU, side_by_side.cores() // CORES))
+    hides. On a CPU as many as it has cores: what one computes in Python, another's launch hides, in parts on all cores
+    that are free."""
+    return max(1, min(jobs, MOST_GPU if device != "cpu" else min(MOST_CPU, side_by_side.cores())))
 
 
 def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]], T], device: str,
@@ -52,8 +50,7 @@ def together(names: Sequence[str], work: Callable[[int, Callable[[float], None]]
         pool, switch = ThreadPoolExecutor(at_once), sys.getswitchinterval()
         sys.setswitchinterval(SWITCH)
         try:
-            with side_by_side.shared_by(at_once):
-                out = list(pool.map(one, range(len(names))))
+            out = list(pool.map(one, range(len(names))))
         finally:
             pool.shutdown(cancel_futures=True)  # what has begun ends, nothing else begins
             sys.setswitchinterval(switch)
