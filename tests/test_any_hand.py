@@ -19,6 +19,8 @@ from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
+from dexsim.recording import led_object, mechanism, read
+from dexsim.recording.compare import compare
 from dexsim.tasks import make_env
 from dexsim.tasks.env import UNIT_SPAN
 from dexsim.tasks.make_grasps import generate
@@ -153,3 +155,19 @@ def test_a_hand_that_a_policy_was_not_trained_for_is_refused(hands, tmp_path):
     train(["task=grasp", f"hand={hands[False]}", *FEW, "iterations=1", "final_episodes=0", f"out={out}"])
     with pytest.raises(UserError, match="joint|observation|layout|action"):
         play([f"checkpoint={out}/policy.pt", "hand=xhand", "episodes=1", "device=cpu", "video=false"])
+
+
+def test_a_play_of_another_hand_is_replayed_with_its_object(hands, tmp_path):
+    """Recorded in the task, replayed by the commands alone: the object is led, and each fingertip's force is there."""
+    out, folder = tmp_path / "run", hands[True]
+    train(["task=grasp", f"hand={folder}", *FEW, "iterations=1", "final_episodes=0", f"out={out}"])
+    record = tmp_path / "play.mcap"
+    assert play([f"checkpoint={out}/policy.pt", "episodes=2", "worlds=2", "device=cpu", "video=false",
+                 f"record={record}", f"out={tmp_path}/played"]) == 0  # fmt: skip
+    r = read(record)
+    m = mechanism.for_recording(r, folder)
+    assert led_object.add_object(m, r) == "led" and m.hand.name == "made"
+    run = mechanism.replay(r, m, 0.007, led_object.pairs(m.hand), led_object.JOINT)
+    c = compare(r, run, m, forces=True)
+    assert c.fingers == ("a", "b", "t") and c.finger_force_simulated[1].shape[1] == 3
+    assert np.median(c.position_rmse()) < 0.05

@@ -335,7 +335,7 @@ def test_a_play_is_replayed_the_same_until_the_object_is_touched(played):
     r = read(paths[0])
     m = mech.for_recording(r)
     assert led_object.add_object(m, r) == "led"
-    run = mech.replay(r, m, env.engine.dt, led_object.PAIRS, led_object.JOINT)
+    run = mech.replay(r, m, env.engine.dt, led_object.pairs(m.hand), led_object.JOINT)
     c = compare(r, run, m, forces=True)
     touched = [k for k, row in enumerate(seen) if row[-1][0]]
     free = c.t < (touched[0] + 0.1) * env.dt  # seen[k] is the end of step k, in which it may have touched
@@ -400,7 +400,7 @@ def test_the_object_of_a_real_recording_is_placed(played, tmp_path):
     for name, stated in (("marked", None), ("led", box)):
         m = mech.for_recording(r)
         assert led_object.add_object(m, r, stated) == name
-        run = mech.replay(r, m, env.engine.dt, led_object.PAIRS, led_object.JOINT)
+        run = mech.replay(r, m, env.engine.dt, led_object.pairs(m.hand), led_object.JOINT)
         forces[name] = run.pair_normal
         np.testing.assert_allclose(run.qpos[0, -7:-4], r.object_pose.value[0, :3], atol=1e-3)
         assert np.abs(np.diff(run.qpos[:, -7:-4], axis=0)).max() > 1e-4, "it moves along"

@@ -122,7 +122,7 @@ def run(play: dict[str, Any]) -> int:
     if play["object"] is not None and not led:
         raise UserError(
             f"object={play['object'].shape}: recording {path} has no /object_pose in the palm frame"
-            " for it, or model= is not the xHand"
+            " for it, or model= is not a hand"
         )
     out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
     print(
@@ -136,7 +136,7 @@ def run(play: dict[str, Any]) -> int:
         flush=True,
     )
     result = mechanism.replay(
-        recording, m, timestep, led_object.PAIRS if led else (), led_object.JOINT if placed != "none" else None
+        recording, m, timestep, led_object.pairs(m.hand) if led else (), led_object.JOINT if placed != "none" else None
     )
     c = compare.compare(recording, result, m, forces=led)
     position, effort = c.position_rmse(), c.effort_rmse()
@@ -185,9 +185,7 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
     state = recording.states.position
     force, names = (None, None), ()
     if c.force_unit == "N" and (c.finger_force is not None or c.finger_force_simulated is not None):
-        from dexsim.assets import xhand
-
-        names = xhand.FINGERS
+        names = m.hand.finger_names if m.hand else ()
         force = tuple(
             None if s is None else np.stack([np.interp(frames, s[0], x) for x in s[1].T], 1)
             for s in (c.finger_force, c.finger_force_simulated)
@@ -201,7 +199,7 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
         clips.append(Clip(model, seen, "recorded", force[0]))
     clips.append(Clip(model, result.qpos, "simulated", force[1]))
     camera = None
-    if m.robot != "xhand_right":
+    if m.hand is None:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         camera = {

@@ -12,7 +12,6 @@ import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402  (pyplot would keep every figure alive)
 
 from dexsim import files  # noqa: E402
-from dexsim.assets import xhand  # noqa: E402
 from dexsim.recording.mechanism import Mechanism, Run  # noqa: E402
 from dexsim.recording.schema import Recording  # noqa: E402
 
@@ -25,7 +24,7 @@ class Comparison:
 
     effort is in N.m: a recorded current is divided by the A per N.m that is known (`effort_scale` [J]) or, where
     none is (`fitted` [J] bool), by the one that fits best here. finger_force, finger_force_simulated: (t, [T, F]) or
-    None; force_unit: N or count.
+    None; force_unit: N or count; fingers: their names, none where the model is no hand.
     """
 
     joints: tuple[str, ...]
@@ -40,6 +39,7 @@ class Comparison:
     finger_force: tuple[np.ndarray, np.ndarray] | None = None
     finger_force_simulated: tuple[np.ndarray, np.ndarray] | None = None
     force_unit: str = "N"
+    fingers: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
 
     def position_rmse(self) -> np.ndarray:
@@ -86,6 +86,7 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
     out = Comparison(
         recording.joints, t, run.target[held][:, columns], position, at(run.position), effort, simulated, scale, fitted
     )
+    out.fingers = m.hand.finger_names if m.hand is not None else ()
     if recording.tactile is not None:
         known = recording.tactile_lsb is not None
         touch = recording.tactile_newtons() if known else recording.tactile
@@ -130,7 +131,7 @@ def plots(c: Comparison, folder: Path, title: str) -> list[Path]:
             if s is not None
         ]
         count = max(s[1].shape[1] for _, _, s in series)
-        names = xhand.FINGERS if count == len(xhand.FINGERS) else tuple(f"pad {k}" for k in range(count))
+        names = c.fingers if count == len(c.fingers) else tuple(f"pad {k}" for k in range(count))
         figure, axes = _grid(count)
         for k, (ax, name) in enumerate(zip(axes, names, strict=False)):
             for label, colour, (t, value) in series:

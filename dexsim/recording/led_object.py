@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from dexsim import yaml_text
-from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
+from dexsim.hand import Hand
+from dexsim.hand.model import HAND_BIT, OBJECT_BIT
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.sim import ContactPair
@@ -23,13 +24,15 @@ TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-PAIRS = tuple(
-    ContactPair(f, ("geom", geom), ("body", NAME)) for f, geom in zip(xhand.FINGERS, xhand.TIP_GEOMS, strict=True)
-)
-"""Fingertip on object, one a finger."""
-
-
 MARKER = 0.015  # m, radius of what stands for an object of unknown shape: seen, not felt
+
+
+def pairs(hand: Hand) -> tuple[ContactPair, ...]:
+    """Fingertip on object, one a finger; a fingertip of several geoms counts as its whole distal link."""
+    return tuple(
+        ContactPair(f.name, ("geom", f.geoms[0]) if len(f.geoms) == 1 else ("body", f.body), ("body", NAME))
+        for f in hand.fingers
+    )
 
 
 @dataclass(frozen=True)
@@ -80,14 +83,14 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     """Add the recorded object to the hand's scene (in place), with its contact stiffness and friction: "led". The
     object follows its recorded path: fingers press on it, it does not yield, so forces follow the error of the joints
     rather than the balance of a grasp. "marked": its path is known and its shape is not, a small ball that touches
-    nothing shows where it was. "none": no path was recorded, or the mechanism is not the hand. stated: what it is;
+    nothing shows where it was. "none": no path was recorded, or the mechanism is not a hand. stated: what it is;
     default: what the recording says."""
     config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else None
     config = config if isinstance(config, dict) else {}
     about = config.get("recorded_world", {}).get("object") if stated is None else stated.about()
     if (
         recording.object_pose is None
-        or m.robot != "xhand_right"
+        or m.hand is None
         or not np.isfinite(recording.object_pose.value).all(1).any()
     ):
         return "none"
@@ -105,7 +108,7 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
         return "marked"
     shape, size = library()[about["shape"]], np.array(about["size"], float)
     common: dict[str, Any] = dict(
-        contype=xhand.OBJECT_BIT, conaffinity=xhand.HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
+        contype=OBJECT_BIT, conaffinity=HAND_BIT, condim=4, density=0.0, friction=[1e-3, 1e-4, 1e-4]
     )
     if shape.kind in TYPES:
         body.add_geom(type=TYPES[shape.kind], size=size, **common)
@@ -117,19 +120,19 @@ def add_object(m: Mechanism, recording: Recording, stated: Stated | None = None)
     body.explicitinertial, body.mass = True, about["mass"]
     body.inertia = [0.1 * about["mass"] * extent**2] * 3
     contact = config.get("task", {}).get("contact", {})
-    _contact(m.spec, about, float(contact.get("impedance", 0.9)))
-    _solver(m.spec, config.get("sim", {}))
+    _contact(m.spec, m.hand, about, float(contact.get("impedance", 0.9)))
+    _solver(m.spec, m.hand, config.get("sim", {}))
     return "led"
 
 
-def _contact(spec: mujoco.MjSpec, about: dict[str, Any], d: float) -> None:
+def _contact(spec: mujoco.MjSpec, hand: Hand, about: dict[str, Any], d: float) -> None:
     """Friction on the hand, stiffness and damping of the tips: see `tasks.objects.Objects`."""
     model = spec.compile()
     for geom in spec.geoms:
         if not geom.contype or geom.parent.name == NAME:
             continue
         geom.friction[0] = about["friction"]
-        if geom.name in xhand.TIP_GEOMS:
+        if geom.name in hand.tip_geoms:
             a = (
                 model.body_invweight0[model.geom(geom.name).bodyid[0], 0]
                 + model.body_invweight0[model.body(NAME).id, 0]
@@ -139,10 +142,10 @@ def _contact(spec: mujoco.MjSpec, about: dict[str, Any], d: float) -> None:
             geom.solref = [-k, -2 * about["damping_ratio"] * np.sqrt(k)]
 
 
-def _solver(spec: mujoco.MjSpec, sim: dict[str, Any]) -> None:
+def _solver(spec: mujoco.MjSpec, hand: Hand, sim: dict[str, Any]) -> None:
     """As in the hand's tasks (`tasks.env`), so that a play is repeated as it was."""
     for joint in spec.joints:
-        if joint.name in xhand.JOINTS:
+        if joint.name in hand.joints:
             joint.solimp_friction, joint.solref_friction = [0.97, 0.99, 1e-3, 0.5, 2.0], [0.02, 1.0]
     for key in ("impratio", "ls_iterations", "noslip_iterations"):
         if key in sim:

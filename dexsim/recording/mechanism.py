@@ -19,26 +19,27 @@ import yaml
 from dexsim import files, yaml_text
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
-from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.schema import FILE as HAND_FILE
-from dexsim.paths import CONFIGS
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
 MAX_MODEL = 64 << 20  # bytes of a model file
+XHAND = "xhand"  # the hand where no model is given
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
 
 @dataclass
 class Mechanism:
-    """A model and what is believed of its drives. joints: the driven ones, in the order of every [J] array."""
+    """A model and what is believed of its drives. joints: the driven ones, in the order of every [J] array; hand: where
+    the model is one."""
 
     spec: mujoco.MjSpec
     joints: tuple[str, ...]
     table: ServoTable
     robot: str
+    hand: Hand | None = None
 
     @property
     def limits(self) -> np.ndarray:
@@ -60,11 +61,6 @@ class Mechanism:
         return np.where(np.isfinite(speed), speed, MAX_SPEED)
 
 
-def xhand_servo_dict() -> dict[str, Any]:
-    """The xHand's nominal servo table: `dexsim/configs/servo/xhand.yaml`."""
-    return yaml.safe_load((CONFIGS / "servo" / "xhand.yaml").read_text(encoding="utf-8"))
-
-
 def of_hand(
     hand: Hand, servo: str | Path | dict | None = None, gravity: Sequence[float] | None = None
 ) -> Mechanism:
@@ -73,7 +69,7 @@ def of_hand(
     _hold_friction(spec)
     if gravity is not None:
         spec.option.gravity = [float(g) for g in gravity]
-    return Mechanism(spec, hand.joints, _table(hand.servo_path if servo is None else servo), hand.robot)
+    return Mechanism(spec, hand.joints, _table(hand.servo_path if servo is None else servo), hand.robot, hand)
 
 
 def mechanism(
@@ -88,15 +84,11 @@ def mechanism(
     joints: the driven ones; by default those of the xHand, else every hinge and slide of the model. gravity: [3] m/s2,
     world frame. Raises UserError for a model or servo that does not serve.
     """
-    if model is None:
-        spec, robot = xhand.hand_spec(), "xhand_right"
-        _hold_friction(spec)
-        table = _table(servo if servo is not None else xhand_servo_dict())
-    elif (folder := _hand_folder(model)) is not None:
-        hand = load_hand(folder)
-        spec, robot, joints = hand.spec(), hand.robot, hand.joints if joints is None else joints
-        _hold_friction(spec)
-        table = _table(hand.servo_path if servo is None else servo)
+    hand = None
+    if (folder := XHAND if model is None else _hand_folder(model)) is not None:
+        own = of_hand(load_hand(folder), servo)
+        spec, robot, table, hand = own.spec, own.robot, own.table, own.hand
+        joints = own.joints if joints is None else joints
     else:
         path = Path(model).expanduser()
         files.check(path, MAX_MODEL, f"model={model}:")
@@ -115,13 +107,13 @@ def mechanism(
     hinges = [
         j.name for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and j.name
     ]
-    chosen = tuple(joints) if joints is not None else (xhand.JOINTS if model is None else tuple(hinges))
+    chosen = tuple(joints) if joints is not None else tuple(hinges)
     for joint in chosen:
         if joint not in hinges:
             raise UserError(f"joint '{joint}' is not in {model or 'the xHand'}; its joints: {', '.join(hinges)}")
     if not chosen:
         raise UserError(f"model={model}: has no named hinge or slide joint to drive")
-    return Mechanism(spec, chosen, table, robot)
+    return Mechanism(spec, chosen, table, robot, hand)
 
 
 def _hand_folder(model: str | Path) -> Path | None:
