@@ -415,6 +415,10 @@ def test_one_world_out_of_rows_is_seen_among_others(fresh):
     e.t.overflow[1], e.t.overflow[2] = lost, 1 << 9
     with pytest.raises(UserError):
         e.check_overflow()
+    if e.kind == "warp":
+        e.t.overflow[1] = 1 << 2
+        with pytest.raises(UserError, match="pairs that come near, which count against sim.nconmax"):
+            e.check_overflow()
     e.t.overflow[1] = 0
     e.check_overflow()
     assert not e.t.overflow.any()

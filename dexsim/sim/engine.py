@@ -15,6 +15,7 @@ from dexsim.errors import UserError
 
 FLAG_NAN = 1 << 30
 """Bit of `Engine.t.flags`: a state of this world is not finite (or its speed is absurd)."""
+NEAR_BIT = 1 << 2  # of MuJoCo-Warp: more pairs of geoms come near each other than sim.nconmax has room for
 OVERFLOW_BITS = (1 << 0) | (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4) | (1 << 8)
 """Bits of `Engine.t.flags` that mean lost contacts or constraint rows (MuJoCo-Warp's OverflowType)."""
 
@@ -49,6 +50,11 @@ def geoms_of(model: mujoco.MjModel, kind: str, name: str) -> np.ndarray:
     else:
         raise UserError(f"contact pair: kind '{kind}' of '{name}' must be geom, body or subtree")
     raise UserError(f"contact pair: no {kind} named '{name}' in the model")
+
+
+def _pairs(flags: int) -> str:
+    """What the peak of contacts does not show."""
+    return ", pairs that come near, which count against sim.nconmax too" if flags & NEAR_BIT else ""
 
 
 class Engine:
@@ -168,8 +174,8 @@ class Engine:
         if flags:
             p = self.peaks()
             raise UserError(
-                f"contact overflow (flags {flags:#x}): peak {p['contacts']:.1f} contacts a world of sim.nconmax={p['nconmax']} on "
-                f"average, {p['rows']:.0f} constraint rows of sim.njmax={p['njmax']}; raise the one that is full "
+                f"contact overflow (flags {flags:#x}{_pairs(flags)}): peak {p['contacts']:.1f} contacts a world of"
+                f" sim.nconmax={p['nconmax']} on average, {p['rows']:.0f} constraint rows of sim.njmax={p['njmax']}; raise the one that is full "
                 f"(e.g. sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
             )
         self.t.overflow.zero_()
