@@ -19,6 +19,8 @@ NEXT = 7
 """Numbers of worlds and seeds of the environments repeat after as many."""
 
 
+SAID = 20
+"""Environments between two lines about memory: what is seen from outside is that of an environment or of none."""
 TOLD = 5000
 """Readings of the loop between two notes of how far it is."""
 
@@ -116,6 +118,8 @@ def envs(count: float, folder: Path) -> str:
             env.step(torch.zeros(worlds, 12))
         env.close()
         tell(folder, k + 1)
+        if k % SAID == 0 or k + 1 == int(count):
+            print(f"environment {k + 1}: heap {look(os.getpid())[0]:.1f} MiB when it is closed", flush=True)
     return f"{int(count)} environments made, stepped and closed"
 
 
