@@ -296,6 +296,13 @@ def test_a_run_folder_is_never_overwritten(configs, place, capfd, run_folder):
     assert (run_folder / "last.pt").read_bytes() == before
 
 
+def test_a_run_that_saved_nothing_is_not_one_to_continue(configs, place, capfd):
+    Path("began").mkdir()
+    Path("began/config.yaml").touch()
+    said = refused(capfd, configs, *QUICK, "out=began")
+    assert "already holds a run" in said and "resume=" not in said
+
+
 def test_full_disk_in_training_keeps_the_last_checkpoint(configs, place, capfd, monkeypatch):
     real, saves = os.fsync, []
 

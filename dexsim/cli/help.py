@@ -35,7 +35,7 @@ examples:
   dexsim play replay=rig.mcap model=rig.xml servo=rig.yaml remap./joint_states=/rig/states meta.effort_is=current_A
 """
 END = """
-  dexsim {script} --cfg      every setting with the value it would have, then stop
+  dexsim {script} --cfg      every setting, those in groups too (task.rewards.force, ...), with its value, then stop
 """
 
 

@@ -121,7 +121,7 @@ def _final_episodes(runner: Runner, cfg: dict[str, Any], where: Path) -> int:
     episodes = cfg["final_episodes"]
     if not episodes:
         return 0
-    print(f"\nplaying {episodes} episodes")
+    print(f"\nplaying {episodes} episodes for metrics and a video (final_episodes=0: none)", flush=True)
     out = folder.make(where / "play", "out=")
     about = {"checkpoint": str(where / "policy.pt"), "iteration": runner.iteration, "versions": machine.versions()}
     try:

@@ -21,10 +21,9 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
         probe.write_bytes(b"x")
         probe.unlink()
         if empty and any(not (p.name.startswith(".writable.") and p.suffix == ".tmp") for p in folder.iterdir()):
-            raise UserError(
-                f"{folder} already holds a run: choose another {setting}, or continue it with"
-                f" resume={folder / 'last.pt'}"
-            )
+            last = folder / "last.pt"  # a run that ended before it was saved has none
+            go_on = f", or continue it with resume={last}" if last.is_file() else ""
+            raise UserError(f"{folder} already holds a run: choose another {setting}{go_on}")
     except OSError as error:
         raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
     return folder

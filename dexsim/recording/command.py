@@ -15,6 +15,9 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(
             "usage: dexsim audit FILE [remap.OURS=THEIRS ...] [meta.KEY=VALUE ...]\n\n"
+            "Say what is in a recording (MCAP, a ROS 2 bag's folder, CSV or NPZ with named columns) and what is wrong "
+            "with it.\n\n"
+            "example:\n  dexsim audit a.mcap remap./joint_states=/xhand/state\n\n"
             "kinds of findings:"
         )
         print("\n".join(f"  {kind:<20}{text}" for kind, text in KINDS.items()))

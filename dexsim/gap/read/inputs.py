@@ -116,7 +116,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
             values = values / per[None]
             if np.isnan(per).all():
                 notes.append(
-                    f"{name}: current_per_torque is unknown, so the current is not compared (python calibrate.py "
+                    f"{name}: current_per_torque is unknown, so the current is not compared (dexsim calibrate "
                     "measures it)"
                 )
         if values is not None and np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0:
