@@ -422,3 +422,15 @@ def test_every_setting_has_a_line_in_the_help(name):
     names = [f"{k}.{i}" for k, v in content.items() if isinstance(v, dict) for i in v]
     names += [k for k, v in content.items() if not isinstance(v, dict)]
     assert sorted(names) == sorted(row[0] for row in lines(path))
+
+
+@pytest.mark.parametrize("line, said", [
+    ("+agent.actor.hidden_dims.task=[16,16]", "agent.actor.hidden_dims is a list"),
+    ("hand=" + "a" * 300, "must be one of xhand, or a folder with a hand.yaml"),
+])  # fmt: skip
+def test_a_name_in_a_list_and_a_name_too_long_for_a_file_are_one_line(line, said, capsys):
+    from dexsim.cli.main import main
+
+    assert main(["train", "task=grasp", "device=cpu", "worlds=1", "iterations=1", line]) == 2
+    out = "".join(capsys.readouterr())
+    assert said in out and "Traceback" not in out

@@ -129,7 +129,11 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
         value = item.value()
         if item.type == OverrideType.CHANGE:
             _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
-        OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
+        try:
+            OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
+        except ValueError:  # a name where a list has numbers
+            owner = key.rpartition(".")[0]
+            raise UserError(f"{key}: {owner} is a list, whose values are numbered: {owner}.0=..., or [..]") from None
     return cfg
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -214,7 +215,8 @@ def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
     plain = settings.resolve(cfg)
     plain["device"] = device
     hand = Path(str(plain["hand"])).expanduser()
-    if hand.exists() and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
+    # os.path: a name that is too long for a file is none
+    if os.path.exists(hand) and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
         plain["hand"] = str(hand.resolve())
     objects.apply(plain)
     return plain

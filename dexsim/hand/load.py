@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copyreg
 import difflib
+import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,15 +45,15 @@ def _file(which: str | Path) -> Path:
     if text in known():
         return HANDS / text / FILE
     path = Path(text).expanduser()
-    if path.is_dir() and (path / FILE).is_file():
+    if os.path.isfile(path / FILE):  # not Path's, which raises where a name is too long for a file
         return (path / FILE).resolve()
-    if path.is_file() and path.name == FILE:
+    if path.name == FILE and os.path.isfile(path):
         return path.resolve()
     near = difflib.get_close_matches(text, known(), 1)
     raise UserError(
         f"hand={text}: must be one of {', '.join(known())}, or a folder with a {FILE}"
         + (f"; did you mean {near[0]}?" if near else "")
-        + (f"; {path} has no {FILE}: write one, {schema.SEE}" if path.is_dir() else "")
+        + (f"; {path} has no {FILE}: write one, {schema.SEE}" if os.path.isdir(path) else "")
     )
 
 
