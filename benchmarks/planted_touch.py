@@ -1,7 +1,7 @@
 """Planted touch and contact effects, several sizes and seeds: python -m benchmarks.planted_touch [seeds=2]
 [load_cell=true] [only=EFFECT].
 
-Three recordings of 8 s a case from the simulated press rig (`dexsim.gap.touch.press_rig`: MuJoCo's contact geometry,
+Three recordings of 8 s a case from the simulated press rig (`benchmarks.press_rig`: MuJoCo's contact geometry,
 the taxel kernels that train policies, counts of 0.1 N, a load cell with 20 mN of noise). Right: named first, or in a
 set of its class. One JSON line at the end. Then the same motion is felt by the sensor that trains, first as believed,
 then with what tactile.yaml hands on: the rms difference where a taxel reads anything (of a rubber, at the force that
@@ -49,8 +49,8 @@ def main(argv: list[str]) -> int:
         if not equals or key not in s:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
+    from benchmarks import press_rig
     from dexsim.gap.touch import handed_on as touch_handed
-    from dexsim.gap.touch import press_rig
     from dexsim.gap.touch.diagnosis import diagnose
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
@@ -112,7 +112,7 @@ def main(argv: list[str]) -> int:
 
 def _felt_again(folder: Path, paths: list[Path], h, planted: dict, seed: int, again: list) -> str:
     """The recorded motion felt by the sensor that trains, as believed and with what is handed on; in words."""
-    from dexsim.gap.touch import press_rig
+    from benchmarks import press_rig
     from dexsim.recording import read
 
     recorded = [read(p, audit=False) for p in paths]

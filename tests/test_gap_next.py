@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_gap import demo, model, plant_run
 
+from benchmarks import press_rig
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import EFFECTS, members, separating
@@ -14,7 +15,6 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.report import next_recording
 from dexsim.gap.search.search import JointSearch, Member
-from dexsim.gap.touch import press_rig
 from dexsim.recording import excitation, read
 from dexsim.recording.mechanism import Mechanism
 

@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks import press_rig
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, touch_confusable
 from dexsim.gap.judge import confidence
@@ -15,7 +16,6 @@ from dexsim.gap.read import inputs
 from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import plant as touch_plant
-from dexsim.gap.touch import press_rig
 from dexsim.gap.touch import read as touch_read
 from dexsim.gap.touch import search as touch_search
 from dexsim.gap.touch.diagnosis import diagnose as diagnose_touch

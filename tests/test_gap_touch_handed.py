@@ -10,16 +10,16 @@ import yaml
 from bundles import make_checkpoint
 from worlds import grasp_cfg, grasp_env, task_cfg
 
+from benchmarks import press_rig
 from dexsim.assets import xhand
 from dexsim.cli import help as help_page
 from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
-from dexsim.gap.touch import press_rig
 from dexsim.gap.touch.handed_on import HEAD, chord, handed
 from dexsim.gap.touch.handed_on import save as write
-from dexsim.gap.touch.settings import PadFacts
+from dexsim.gap.touch.result import PadFacts
 from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.tactile.file import load

@@ -225,7 +225,7 @@ def test_everything_at_once_reads_as_the_plant_of_the_diagnosis(tmp_path):
     counts."""
     from test_gap_touch import collected
 
-    from dexsim.gap.touch import press_rig
+    from benchmarks import press_rig
 
     pads = {"index": {"gain": 0.8, "crosstalk": 0.25, "hysteresis": 0.3, "hysteresis_time": 0.4, "delay": 2 / 90}}
     paths = press_rig.record(tmp_path, 1, 5.0, seed=3, sensor={"pads": pads})

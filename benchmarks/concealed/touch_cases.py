@@ -94,8 +94,8 @@ REFIT = {"stiffness": 0.05, "gain": 0.05, "zero": 1.5e-4, "along": 6e-4, "across
 
 def bench(finger: str, where: Path):
     """The rig as it is believed (rig.xml, rig's servo.yaml in `where`) and its pad for the plant."""
+    from benchmarks.press_rig import RADIUS, SERVO, spec
     from dexsim.assets import xhand
-    from dexsim.gap.touch.press_rig import RADIUS, SERVO, spec
 
     s, _, press, slide = spec(finger)
     model = s.compile()

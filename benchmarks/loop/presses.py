@@ -40,7 +40,7 @@ DRAWN = 0.25  # share of what was found by which training draws about it, at mos
 
 def rig(finger: str):
     """The press rig of `touch_rig` with a third slide, so that the ball reaches all of the pad: spec."""
-    from dexsim.gap.touch import press_rig
+    from benchmarks import press_rig
 
     s, _, direction, along = press_rig.spec(finger)
     side = s.body("slider")
@@ -73,7 +73,7 @@ def path(places: list[tuple[float, float]], onset, rng: np.random.Generator) -> 
 def record(given: dict[str, str]) -> None:
     """Writes SETS recordings of one fingertip, the rig's model and its drives (which nothing commands: the slides are
     led by hand)."""
-    from dexsim.gap.touch.press_rig import SERVO
+    from benchmarks.press_rig import SERVO
     from dexsim.sim.quiet import quiet_warp
 
     quiet_warp("cpu")
@@ -101,9 +101,9 @@ class Sensor:
     def __init__(self, world: dict, finger: str, pinched: bool = False):
         import torch
 
+        from benchmarks.press_rig import RADIUS
         from dexsim.assets import xhand
         from dexsim.assets.objects import library
-        from dexsim.gap.touch.press_rig import RADIUS
         from dexsim.tactile.layout import xhand_layout
         from dexsim.tactile.posed import PosedEngine
         from dexsim.tactile.shapes import ShapeSet

@@ -16,7 +16,7 @@ from dexsim.gap.effects.controller_term import ControllerTerm
 from dexsim.gap.effects.coulomb_friction import CoulombFriction
 from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.effects.deadband import Deadband
-from dexsim.gap.effects.effect import Effect, Variant
+from dexsim.gap.effects.effect import Effect, TouchEffect, Variant
 from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.effects.gain_mismatch import GainMismatch
 from dexsim.gap.effects.inertia import Inertia
@@ -39,7 +39,6 @@ from dexsim.gap.effects.thermal import Thermal
 from dexsim.gap.effects.torque_limit import TorqueLimit
 from dexsim.gap.effects.torque_ripple import TorqueRipple
 from dexsim.gap.effects.torque_speed_limit import TorqueSpeedLimit
-from dexsim.gap.effects.touch_effect import TouchEffect
 from dexsim.gap.effects.viscous_friction import ViscousFriction
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.touch_effect import TouchEffect
+from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.touch.plant import shear
-from dexsim.gap.touch.settings import PadSettings, fitted
+from dexsim.gap.touch.result import PadSettings, fitted
 
 if TYPE_CHECKING:
     from dexsim.gap.touch.read import PadRun

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dexsim.gap.effects.touch_effect import TouchEffect
-from dexsim.gap.touch.settings import PadSettings, fitted, instead, times
+from dexsim.gap.effects.effect import TouchEffect
+from dexsim.gap.touch.result import PadSettings, fitted, instead, times
 
 if TYPE_CHECKING:
     from dexsim.gap.touch.search import TouchTrial

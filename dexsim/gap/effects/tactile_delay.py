@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from dexsim.gap.effects.touch_effect import TouchEffect
-from dexsim.gap.touch.settings import PadSettings, fitted
+from dexsim.gap.effects.effect import TouchEffect
+from dexsim.gap.touch.result import PadSettings, fitted
 
 
 class TactileDelay(TouchEffect):

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.touch_effect import TouchEffect
+from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.touch.plant import readings
-from dexsim.gap.touch.settings import Fit, PadSettings, fitted, instead, times, wide
+from dexsim.gap.touch.result import Fit, PadSettings, fitted, instead, times, wide
 
 if TYPE_CHECKING:
     from dexsim.gap.touch.read import PadRun

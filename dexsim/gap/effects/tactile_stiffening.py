@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from dexsim.gap.effects.touch_effect import TouchEffect
+from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.touch.plant import THICKNESS
-from dexsim.gap.touch.settings import PadSettings, fitted, ranged, wide
+from dexsim.gap.touch.result import PadSettings, fitted, ranged, wide
 from dexsim.tactile.pads import PAD_COLUMNS
 
 

@@ -20,9 +20,8 @@ from dexsim.gap.touch import constant_taxels, locate, report
 from dexsim.gap.touch.handed_on import handed
 from dexsim.gap.touch.judge import PadAnswer
 from dexsim.gap.touch.read import PadRun, TouchData, collect, stretches
-from dexsim.gap.touch.result import TouchResult
+from dexsim.gap.touch.result import PadFacts, TouchResult
 from dexsim.gap.touch.search import PadOutcome, PadSearch
-from dexsim.gap.touch.settings import PadFacts
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 

@@ -19,7 +19,7 @@ import yaml
 from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.touch.settings import Fit, PadFacts, PadSettings, ranged, times
+from dexsim.gap.touch.result import Fit, PadFacts, PadSettings, ranged, times
 from dexsim.tactile.config import COLUMNS
 from dexsim.tactile.file import RANGES
 from dexsim.tactile.pads import PAD_COLUMNS

@@ -16,8 +16,8 @@ from dexsim.gap.touch import constant_taxels, locate
 from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.handed_on import chord
 from dexsim.gap.touch.plant import PARAMS, contact, readings
+from dexsim.gap.touch.result import Fit, PadFacts
 from dexsim.gap.touch.search import PadOutcome, PadSearch
-from dexsim.gap.touch.settings import Fit, PadFacts
 from dexsim.recording.schema import TACTILE
 
 

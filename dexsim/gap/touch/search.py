@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
+from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.effects.tactile_gain import TactileGain
-from dexsim.gap.effects.touch_effect import TouchEffect
 from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.plant import PARAMS, readings

@@ -1,4 +1,4 @@
-"""A press rig with hidden effects, for tests and the demo of touch: one xHand fingertip, a ball on two slides, 120
+"""A press rig with hidden effects, for tests and benchmarks of touch: one xHand fingertip, a ball on two slides, 120
 taxels, a load cell.
 
 The ball's motion and the contact's depth come from MuJoCo's geometry (the tip's hull), the readings from the touch
