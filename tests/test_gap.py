@@ -15,11 +15,10 @@ from dexsim.actuator import reference
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import command, demo
+from dexsim.gap import command, demo, locate
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
 from dexsim.gap.judge import errors
-from dexsim.gap.locate import bins
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build, noise
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
@@ -235,15 +234,15 @@ def test_map_finds_the_regime_and_controls_false_discoveries():
     speed, other = rng.uniform(0, 1, n), rng.uniform(0, 1, n)
     block = np.arange(n) // 50
     plain = rng.standard_normal(n)
-    found = bins.control(
-        bins.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng)
+    found = locate.control(
+        locate.spots("j", np.where(speed > 0.75, 3.0, 1.0) * plain, block, {"speed": speed, "load": other}, rng)
     )
     assert found and found[0].regime == "speed" and found[0].low > 0.7 and found[0].text == found[0].where
-    both = bins.control(
-        bins.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found
+    both = locate.control(
+        locate.spots("j", np.where(speed > 0.75, 9.0, 3.0) * plain, block, {"speed": speed}, rng, "effort") + found
     )
     assert both[0].of == "position" and both[-1].of == "effort" and both[-1].text.startswith("effort, speed")
-    assert not bins.control(bins.spots("j", plain, block, {"speed": speed, "load": other}, rng))
+    assert not locate.control(locate.spots("j", plain, block, {"speed": speed, "load": other}, rng))
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.7])

@@ -12,9 +12,8 @@ from dexsim.gap.effects.thermal import temperature_follows
 from dexsim.gap.judge import confidence, verdict
 from dexsim.gap.judge.confidence import Evidence
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.param import Param, at_bound
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import bounds
 
 DOUBTED = JUDGE.doubted
 CASE = SimpleNamespace(
@@ -58,16 +57,16 @@ def test_all_sizes_must_hold_nothing_and_shapes_do_not_count():
 
 def test_a_size_at_its_bound_is_told_from_one_at_nothing():
     # less than none cannot be, and some is believed
-    assert bounds.at_bound([viscous()], {"coefficient": 0.0}, CASE) == "coefficient"
-    assert bounds.at_bound([viscous()], {"coefficient": 0.01}, CASE) == ""
+    assert at_bound([viscous()], {"coefficient": 0.0}, CASE) == "coefficient"
+    assert at_bound([viscous()], {"coefficient": 0.01}, CASE) == ""
     turns = Param("per_turn", ("ripple_per_turn",), "set", 3.92, 4.08, 4.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"ripple_per_turn": 0.0}))
-    assert bounds.at_bound([turns], {"per_turn": 4.08}, case) == "per_turn"
+    assert at_bound([turns], {"per_turn": 4.08}, case) == "per_turn"
     coulomb = Param("torque", ("coulomb_friction",), "set", 0.0, 1.0, 0.0)
-    assert bounds.at_bound([coulomb], {"torque": 0.0}, CASE) == ""
+    assert at_bound([coulomb], {"torque": 0.0}, CASE) == ""
     scale = Param("scale", ("position_scale",), "set", 0.7, 1.4, 1.0)
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"position_scale": 1.0}))
-    assert [bounds.at_bound([scale], {"scale": x}, case) for x in (1.3986, 1.37, 1.0, 0.701)] == [
+    assert [at_bound([scale], {"scale": x}, case) for x in (1.3986, 1.37, 1.0, 0.701)] == [
         "scale",
         "",
         "",
@@ -75,7 +74,7 @@ def test_a_size_at_its_bound_is_told_from_one_at_nothing():
     ]
     gap = Param("gap", ("backlash",), "set", 0.0015, 0.4, 0.0015)  # begins near nothing: a small one is not at a bound
     case = SimpleNamespace(scales=SimpleNamespace(nominal={"backlash": 0.0}))
-    assert bounds.at_bound([gap], {"gap": 0.004}, case) == ""
+    assert at_bound([gap], {"gap": 0.004}, case) == ""
 
 
 def test_what_the_error_kept_out_does_not_ask_for_is_not_sure():

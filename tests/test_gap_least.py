@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, errors
+from dexsim.gap.judge import confidence, errors, joint
 from dexsim.gap.judge.joint import JointAnswer
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import bounds
 
 ROWS = 400
 
@@ -79,7 +78,7 @@ def test_a_name_is_doubted_by_the_interval_that_is_reported(monkeypatch, narrow,
     monkeypatch.setattr(confidence, "holds_nothing", lambda params, spread, case: spread)
     for name in ("too_small", "unresolved"):
         monkeypatch.setattr(confidence, name, lambda *_: "")
-    monkeypatch.setattr(bounds, "at_bound", lambda *_: "")
+    monkeypatch.setattr(joint, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
     evidence = JointAnswer._weighed(answer, answer.member, {}, narrow, 1.0, 0.1, False)
     assert len(evidence.reasons) == doubted and all("nothing is missing" in r for r in evidence.reasons)

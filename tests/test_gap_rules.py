@@ -11,13 +11,12 @@ import pytest
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
 
-from dexsim.gap import rules
+from dexsim.gap import locate, rules
 from dexsim.gap.drives import Drives
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
 from dexsim.gap.judge.joint import JointAnswer, stretched
-from dexsim.gap.locate import bins
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.report import sections
 from dexsim.gap.search import selection
@@ -508,8 +507,8 @@ def test_what_the_rest_depends_on_is_said_where_much_is_left():
         answer = SimpleNamespace(search=search, none=trial, best=trial,
                                  case=SimpleNamespace(joint="j", sigma=1.0, regimes={}))  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(bins, "spots", lambda *_: [SimpleNamespace(text="while it moves fast")])
-            patch.setattr(bins, "control", lambda spots: spots)
+            patch.setattr(locate, "spots", lambda *_: [SimpleNamespace(text="while it moves fast")])
+            patch.setattr(locate, "control", lambda spots: spots)
             JointAnswer.locate(answer, None, 0)
         assert (answer.depends_on == ["while it moves fast (j)"]) is said, left
 

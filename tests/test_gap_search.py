@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from dexsim.gap import parallel
 from dexsim.gap.command import Progress
 from dexsim.gap.judge import conclude, errors, verdict
 from dexsim.gap.judge.joint import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.param import Param
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import parallel
 from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, subset
 from tests.test_gap import model, plant_run
@@ -179,7 +179,7 @@ def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeyp
             tell(part)
         return k
 
-    assert parallel.together(["knuckle"], work, "cpu", Progress()) == [0]
+    assert parallel.map_joints(["knuckle"], work, "cpu", Progress()) == [0]
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == [
         "searching knuckle (1/1)",

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dexsim.gap.drives import Drives, cannot_be_seen
-from dexsim.gap.inquiry import Inquiry, read_files, to_runs
+from dexsim.gap.inquiry import Inquiry, NothingToJudge, read_files, to_runs
 from dexsim.gap.judge import not_considered
 from dexsim.gap.report.files import save
 from dexsim.gap.report.next_recording import plan_next
 from dexsim.gap.result import Diagnosis, Settings, empty
 from dexsim.gap.search.time_limit import TimeLimit
-from dexsim.gap.steps import NothingToJudge
 from dexsim.gap.touch.diagnosis import Touch
 
 

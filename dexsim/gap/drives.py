@@ -12,10 +12,11 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
-from dexsim.gap.inquiry import Inquiry
+from dexsim.gap.inquiry import Inquiry, NothingToJudge, Steps
 from dexsim.gap.judge import errors, full_model, not_considered, residual_fit
 from dexsim.gap.judge.conclude import Noise, add_behind, assemble
 from dexsim.gap.judge.joint import JointAnswer, Kept
+from dexsim.gap.parallel import map_joints, workers
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.coupled_motion import again, coupled, sharpen
 from dexsim.gap.read import end_stops, inputs, keep_out, stage_tests
@@ -25,9 +26,7 @@ from dexsim.gap.report.next_recording import rival_of
 from dexsim.gap.result import Diagnosis
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import baseline, external_force, torque_told
-from dexsim.gap.search.parallel import lanes, together
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
-from dexsim.gap.steps import NothingToJudge, Steps
 from dexsim.gap.touch.result import TouchResult
 
 # of what is left of a joint: by as much it must change with what is known of the others to be searched again
@@ -150,12 +149,12 @@ class Drives(Steps):
         self._left = len(self.cases)  # joints that are still to be searched: they share the time
         linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
         if linked:
-            first = together([c.joint for c in self.cases], self._start, w.settings.device)
+            first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
             if all(t is not None for t in first):
                 self._coupled_by(first)
             w.clock.lap("model along the motion")
         self._test_stages()
-        answers = together([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
+        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
         if linked:
             self._search_again(answers)
         for search, found in answers:
@@ -179,7 +178,7 @@ class Drives(Steps):
     def _begun(self, k: int, tell: Callable[[float], None]) -> JointSearch:
         """The search of one joint, not yet run."""
         w, case = self.w, self.cases[k]
-        deadline = w.limit.share(case.joint, min(1.0, lanes(w.settings.device, len(self.cases)) / max(self._left, 1)))
+        deadline = w.limit.share(case.joint, min(1.0, workers(w.settings.device, len(self.cases)) / max(self._left, 1)))
         return JointSearch(
             case,
             self.parts.train,
@@ -229,7 +228,7 @@ class Drives(Steps):
         ]
         self._left = len(unsettled)
         joints = [self.cases[k].joint for k in unsettled]
-        renewed = together(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
+        renewed = map_joints(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
         for k, answer in zip(unsettled, renewed, strict=True):
             answers[k] = answer
 

@@ -1,8 +1,10 @@
-"""What a diagnosis is asked and has read: mechanism, recordings, their runs, what is wrong with signals. Every part
-begins from it."""
+"""A diagnosis under way: the `Inquiry` that every part of a machine begins from (mechanism, recordings, their runs,
+what is wrong with signals) and the `Steps` that each is taken through, its drives (`gap.drives`) and its touch
+(`gap.touch.diagnosis`) alike."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +15,7 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.gap.read import channels, inputs
 from dexsim.gap.read.runs import Run
-from dexsim.gap.result import Clock, Settings
+from dexsim.gap.result import Clock, Diagnosis, Settings
 from dexsim.gap.search.time_limit import TimeLimit
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
@@ -55,6 +57,45 @@ class Inquiry:
     def nothing_left(self) -> bool:
         """Whether no run is left, or none that is fitted."""
         return not self.runs or bool(self.settings.held_out and len(self.held) == len(self.runs))
+
+
+class NothingToJudge(Exception):
+    """A part of which nothing can be said, and why."""
+
+
+class Steps(ABC):
+    """One part of a machine under diagnosis. Each step keeps what it found out for the next ones; any may raise
+    NothingToJudge."""
+
+    @abstractmethod
+    def read(self) -> None:
+        """What of the recordings tells of this part alone, as arrays."""
+
+    @abstractmethod
+    def model(self) -> None:
+        """The plant that simulates it along the recordings, what is kept out of the fit, and the noise."""
+
+    @abstractmethod
+    def search(self) -> None:
+        """Which effects it has: scan, fit, select on conditions left out."""
+
+    @abstractmethod
+    def locate(self) -> None:
+        """Where and in which regime the believed simulator, its uncertain figures refitted, parts from the
+        recordings."""
+
+    @abstractmethod
+    def judge(self) -> None:
+        """Findings, confidences and errors on what was kept out of the fit."""
+
+    @abstractmethod
+    def report(self, d: Diagnosis) -> None:
+        """Adds the answer to a diagnosis: findings, verdict, sentence, what is handed on to training."""
+
+    def run(self) -> None:
+        """All steps up to the judgement, in order."""
+        for step in (self.read, self.model, self.search, self.locate, self.judge):
+            step()
 
 
 def read_files(w: Inquiry) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from dexsim.actuator.table import ServoTable
+from dexsim.gap import locate
 from dexsim.gap.judge import confidence, full_model, residual_fit
-from dexsim.gap.locate import bins
 from dexsim.gap.search.search import Outcome
 from dexsim.gap.search.time_limit import TimeLimit
 from dexsim.gap.touch.result import TouchResult
@@ -62,7 +62,7 @@ class Diagnosis:
     sentence: str
     notes: list[str]
     curves: list[Curve] = field(default_factory=list)
-    spots: list[bins.Spot] = field(default_factory=list)
+    spots: list[locate.Spot] = field(default_factory=list)
     # by joint: before, after, sigma; as_fitted: after, where it was taken back
     joints: dict[str, dict[str, float]] = field(default_factory=dict)
     outcomes: list[Outcome] = field(default_factory=list)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.gap import locate
 from dexsim.gap.effects.catalogue import EFFECTS, entry
 from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
-from dexsim.gap.locate import bins
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.result import Diagnosis, Settings
@@ -73,7 +73,7 @@ def assemble(
         data["unexplained"]["depends_on"] += a.depends_on
         if (curve := a.curve()) is not None:
             d.curves.append(curve)
-    d.spots = bins.control([x for a in answers for x in a.spots])
+    d.spots = locate.control([x for a in answers for x in a.spots])
     refuted = _take_back(d, answers, findings)
     noise = noise.at_most({a.case.joint: rms(a.after) for a in answers if a.found and a.case.joint not in refuted})
     if noise.lowered:

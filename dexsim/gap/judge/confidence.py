@@ -15,8 +15,8 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.param import SHAPES, neutral_of
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.bounds import SHAPES, neutral_of
 
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 

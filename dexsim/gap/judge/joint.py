@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from dexsim.gap import locate
 from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.judge import confidence, errors, verdict
-from dexsim.gap.locate import bins
 from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.param import at_bound
 from dexsim.gap.read.runs import Run
 from dexsim.gap.result import Curve
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import bounds, jitter
+from dexsim.gap.search import jitter
 from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.recording.mechanism import Mechanism
@@ -76,7 +77,7 @@ class JointAnswer:
         self.spans: dict[str, float] = {}
         self.found: list[dict[str, Any]] = []
         self.evidence: list[confidence.Evidence] = []
-        self.spots: list[bins.Spot] = []
+        self.spots: list[locate.Spot] = []
         self.depends_on: list[str] = []
 
     @property
@@ -234,7 +235,7 @@ class JointAnswer:
             evidence.reasons.append(small)
         if mm.id in self.search.unasked:
             evidence.reasons.append("the search ended before all that it may be confused with was tried in its place")
-        stopped = bounds.at_bound(mm.variant.params, raw, case)
+        stopped = at_bound(mm.variant.params, raw, case)
         if stopped:
             evidence.reasons.append(f"its {stopped.replace('_', ' ')} stopped at the bound of what is physical")
         elif far := confidence.beyond(mm.variant.params, self._fitted(mm, self.bounds)[1], case):
@@ -253,11 +254,11 @@ class JointAnswer:
         n, blocks = search.long.n, search.blocks[: search.long.n]
         regimes = {k: v[search.long.sample_row] for k, v in case.regimes.items()}
         everything = search.fitter.evaluate(self.none.fit.params, self.none.fit.x)
-        found = bins.spots(case.joint, everything[:n] * case.sigma, blocks, regimes, rng)
+        found = locate.spots(case.joint, everything[:n] * case.sigma, blocks, regimes, rng)
         if search.fitter.use_torque:
             on = search.fitter.tau_on
             effort = everything[n:][on] * search.r.sigma_torque
-            found += bins.spots(
+            found += locate.spots(
                 case.joint,
                 effort,
                 blocks[on],
@@ -267,7 +268,7 @@ class JointAnswer:
             )
         with search._fix(self.best.members):
             left = search.fitter.evaluate(self.best.fit.params, self.best.fit.x)[:n]
-        spots = bins.control(bins.spots(case.joint, left * case.sigma, blocks, regimes, rng))
+        spots = locate.control(locate.spots(case.joint, left * case.sigma, blocks, regimes, rng))
         self.spots, self.depends_on = (
             found,
             [f"{x.text} ({case.joint})" for x in spots[:2]] if rms(left**2) > JUDGE.clear else [],

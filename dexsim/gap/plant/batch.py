@@ -5,21 +5,22 @@ from __future__ import annotations
 import copy
 import itertools
 import threading
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 
+from dexsim.gap import parallel
 from dexsim.gap.plant import kernel as pk
-from dexsim.gap.plant import side_by_side
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
-from dexsim.gap.plant.known import Known
 from dexsim.gap.plant.mechanics import JointConstants
 
 # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there
 # are
 BLOCK = 32
+KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
@@ -74,6 +75,44 @@ def lane(device: str) -> Lane:
     if device not in known:
         known[device] = Lane(device)
     return known[device]
+
+
+class Known:
+    """What was simulated before: a search asks for the same guess where one fit ends and the next begins, where a step
+    is damped more, where a fit is judged.
+
+    Answers (positions [n], torques [n]) by all that they depend on, as bytes; of more than `room` bytes those go
+    that were not asked for the longest."""
+
+    def __init__(self, room: int = KNOWN):
+        self._room, self._rows = room, OrderedDict[bytes, tuple[np.ndarray, np.ndarray]]()
+
+    def clear(self) -> None:
+        """Forgets all."""
+        self._rows.clear()
+
+    def answers(
+        self, keys: Sequence[bytes], simulate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and torques [H, n] of the keys. simulate(which [h]) makes those [h, n] of the keys with these
+        numbers; it is asked for each that is not known, once."""
+        new = {key: k for k, key in reversed(list(enumerate(keys))) if key not in self._rows}
+        made = simulate(np.array(sorted(new.values()))) if new else None
+        if made is not None and len(new) == len(keys):
+            q, torque = made
+        else:
+            rows = dict(self._rows)
+            if made is not None:
+                rows |= {keys[k]: row for k, row in zip(sorted(new.values()), zip(*made, strict=True), strict=True)}
+            q, torque = (np.stack([rows[key][i] for key in keys]) for i in (0, 1))
+        most = self._room // max(16 * q.shape[1], 1)
+        for k in range(max(len(keys) - most, 0), len(keys)):
+            if keys[k] not in self._rows:
+                self._rows[keys[k]] = q[k].copy(), torque[k].copy()
+            self._rows.move_to_end(keys[k])
+        while len(self._rows) > most:
+            self._rows.popitem(last=False)
+        return q, torque
 
 
 @dataclass
@@ -368,7 +407,7 @@ class JointPlant:
                 device="cpu",
             )
 
-        side_by_side.run(launch, side_by_side.parts(steps, H))
+        parallel.run(launch, parallel.parts(steps, H))
 
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""

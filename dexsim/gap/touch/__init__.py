@@ -1,1 +1,1 @@
-"""Touch through the same steps (`gap.steps`) as the drives: taxels and contact, pad by pad."""
+"""Touch through the same steps (`gap.inquiry`) as the drives: taxels and contact, pad by pad."""

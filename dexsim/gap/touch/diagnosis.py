@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexsim.assets import xhand
+from dexsim.gap.inquiry import Steps
 from dexsim.gap.judge import confidence
 from dexsim.gap.judge.errors import rms_interval
 from dexsim.gap.result import Diagnosis
 from dexsim.gap.rules import TOUCH
-from dexsim.gap.steps import Steps
 from dexsim.gap.touch import constant_taxels, locate, report
 from dexsim.gap.touch.handed_on import handed
 from dexsim.gap.touch.judge import PadAnswer

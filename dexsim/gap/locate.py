@@ -1,5 +1,5 @@
-"""Where a residual lives: its size in bins of every regime variable, with block-bootstrap intervals and one
-false-discovery control over all bins of all joints."""
+"""Where and in which regime simulation and recording part: the residual's size in bins of every regime variable, with
+block-bootstrap intervals and one false-discovery control over all bins of all joints."""
 
 from __future__ import annotations
 

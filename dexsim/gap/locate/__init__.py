@@ -1,1 +1,0 @@
-"""Step 2: where and in which regime simulation and recording part."""
