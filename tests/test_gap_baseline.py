@@ -13,7 +13,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read.runs import Run
 from dexsim.gap.search import baseline
-from dexsim.gap.search.recorded_motion import forbids, room_for_friction
+from dexsim.gap.search.baseline import forbids, room_for_friction
 
 PENDULUM = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="joint" axis="0 1 0" armature="0.001"/>
 <geom type="sphere" size="0.01" pos="0 0 -0.1" mass="0.5"/></body></worldbody></mujoco>"""

@@ -11,8 +11,7 @@ from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.thermal import temperature_follows
 from dexsim.gap.judge import confidence, verdict
 from dexsim.gap.judge.confidence import Evidence
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param, at_bound
+from dexsim.gap.plant.columns import INDEX, Param, at_bound
 from dexsim.gap.rules import JUDGE
 
 DOUBTED = JUDGE.doubted

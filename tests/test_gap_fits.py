@@ -10,8 +10,7 @@ import pytest
 
 from dexsim.gap.judge.joint import stretched, traded
 from dexsim.gap.plant.case import build
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.search import JointSearch, Member, Trial
 from tests.test_gap import model, plant_run

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dexsim.gap.read import repeated
+from dexsim.gap.read import channels
 from dexsim.gap.read.runs import Run
 
 T = np.arange(0, 7, 0.01)
@@ -60,7 +60,7 @@ def test_a_frozen_stretch_is_found_in_every_noise(noise, first, last):
     runs = clean(noise)
     q = runs[1].q
     q[first : last + 1] = q[first]
-    none, found = repeated.stretches(runs, "joint")
+    none, found = channels.repeated_stretches(runs, "joint")
     assert none == [] and len(found) == 1
     a, b = found[0]
     assert first - 3 <= a <= first and last <= b <= last + 3
@@ -70,28 +70,28 @@ def test_a_frozen_stretch_is_found_in_every_noise(noise, first, last):
 @pytest.mark.parametrize("stiction", [0.0, 0.02, 0.1, 0.3])
 def test_rests_of_a_coarse_encoder_and_of_a_joint_that_sticks_are_honest(quantum, stiction):
     runs = clean(0.0, quantum, stiction)
-    longest = max(T[b] - T[a] for a, b in repeated.rests(runs[0].q[:, 0]))
+    longest = max(T[b] - T[a] for a, b in channels.rests(runs[0].q[:, 0]))
     assert longest > 0.3  # it does rest: readings repeat for as long as a frozen one's would
-    assert repeated.stretches(runs, "joint") == [[], []]
-    assert not any(repeated.duplicates(r.t, r.q[:, 0]).any() for r in runs)
+    assert channels.repeated_stretches(runs, "joint") == [[], []]
+    assert not any(channels.repeated_samples(r.t, r.q[:, 0]).any() for r in runs)
 
 
 def test_a_spike_at_rest_and_a_joint_that_is_held_are_no_old_readings():
     runs = clean(0.0)
-    a, b = max(repeated.rests(runs[0].q[:, 0]), key=lambda x: x[1] - x[0])
+    a, b = max(channels.rests(runs[0].q[:, 0]), key=lambda x: x[1] - x[0])
     runs[0].q[b] += 0.3  # one sample, and back
-    assert repeated.stretches(runs, "joint") == [[], []]
+    assert channels.repeated_stretches(runs, "joint") == [[], []]
     target = goal(1)
     held = follow(np.where((T > 2) & (T < 4), target[200], target))  # somebody holds it for two seconds, then lets go
-    assert repeated.stretches([clean(0.0)[0], run("1", target, held)], "joint") == [[], []]
+    assert channels.repeated_stretches([clean(0.0)[0], run("1", target, held)], "joint") == [[], []]
 
 
 def test_single_readings_sent_twice():
     once = clean(2e-4)[1]
-    assert not repeated.duplicates(once.t, once.q[:, 0]).any()
+    assert not channels.repeated_samples(once.t, once.q[:, 0]).any()
     twice = once.q[:, 0].copy()
     twice[1::4] = twice[0::4]
-    found = repeated.duplicates(once.t, twice)
+    found = channels.repeated_samples(once.t, twice)
     assert found[1::4].sum() > 0.2 * len(twice) / 4 and not found[0::4].any()
 
 
@@ -108,5 +108,5 @@ def test_a_run_without_the_joint_and_two_joints():
         np.zeros(3),
     )
     two.q[200:330, 1] = two.q[200, 1]
-    assert repeated.stretches([*runs, two], "other") == [[], [], []]
-    assert [len(x) for x in repeated.stretches([*runs, two], "joint")] == [0, 0, 1]
+    assert channels.repeated_stretches([*runs, two], "other") == [[], [], []]
+    assert [len(x) for x in channels.repeated_stretches([*runs, two], "joint")] == [0, 0, 1]

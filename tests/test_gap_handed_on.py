@@ -244,7 +244,7 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
     from types import SimpleNamespace
 
     from dexsim.gap.judge.findings import servo_changes
-    from dexsim.gap.plant.param import Param
+    from dexsim.gap.plant.columns import Param
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
     age = Param("feedback_delay", ("feedback_delay",), "set", 0.0, 0.003, 0.0, "s", nuisance=True)

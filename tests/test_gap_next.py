@@ -9,8 +9,7 @@ from test_gap import demo, model, plant_run
 from benchmarks import press_rig
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.effects.catalogue import EFFECTS, members, separating
-from dexsim.gap.effects.confusion import CLASSES
+from dexsim.gap.effects.catalogue import CLASSES, EFFECTS, members, separating
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.report import next_recording

@@ -14,7 +14,7 @@ from dexsim.gap.command import Progress
 from dexsim.gap.judge import conclude, errors, verdict
 from dexsim.gap.judge.joint import stretched
 from dexsim.gap.plant.case import REFERENCE, build
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import Param
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Fitted, Fitter, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, subset

@@ -1,22 +1,27 @@
-"""The catalogue: every effect in the order in which the search asks for it, and which of them may stand for another."""
+"""The catalogue: every effect in the order in which the search asks for it, and the classes of effects that some
+recordings cannot tell apart, each with the experiment that does.
+
+An effect names the classes that it belongs to; only members of one class may be reported as a set.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dexsim.gap.effects.backlash import Backlash
 from dexsim.gap.effects.braking_limit import BrakingLimit
 from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.effects.compliance import Compliance
-from dexsim.gap.effects.confusion import BLIND, CLASSES
 from dexsim.gap.effects.contact_friction import ContactFriction
 from dexsim.gap.effects.contact_stiffness import ContactStiffness
 from dexsim.gap.effects.controller_term import ControllerTerm
 from dexsim.gap.effects.coulomb_friction import CoulombFriction
 from dexsim.gap.effects.current_sensor import CurrentSensor
 from dexsim.gap.effects.deadband import Deadband
-from dexsim.gap.effects.effect import Effect, TouchEffect, Variant
+from dexsim.gap.effects.effect import SLOW, Effect, TouchEffect, Variant
 from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.effects.gain_mismatch import GainMismatch
 from dexsim.gap.effects.inertia import Inertia
@@ -40,6 +45,7 @@ from dexsim.gap.effects.torque_limit import TorqueLimit
 from dexsim.gap.effects.torque_ripple import TorqueRipple
 from dexsim.gap.effects.torque_speed_limit import TorqueSpeedLimit
 from dexsim.gap.effects.viscous_friction import ViscousFriction
+from dexsim.gap.rules import JUDGE
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -86,6 +92,40 @@ TOUCH_CATALOGUE: tuple[TouchEffect, ...] = (
 """Effects of touch and contact."""
 TOUCH_EFFECTS: dict[str, TouchEffect] = {e.id: e for e in TOUCH_CATALOGUE}
 
+CLASSES: dict[str, str] = {
+    "friction or play": "small reversals about a pose while a load holds the joint to one side, then without it, "
+    "and very slow ramps (both encoders logged if there are two)",
+    "late": "steps of two sizes and a fast chirp: a delay shifts the motion, a lag rounds it",
+    "with speed": "constant speeds from slow to fast, and steps against a known load",
+    "static load": "static poses while a known weight is held",
+    "friction and load": "the same slow motion under two or more loads",
+    "drive weakens": "this joint alone, then with the others loaded, cold and warm in random order",
+    "zero or gravity": "static poses over the whole range, and the same with the mechanism turned over: "
+    "what gravity does changes sign, an encoder's zero stays",
+    "limits at speed": "large steps at full speed, and stops from it: one limit acts while driving, the other while "
+                       "braking",
+    "loop": "constant speeds from slow to fast, steps of several sizes and long holds against a known load",
+    "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint "
+                        "to a side",
+    "weight or push": "static poses over the whole range, twice, with nothing in reach",
+}
+TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
+"""Of touch: the first one's own experiment tells its members apart."""
+
+
+def at_one_load(case: Case, runs: Sequence[int]) -> bool:
+    """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and
+    one that does not are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its
+    mean."""
+    slides = case.regimes["speed"] > SLOW * case.scales.speed
+    load = np.abs(case.regimes["_load"][slides & np.isin(case.plant.run_of, runs)])
+    return bool(len(load)) and float(load.std()) < JUDGE.one_load * float(load.mean())
+
+
+BLIND: dict[str, Callable[[Case, Sequence[int]], bool]] = {"friction and load": at_one_load}
+"""Of classes: whether recordings cannot separate their members, however one of them may fit a little better than the
+others."""
+
 
 def members(name: str) -> frozenset[str]:
     """The effects of one class of `CLASSES`."""
@@ -106,7 +146,7 @@ def confusable(a: str, b: str) -> bool:
 
 
 def inseparable(effect: str, case: Case, runs: Sequence[int]) -> list[str]:
-    """Effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`confusion.BLIND`)."""
+    """Effects of a class of this one that the recordings `runs` of a joint cannot tell from it (`BLIND`)."""
     blind = [c for c in EFFECTS[effect].classes if c in BLIND and BLIND[c](case, runs)]
     return [e for e in EFFECTS if e != effect and {*EFFECTS[e].classes} & {*blind}]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import Param
 from dexsim.gap.plant.scales import Scales
 from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.result import Fit, PadFacts, PadSettings
@@ -101,7 +101,7 @@ class Effect:
     """An entry of the catalogue.
 
     id: as `diagnosis.json` has it; words: a phrase after "joint X ..."; shows: the regime in which it leaves its trace;
-    experiment: what shows it best; classes: those of `confusion.CLASSES` that it belongs to.
+    experiment: what shows it best; classes: those of `catalogue.CLASSES` that it belongs to.
     """
 
     id: ClassVar[str]
@@ -168,7 +168,7 @@ class TouchEffect:
 
     id, words, shows, experiment as of `Effect`; fits: parameters of `touch.plant.PARAMS`; starts: values of them
     to begin from; stage: `cell` where a load cell judges it alone, `taxels`, `shear`; report: parameter -> key in
-    `diagnosis.json`; classes: those of `confusion.TOUCH_CLASSES`.
+    `diagnosis.json`; classes: those of `catalogue.TOUCH_CLASSES`.
     """
 
     id: ClassVar[str]

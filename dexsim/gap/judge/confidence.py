@@ -15,7 +15,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
 from dexsim.gap.plant.case import BELIEF, Case
-from dexsim.gap.plant.param import SHAPES, neutral_of
+from dexsim.gap.plant.columns import SHAPES, neutral_of
 from dexsim.gap.rules import JUDGE
 
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in

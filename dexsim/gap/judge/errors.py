@@ -6,8 +6,7 @@ import numpy as np
 
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.read.runs import Run, same_commands, spans
 
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its

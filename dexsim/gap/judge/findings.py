@@ -13,8 +13,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
-from dexsim.gap.plant.columns import SERIES_INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import SERIES_INDEX, Param
 from dexsim.gap.rules import JUDGE
 
 

@@ -28,8 +28,7 @@ from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.errors import free_run
 from dexsim.gap.judge.findings import columns_beside, handed, model_changes, undamped
 from dexsim.gap.plant.case import REFERENCE, Case
-from dexsim.gap.plant.columns import SERIES_INDEX
-from dexsim.gap.plant.param import expand
+from dexsim.gap.plant.columns import SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial

@@ -13,7 +13,7 @@ from dexsim.gap.effects.catalogue import confusable, inseparable, separating
 from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.judge import confidence, errors, verdict
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.param import at_bound
+from dexsim.gap.plant.columns import at_bound
 from dexsim.gap.read.runs import Run
 from dexsim.gap.result import Curve
 from dexsim.gap.rules import JUDGE

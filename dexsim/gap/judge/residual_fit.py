@@ -15,8 +15,7 @@ import numpy as np
 from dexsim.actuator.reference import torque_along
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.plant.param import expand
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial

@@ -17,8 +17,7 @@ import numpy as np
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import Case, build
-from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
-from dexsim.gap.plant.param import expand
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run, local_polynomial
 
 WIDTH = 0.06  # s: of the smoothing of the difference

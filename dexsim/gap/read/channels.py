@@ -4,6 +4,13 @@ them.
 The reader's audit names what a recording alone shows. Beside the model and the commands more can be told: degrees on
 both sides, a position that runs against its target or before it, readings that are repeated while the joint moves, an
 encoder that stops.
+
+Readings repeat old ones for a while where a bus sends again what it read last or an encoder is not read. Quantised
+readings of a joint at rest repeat honestly, and so do those of one that sticks while its target creeps. Two things give
+a frozen one away, both by what the same joint does elsewhere in its recordings. It ends in a jump: between two samples
+the reading goes faster than just before and just after, by more than a mass can (noise, quantum and stick-slip make
+such pulses too, but not one of this size). And its target went a way in the meantime that the joint has never let pass
+before.
 """
 
 from __future__ import annotations
@@ -15,8 +22,8 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from dexsim.gap.read import repeated
 from dexsim.gap.read.runs import Run
+from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 
 SPOILS = ("wrap", "unit")  # kinds of the audit's errors after which a position or a target cannot be used
@@ -28,6 +35,12 @@ STILL = 0.1  # rad that the target of a joint that never moves must span
 REST = 0.05  # s
 HOLDS = 1.5  # x the error at which dry friction has held the joint before
 TURN = 180 / np.pi
+LONG = 0.1  # s: what stays the same for as long is looked at
+PULSE = 2.0  # x the largest pulse that does not end a rest
+PASSED = 2.0  # x the way that a target has gone during another rest
+WAY = 0.1  # of all the way that the target spans: less tells nothing
+OFTEN = 0.02  # of a recording's samples (and `FEW` at least): repeated ones of a moving joint are named from there on
+FEW = 8
 
 
 def finding(
@@ -85,7 +98,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     taken out of the runs, which can then be used, but for those stretches."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     out = dict(known)
-    long = {joint: repeated.stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
+    long = {joint: repeated_stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
 
     def add(
@@ -160,7 +173,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                     0.7,
                 )
                 continue
-            held, single = _held(run.t, q), repeated.duplicates(run.t, q)
+            held, single = _held(run.t, q), repeated_samples(run.t, q)
             for a, b in long[joint][i]:
                 held[a + 1 : b + 1] = True
                 if run.t[b] - run.t[a] > BLIND:
@@ -337,8 +350,8 @@ def _holds(run: Run, j: int, end: int) -> float:
     `end`."""
     q = run.q[:end, j]
     error = np.abs(run.command_at(run.t[:end])[:, j] - q)
-    rests = [(a, b) for a, b in repeated.rests(q) if b + 1 < end and run.t[b] - run.t[a] >= REST]
-    return max((float(np.median(error[max(b - 2, a) : b + 1])) for a, b in rests), default=0.0)
+    stood = [(a, b) for a, b in rests(q) if b + 1 < end and run.t[b] - run.t[a] >= REST]
+    return max((float(np.median(error[max(b - 2, a) : b + 1])) for a, b in stood), default=0.0)
 
 
 def _held(t: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -366,3 +379,57 @@ def _keep(run: Run, on: np.ndarray) -> None:
     for name in ("v", "torque", "temperature", "duty", "enabled", "supply"):
         x = getattr(run, name)
         setattr(run, name, None if x is None else x[on])
+
+
+def rests(q: np.ndarray) -> list[tuple[int, int]]:
+    """(first, last) sample of each stretch of readings that are all the same."""
+    edge = np.flatnonzero(np.diff(np.r_[0, (np.diff(q) == 0).astype(int), 0]))
+    return list(zip(edge[::2].tolist(), edge[1::2].tolist(), strict=True))
+
+
+def pulses(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[S - 1] how far the step after each sample goes beyond what the faster of the steps beside it would give in its
+    time; 0 where one beside it goes the other way just as far (a reading that comes back is a spike, not a jump)."""
+    dt, dq = np.maximum(np.diff(t), 1e-6), np.diff(q)
+    speed = dq / dt
+    before, after = np.r_[0.0, speed[:-1]], np.r_[speed[1:], 0.0]
+    sign = np.sign(dq)
+    beside = np.maximum(np.maximum(before * sign, after * sign), 0.0)
+    back = np.minimum(np.r_[0.0, dq[:-1]] * sign, np.r_[dq[1:], 0.0] * sign) < -0.5 * np.abs(dq)
+    return np.where(back, 0.0, np.maximum(np.abs(speed) - beside, 0.0) * np.minimum(dt, 2 * np.median(dt)))
+
+
+def repeated_stretches(runs: Sequence[Run], joint: str) -> list[list[tuple[int, int]]]:
+    """Of each run, (first, last) sample of the stretches in which the joint's readings are old ones; `last` is the last
+    old one. Runs without the joint have none."""
+    seen: list[tuple[int, int, int, float, float]] = []  # run, first, last, pulse at its end, way of the target
+    pulse, spans = [], []
+    for k, run in enumerate(runs):
+        if joint not in run.joints or len(run.t) < 20:
+            continue
+        j = run.joints.index(joint)
+        q, cmd = run.q[:, j], run.command_at(run.t)[:, j]
+        size = pulses(run.t, q)
+        spans.append(float(np.ptp(cmd)))
+        for a, b in rests(q):
+            if b + 1 < len(q) and run.t[b] - run.t[a] >= LONG:
+                seen.append((k, a, b, float(size[b]), float(np.ptp(cmd[a : b + 1]))))
+                size[b] = 0.0
+        pulse.append(size)
+    out: list[list[tuple[int, int]]] = [[] for _ in runs]
+    if not seen:
+        return out
+    usual = float(max(x.max() for x in pulse))
+    jump = [s for s in seen if s[3] > PULSE * usual]
+    passed = max((s[4] for s in seen if s not in jump), default=0.0)
+    for k, a, b, _, way in jump:
+        if way > max(PASSED * passed, WAY * max(spans)):
+            out[k].append((a, b))
+    return out
+
+
+def repeated_samples(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[S] bool: single readings that repeat the one before in a steady motion and are made up for by the next; none
+    where there are few."""
+    again = repeats(t, q)
+    return again if again.sum() >= max(FEW, OFTEN * len(t)) else np.zeros(len(t), bool)

@@ -18,8 +18,7 @@ from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
 from dexsim.gap.effects.effect import Effect
 from dexsim.gap.plant.case import Case, build
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import expand
+from dexsim.gap.plant.columns import INDEX, expand
 from dexsim.gap.read.runs import Run
 from dexsim.gap.report.sentence import place
 from dexsim.gap.result import Diagnosis, Settings

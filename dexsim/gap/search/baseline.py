@@ -3,6 +3,10 @@ delay.
 
 A small bounded least squares by simulation on a few windows of what is fitted, from the best of guesses all over the
 bounds. Whatever else a diagnosis finds has to follow what was kept out better than this, or this is what is handed on.
+
+What recorded motions say against its friction: a stretch that begins at rest and moves the joint on needs, at its best
+moment, more driving torque than dry friction. The drive's part is known where the drive is off (0) or its torque was
+recorded, and is otherwise at most its limit; gravity and the other joints' pull are the model's.
 """
 
 from __future__ import annotations
@@ -16,11 +20,9 @@ import numpy as np
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import BELIEF, Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
-from dexsim.gap.search.recorded_motion import forbids, room_for_friction
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
 GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside what is believed
@@ -28,6 +30,9 @@ ITERATIONS = 8
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
 WORSE = 1.05  # x the plain model's error on what was kept out: beyond it an answer is worse
+MOVING = 0.05  # of the joint's large speed
+TRAVEL, LASTS = 0.02, 0.1  # of the joint's span, and s: shorter stretches may be noise
+BELIEVED = 1.1  # x the driving torque: gravity and limits are off by a few percent
 AT_NOISE = 1.3  # x the noise: what is followed to it is as good as anything
 BLOCK, DRAWS, SURE = 0.5, 400, 0.95  # s, and in how many of the bootstraps it has to be worse
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
@@ -273,3 +278,64 @@ def text(data: dict[str, Any], unit: str) -> str:
         f"{1e3 * data['error_before']:.3g} on what was kept out"
     )
     return said + (f"; it is what is handed on for {', '.join(data['handed_on'])}" if data["handed_on"] else "")
+
+
+def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
+    """By direction (1, -1): the largest dry friction [N.m] with which every motion of these runs that began at rest
+    could begin; infinite where none did."""
+    out = {1: np.inf, -1: np.inf}
+    plant, speed = case.plant, case.regimes["_speed"]
+    for r in runs:
+        rows = plant.rows(r)
+        t, q, v = plant.t[rows], plant.q[rows], speed[rows]
+        if len(t) < 3:
+            continue
+        drive, pull = _drive(case, r), _series(case, r, "gravity_cos") + _series(case, r, "rest")
+        for way in (1, -1):
+            on = way * v > MOVING * case.scales.speed
+            edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
+            for a, b in zip(edge[::2], edge[1::2], strict=True):
+                if (
+                    a == 0
+                    or t[b - 1] - t[a] < LASTS
+                    or abs(q[b - 1] - q[a]) < max(TRAVEL * case.scales.span, 20 * case.sigma)
+                ):
+                    continue
+                a = max(a - 2, 0)  # the torque that set it off is from just before
+                out[way] = min(out[way], max(BELIEVED * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))
+    return out
+
+
+def forbids(case: Case, runs: Sequence[int], friction: float, asymmetry: float = 0.0) -> str:
+    """Why a dry friction [N.m] (its asymmetry as in servo.yaml) cannot be: a motion was recorded that it forbids. Empty
+    where none is."""
+    for way, room in room_for_friction(case, runs).items():
+        level = friction * (1 + 0.5 * way * asymmetry) + case.constants.friction
+        if level > room:
+            unit = "N" if case.scales.slide else "N.m"
+            return (
+                f"a dry friction of {level:.3g} {unit} would hold the joint, but it was recorded setting itself in "
+                "motion "
+                f"{'forwards' if way > 0 else 'backwards'} with at most {room:.3g} {unit} to drive it"
+            )
+    return ""
+
+
+def _series(case: Case, run: int, name: str) -> np.ndarray:
+    """A prescribed column at the samples of a run."""
+    plant = case.plant
+    rows = plant.rows(run)
+    part = plant.series[plant._grid[run] : plant._grid[run + 1], SERIES_INDEX[name]]
+    return np.interp(plant.t[rows] - plant.t[rows][0], plant.dt * np.arange(len(part)), part)
+
+
+def _drive(case: Case, run: int) -> dict[int, np.ndarray]:
+    """By direction: the most torque [S] that the drive may give that way."""
+    plant = case.plant
+    rows = plant.rows(run)
+    shown, on = plant.torque[rows], _series(case, run, "enabled") > 0.5
+    limit = float(plant.nominal[run][SERVO["torque_limit"]])
+    limit = max(limit, case.ranges.get("torque_limit", (0.0, limit))[1])
+    if "torque_limit" in case.unknown:
+        limit = np.inf
+    return {way: np.where(~on, 0.0, np.where(np.isfinite(shown), way * np.nan_to_num(shown), limit)) for way in (1, -1)}

@@ -19,7 +19,7 @@ import numpy as np
 from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.read.runs import Run
 from dexsim.gap.search import body_torque
-from dexsim.gap.search.torque_columns import Columns, columns_of, moved, readable, solved, sums, unphysical
+from dexsim.gap.search.body_torque import Columns, columns_of, moved, readable, solved, sums, unphysical
 
 MUCH = 0.3  # of the torque's variance: what a plain fit leaves where something else pushes
 QUIET = 0.3  # of the variance of the quiet torque: what the trimmed fit may leave there to be believed

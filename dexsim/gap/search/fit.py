@@ -8,8 +8,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dexsim.gap.plant.batch import JointPlant, Windows
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.plant.columns import INDEX, Param, expand
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go

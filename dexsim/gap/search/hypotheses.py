@@ -8,8 +8,7 @@ import numpy as np
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.beliefs import refitted, unknown
 from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of

@@ -20,7 +20,7 @@ import numpy as np
 from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.gap.search import body_torque
-from dexsim.gap.search.torque_columns import WEIGHT, Columns, columns_of, least, misfit, solved, sums, unphysical
+from dexsim.gap.search.body_torque import WEIGHT, Columns, columns_of, least, misfit, solved, sums, unphysical
 
 SHED = 0.8  # of the misfit: what halving the cutoff leaves, where what it sheds is noise of derivatives
 # what gravity's factor must be known to by the recordings, to be fitted beside the friction and not believed

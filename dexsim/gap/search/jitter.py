@@ -20,8 +20,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq, minimize
 
-from dexsim.gap.plant.columns import INDEX, LATE_GROUPS
-from dexsim.gap.plant.param import expand
+from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, expand
 from dexsim.gap.search.fit import Fitter
 from dexsim.gap.search.search import JointSearch, Trial, subset
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexsim.gap.plant.param import SHAPES, at_bound
+from dexsim.gap.plant.columns import SHAPES, at_bound
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Fitter, disbelief, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, subset

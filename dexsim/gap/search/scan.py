@@ -9,8 +9,7 @@ import numpy as np
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.effects.effect import Variant
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param, expand
+from dexsim.gap.plant.columns import INDEX, Param, expand
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import prior_weight, slopes_of
 from dexsim.gap.search.left_out import BOOTSTRAPS, JointLosses

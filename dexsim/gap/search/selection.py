@@ -9,8 +9,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import BELIEF, Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import slopes_of

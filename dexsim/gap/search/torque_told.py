@@ -11,8 +11,8 @@ import numpy as np
 
 from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.search import body_torque
+from dexsim.gap.search.body_torque import HEAVY, NAMES, PER_CUTOFF, columns_of, moved, readable
 from dexsim.gap.search.inverse_dynamics import BY_DIRECTION, LAG, LEAST, LOAD, STRIBECK, solve
-from dexsim.gap.search.torque_columns import HEAVY, NAMES, PER_CUTOFF, columns_of, moved, readable
 
 SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
 TRUSTED = 0.6  # of the torque's rms: what may be left for figures to be believed

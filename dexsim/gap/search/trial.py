@@ -8,8 +8,7 @@ import numpy as np
 
 from dexsim.gap.effects.catalogue import compatible
 from dexsim.gap.effects.effect import Effect, Variant
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.param import Param
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted
 
 
