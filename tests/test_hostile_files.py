@@ -520,6 +520,14 @@ def edits():
         ("task", "rotate"),
         ("version", "1"),
         ("format", None),
+        ("hand.name", "é\u202e"),
+        ("hand.name", "../../elsewhere"),
+        ("hand.name", None),
+        ("hand.folder", "hand"),
+        ("hand.folder", "../elsewhere"),
+        ("hand.scale", 7.0),
+        ("hand.mirror", "yes"),
+        ("hand", ["xhand"]),
     )
 
 

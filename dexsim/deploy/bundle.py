@@ -14,6 +14,8 @@ from dexsim import yaml_text
 from dexsim.deploy import manifests
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
+from dexsim.hand.load import FILE as HAND_FILE
+from dexsim.hand.load import known
 
 FORMAT, VERSION = manifests.FORMAT, manifests.VERSION
 POLICY, MANIFEST, GOLDEN, CONFIG = "policy.onnx", "manifest.yaml", "golden.npz", "config.yaml"
@@ -51,7 +53,7 @@ def load(path: str | Path) -> Bundle:
         raise UserError(f"{path}: no {MANIFEST} there; dexsim export checkpoint=... out=DIR writes a bundle")
     manifest = _mapping(path / MANIFEST)
     which = manifests.hand_entry(manifest, path / MANIFEST)
-    hand = load_hand(which.name if which.folder is None else path / which.folder, which.mirror, which.scale)
+    hand = _hand(which, path)
     manifests.check(manifest, path / MANIFEST, hand)
     _same_table(manifest, path / MANIFEST, hand)
     policy = path / POLICY
@@ -65,6 +67,23 @@ def load(path: str | Path) -> Bundle:
     bundle = Bundle(path, manifest, session(data, policy), hand)
     _try(bundle, policy)
     return bundle
+
+
+def _hand(which: manifests.HandEntry, path: Path) -> Hand:
+    """The hand of a bundle in folder `path`: one that comes with dexsim, or the bundle's own. A name is no path: a
+    manifest cannot have other folders of this machine read."""
+    file, own = path / MANIFEST, path / HAND
+    if which.folder is None and which.name not in known():
+        raise UserError(
+            f"{file}: hand.name is {which.name!r}, must be one of {', '.join(known())} (any other hand comes in the"
+            f" bundle's own folder, hand.folder: {HAND}); {manifests.AGAIN}"
+        )
+    if which.folder is not None and not (own / HAND_FILE).is_file():
+        raise UserError(f"{file}: hand.folder is {which.folder}, but there is no {own / HAND_FILE}; {manifests.AGAIN}")
+    try:
+        return load_hand(which.name if which.folder is None else own, which.mirror, which.scale)
+    except UserError as error:
+        raise UserError(f"{file}: its hand cannot be read: {error}") from None
 
 
 def builder(task: str) -> Any:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dexsim.recording import audit_time, audit_values
+from dexsim.recording import audit_time, audit_values, reach
 from dexsim.recording.schema import SEVERITIES, Finding, Recording, Series
 
 KINDS: dict[str, str] = {
@@ -79,6 +79,8 @@ def audit(recording: Recording) -> list[Finding]:
             audit_values.units,
         ):
             found += check(r)
+        told = {(f.topic, f.joint) for f in found if f.kind in ("unit", "wrap") and f.severity == "error"}
+        found += reach.unreachable(r, told)
     return sorted(found, key=lambda f: (f.topic, f.time if np.isfinite(f.time) else -1.0))
 
 

@@ -461,15 +461,21 @@ def units(r: Recording) -> Iterator[Finding]:
             # a drive may follow less than it is asked, but none goes twenty times as far and beyond a turn
             far = ratio is not None and ratio > 20 and np.nanmax(np.abs(q)) > 2 * np.pi
             nearest = min(RATIOS, key=lambda k: abs(np.log(ratio / k))) if far else None
+            named = False
             for known, unit in RATIOS.items():
                 for k, whose in ((known, "position"), (1 / known, "command")):
                     loose = whose == "position" and known == nearest and 0.5 < ratio / k < 1.3
                     if ratio is not None and (abs(ratio / k - 1) < 0.1 or loose):
+                        named = True
                         yield finding(
                             s.position if whose == "position" else c,
                             f"{whose} of {joint} is {known:.4g} times the other: {unit}?",
                             joint,
                         )
+            if far and not named:
+                yield finding(
+                    s.position, f"position of {joint} goes {ratio:.4g} times as far as its command: which unit?", joint
+                )
         if s.velocity is not None and len(s.velocity) > 20 and np.isfinite(s.velocity.value[:, j]).all():
             speed = np.gradient(s.position.value[:, j], s.position.t) if (np.diff(s.position.t) > 0).all() else None
             ratio = None if speed is None else _ratio(_smooth(speed), _smooth(s.velocity.value[:, j]))

@@ -29,6 +29,7 @@ from dexsim.hand.places import places
 from dexsim.hand.skin import tip_skins
 from dexsim.sim import ContactPair, make_engine
 from dexsim.sim.make import engine_of, newton_iterations
+from dexsim.sim.memory import give_back
 from dexsim.sim.scene import OBJECT, OBJECT_FIELDS, SLOTS, hand_object_scene
 from dexsim.sim.warmup import compile_together
 from dexsim.tactile.layout import hand_layout, tip_layout
@@ -545,7 +546,9 @@ class HandEnv(VecEnv):
             held = self.__dict__.pop(part, None)
             if hasattr(held, "__dict__"):
                 vars(held).clear()
+        held = None
         vars(self).clear()
+        give_back()
 
     def check(self) -> None:
         """Raise UserError if contacts were lost since the last call, or more than MOST_NAN of all world-steps were not

@@ -87,6 +87,11 @@ FOUND = [
     ("checkpoint", 1165),
     ("overrides", 1153),
     ("recording", 70119),
+    ("recording", 1004148),
+    ("manifest", 1018735),
+    ("checkpoint", 1008330),
+    ("checkpoint", 1011057),
+    ("overrides", 1017359),
 ]
 """Cases of long runs that once broke something."""
 

@@ -17,18 +17,16 @@ from tests.soak.watch import look
 ROOT = Path(__file__).parents[2]
 NEXT = 7
 """Numbers of worlds and seeds of the environments repeat after as many."""
-
-
-SAID = 20
-"""Environments between two lines about memory: what is seen from outside is that of an environment or of none."""
 TOLD = 5000
 """Readings of the loop between two notes of how far it is."""
 
 
-def tell(folder: Path, done: float) -> None:
-    """How much of its work a part has done, in a file `done`, for who watches it."""
+def tell(folder: Path, done: float, between: bool = True) -> None:
+    """How much of its work a part has done, and where it is `between` two pieces of it (all that they had is given
+    back), the memory that the process then keeps [MiB], in a file `done`, for who watches it."""
+    kept = look(os.getpid()) if between else None
     part = folder / "done.tmp"
-    part.write_text(f"{done:.6g}")
+    part.write_text(f"{done:.6g} {kept[0]:.6g}" if kept else f"{done:.6g}")
     part.replace(folder / "done")
 
 
@@ -53,7 +51,7 @@ class Lagging:
         self.q = self.q + (self.target - self.q) * (1 - np.exp(-(now - self.last) / 0.03))
         self.last, self.sequence = now, self.sequence + 1
         if self.folder is not None and self.sequence % TOLD == 1:
-            tell(self.folder, (now - self.begun) / 3600)
+            tell(self.folder, (now - self.begun) / 3600, between=False)
         touch = np.zeros((5, 120, 3), np.float32)
         touch[:, self.sequence % 120, 2] = 3.0
         error = np.zeros(12, int)
@@ -117,9 +115,8 @@ def envs(count: float, folder: Path) -> str:
         for _ in range(2):
             env.step(torch.zeros(worlds, 12))
         env.close()
+        del env
         tell(folder, k + 1)
-        if k % SAID == 0 or k + 1 == int(count):
-            print(f"environment {k + 1}: heap {look(os.getpid())[0]:.1f} MiB when it is closed", flush=True)
     return f"{int(count)} environments made, stepped and closed"
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-COLUMNS = ("seconds", "heap_mib", "rss_mib", "files", "threads", "gpu_mib", "done")
-"""done: how much of its work the process has done, in the work's own unit."""
+COLUMNS = ("seconds", "heap_mib", "rss_mib", "files", "threads", "gpu_mib", "kept_mib", "done")
+"""kept_mib: anonymous memory between two pieces of its work, as the process told it last (NaN where it has none); done:
+how much of its work the process has done, in the work's own unit."""
 GPU_EVERY = 5.0
 """s between two looks at the GPU's memory, each a program of its own."""
 WARM_UP = 0.25
@@ -49,15 +50,16 @@ def gpu_mib() -> float:
 
 
 class Watch(threading.Thread):
-    """Looks at a child every `every` s until it ends, from the moment that `done` is no longer None: how much of its
-    work it has done. `rows` are of COLUMNS, and written to `path` as they come. gpu: at the first GPU's memory too."""
+    """Looks at a child every `every` s until it ends, from the moment that `done` is no longer None: (how much of its
+    work it has done, what it keeps between two pieces, MiB). `rows` are of COLUMNS, and written to `path` as they
+    come. gpu: at the first GPU's memory too."""
 
     def __init__(
         self,
         child: subprocess.Popen,
         gpu: bool = False,
         every: float = 0.5,
-        done: Callable[[], float | None] = lambda: math.nan,
+        done: Callable[[], tuple[float, float] | None] = lambda: (math.nan, math.nan),
         path: Path | None = None,
     ):
         super().__init__(daemon=True)
@@ -77,7 +79,8 @@ class Watch(threading.Thread):
                     gpu, asked = gpu_mib(), time.monotonic()
                 seen, done = look(self.child.pid), self.done()
                 if seen is not None and seen[0] > 0:  # one that has ended, and was not waited for, has no memory
-                    row = (time.monotonic() - self.begun, *seen, gpu, math.nan if done is None else done)
+                    worked, kept = (math.nan, math.nan) if done is None else done
+                    row = (time.monotonic() - self.begun, *seen, gpu, kept, worked)
                     self.rows.append(row)
                     file.write(",".join(f"{x:.6g}" for x in row) + "\n")
                 time.sleep(self.every)

@@ -41,6 +41,7 @@ PASSED = 2.0  # x the way that a target has gone during another rest
 WAY = 0.1  # of all the way that the target spans: less tells nothing
 OFTEN = 0.02  # of a recording's samples (and `FEW` at least): repeated ones of a moving joint are named from there on
 FEW = 8
+FAR = 3.0  # x a joint's range, beyond which a position or a target is not that joint's
 
 
 def finding(
@@ -135,6 +136,23 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                     run,
                     joint,
                     [STATES, COMMANDS],
+                    whole,
+                )
+                continue
+            far = [] if limits is None else [
+                (what, topic, _farthest(x, limits))
+                for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
+                if _outside(x, limits) > max(FAR * (limits[1] - limits[0]), 2 * np.pi)
+            ]
+            if far:
+                add(
+                    "unit",
+                    f"{' and '.join(what for what, _, _ in far)} of {joint} reach"
+                    f"{'es' if len(far) == 1 else ''} {' and '.join(f'{x:.4g}' for _, _, x in far)}, where the model"
+                    f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
+                    run,
+                    joint,
+                    [topic for _, topic, _ in far],
                     whole,
                 )
                 continue
@@ -282,11 +300,20 @@ def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
     return model.jnt_range[i] if model.jnt_limited[i] and hinge else None
 
 
+def _outside(x: np.ndarray, limits: np.ndarray) -> float:
+    """How far beyond a range the values go, 0 or less where they do not."""
+    return float(max(x.max() - limits[1], limits[0] - x.min()))
+
+
+def _farthest(x: np.ndarray, limits: np.ndarray) -> float:
+    return float(x[np.argmax(np.abs(x - np.mean(limits)))])
+
+
 def _degrees(q: np.ndarray, cmd: np.ndarray, limits: np.ndarray) -> bool:
     """Far outside the range and more than a turn, both of them, and inside once divided. (Less than a turn outside: the
     model's range may be the one in degrees.)"""
     wide = 0.1 * (limits[1] - limits[0])
-    outside = lambda x: max(x.max() - limits[1], limits[0] - x.min()) > 3 * (limits[1] - limits[0])  # noqa: E731
+    outside = lambda x: _outside(x, limits) > FAR * (limits[1] - limits[0])  # noqa: E731
     inside = (q / TURN).min() > limits[0] - wide and (q / TURN).max() < limits[1] + wide
     return bool(outside(q) and outside(cmd) and inside and min(np.abs(q).max(), np.abs(cmd).max()) > 2 * np.pi)
 
