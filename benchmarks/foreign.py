@@ -65,27 +65,35 @@ def seed_of_sources(folder: Path = ROOT / "dexsim") -> int:
     return 10_000 + int(digest.hexdigest()[:8], 16) % 90_000
 
 
-def generate(plant: Path, seed: int, only: Sequence[int], out: Path, jobs: int) -> None:
-    """Cases of one seed into out/cases and out/truth."""
+def generate(plant: Path, wanted: Sequence[tuple[int, Sequence[int]]], out: Path, jobs: int) -> None:
+    """Cases into out/cases and out/truth: of each seed all (an empty list) or these numbers."""
     with tempfile.TemporaryDirectory() as scratch:
         code = Path(scratch) / "plant"
         shutil.copytree(plant, code, ignore=shutil.ignore_patterns("cases", "truth", "results"))
-        # a plain loop over processes of its own: what it computes does not depend on how many there are
-        argv = [sys.executable, "generate.py", "--seed", str(seed), "--jobs", str(jobs), "--out", scratch]
-        argv += ["--only", ",".join(map(str, only))] if only else []
-        done = subprocess.run(
-            argv, cwd=code, env=os.environ | {"NUMBA_CACHE_DIR": f"{scratch}/numba"}, capture_output=True, text=True
-        )
-        if done.returncode:
-            raise UserError(
-                f"plant={plant}: its generator ended with {done.returncode}: {done.stderr.strip().splitlines()[-1:]}"
-            )
-        for part in ("cases", "truth"):
-            (out / part).mkdir(parents=True, exist_ok=True)
-            for item in (Path(scratch) / part).iterdir():
-                target = out / part / item.name
-                if not target.exists():
-                    shutil.move(str(item), target)
+        # one case alone compiles the plant: every other process, of every seed, reads that from the cache
+        _generate(code, wanted[0][0], [NULLS[0]], Path(scratch) / "compiled", 1)
+        folders = [Path(scratch) / f"seed_{seed}" for seed, _ in wanted]
+        with ThreadPoolExecutor(len(wanted)) as pool:
+            list(pool.map(lambda job: _generate(code, *job[0], job[1], jobs), zip(wanted, folders, strict=True)))
+        for folder in folders:
+            for part in ("cases", "truth"):
+                (out / part).mkdir(parents=True, exist_ok=True)
+                for item in (folder / part).iterdir():
+                    if not (target := out / part / item.name).exists():
+                        shutil.move(str(item), target)
+
+
+def _generate(code: Path, seed: int, only: Sequence[int], out: Path, jobs: int) -> None:
+    out.mkdir()
+    # a plain loop over processes of its own: what it computes does not depend on how many there are
+    argv = [sys.executable, "generate.py", "--seed", str(seed), "--jobs", str(jobs), "--out", str(out)]
+    argv += ["--only", ",".join(map(str, only))] if only else []
+    done = subprocess.run(
+        argv, cwd=code, env=os.environ | {"NUMBA_CACHE_DIR": f"{code}/numba"}, capture_output=True, text=True
+    )
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1:]
+        raise UserError(f"the plant's generator (seed {seed}) ended with {done.returncode}: {last}")
 
 
 def diagnose(case: Path, out: Path, limit: int, threads: int) -> None:
@@ -220,9 +228,10 @@ def main(argv: Sequence[str]) -> dict | None:
     only = [int(x) for x in s["cases"].strip("[]").split(",") if x]
     if not (out / "made").is_file():
         print(f"making the cases of seed {seed} ...", flush=True)
-        generate(plant, seed, only, out, jobs)
+        wanted: list[tuple[int, Sequence[int]]] = [(seed, only)]
         for k in range(0, int(s["nulls"]), len(NULLS)):
-            generate(plant, seed + 1 + k // len(NULLS), list(NULLS)[: int(s["nulls"]) - k], out, jobs)
+            wanted.append((seed + 1 + k // len(NULLS), list(NULLS)[: int(s["nulls"]) - k]))
+        generate(plant, wanted, out, jobs)
         (out / "made").write_text("", encoding="utf-8")
     ids = sorted(p.name for p in (out / "cases").iterdir())
     np.random.default_rng(seed).shuffle(ids)  # where it is ended early, what was done is a fair sample
