@@ -72,6 +72,27 @@ def test_sizes_and_layout(env):
         assert sum(row[1] for row in groups[group]) == obs[group].shape[1]
 
 
+@pytest.mark.parametrize(
+    "name, weight, said",
+    [
+        ("balance", 1.0, "task.rewards.balance=1.0: the task grasp has no reward of this name, .* it has action"),
+        ("reach", math.nan, "task.rewards.reach=nan: must be a finite number"),
+        ("reach", "much", "task.rewards.reach=much: must be a finite number"),
+    ],
+)
+def test_a_reward_that_the_task_does_not_know_is_one_line(name, weight, said):
+    cfg = grasp_cfg()
+    cfg["task"]["rewards"][name] = weight
+    with pytest.raises(UserError, match=said) as error:
+        make_env(cfg, 2, "cpu", 0)
+    assert "dexsim/configs/task/grasp.yaml" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_every_reward_has_a_weight_and_words(env):
+    rows = {name: words for name, _, words in env.describe()["rewards"]}
+    assert set(rows) == set(env.reward_words()) == set(env.rewards()) and all(rows.values())
+
+
 def test_critic_paper_has_the_actors_rows():
     env = grasp_env("task.critic=paper", "tactile.others=false", worlds=2)
     obs, *_ = env.step(torch.zeros(2, 12))

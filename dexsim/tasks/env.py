@@ -91,6 +91,7 @@ class HandEnv(VecEnv):
         self.decimation, self.dt = _periods(sim, self.task)
         if self.task["action"]["mode"] not in ("relative", "absolute"):
             raise UserError(f"task.action.mode={self.task['action']['mode']}: must be relative or absolute")
+        self._check_rewards()
         self._length_limit = torch.zeros((), dtype=torch.long, device=device)
         self.max_episode_length = int(round(self.task["episode_s"] / self.dt))
         shapes = named(self.task["objects"])
@@ -176,6 +177,18 @@ class HandEnv(VecEnv):
         compile_together(self._name_kernels, device)
         self.reset_all()
 
+    def _check_rewards(self) -> None:
+        """UserError for a weight of a reward that the task does not know, or that is no number."""
+        known, file = self.reward_words(), f"dexsim/configs/task/{self.task['name']}.yaml"
+        for name, weight in self.task["rewards"].items():
+            if name not in known:
+                raise UserError(
+                    f"task.rewards.{name}={weight}: the task {self.task['name']} has no reward of this name, or no"
+                    f" words for it in `reward_words` of its file; it has {', '.join(sorted(known))} ({file})"
+                )
+            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+                raise UserError(f"task.rewards.{name}={weight}: must be a finite number; 0 leaves it out ({file})")
+
     # -- for the task to fill in
     # -----------------------------------------------------------------------------------------
     def setup(self) -> None:
@@ -196,6 +209,15 @@ class HandEnv(VecEnv):
     def terminated(self) -> dict[str, torch.Tensor]:
         """Named terminations, bool [N] each."""
         raise NotImplementedError
+
+    def reward_words(self) -> dict[str, str]:
+        """By name of each reward term that the task knows: what it is, for the first screen."""
+        raise NotImplementedError
+
+    def reward_rows(self) -> list[tuple[str, float, str]]:
+        """(name, weight, what it is) of the rewards in the settings."""
+        words = self.reward_words()
+        return [(name, weight, words[name]) for name, weight in self.task["rewards"].items()]
 
     def rewards(self) -> dict[str, torch.Tensor]:
         """Named reward terms, weighted, [N] each."""

@@ -272,8 +272,12 @@ class GraspEnv(HandEnv):
 
     # -- rewards
     # ---------------------------------------------------------------------------------------------------------------
+    def reward_words(self) -> dict[str, str]:
+        words = grasp_rewards.TERMS
+        return words | {"centre": f"{words['centre']}, over {self.unit * CENTRE_LENGTH:.3g} m"}
+
     def rewards(self) -> dict[str, torch.Tensor]:
-        w, names = self.task["rewards"], grasp_rewards.TERMS
+        w, names = self.task["rewards"], tuple(grasp_rewards.TERMS)
         rows = len(names) + len(grasp_rewards.METRICS) + 1
         out = torch.empty(rows, self.num_envs, device=self.device)
         weights = grasp_rewards.Weights(*(float(w.get(name, 0.0)) for name in names))
@@ -360,23 +364,6 @@ class GraspEnv(HandEnv):
 
     def describe(self) -> dict:
         """Tables for the first screen."""
-        r = self.task["rewards"]
-        notes = {
-            "force": "R_force",
-            "torque": "R_torque",
-            "diff": "R_diff",
-            "outer": "R_outter",
-            "termination": "terminal penalty",
-            "action": "R_action",
-            "velocity": "R_vel",
-            "grip": "ours: thumb and fingers touch",
-            "still": "ours: object speed",
-            "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers",
-            "reach": "ours: pads near the object",
-            "worst": "ours: force_near of the finger that is furthest off",
-            "centre": f"ours: object beside the fingers' middle, over {self.unit * CENTRE_LENGTH:.3g} m",
-            "self": "ours: tips pressing on the hand",
-        }
         table = self.rows()
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in table]}
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in table]
@@ -390,7 +377,7 @@ class GraspEnv(HandEnv):
                 (j, float(lo), float(hi), f"rad ({act['mode']})")
                 for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
             ],
-            "rewards": [(k, w, notes[k]) for k, w in r.items()],
+            "rewards": self.reward_rows(),
             "terminations": [
                 (
                     "dropped",

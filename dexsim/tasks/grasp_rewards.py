@@ -9,10 +9,23 @@ can as well be written in torch: `GraspEnv.rewards` returns them all by name.
 
 import warp as wp
 
-TERMS = (
-    "force", "torque", "diff", "outer", "termination", "action", "velocity", "grip", "force_near", "reach", "self",
-    "still", "worst", "centre",
-)  # fmt: skip
+TERMS = {
+    "force": "R_force",
+    "torque": "R_torque",
+    "diff": "R_diff",
+    "outer": "R_outter",
+    "termination": "terminal penalty",
+    "action": "R_action",
+    "velocity": "R_vel",
+    "grip": "ours: thumb and fingers touch",
+    "force_near": "ours: 1 - |F_i - F_cmd F_max| / F_max, mean of the fingers",
+    "reach": "ours: pads near the object",
+    "self": "ours: tips pressing on the hand",
+    "still": "ours: object speed",
+    "worst": "ours: force_near of the finger that is furthest off",
+    "centre": "ours: object beside the fingers' middle",
+}
+"""Name of each reward and its words for the first screen, in the order of the kernel `rewards`."""
 METRICS = ("held", "force_error", "fingers_touching", "force_other")
 """What follows the terms: what the log shows of worlds that are `LATE`, 0 in others; then whether they are."""
 LATE = 2.0

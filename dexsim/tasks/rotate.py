@@ -264,8 +264,19 @@ class RotateEnv(HandEnv):
 
     # -- rewards
     # ---------------------------------------------------------------------------------------------------------------
+    def reward_words(self) -> dict[str, str]:
+        return {
+            "goal": "w_goal, close to goal",
+            "action": "w_action",
+            "bonus": "C_Bonus",
+            "spin": "ours: turning about the axis",
+            "lost": "ours: dropped or tipped",
+            "velocity": "ours: joint speed",
+            "torque": "ours: motor torque",
+        }
+
     def rewards(self) -> dict[str, torch.Tensor]:
-        w, r = self.task["rewards"], self.task["reward"]
+        w, r = dict.fromkeys(self.reward_words(), 0.0) | self.task["rewards"], self.task["reward"]
         q = self.object_pose[:, 3:]
         self.d_rot.copy_(rotation.error(q, self.goal))
         self.d_pos.copy_((self.object_pose[:, :3] - self.home).norm(dim=1))
@@ -447,16 +458,6 @@ class RotateEnv(HandEnv):
     def describe(self) -> dict:
         """Tables for the first screen."""
         t = self.task
-        notes = {
-            "goal": "w_goal, close to goal",
-            "action": "w_action",
-            "bonus": "C_Bonus",
-            "spin": "ours: turning about the axis",
-            "lost": "ours: dropped or tipped",
-            "velocity": "ours: joint speed",
-            "torque": "ours: motor torque",
-            "other": "ours: touched by palm or links",
-        }
         whole = [row for row in observations.actor(*self.sizes) if row[1]]
         seen = [(name, width, f"{unit}; clean") for name, width, unit, _ in whole]
         seen += [row[:3] for row in critic(*self.sizes[:2])]
@@ -471,7 +472,7 @@ class RotateEnv(HandEnv):
                 (j, float(lo), float(hi), f"rad ({t['action']['mode']})")
                 for j, lo, hi in zip(self.hand.joints, self.q_low.tolist(), self.q_high.tolist(), strict=True)
             ],
-            "rewards": [(k, w, notes[k]) for k, w in t["rewards"].items() if w],
+            "rewards": [row for row in self.reward_rows() if row[1]],
             "terminations": [
                 ("dropped", f"centre {self.unit * limit['distance']:.3g} m from its start or below"
                  f" {self.unit * limit['below'] + self.rise:.3g} m"),

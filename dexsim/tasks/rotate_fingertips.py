@@ -220,9 +220,12 @@ class FingertipEnv(RotateEnv):
         self.nan_end.copy_(self.nan)
         return {"dropped": self.dropped, "leaned": self.tipped}
 
+    def reward_words(self) -> dict[str, str]:
+        return super().reward_words() | {"other": "ours: touched by palm or links"}
+
     def rewards(self) -> dict[str, torch.Tensor]:
         out = super().rewards()
-        w = self.task["rewards"]["other"]
+        w = self.task["rewards"].get("other", 0.0)
         if w:
             out["other"] = w * (self.other_force > TOUCH).float()
         return out
