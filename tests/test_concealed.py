@@ -15,7 +15,8 @@ import pytest
 import yaml
 
 from benchmarks.concealed import __main__ as command
-from benchmarks.concealed import baselines, effects, generate, page, plant, rigs, score, touch
+from benchmarks.concealed import baselines, effects, generate, page, plant, rigs, same_cases, score, touch
+from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.recording import read
 from tests.made_hand import made_hand
@@ -543,3 +544,53 @@ def test_right_by_size_and_by_confidence_are_counted():
     assert sizes[2.2] == [2, 2, 0] and sizes[6.0] == [1, 0, 1] and sizes[1.25] == [0, 0, 0]
     sure = {a: x for a, _, *x in page.by_confidence([r, silent, as_set, {**r, "decoy": "bad_channel"}])}
     assert sure[0.95] == [1, 1] and sure[0.65] == [1, 0] and sure[0.8] == [0, 0]  # a set is no single name
+
+
+def test_two_runs_of_the_same_cases_are_compared_case_by_case(tmp_path):
+    """Only what both answered counts; another name is shown; other cases under the same name are refused."""
+    published = "benchmarks/concealed/published/seed_32005.tgz"
+    before = same_cases.load(published)
+    some = [json.loads(json.dumps(r)) for r in list(before.values())[:40]]
+    assert {r["group"] for r in some} > {"effect", "none"}
+    effect = next(r for r in some if r["group"] == "effect" and r["right"])
+    effect["said"], effect["right"], effect["alone"] = [["backlash", "joint0", 0.7, []]], False, False
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps({"results": some}))
+    text = same_cases.show(*same_cases.compared(before, same_cases.load(str(file))))
+    assert "| 40 cases |" in text and "the same verdict and\nnames" not in text
+    assert "in 39 of 40; the same verdict and names in 39" in text
+    assert f"- {effect['name']} (effect" in text and "backlash@joint0 0.70" in text
+    effect["tier"] = "none"
+    file.write_text(json.dumps({"results": some}))
+    with pytest.raises(UserError, match=f"case {effect['name']}: .* not the same cases"):
+        same_cases.compared(before, same_cases.load(str(file)))
+    file.write_text("{}")
+    with pytest.raises(UserError, match=r"results.json: must be a results.json"):
+        same_cases.load(str(file))
+
+
+def test_the_first_cases_of_a_set_are_those_of_the_whole(monkeypatch, tmp_path):
+    """`first=` cuts the drawn order and changes no case."""
+    built = []
+
+    class Ended(Exception):
+        pass
+
+    class Pool:
+        def __init__(self, *_, **__): ...
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_): ...
+
+        def map(self, _, jobs):
+            built.append(list(jobs))
+            raise Ended
+
+    monkeypatch.setattr(command, "ProcessPoolExecutor", Pool)
+    for more in ([], ["first=5"]):
+        with pytest.raises(Ended):
+            command.main(["mix=effect:8,none:4", "seed=3", f"out={tmp_path}", *more])
+    whole, first = built
+    assert len(whole) == 12 and first == whole[:5]

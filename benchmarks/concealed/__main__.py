@@ -1,7 +1,7 @@
 """Concealed benchmark: generate cases, publish the hashes of their truth, diagnose, score.
 
     python -m benchmarks.concealed [mix=effect:14,none:4,...] [seed=1] [laws=two] [out=out/concealed] [jobs=1]
-    [limit=900] [budget=0] [until=0] [hand=xhand] [mirror=false]
+    [limit=900] [budget=0] [until=0] [first=0] [hand=xhand] [mirror=false]
     python -m benchmarks.concealed ci=true                    # eight cases of one to three joints
     python -m benchmarks.concealed baselines=8 ...            # and what others' methods leave of the error in eight
 
@@ -10,7 +10,8 @@ that no change of the tool can have been made with its cases in view; hand, mirr
 and large are (a folder, or a hand that comes with dexsim; its mirror image); laws: `two` draws which law an effect
 follows where it has two (`laws.py`), `one` takes the first; limit: seconds a diagnosis may take, handed to it as
 `limit=` (half as much again ends it); budget: seconds after which no further diagnosis is begun, until: after which
-those under way are stopped and left out too (0: none). Resumable: what is finished is not run again. Writes hashes.txt
+those under way are stopped and left out too (0: none); first: only so many cases of the drawn order, by which a part of
+a set is a fair sample of it (0: all). Resumable: what is finished is not run again. Writes hashes.txt
 before any diagnosis, results.json and table.txt to out=/seed_N (seed_N_one with laws=one, seed_N_NAME of another hand);
 prints the table and one JSON line.
 """
@@ -35,7 +36,7 @@ from dexsim.hand import load_hand
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {"mix": dict(generate.MIX), "seed": 1, "laws": "two", "out": "out/concealed", "jobs": 1, "limit": 900,
-            "budget": 0, "until": 0, "baselines": 0, "ci": False, "one_joint": False,
+            "budget": 0, "until": 0, "first": 0, "baselines": 0, "ci": False, "one_joint": False,
             "hand": "xhand", "mirror": False}
 CI = {"effect": 3, "none": 2, "pair": 1, "outside": 1, "decoy": 1}
 
@@ -147,6 +148,7 @@ def main(argv: list[str]) -> dict:
     name = f"seed_{s['seed']}{'_one' if s['laws'] == 'one' else ''}{'_' + whose.robot if whose else ''}"
     root = Path(s["out"]).expanduser().resolve() / name
     plan = generate.plan(s["mix"], s["seed"], s["one_joint"])
+    plan = plan[: s["first"] or len(plan)]
     for entry in plan:
         if whose is not None and entry["shape"] == "hand":
             entry["hand"] = whose.identity
