@@ -7,6 +7,7 @@ import copy
 import gzip
 import io
 import json
+import os
 import pickle
 import shutil
 import sys
@@ -544,3 +545,66 @@ def test_a_manifest_of_the_wrong_kind_is_named(b, tmp_path, key, value):
     with pytest.raises(UserError) as error:
         main([f"bundle={b}", "record=none", "driver=xhand"])  # ends before a hand is asked for
     assert "manifest" in (text := one_line(error)) or "calibration" in text or "policy.onnx" in text, text
+
+
+TWELVE_TIMES = "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(12))
+MODELS = {
+    "pipe as a mesh": ("<asset>", '<asset><mesh name="x" file="pipe.obj"/>', "pipe.obj, a device, a pipe or a socket"),
+    "pipe in meshdir": ("<asset>", '<asset><mesh name="x" file="inner.obj"/>', "inner.obj, a device, a pipe"),
+    "pipe as a texture": ("<asset>", '<asset><texture name="x" type="2d" file="pipe.png"/>', "pipe.png, a device"),
+    "pipe included": ("<asset>", '<include file="pipe.xml"/><asset>', "pipe.xml, a device"),
+    "pipe included by an included one": ("<asset>", '<include file="more.xml"/><asset>', "more.xml: <mesh> names pipe"),
+    "a device": ("<asset>", '<asset><mesh name="x" file="/dev/zero"/>', "/dev/zero, a device"),
+    "copies without end": (
+        "</worldbody>",
+        '<replicate count="20000"><geom size=".1"/></replicate></worldbody>',
+        "20,000 copies",
+    ),
+    "copies of copies": (
+        "</worldbody>",
+        '<replicate count="900"><replicate count="900"><geom size=".1"/></replicate></replicate></worldbody>',
+        "810,000 copies",
+    ),
+    "pixels": (
+        "<asset>",
+        '<asset><texture name="x" type="2d" builtin="flat" width="60000" height="9"/>',
+        "60,000 pixels",
+    ),
+    "entities": ("<mujoco", f'<!DOCTYPE mujoco [<!ENTITY a "lol">{TWELVE_TIMES}]><mujoco', "defines XML entities"),
+}
+
+
+@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("reader", ["hand", "model=", "model_file=", "import-hand"])
+def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp_path):
+    """Each as a hand's own, a diagnosis', a training's and one to be imported; at once, and in one line."""
+    from dexsim.hand import load_hand
+    from dexsim.hand.load import HANDS
+    from dexsim.import_hand import source
+    from dexsim.paths import CONFIGS
+    from dexsim.recording.mechanism import mechanism
+    from dexsim.tasks.env import model_of
+
+    folder = tmp_path / "a" / "hand"
+    shutil.copytree(HANDS / "xhand", folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    text = (folder / "hand.yaml").read_text().replace("../../configs/servo/xhand.yaml", "servo.yaml")
+    (folder / "hand.yaml").write_text(text)
+    shutil.copy(CONFIGS / "servo" / "xhand.yaml", folder / "servo.yaml")
+    for name in ("pipe.obj", "pipe.png", "pipe.xml", "meshes/inner.obj"):
+        os.mkfifo(folder / name)
+    (folder / "more.xml").write_text('<mujoco><asset><mesh name="x" file="pipe.obj"/></asset></mujoco>')
+    here, there, said = MODELS[kind]
+    model = folder / "xhand_right.xml"
+    assert here in (sound := model.read_text())
+    model.write_text(sound.replace(here, there, 1))
+    read = {
+        "hand": lambda: load_hand(folder),
+        "model=": lambda: mechanism(model, folder / "servo.yaml"),
+        "model_file=": lambda: model_of(load_hand("xhand"), str(model)),
+        "import-hand": lambda: source.read(model, []),
+    }[reader]
+    begun = time.process_time()
+    with pytest.raises(UserError) as error:
+        read()
+    assert said in (text := one_line(error)) and "xhand_right.xml" in text, text
+    assert time.process_time() - begun < 5

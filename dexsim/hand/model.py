@@ -8,12 +8,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim import files
+from dexsim import model_file
 from dexsim.errors import UserError
 from dexsim.hand.schema import HandFile
 
-MAX_MODEL = 64 << 20
-"""Bytes of a model file."""
 OBJECT_BIT, HAND_BIT = 1, 2
 """Collision bits. Colliding hand geoms have contype HAND_BIT and conaffinity OBJECT_BIT, objects' geoms contype
 OBJECT_BIT and conaffinity HAND_BIT; bits 4 and up are the hand's own, about itself."""
@@ -24,7 +22,7 @@ ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, list[tuple[str, ...]]]:
     """The model in the palm frame, and the names of each fingertip's geoms. Raises UserError."""
     at = path.parent / file.model
-    spec = read(at, f"{where}: model ({file.model})")
+    spec = model_file.read(at, f"{where}: model ({file.model})")
     _alone(spec, at, f"{where}: model ({file.model})")
     _joints(spec, file, where)
     for group in (spec.actuators, spec.sensors, spec.keys, spec.lights, spec.cameras):
@@ -34,17 +32,6 @@ def prepared(file: HandFile, path: Path, where: str) -> tuple[mujoco.MjSpec, lis
     _collide(spec, {g for names in tips for g in names})
     _place(spec, file, where)
     return spec, tips
-
-
-def read(path: Path, where: str) -> mujoco.MjSpec:
-    """The model of an MJCF or URDF file that compiles. Raises UserError."""
-    files.check(path, MAX_MODEL, where)
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.copy().compile()
-    except (ValueError, RuntimeError) as error:
-        raise UserError(f"{where}: {' '.join(str(error).split())}") from None
-    return spec
 
 
 def limits(spec: mujoco.MjSpec, joints: list[str], where: str) -> np.ndarray:

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dexsim import files
+from dexsim import files, model_file
 from dexsim.errors import UserError
 from dexsim.import_hand import urdf
 
@@ -52,6 +52,7 @@ def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", den
             speeds, bare = text.speeds, text.bare
             spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
         else:
+            model_file.check(path, f"model {path}")
             spec = _parsed(path, lambda: mujoco.MjSpec.from_file(str(path)))
             _meshes_there(spec, path)
         notes: list[str] = []

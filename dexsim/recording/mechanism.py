@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import yaml
 
-from dexsim import files, yaml_text
+from dexsim import model_file, yaml_text
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -25,7 +25,6 @@ from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
-MAX_MODEL = 64 << 20  # bytes of a model file
 XHAND = "xhand"  # the hand where no model is given
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
@@ -91,12 +90,7 @@ def mechanism(
         joints = own.joints if joints is None else joints
     else:
         path = Path(model).expanduser()
-        files.check(path, MAX_MODEL, f"model={model}:")
-        try:
-            spec = mujoco.MjSpec.from_file(str(path))
-            spec.compile()
-        except (ValueError, RuntimeError) as error:
-            raise UserError(f"model={model}: {' '.join(str(error).split())}") from None
+        spec = model_file.read(path, f"model={model}")
         _physical(spec.compile(), f"model={model}")
         robot = path.stem
         if servo is None:

@@ -20,6 +20,7 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from dexsim import model_file
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets.objects.own import named
@@ -668,11 +669,7 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
         return hand.spec()
     if not Path(path).expanduser().is_file():
         raise UserError(f"model_file={path}: no such file")
-    try:
-        spec = mujoco.MjSpec.from_file(str(Path(path).expanduser()))
-        spec.compile()
-    except (ValueError, RuntimeError) as error:
-        raise UserError(f"model_file={path}: {' '.join(str(error).split())}") from None
+    spec = model_file.read(Path(path).expanduser(), f"model_file={path}")
     has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
     missing = [n for n in (*hand.joints, *hand.tip_bodies, *hand.tip_geoms) if n not in has]
     if missing:
