@@ -1,8 +1,8 @@
 """What an entry of the catalogue holds: everything that the diagnosis needs to know of one effect, on a joint
 (`Effect`) or of touch and contact (`TouchEffect`).
 
-To add an effect: a file here with a class of its own, its line in `catalogue.CATALOGUE`, its column
-(`dexsim.actuator.columns`, or `dexsim.gap.plant.columns` where training has no use for it), its law and a test.
+Of an effect that training has no use for the columns stand in `dexsim.gap.plant.columns`, of all others in
+`dexsim.actuator.columns`; how to add one, step by step, is in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
