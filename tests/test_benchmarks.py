@@ -153,6 +153,7 @@ def run(*command: str) -> subprocess.CompletedProcess:
         ("physics", "only=chosn"),
         ("engines", "worlds=many"),
         ("trace", "device=cpu"),
+        ("minutes", "task=walk"),
     ],
 )
 def test_bad_settings_are_one_clear_line(name, setting):
@@ -172,12 +173,15 @@ def test_a_bad_setting_ends_with_code_2():
 @pytest.mark.parametrize("command, keys", [
     (("benchmarks.engines", "worlds=8", "seconds=2"), ("physics_ratio", "env_ratio", "rows")),
     (("benchmarks.learning", "device=cpu", "worlds=8", "iterations=1", "settle=2"), ("rows",)),
+    (("benchmarks.minutes", "device=cpu", "worlds=8", "seconds=400", "iterations=2", "preset=none", "episodes=2",
+      "judge=task.evaluation.cap_s=1"), ("training", "trained_and_judged_s", "capped")),
     (("benchmarks.physics", "device=cpu", "worlds=8", "steps=2", "only=chosen,impratio 1"), ("rows",)),
     (("benchmarks.startup", "device=cpu", "worlds=4", "engines=mujoco"), ("mujoco_cold", "mujoco_warm")),
     (("benchmarks.touch", "device=cpu", "worlds=4", "alternatives=false"), ("us", "bytes", "flops")),
 ])  # fmt: skip
 def test_they_run_on_a_cpu_and_end_in_one_json_line(command, keys, tmp_path):
-    done = run(*command, *((f"out={tmp_path}",) if command[0] == "benchmarks.physics" else ()))
+    writes = command[0] in ("benchmarks.physics", "benchmarks.minutes")
+    done = run(*command, *((f"out={tmp_path}",) if writes else ()))
     assert done.returncode == 0, done.stderr[-2000:]
     out = json.loads(done.stdout.splitlines()[-1])
     assert out["benchmark"] == command[0].split(".")[1] and "versions" in out and "device" in out
