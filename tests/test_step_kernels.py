@@ -18,6 +18,7 @@ N = 64
 @pytest.fixture(scope="module", params=["mujoco", "warp"])
 def env(request):
     env = grasp_env(worlds=N, engine=request.param)
+    env.task["rewards"] |= {"torque_near": 1.0, "torque_worst": 1.0}  # off by default
     yield env
     env.close()
 
@@ -55,6 +56,7 @@ def rewards(env) -> tuple[dict, dict]:
     torque = env.torque[:, env.roots] * env.root_closes
     opposed, pressed = contact[:, env.opposing].any(1), contact[:, env.others]
     aside = force[:, env.others] / env.f_max - env.command[:, None]
+    slack = (torque / env.tau_max)[:, env.others] - env.command[:, None]
     p = env.object_pose[:, :3]
     dropped = (p - env.reach).norm(dim=1) > env.unit * end["distance"]
     dropped |= p[:, 2] < env.unit * end["below"] + env.rise
@@ -75,6 +77,8 @@ def rewards(env) -> tuple[dict, dict]:
         "self": (env.self_force.sum(1) / env.f_max).clamp(max=5.0),
         "still": env.object_velocity[:, :3].norm(dim=1).clamp(max=1.0),
         "worst": (1 - aside.abs().amax(1)).clamp(min=0),
+        "torque_near": (1 - slack.abs()).clamp(min=0).mean(1),
+        "torque_worst": (1 - slack.abs().amax(1)).clamp(min=0),
         "centre": beside.clamp(max=2.0),
     }
     late = env.episode_length_buf * env.dt > 2.0

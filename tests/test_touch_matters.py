@@ -126,7 +126,7 @@ def test_rows_are_judged_where_all_have_come(tmp_path):
 
 
 def test_a_row_that_is_not_is_named():
-    assert [r.key for r in chosen("full,no_pose")] == ["full", "no_pose"]
+    assert [[r.key for r in turn] for turn in chosen("full,no_pose/bits")] == [["full", "no_pose"], ["bits"]]
     with pytest.raises(UserError, match="nonsense"):
         chosen("full,nonsense")
 

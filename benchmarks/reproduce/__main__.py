@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
     table = own["table"]
     if table not in rows.TABLES:
         raise UserError(f"table={table or 'null'}: must be {' or '.join(rows.TABLES)}")
-    every = [*rows.TABLES[table], *(rows.OURS if table == "rotation" else ())]
+    every = [*rows.TABLES[table], *(rows.OURS if table == "rotation" else (rows.TORQUE_NEAR,))]
     chosen = every if own["rows"] == "null" else [r for k in own["rows"].split(",") for r in every if r.key == k]
     if not chosen or (own["rows"] != "null" and len(chosen) != len(own["rows"].split(","))):
         raise UserError(f"rows={own['rows']}: must be of {', '.join(r.key for r in every)}, with commas between")

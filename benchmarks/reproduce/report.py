@@ -256,7 +256,7 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
         for row in order:
             found = [m for j in all_jobs if j.row == row and (m := jobs.read(j, plan, world)) is not None]
             p = row.paper
-            paper = f"{p['force_low']:g}-{p['force_high']:g}, {p['torque_low']:g}-{p['torque_high']:g}"
+            paper = f"{p['force_low']:g}-{p['force_high']:g}, {p['torque_low']:g}-{p['torque_high']:g}" if p else "-"
             cells, entry = (
                 [],
                 {"by_command": [m.get("by_command") for m in found], "steps": [m["trained_steps"] for m in found]},
@@ -376,9 +376,10 @@ def write(table: str, plan: Plan, all_jobs: list[Job], about: dict[str, Any]) ->
 
     stage = "" if plan.level is None else f"_at_{plan.level / 1e6:.4g}M"
     written = []
+    apart = [j for j in all_jobs if not j.row.paper] if table == "rotation" else []
     for name, make, chosen in (
-        (table, {"rotation": rotation, "grasp": grasp}[table], [j for j in all_jobs if j.row.paper]),
-        (f"{table}_own", own.table, [j for j in all_jobs if not j.row.paper]),
+        (table, {"rotation": rotation, "grasp": grasp}[table], [j for j in all_jobs if j not in apart]),
+        (f"{table}_own", own.table, apart),
     ):
         if not chosen:
             continue

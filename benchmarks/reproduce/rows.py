@@ -73,5 +73,9 @@ GRASP = (  # table "Ablation on the rewards R_Force and R_torque"
     Row("torque", "R_torque only", ("task.rewards.force=0", "task.rewards.force_near=0", "task.rewards.worst=0"),
         {"force_low": 38.45, "force_high": 47.12, "torque_low": 0.85, "torque_high": 1.02}),
 )
+TORQUE_NEAR = Row("torque_near", "R_torque only, with dense companions as R_force has them",
+    (*GRASP[2].settings, "task.rewards.torque_near=1.0", "task.rewards.torque_worst=1.0"))  # fmt: skip
+"""A row of our own beside the grasp's: "R_force only" keeps two dense companions of it that are ours, "R_torque only"
+has none."""
 TABLES = {"rotation": ROTATION, "grasp": GRASP}
 TASK = {"rotation": "rotate", "grasp": "grasp"}

@@ -1,14 +1,15 @@
 """Train every row of sensors with paired seeds on the task by fingertips, and judge each policy in three worlds.
 
-    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch,..]
+    python -m benchmarks.touch_matters [out=out/touch_matters] [rows=paper|taxels|full,no_touch/bits,..]
         [seeds=11,12,13,14,15] [gpus=0,1,..] [each=1] [iterations=600] [seconds=S] [episodes=512] [bench_episodes=32]
         [cap=120] [save=25] [judged=training,wide,bench|none] [at=ITERATION]
         [any other setting of train.py]
     python -m benchmarks.touch_matters.analysis out=out/touch_matters
 
-`each` trainings share a GPU. `seconds` after the start trainings are ended, saved and judged; all rows are judged at
-the last iteration (a multiple of `save`) that every one has reached, or `at`. The same command again goes on where it
-stopped. Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's
+`each` trainings share a GPU; rows after a `/` wait for those before it. `seconds` after the start trainings are ended
+and saved. All are judged at the last iteration (a multiple of `save`) that every one has reached, when all have ended;
+with `at` at that one, each as soon as it has ended, and those that did not come so far are left out. The same command
+again goes on where it stopped. Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's
 table and figure.
 """
 
@@ -48,16 +49,13 @@ class Job:
     folder: Path
 
 
-def chosen(text: str) -> list[rows.Row]:
-    """Rows by name, or a group of them. Raises UserError."""
-    groups = {"paper": rows.PAPER, "taxels": rows.TAXELS, "every": rows.EVERY}
-    if text in groups:
-        return list(groups[text])
-    known = {r.key: r for r in rows.EVERY}
-    wrong = [k for k in text.split(",") if k not in known]
+def chosen(text: str) -> list[list[rows.Row]]:
+    """Rows by name or by set, in turns. Raises UserError."""
+    sets = {"paper": rows.PAPER, "taxels": rows.TAXELS, "every": rows.EVERY} | {r.key: (r,) for r in rows.EVERY}
+    wrong = [k for k in text.replace("/", ",").split(",") if k not in sets]
     if wrong:
-        raise UserError(f"rows={text}: no row '{wrong[0]}'; rows: {', '.join([*groups, *known])}")
-    return [known[k] for k in text.split(",")]
+        raise UserError(f"rows={text}: no row '{wrong[0]}'; rows: {', '.join(sets)}")
+    return [[r for k in turn.split(",") for r in sets[k]] for turn in text.split("/")]
 
 
 def train(job: Job, gpu: str | None, iterations: int, until: float, save: int, extra: Sequence[str]) -> None:
@@ -145,10 +143,11 @@ def main(argv: list[str]) -> None:
         gpus = [v.strip() for v in own["gpus"].split(",")]
     out = Path(own["out"]).expanduser().absolute()
     seeds = tools.numbers(own["seeds"], "seeds")
-    every = chosen(own["rows"])
+    turns = chosen(own["rows"])
+    every = [r for turn in turns for r in turn]
     for row in every:  # refuse a slip before an hour of training
         tools.config(["task=rotate_fingertips", *row.settings, *extra])
-    jobs = [Job(r, s, out / r.key / f"seed{s}") for s in seeds for r in every]
+    jobs = [Job(r, s, out / r.key / f"seed{s}") for turn in turns for s in seeds for r in turn]
     iterations, each, save = (tools.numbers(own[k], k)[0] for k in ("iterations", "each", "save"))
     until = math.inf if own["seconds"] == "null" else began + float(own["seconds"])
 
@@ -157,38 +156,59 @@ def main(argv: list[str]) -> None:
 
     say(f"{len(jobs)} trainings of {iterations} iterations, {each} at a time on each of {len(gpus)} devices: {out}")
 
-    def training(job: Job) -> Callable[[str | None], None]:
-        def run(gpu: str | None) -> None:
-            train(job, gpu, iterations, until, save, extra)
-            say(f"{job.row.key} seed {job.seed}: {done(job.folder).steps / 1e6:.1f} M steps")
-
-        return run
-
-    for t in lanes([training(j) for j in jobs], [g for _ in range(each) for g in gpus]):
-        t.join()
-    if own["judged"] == "none":
-        return
-    at = common(jobs) if own["at"] == "null" else tools.numbers(own["at"], "at")[0]
-    if at is None or not all(at in checkpoints(j.folder) for j in jobs):
-        raise UserError(f"out={out}: not every training kept iteration {at or save}; see its train.log")
-    say(f"judging all at iteration {at}")
-    asked = own["judged"].split(",")
+    at = None if own["at"] == "null" else tools.numbers(own["at"], "at")[0]
+    asked = [] if own["judged"] == "none" else own["judged"].split(",")
     if not set(asked) <= set(rows.WORLDS):
         raise UserError(f"judged={own['judged']}: must be none, or of {', '.join(rows.WORLDS)}")
     cores = len(os.sched_getaffinity(0))
     spare = max(1, cores - 2 * len(gpus))
     threads = max(1, min(4, spare // max(len(jobs), 1)))
-    on_gpu = [  # all seeds of a row at once: an evaluation takes as long for many worlds as for few
-        lambda gpu, r=r, w=w: judge(out, r, [j.seed for j in jobs if j.row == r], w, at, gpu, own, threads)
-        for w in asked if w not in rows.ON_CPU for r in every
-    ]  # fmt: skip
-    on_cpu = [
-        lambda _, j=j, w=w: judge(out, j.row, [j.seed], w, at, None, own, threads)
-        for w in asked if w in rows.ON_CPU for j in jobs
-    ]  # fmt: skip
-    running = lanes(on_gpu, gpus if None in gpus else [g for _ in range(3) for g in gpus])
-    running += lanes(on_cpu, [None] * max(1, spare // threads))
-    for t in running:
+    free = threading.Semaphore(max(1, spare // threads))  # of judgings on the CPU
+    beside: list[threading.Thread] = []
+
+    def on_cpu(job: Job, world: str, at: int) -> None:
+        with free:
+            judge(out, job.row, [job.seed], world, at, None, own, threads)
+
+    def start_on_cpu(job: Job, at: int) -> None:
+        for world in asked:
+            if world in rows.ON_CPU:
+                beside.append(threading.Thread(target=on_cpu, args=(job, world, at), daemon=True))
+                beside[-1].start()
+
+    def training(job: Job) -> Callable[[str | None], None]:
+        def run(gpu: str | None) -> None:
+            train(job, gpu, iterations, until, save, extra)
+            say(f"{job.row.key} seed {job.seed}: {done(job.folder).steps / 1e6:.1f} M steps")
+            if at is None:
+                return
+            if at not in checkpoints(job.folder):
+                say(f"{job.row.key} seed {job.seed}: did not come to iteration {at}, not judged")
+                return
+            start_on_cpu(job, at)
+            for world in asked:
+                if world not in rows.ON_CPU:
+                    judge(out, job.row, [job.seed], world, at, gpu, own, threads)
+            say(f"{job.row.key} seed {job.seed}: judged at iteration {at}")
+
+        return run
+
+    for t in lanes([training(j) for j in jobs], [g for _ in range(each) for g in gpus]):
+        t.join()
+    if at is None and asked:
+        at = common(jobs)
+        if at is None:
+            raise UserError(f"out={out}: not every training kept iteration {save}; see its train.log")
+        say(f"judging all at iteration {at}")
+        for job in jobs:
+            start_on_cpu(job, at)
+        on_gpu = [  # all seeds of a row at once: an evaluation takes as long for many worlds as for few
+            lambda gpu, r=r, w=w: judge(out, r, [j.seed for j in jobs if j.row == r], w, at, gpu, own, threads)
+            for w in asked if w not in rows.ON_CPU for r in every
+        ]  # fmt: skip
+        for t in lanes(on_gpu, gpus if None in gpus else [g for _ in range(3) for g in gpus]):
+            t.join()
+    for t in beside:
         t.join()
     say("done: python -m benchmarks.touch_matters.analysis out=" + str(out))
 

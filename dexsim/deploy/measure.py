@@ -23,20 +23,23 @@ def for_bundle(manifest: dict[str, Any], calibration: Calibration) -> Measure | 
     period = float(manifest["rates"]["policy_period_s"])
     if manifest["task"] == "rotate":
         return TurnMeasure(calibration, manifest, period)
-    return Measure(calibration, manifest["normalization"]["force_max_N"], period)
+    touch = any(row["name"] == "contact_force" for row in manifest["observation"])
+    return Measure(calibration, manifest["normalization"]["force_max_N"], period, touch)
 
 
 class Measure:
     """The grasp: turns readings into observations; keeps what has memory: the first x, y of the object and its last
     height.
 
-    period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training.
+    period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training. touch:
+    whether the policy has rows of touch (task.observe.touch).
     """
 
     needs: str | None = PLACE
 
-    def __init__(self, calibration: Calibration, force_max: float, period: float):
+    def __init__(self, calibration: Calibration, force_max: float, period: float, touch: bool = True):
         self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
+        self.touch = touch
         self.hand = HandKinematics(calibration.hand)
         self.reset()
 
@@ -52,10 +55,13 @@ class Measure:
         """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame;
         command 0..1."""
         s = self.signals(state, seen, command)
-        return self.observation(s), s.touch_force[0].numpy()
+        force = s.touch_force[0].numpy()
+        if not self.touch:  # it is shown and recorded all the same
+            s = s._replace(touch_force=s.touch_force[:, :0], touch_centre=s.touch_centre[:, :0])
+        return self.observation(s), force
 
     def signals(self, state: HandState, place: np.ndarray, command: float) -> observations.Signals:
-        """See `observe`."""
+        """See `observe`; of touch, all that the hand feels."""
         c = self.calibration
         tips, position, rotation_ = self.hand(state.position)
         force, centre = self.hand.touch(c.normal_force(state.tactile), position, rotation_)

@@ -50,6 +50,10 @@ class GraspEnv(HandEnv):
 
     def setup(self) -> None:
         t, n, dev = self.task, self.num_envs, self.device
+        felt = (t.get("observe") or {}).get("touch", True)  # checkpoints from before have no such setting
+        if not isinstance(felt, bool):
+            raise UserError(f"task.observe.touch={felt}: must be true or false")
+        self.felt = self.pads if felt else 0  # pads that the actor sees
         drive = 1.0
         for name in ("servo.efficiency", "servo.torque_limit"):
             low, high, _ = self.sampler.range(name)
@@ -317,8 +321,8 @@ class GraspEnv(HandEnv):
                 object_xy=self.first_xy,
                 object_z=self.z_seen,
                 object_vz=self.vz_seen.masked_fill(self.episode_length_buf == 0, 0.0),
-                touch_force=self.touch.force[:, : self.pads],
-                touch_centre=self.touch.centre[:, : self.pads],
+                touch_force=self.touch.force[:, : self.felt],
+                touch_centre=self.touch.centre[:, : self.felt],
                 fingertip=sensed.tip,
                 command=self.command,
             ),
@@ -339,7 +343,7 @@ class GraspEnv(HandEnv):
 
     def rows(self) -> list[tuple[str, int, str, str]]:
         """(name, width, unit, what it is on hardware) of the actor's observation."""
-        return observations.rows(self.num_actions, self.fingers, self.pads)
+        return observations.rows(self.num_actions, self.fingers, self.felt)
 
     def _privileged(self) -> list[torch.Tensor]:
         o = self.objects

@@ -24,6 +24,8 @@ TERMS = {
     "still": "ours: object speed",
     "worst": "ours: force_near of the finger that is furthest off",
     "centre": "ours: object beside the fingers' middle",
+    "torque_near": "ours: 1 - |tau_i / tau_max - F_cmd|, mean of the fingers",
+    "torque_worst": "ours: torque_near of the finger that is furthest off",
 }
 """Name of each reward and its words for the first screen, in the order of the kernel `rewards`."""
 METRICS = ("held", "force_error", "fingers_touching", "force_other")
@@ -231,6 +233,34 @@ def worst(w: int, s: State, shape: Shape):
 
 
 @wp.func
+def slack(i: int, w: int, s: State, shape: Shape):
+    """How far the torque of the i-th of the others is from the command, as a fraction of its maximum."""
+    f = shape.others[i]
+    x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
+    return wp.abs(x - s.command[w])
+
+
+@wp.func
+def torque_near(w: int, s: State, shape: Shape):
+    """Ours, `force_near` for R_torque: 1 - |tau_i / tau_max - F_cmd|, not below 0, mean of the others."""
+    total = float(0.0)
+    for i in range(shape.others.shape[0]):
+        total += at_least(1.0 - slack(i, w, s, shape), 0.0)
+    return total / float(shape.others.shape[0])
+
+
+@wp.func
+def torque_worst(w: int, s: State, shape: Shape):
+    """Ours: `torque_near` of the finger that is furthest off."""
+    furthest = float(0.0)
+    for i in range(shape.others.shape[0]):
+        off = slack(i, w, s, shape)
+        if off > furthest or wp.isnan(off):
+            furthest = off
+    return at_least(1.0 - furthest, 0.0)
+
+
+@wp.func
 def reach(w: int, s: State, shape: Shape):
     """Ours: pads near the object, mean of the others. A finger that does not touch has nothing else that says which way
     the object lies."""
@@ -299,6 +329,8 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[11] = still(w, s)
     value[12] = worst(w, s, shape)
     value[13] = centre(w, s, shape)
+    value[14] = torque_near(w, s, shape)
+    value[15] = torque_worst(w, s, shape)
     for k in range(wp.static(len(TERMS))):
         out[k, w] = weight[k] * value[k]
 
