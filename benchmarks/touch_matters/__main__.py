@@ -9,8 +9,8 @@
 `each` trainings share a GPU; rows after a `/` wait for those before it. `seconds` after the start trainings are ended
 and saved. All are judged at the last iteration (a multiple of `save`) that every one has reached, when all have ended;
 with `at` at that one, each as soon as it has ended, and those that did not come so far are left out. The same command
-again goes on where it stopped. Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which `analysis` makes the page's
-table and figure.
+again goes on where it stopped. Writes out/<row>/seed<k>/<world>.json, one for each row, seed and world, of which
+`analysis` makes the page's table and figure.
 """
 
 from __future__ import annotations
