@@ -37,16 +37,18 @@ def scatter(env, seed: int) -> None:
 
     u(env.q, -0.5, 2.0), u(env.qd, -5, 5), u(env.torque, -1.1, 1.1), u(env.action, -1, 1), u(env.last_action, -1, 1)
     u(env.tip_force, -3.0, 1.2 * env.f_max), u(env.self_force, 0, 20), u(env.command, 0, 1), u(env.reward, -1, 1)
+    u(env.thumb_command, -1, 1)
     env.tip_force.clamp_(min=0)
     u(env.clearance.distance, -0.01, 0.05), u(env.object_velocity, -1.0, 1.0), u(env.object_pose, -0.15, 0.15)
     env.episode_length_buf = torch.randint(0, 300, (N,), generator=g)
 
 
 def tracking(x, command, x_max, sigma, low, high, contact):
+    """command: [N, F] of each finger, below 0: the band alone."""
     band = ((x >= low * x_max) & (x <= high * x_max)).float()
-    error = (x[:, 1:] - command[:, None] * x_max) / (sigma * x_max)
-    gauss = torch.exp(-0.5 * error.square())
-    return (torch.cat([band[:, :1], gauss * band[:, 1:]], 1) * contact).sum(1)
+    error = (x - command * x_max) / (sigma * x_max)
+    gauss = torch.where(command < 0, torch.ones_like(x), torch.exp(-0.5 * error.square()))
+    return (gauss * band * contact).sum(1)
 
 
 def rewards(env) -> tuple[dict, dict]:
@@ -56,6 +58,8 @@ def rewards(env) -> tuple[dict, dict]:
     torque = env.torque[:, env.roots] * env.root_closes
     opposed, pressed = contact[:, env.opposing].any(1), contact[:, env.others]
     aside = force[:, env.others] / env.f_max - env.command[:, None]
+    own, none = env.thumb_command[:, None], torch.full((N, 1), -1.0)
+    shared = env.command[:, None].expand(N, env.fingers - 1)
     slack = (torque / env.tau_max)[:, env.others] - env.command[:, None]
     p = env.object_pose[:, :3]
     dropped = (p - env.reach).norm(dim=1) > env.unit * end["distance"]
@@ -64,8 +68,8 @@ def rewards(env) -> tuple[dict, dict]:
     near = -env.clearance.distance[:, env.others].clamp(min=0) / (env.unit * r["reach_length"])
     beside = (p[:, 1] - env.beside).abs() / (env.unit * CENTRE_LENGTH)
     out = {
-        "force": tracking(force, env.command, env.f_max, *bands[0], contact),
-        "torque": tracking(torque / env.tau_max, env.command, 1.0, *bands[1], contact),
+        "force": tracking(force, torch.cat([own, shared], 1), env.f_max, *bands[0], contact),
+        "torque": tracking(torque / env.tau_max, torch.cat([none, shared], 1), 1.0, *bands[1], contact),
         "diff": (env.q[:, env.inner] * env.inner_closes).var(dim=1, unbiased=False),
         "outer": (env.q[:, env.outer] - env.q_mid[env.outer]).norm(dim=1),
         "termination": dropped.float(),
@@ -79,6 +83,7 @@ def rewards(env) -> tuple[dict, dict]:
         "worst": (1 - aside.abs().amax(1)).clamp(min=0),
         "torque_near": (1 - slack.abs()).clamp(min=0).mean(1),
         "torque_worst": (1 - slack.abs().amax(1)).clamp(min=0),
+        "thumb_near": (1 - (force[:, 0] / env.f_max - own[:, 0]).abs()).clamp(min=0) * (own[:, 0] >= 0),
         "centre": beside.clamp(max=2.0),
     }
     late = env.episode_length_buf * env.dt > 2.0

@@ -23,8 +23,10 @@ def for_bundle(manifest: dict[str, Any], calibration: Calibration) -> Measure | 
     period = float(manifest["rates"]["policy_period_s"])
     if manifest["task"] == "rotate":
         return TurnMeasure(calibration, manifest, period)
-    touch = any(row["name"] == "contact_force" for row in manifest["observation"])
-    return Measure(calibration, manifest["normalization"]["force_max_N"], period, touch)
+    width = {row["name"]: row["stop"] - row["start"] for row in manifest["observation"]}
+    made = Measure(calibration, manifest["normalization"]["force_max_N"], period)
+    made.touch, made.commands = "contact_force" in width, width.get("force_command", 1)
+    return made
 
 
 class Measure:
@@ -32,14 +34,15 @@ class Measure:
     height.
 
     period: the policy's [s], over which the height's difference is taken. force_max: F_max [N] of training. touch:
-    whether the policy has rows of touch (task.observe.touch).
+    whether the policy has rows of touch (task.observe.touch). commands: 2 for a policy whose thumb has one of its own
+    (task.command.thumb), which is given the others'.
     """
 
     needs: str | None = PLACE
 
-    def __init__(self, calibration: Calibration, force_max: float, period: float, touch: bool = True):
+    def __init__(self, calibration: Calibration, force_max: float, period: float):
         self.calibration, self.force_max, self.period = calibration, float(force_max), float(period)
-        self.touch = touch
+        self.touch, self.commands = True, 1
         self.hand = HandKinematics(calibration.hand)
         self.reset()
 
@@ -73,7 +76,8 @@ class Measure:
         return observations.Signals(
             _tensor(state.position), _tensor(c.torque_norm(np.asarray(state.current, float) * 1e-3)),
             _tensor(self._xy), z, vz,
-            _tensor(force), _tensor(centre), _tensor(tips), _tensor([command])[0])  # fmt: skip
+            _tensor(force), _tensor(centre), _tensor(tips),
+            _tensor([command] * self.commands))  # fmt: skip
 
     def observation(self, signals: observations.Signals) -> np.ndarray:
         """[1, D] float32, by the builder that training used."""

@@ -23,9 +23,10 @@ ORDER = {
 }  # fmt: skip
 
 
-def rows(joints: int, fingers: int, pads: int) -> list[tuple[str, int, str, str]]:
+def rows(joints: int, fingers: int, pads: int, commands: int = 1) -> list[tuple[str, int, str, str]]:
     """(name, width, unit, what it is on hardware) of the observation, table (a) of the paper, for a hand of so many
-    joints, fingers and touch pads (without pads: without the rows of touch)."""
+    joints, fingers and touch pads (without pads: without the rows of touch). commands: 2 where the thumb has its own,
+    after the others'."""
     table = (
         ("joint_angle", joints, "rad", "measured"),
         ("joint_torque", joints, "tau/tau_max", "motor current, as calibrated"),
@@ -34,7 +35,7 @@ def rows(joints: int, fingers: int, pads: int) -> list[tuple[str, int, str, str]
         ("contact_force", pads, "F/F_max", "sum of a pad's normal forces"),
         ("contact_centre", 3 * pads, "m", "force-weighted mean of taxel positions, palm frame"),
         ("fingertip_position", 3 * fingers, "m", "palm frame, forward kinematics"),
-        ("force_command", 1, "F/F_max", "0..1"),
+        ("force_command", commands, "F/F_max", "0..1"),
     )
     return [row for row in table if row[1]]
 
@@ -42,8 +43,8 @@ def rows(joints: int, fingers: int, pads: int) -> list[tuple[str, int, str, str]
 class Signals(NamedTuple):
     """What is measured, N hands at once. joint_position [N, J] rad; joint_torque [N, J] over tau_max, positive along
     positive joint position; object_xy [N, 2], object_z [N] m, object_vz [N] m/s; touch_force [N, P] N, touch_centre
-    [N, P, 3] (P pads, 0 without touch) and fingertip [N, F, 3] m, palm frame; command [N] 0..1. Joints and fingers in
-    the hand's order."""
+    [N, P, 3] (P pads, 0 without touch) and fingertip [N, F, 3] m, palm frame; command [N] 0..1, or [N, 2] with the
+    thumb's. Joints and fingers in the hand's order."""
 
     joint_position: torch.Tensor
     joint_torque: torch.Tensor
@@ -67,7 +68,7 @@ def build(s: Signals, force_max: float) -> torch.Tensor:
         s.touch_force / force_max,
         s.touch_centre.flatten(1),
         s.fingertip.flatten(1),
-        s.command[:, None],
+        s.command.reshape(len(s.command), -1),
     ], 1)  # fmt: skip
 
 

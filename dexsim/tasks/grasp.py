@@ -45,6 +45,12 @@ def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
     )  # fmt: skip
 
 
+def _is_range(pair: Any) -> bool:
+    """Two numbers, 0 <= low <= high <= 1."""
+    numbers = isinstance(pair, list) and [x for x in pair if isinstance(x, (int, float)) and not isinstance(x, bool)]
+    return bool(numbers) and len(pair) == len(numbers) == 2 and 0 <= pair[0] <= pair[1] <= 1
+
+
 class GraspEnv(HandEnv):
     """The grasp task; see the module."""
 
@@ -109,6 +115,11 @@ class GraspEnv(HandEnv):
                 f"task.command: low={t['command']['low']}, high={t['command']['high']} must satisfy 0 <= low <= high"
                 " <= 1"
             )
+        self.thumb_range = t["command"].get("thumb")
+        if self.thumb_range is not None and not _is_range(self.thumb_range):
+            raise UserError(
+                f"task.command.thumb={self.thumb_range}: must be null or [low, high] with 0 <= low <= high <= 1"
+            )
         if t["critic"] not in ("paper", "privileged"):
             raise UserError(f"task.critic={t['critic']}: must be paper or privileged")
         base_path.of((t.get("evaluation") or {}).get("base", "turn"))  # refused now, not after the training
@@ -128,6 +139,7 @@ class GraspEnv(HandEnv):
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self.command, self.command_left = zeros(), zeros()
+        self.thumb_command = zeros() - 1.0  # below 0: none of its own
         self.push, self.push_left, self.push_wait = zeros(3), zeros(), zeros()
         self.first_xy, self.z_seen, self.vz_seen = zeros(2), zeros(), zeros()
         lag = max(1, int(round(t["sensors"]["vision_delay"][1] / self.dt)) + 1)
@@ -135,6 +147,7 @@ class GraspEnv(HandEnv):
         self.torque_bias = zeros(self.num_actions)
         self.outside_force = zeros(3)  # N on the object's body frame, on top of the random pushes (evaluation)
         self.fixed_command: torch.Tensor | None = None  # [N], or None to resample within the episode
+        self.fixed_thumb: torch.Tensor | None = None  # the same of the thumb's own
         self.pushes = True
         self._for_kernels(zeros)
 
@@ -157,7 +170,7 @@ class GraspEnv(HandEnv):
             low=self.q_low.contiguous(), high=self.q_high.contiguous(), lay=self.lay, delay_low=low, delay_high=high,
         )  # fmt: skip
         names = ("q", "qd", "torque", "action", "last_action", "tip_force", "self_force", "object_pose")
-        names += ("object_velocity", "command", "episode_length")
+        names += ("object_velocity", "command", "thumb_command", "episode_length")
         own = {name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in names}
         self._state = filled(grasp_rewards.State, clearance=self.clearance.distance, **own)
         hand = ("opposing", "others", "roots", "root_closes", "tau_max", "inner", "inner_closes", "outer", "q_mid")
@@ -235,6 +248,7 @@ class GraspEnv(HandEnv):
         orders, o = self._draw_orders(), self.objects
         args = (self._place, fall, *orders, o.variant, o.radius, o.mass, self._begun, self._orders)
         self._launch(kernels.begin, self.num_envs, mask, *args)
+        self._command_thumb(mask)
         self.place(mask, self.start.hand, self.start.pose, self.start.velocity)
 
     def _draw_orders(self) -> tuple[Any, Any]:
@@ -258,6 +272,7 @@ class GraspEnv(HandEnv):
 
     def memory(self) -> dict:
         names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen")
+        names += () if self.thumb_range is None else ("thumb_command",)
         own = {name: getattr(self, name) for name in (*names, "z_history", "torque_bias", "outside_force")}
         return super().memory() | own | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
 
@@ -265,7 +280,17 @@ class GraspEnv(HandEnv):
         """The command changes once it was held for long enough; pushes come and go."""
         o, kernel = self.objects, kernels.orders_kernel(self.engine.real)
         args = (*self._draw_orders(), o.mass, self.outside_force, self._orders, self._xfrc)
+        left = self.command_left if self.thumb_range is None else self.command_left.clone()
         self._launch(kernel, self.num_envs, self.dt, self.pushes, o.body, *args)
+        self._command_thumb(self.command_left > left)  # a new command is held for longer than was left of the old
+
+    def _command_thumb(self, mask: torch.Tensor) -> None:
+        """Where mask [N] holds, a new command of the thumb's own, if it has one."""
+        if self.thumb_range is None:
+            return
+        low, high = self.thumb_range
+        drawn = low + (high - low) * self.sampler.uniform() if self.fixed_thumb is None else self.fixed_thumb
+        self.thumb_command.copy_(torch.where(mask, drawn, self.thumb_command))
 
     # -- terminations
     # --------------------------------------------------------------------------------------------------------
@@ -324,7 +349,7 @@ class GraspEnv(HandEnv):
                 touch_force=self.touch.force[:, : self.felt],
                 touch_centre=self.touch.centre[:, : self.felt],
                 fingertip=sensed.tip,
-                command=self.command,
+                command=self._commands(),
             ),
             self.f_max,
         )  # the deployed loop builds its own with the same function
@@ -332,7 +357,7 @@ class GraspEnv(HandEnv):
             self.q, self.torque / torque_max, self.object_pose[:, :3], self.object_velocity[:, :3],
             self.touch.force_clean[:, : self.pads] / self.f_max, self.touch.centre_clean[:, : self.pads].flatten(1),
             self.tips.flatten(1),
-            self.command[:, None],
+            self._commands().reshape(self.num_envs, -1),
         ]  # fmt: skip
         if self.task["critic"] == "privileged":
             critic += self._privileged()
@@ -341,9 +366,13 @@ class GraspEnv(HandEnv):
             "critic": torch.nan_to_num(torch.cat(critic, 1)),
         }
 
+    def _commands(self) -> torch.Tensor:
+        """[N], or [N, 2] with the thumb's own."""
+        return self.command if self.thumb_range is None else torch.stack([self.command, self.thumb_command], 1)
+
     def rows(self) -> list[tuple[str, int, str, str]]:
         """(name, width, unit, what it is on hardware) of the actor's observation."""
-        return observations.rows(self.num_actions, self.fingers, self.felt)
+        return observations.rows(self.num_actions, self.fingers, self.felt, 1 if self.thumb_range is None else 2)
 
     def _privileged(self) -> list[torch.Tensor]:
         o = self.objects

@@ -80,6 +80,9 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     training_length, env.max_episode_length = env.max_episode_length, steps + 2
     env.pushes = False
     env.fixed_command = torch.rand(n, generator=env.rng, device=dev)
+    if env.thumb_range is not None:
+        low, high = env.thumb_range
+        env.fixed_thumb = low + (high - low) * torch.rand(n, generator=env.rng, device=dev)
     env.reset_all()
     obs = env.get_observations()
     pushed = torch.arange(n, device=dev) % 2 == 0
@@ -91,6 +94,7 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
     command, mass, friction, shape = (
         x.clone() for x in (env.fixed_command, env.objects.mass, env.objects.friction, env.objects.variant)
     )
+    thumb_command = env.thumb_command.clone()
     alive = torch.ones(n, dtype=torch.bool, device=dev)
     held, held90, held180 = (torch.zeros(n, dtype=torch.bool, device=dev) for _ in range(3))
     place = torch.zeros(n, 3, device=dev)
@@ -144,12 +148,13 @@ def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episo
         if progress is not None and k % 10 == 0:
             progress(done + min(n, episodes - done) * k // steps, episodes, f"{label}, {t:.1f} s")
     env.outside_force.zero_()
-    env.fixed_command, env.pushes, env.max_episode_length = None, True, training_length
+    env.fixed_command, env.fixed_thumb, env.pushes, env.max_episode_length = None, None, True, training_length
     samples = samples.clamp(min=1)
     out = {
         "command": command, "mass": mass, "friction": friction, "shape": shape, "pushed": pushed, "held": held,
         "held90": held90,
         "held180": held180, "load": load, "force": force / samples[:, None], "torque": torque / samples[:, None],
+        "thumb_command": thumb_command,
         "alive": alive, "moved": moved, "untouched": untouched, "tips": by_tips / by_all.clamp(min=1e-6),
     }  # fmt: skip
     out = {k: v.cpu().numpy() for k, v in out.items()}
@@ -236,6 +241,10 @@ def _metrics(r: dict, k: dict, env) -> dict:
     }  # fmt: skip
     for i, name in enumerate(env.hand.finger_names):
         out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])
+    if env.thumb_range is not None and held.any():
+        own, pressed = r["thumb_command"][held], r["force"][held, 0]
+        out["thumb_own_command_correlation"] = _corr(own, pressed)
+        out["thumb_own_command_error_N"] = float(np.abs(pressed - own * f_max).mean())
     if held.sum() > 2:
         slope, offset = np.polyfit(r["command"][held] * n * f_max, total[held], 1)
         out["force_slope"], out["force_offset_N"] = float(slope), float(offset)

@@ -26,6 +26,7 @@ TERMS = {
     "centre": "ours: object beside the fingers' middle",
     "torque_near": "ours: 1 - |tau_i / tau_max - F_cmd|, mean of the fingers",
     "torque_worst": "ours: torque_near of the finger that is furthest off",
+    "thumb_near": "ours: the thumb's force near a command of its own (task.command.thumb)",
 }
 """Name of each reward and its words for the first screen, in the order of the kernel `rewards`."""
 METRICS = ("held", "force_error", "fingers_touching", "force_other")
@@ -79,6 +80,7 @@ class State:
     object_pose: wp.array2d(dtype=float)
     object_velocity: wp.array2d(dtype=float)
     command: wp.array(dtype=float)
+    thumb_command: wp.array(dtype=float)  # below 0: none of its own
     episode_length: wp.array(dtype=wp.int64)
 
 
@@ -99,13 +101,13 @@ def touches(f: int, w: int, s: State, shape: Shape):
 
 
 @wp.func
-def tracking(x: float, command: float, x_max: float, sigma: float, low: float, high: float, finger: int):
+def tracking(x: float, command: float, x_max: float, sigma: float, low: float, high: float):
     """R_i of a finger that touches (R_force, R_torque): exp(-(x - command x_max)^2 / (2 (sigma x_max)^2)) within [low
-    x_max, high x_max]; of the thumb, finger 0, the band alone. The paper prints tau_thumb in the fingers' torque band;
-    we take it for tau_i."""
+    x_max, high x_max]; for a command below 0, as the thumb's is unless it has its own, the band alone. The paper prints
+    tau_thumb in the fingers' torque band; we take it for tau_i."""
     if not (x >= low * x_max and x <= high * x_max):
         return float(0.0)
-    if finger == 0:
+    if command < 0.0:
         return float(1.0)
     error = (x - command * x_max) / (sigma * x_max)
     return wp.exp(-0.5 * error * error)
@@ -117,8 +119,9 @@ def force(w: int, s: State, shape: Shape):
     total = float(0.0)
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
-            total += tracking(s.tip_force[w, f], s.command[w], shape.f_max, shape.force_sigma, shape.force_low,
-                              shape.force_high, f)  # fmt: skip
+            command = wp.where(f == 0, s.thumb_command[w], s.command[w])
+            total += tracking(s.tip_force[w, f], command, shape.f_max, shape.force_sigma, shape.force_low,
+                              shape.force_high)  # fmt: skip
     return total
 
 
@@ -129,7 +132,8 @@ def torque(w: int, s: State, shape: Shape):
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
             x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
-            total += tracking(x, s.command[w], 1.0, shape.torque_sigma, shape.torque_low, shape.torque_high, f)
+            command = wp.where(f == 0, float(-1.0), s.command[w])
+            total += tracking(x, command, 1.0, shape.torque_sigma, shape.torque_low, shape.torque_high)
     return total
 
 
@@ -261,6 +265,14 @@ def torque_worst(w: int, s: State, shape: Shape):
 
 
 @wp.func
+def thumb_near(w: int, s: State, shape: Shape):
+    """Ours: 1 - |F_thumb / F_max - its own command|, not below 0; 0 where it has none."""
+    if s.thumb_command[w] < 0.0:
+        return float(0.0)
+    return at_least(1.0 - wp.abs(s.tip_force[w, 0] / shape.f_max - s.thumb_command[w]), 0.0)
+
+
+@wp.func
 def reach(w: int, s: State, shape: Shape):
     """Ours: pads near the object, mean of the others. A finger that does not touch has nothing else that says which way
     the object lies."""
@@ -331,6 +343,7 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[13] = centre(w, s, shape)
     value[14] = torque_near(w, s, shape)
     value[15] = torque_worst(w, s, shape)
+    value[16] = thumb_near(w, s, shape)
     for k in range(wp.static(len(TERMS))):
         out[k, w] = weight[k] * value[k]
 
