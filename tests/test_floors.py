@@ -18,7 +18,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     for names in (
         "errors paths version rotation intervals",
         "console files typed",
-        "outputs yaml_text",
+        "outputs yaml_text model_file",
         "assets hand",
         "sim",
         "actuator tactile",

@@ -114,12 +114,12 @@ def test_weigh_takes_every_doubt_into_account():
 def test_what_stands_beside_a_doubtful_effect_is_doubtful_and_so_is_a_crowd():
     sure, doubtful = evidence(effect="backlash", confidence=0.99), evidence(effect="deadband", confidence=0.4)
     later = evidence(effect="supply_sag", confidence=0.99)
-    confidence.together([sure, doubtful])
+    confidence.doubt_beside_others([sure, doubtful])
     assert sure.confidence == 0.99
-    confidence.together([doubtful, later])
+    confidence.doubt_beside_others([doubtful, later])
     assert later.confidence == DOUBTED and "deadband" in later.reasons[0]
     crowd = [evidence(effect=x, confidence=0.99) for x in ("backlash", "deadband", "supply_sag")]
-    confidence.together(crowd)
+    confidence.doubt_beside_others(crowd)
     assert [e.confidence for e in crowd] == [0.99, DOUBTED, DOUBTED]
 
 
@@ -138,9 +138,9 @@ def test_two_torques_of_the_pose_can_be_any():
         evidence(effect=e, confidence=0.99, of_pose=o)
         for e, o in (("payload", True), ("torque_ripple", True), ("torque_ripple", False))
     )
-    confidence.together([load, fast])
+    confidence.doubt_beside_others([load, fast])
     assert load.confidence == fast.confidence == 0.99
-    confidence.together([load, slow])
+    confidence.doubt_beside_others([load, slow])
     assert load.confidence == slow.confidence == DOUBTED and "any torque" in load.reasons[0]
 
 
@@ -196,10 +196,10 @@ def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, w
 
 def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():
     both = [evidence(effect="lag", confidence=0.99), evidence(effect="inertia", confidence=0.9)]
-    confidence.together(both)
+    confidence.doubt_beside_others(both)
     assert both[0].confidence == 0.99 and both[1].confidence == DOUBTED and "what is fast" in both[1].reasons[0]
     apart = [evidence(effect="lag", confidence=0.99), evidence(effect="coulomb_friction", confidence=0.9)]
-    confidence.together(apart)
+    confidence.doubt_beside_others(apart)
     assert [e.confidence for e in apart] == [0.99, 0.9]
 
 

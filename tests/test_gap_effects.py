@@ -133,7 +133,7 @@ def test_an_interval_holds_the_size_by_another_law():
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs), allowed={"stribeck_friction"})
     best = search.run().best
     assert best.ids == ("stribeck_friction",) and len(search.by_law["stribeck_friction"]) == 2
-    low, high = search.widen(best, intervals(best.fit, search.blocks, knee=search.r.knee))[0]
+    low, high = search.widen(best, intervals(best.fit, search.blocks, huber=search.r.huber))[0]
     assert low < 0.06 < high < 0.1
     assert best.members[0].variant.label == "exponential in speed"
 

@@ -298,7 +298,7 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
         )
         runs[-1].smooth()
     case = build(spec.compile(), runs)[0]
-    none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
+    none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
     found = residual_fit.fit(case, runs, none, [0, 2], [1])
     assert found is not None and found.after < 0.5 * found.before
     assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
@@ -319,5 +319,5 @@ def test_no_stand_in_where_nothing_is_left():
     for r in runs:
         r.smooth()
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
-    none = JointSearch(case, [0, 2], None, conditions(runs)).idle().none
+    none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
     assert residual_fit.fit(case, runs, none, [0, 2], [1]) is None

@@ -34,7 +34,7 @@ def found(changes: dict[str, float], effect: str) -> tuple[dict, str]:
     search = JointSearch(case, [0, 1, 2], None, conditions(runs), allowed={effect})
     best = search.run().best
     assert best.ids == (effect,)
-    bounds = search.widen(best, intervals(best.fit, search.blocks, knee=search.r.knee))
+    bounds = search.widen(best, intervals(best.fit, search.blocks, huber=search.r.huber))
     keys, member = [p.key for p in best.fit.params], best.members[0]
     at = {p.key: keys.index(f"{effect}.{p.key}") for p in member.variant.params}
     raw, spread = (
@@ -262,5 +262,5 @@ def test_what_only_looks_like_jitter_is_not_reported():
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
-    none = search.idle().none
+    none = search.without_search().none
     assert none.fit.loss > jitter.LEFT and jitter.estimate(search, none) is None

@@ -33,7 +33,7 @@ class Made(JointSearch):
 
     def __init__(self):
         self.blocks, self.rng, self.none_loss, self.by_law = np.arange(40), np.random.default_rng(0), np.ones(40), {}
-        self.saved, self.fitter = [], SimpleNamespace(shake=lambda params, fit, rng: "shaken")
+        self.saved, self.fitter = [], SimpleNamespace(perturbed_restarts=lambda params, fit, rng: "restarted")
 
     def _left(self, trial):
         return trial.loss
@@ -123,8 +123,8 @@ def test_the_short_list_asks_a_price():
 def test_within_the_noise_nothing_is_looked_for_nearby():
     search = Made()
     assert (
-        search._shaken([], SimpleNamespace(loss=1.3)) == "shaken"
-        and search._shaken([], SimpleNamespace(loss=1.1)) != "shaken"
+        search._restarted([], SimpleNamespace(loss=1.3)) == "restarted"
+        and search._restarted([], SimpleNamespace(loss=1.1)) != "restarted"
     )
 
 
@@ -189,7 +189,7 @@ class Selecting(Made):
         return {m.id: ([], 1.0, 0.5) for m in current.members}
 
     _on = cross = lambda *_: None
-    thorough = refold = _drop = _refine = _lawful = lambda self, trial: trial
+    thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
@@ -273,11 +273,12 @@ class Started(JointHypotheses):
         n = len(q)
         windows = SimpleNamespace(n=n, sample_window=np.zeros(n, int))
         residual = np.concatenate([q, torque])
-        fitter = SimpleNamespace(use_torque=True, w=windows, tau_on=np.ones(n, bool), homeward=lambda params, fit: fit)
+        fitter = SimpleNamespace(use_torque=True, w=windows, tau_on=np.ones(n, bool))
+        fitter.toward_prior = lambda params, fit: fit
         fitter.fit = lambda params, x0, **_: SimpleNamespace(x=x0, residual=residual, loss=1.0, jacobian=None)
         self.scan_fitter = self.fitter = fitter
         self.all_nuisances = self.nuisances = []
-        self.r = SimpleNamespace(sigma_q=1.0, sigma_torque=1.0, knee=3.0)
+        self.r = SimpleNamespace(sigma_q=1.0, sigma_torque=1.0, huber=3.0)
         self.start()
 
 
@@ -416,7 +417,7 @@ def test_many_effects_on_one_joint_are_doubted():
         [doubtful(effect=e) for e in ("deadband", "supply_sag", "backlash", "lag", "thermal")[:n]] for n in (2, 3, 5)
     )
     for mine in (pair, three, five):
-        confidence.together(mine)
+        confidence.doubt_beside_others(mine)
     crowded = lambda mine: [any("effects on one joint" in r for r in e.reasons) for e in mine]  # noqa: E731
     assert not any(crowded(pair)) and crowded(three) == [False, True, True] and all(crowded(five)[1:])
 

@@ -134,7 +134,7 @@ def valley(n: int = 400) -> tuple[Fitter, list[Param]]:
     a, c, noise = rng.standard_normal(n), rng.standard_normal(n), 0.02 * rng.standard_normal(n)
     fitter = Fitter.__new__(Fitter)
     fitter.r, fitter.eliminate, fitter.window, fitter.count = (
-        SimpleNamespace(knee=0.0, sigma_q0=0.0, sigma_v0=0.0),
+        SimpleNamespace(huber=0.0, sigma_q0=0.0, sigma_v0=0.0),
         False,
         np.zeros(n, int),
         1,
@@ -153,10 +153,10 @@ def valley(n: int = 400) -> tuple[Fitter, list[Param]]:
 def test_a_belief_that_was_moved_along_a_valley_goes_back_home():
     fitter, params = valley()
     astray = fitter.fit(params, x0=np.array([0.7, 1.6, 1.0]), iterations=0)
-    home = fitter.homeward(params, astray)
+    home = fitter.toward_prior(params, astray)
     score = lambda f: f.loss + prior_weight(params) @ (f.x - np.array([p.start for p in params])) ** 2 / len(f.residual)  # noqa: E731
     assert abs(home.x[1] - 1.0) < 0.02 and abs(home.x[0] - 1.3) < 0.03 and score(home) < 0.1 * score(astray)
-    assert fitter.homeward(params, home) is home  # there is nothing to gain
+    assert fitter.toward_prior(params, home) is home  # there is nothing to gain
 
 
 def test_intervals_follow_how_well_what_was_kept_out_is_followed():

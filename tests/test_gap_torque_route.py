@@ -158,5 +158,5 @@ def test_the_torques_figures_are_handed_on_where_the_loop_is_not_the_believed_on
     # of the elbow the torque told nothing
     stages = [SimpleNamespace(joint="shoulder", fit=0.1), SimpleNamespace(joint="elbow", fit=0.1)]
     given[1][0].told = False
-    assert torque_told.mute(given, stages, notes) == {"shoulder"} and "controller is another" in notes[0]
-    assert torque_told.mute(given, [SimpleNamespace(joint="shoulder", fit=0.9)], notes) == set()
+    assert torque_told.unknown_controllers(given, stages, notes) == {"shoulder"} and "controller is another" in notes[0]
+    assert torque_told.unknown_controllers(given, [SimpleNamespace(joint="shoulder", fit=0.9)], notes) == set()

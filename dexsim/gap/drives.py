@@ -14,11 +14,11 @@ from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import Inquiry, NothingToJudge, Steps
 from dexsim.gap.judge import errors, full_model, not_considered, residual_fit
-from dexsim.gap.judge.conclude import Noise, add_behind, assemble
+from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint import JointAnswer, Kept
 from dexsim.gap.parallel import map_joints, workers
 from dexsim.gap.plant.case import Case, build
-from dexsim.gap.plant.coupled_motion import again, coupled, sharpen
+from dexsim.gap.plant.coupled_motion import coupled, refine_motion, refine_motion_by_fits
 from dexsim.gap.read import end_stops, inputs, keep_out, stage_tests
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain
@@ -50,7 +50,7 @@ class Drives(Steps):
         # joint
         self.stages: Sequence[stage_tests.Stage] = ()
         self.by_torque: Sequence[tuple] = ()
-        self.mute: set[str] = set()
+        self.unknown_controllers: set[str] = set()
         self.outcomes: list[tuple[Case, JointSearch, Outcome]] = []
         # locate and judge
         self.answers: list[JointAnswer] = []
@@ -121,7 +121,7 @@ class Drives(Steps):
         count = len(w.runs[0].joints)
         w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
         self.cases = build(self.mj_model, w.runs, device=s.device, dt=_step(w.runs))
-        self.cases = sharpen(self.mj_model, w.runs, self.cases, s.device, _step(w.runs), only=s.joints)
+        self.cases = refine_motion(self.mj_model, w.runs, self.cases, s.device, _step(w.runs), only=s.joints)
         self.left_out = not_considered.reasons(self.cases, self.felt, s.allowed)
         w.notes += cannot_be_seen(s.allowed, self.left_out) + not_considered.not_fitted(self.cases)
         if s.joints is not None:
@@ -200,7 +200,7 @@ class Drives(Steps):
         search, case = self._begun(k, tell), self.cases[k]
         if len(search.long.window) == 0:
             return search, None
-        found = search.run() if case.moved and case.joint not in self.mute else search.idle()
+        found = search.run() if case.moved and case.joint not in self.unknown_controllers else search.without_search()
         search.settle(found)
         self._left -= 1
         return search, found
@@ -208,7 +208,7 @@ class Drives(Steps):
     def _coupled_by(self, trials: Sequence[Trial]) -> None:
         """The cases once more, with the others' motion as these trials have it."""
         w = self.w
-        self.cases = again(self.mj_model, w.runs, self.cases, trials, w.settings.device, _step(w.runs))
+        self.cases = refine_motion_by_fits(self.mj_model, w.runs, self.cases, trials, w.settings.device, _step(w.runs))
 
     def _search_again(self, answers: Answers) -> None:
         """Joints that what was found in the others moves otherwise, searched once more; `answers` is changed."""
@@ -217,7 +217,7 @@ class Drives(Steps):
             k
             for k, (search, found) in enumerate(answers)
             if found is not None
-            and search.case.joint not in self.mute
+            and search.case.joint not in self.unknown_controllers
             and (found.best.members or found.best.fit.loss > UNSETTLED)
         ]
         if len(unsettled) < 2 or any(found is None for _, found in answers):
@@ -244,7 +244,7 @@ class Drives(Steps):
         self.behind = torque_told.texts(self.by_torque)
         self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
         w.notes += torque_told.believe(self.by_torque)
-        self.mute = torque_told.mute(self.by_torque, self.stages, w.notes)
+        self.unknown_controllers = torque_told.unknown_controllers(self.by_torque, self.stages, w.notes)
         for x in self.behind[:4]:
             w.say(f"  {x}")
         w.clock.lap("stage tests")
@@ -275,7 +275,7 @@ class Drives(Steps):
     def report(self, d: Diagnosis) -> None:
         """The joints into a diagnosis: findings, verdict, what is handed on."""
         w, p = self.w, self.parts
-        assemble(d, w.settings, self.answers, self.kept, self.noise, p.how, w.channel, self.plains)
+        into_diagnosis(d, w.settings, self.answers, self.kept, self.noise, p.how, w.channel, self.plains)
         d.data["held_out"]["not_judged"] = p.not_judged
         if p.not_judged:
             w.notes.append(

@@ -44,7 +44,7 @@ class Noise:
         return Noise(min(floor, self.floor), self.how, joints, tuple(lower))
 
 
-def assemble(
+def into_diagnosis(
     d: Diagnosis,
     s: Settings,
     answers: Sequence[JointAnswer],
@@ -259,7 +259,7 @@ def _doubts(d: Diagnosis, findings: list[dict[str, Any]], channel: list[dict[str
     by = {(e.joint, e.effect): e for e in d.evidence}
     mine = [by[f["where"]["joints"][0], f["effect"]] for f in findings]
     for joint in {e.joint for e in mine}:
-        confidence.together([e for e in mine if e.joint == joint])
+        confidence.doubt_beside_others([e for e in mine if e.joint == joint])
     coupled = {
         f["where"]["joints"][0]: f["parameters"]["from_joint"]["value"]
         for f in findings

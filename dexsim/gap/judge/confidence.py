@@ -132,7 +132,7 @@ def weigh(e: Evidence, before: float, after: float, without: float, noise: float
     return float(min(c, 0.99, JUDGE.doubted if e.reasons else 1.0))
 
 
-def together(mine: list[Evidence]) -> None:
+def doubt_beside_others(mine: list[Evidence]) -> None:
     """What the findings of one joint (the largest first) say of each other."""
     slow = [e for e in mine if e.of_pose]
     for k, e in enumerate(mine):

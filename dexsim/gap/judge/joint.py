@@ -66,7 +66,7 @@ class JointAnswer:
         self.sensed = np.isfinite(self.torque)
         self.effort_before = (self.torque - effort_before)[self.sensed] ** 2 if self.sensed.any() else None
         self.effort_after = (self.torque - effort_after)[self.sensed] ** 2 if self.sensed.any() else None
-        self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, knee=search.r.knee))
+        self.widest = search.widen(self.best, intervals(self.best.fit, search.blocks, huber=search.r.huber))
         told, laws = (
             stretched(self.widest, self.best.fit, rms(self.after) / case.sigma if len(rows) else 0.0),
             search.law_spread(self.best),

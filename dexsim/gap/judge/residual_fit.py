@@ -138,8 +138,8 @@ def fit(
     gram = np.zeros((count, 4, 4))
     right = np.zeros((count, 4))
     z = x / scale
-    knee = 2.5 * float(np.median(np.abs(y - np.median(y)))) + 1e-12
-    weight = np.minimum(1.0, knee / np.maximum(np.abs(y - np.median(y)), 1e-12))
+    huber = 2.5 * float(np.median(np.abs(y - np.median(y)))) + 1e-12
+    weight = np.minimum(1.0, huber / np.maximum(np.abs(y - np.median(y)), 1e-12))
     np.add.at(gram, block, weight[:, None, None] * z[:, :, None] * z[:, None, :])
     np.add.at(right, block, (weight * y)[:, None] * z)
     ridge = 1e-3 * len(y) * np.eye(4)

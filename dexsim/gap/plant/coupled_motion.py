@@ -3,8 +3,8 @@ accelerations.
 
 Differentiating samples smears out every start and stop, and the neighbours of a joint feel its acceleration. Here each
 joint is simulated along the recording with what is believed, and only the small difference from what was measured is
-smoothed. Once something was fitted, `again` does the same with that: what is left to be smoothed is smaller, and so is
-its error.
+smoothed. Once something was fitted, `refine_motion_by_fits` does the same with that: what is left to be smoothed is
+smaller, and so is its error.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run, local_polynomial
 
 WIDTH = 0.06  # s: of the smoothing of the difference
-EVERY = 2e-3  # s between the samples of the sharpened motion
+EVERY = 2e-3  # s between the samples of the refined motion
 PASSES = 2
-# of a joint's typical torque: what reaches it from the motion of others before it matters how sharply that is known
-SHAKES = 0.03
+# of a joint's typical torque: what reaches it from the motion of others before it matters how well that is known
+COUPLED = 0.03
 
 
-def sharpen(
+def refine_motion(
     model: mujoco.MjModel,
     runs: list[Run],
     cases: list[Case],
@@ -36,7 +36,7 @@ def sharpen(
     progress=None,
     only: set[str] | None = None,
 ) -> list[Case]:
-    """The cases (at last those of `only`) built again along sharpened motions (`Run.fine`); as they are where there is
+    """The cases (at last those of `only`) built again along refined motions (`Run.fine`); as they are where there is
     one joint only.
 
     Else the list `cases` is emptied: together, long recordings of many joints before and after would not fit into
@@ -55,13 +55,13 @@ def sharpen(
 
 def coupled(cases: Sequence[Case]) -> bool:
     """Whether the joints' motions reach each other through the mechanism."""
-    return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > SHAKES * c.scales.tau for c in cases)
+    return any(float(np.std(c.plant.series[:, SERIES_INDEX["rest"]])) > COUPLED * c.scales.tau for c in cases)
 
 
-def again(
+def refine_motion_by_fits(
     model: mujoco.MjModel, runs: list[Run], cases: Sequence[Case], fitted: Sequence[Any], device: str, dt: float
 ) -> list[Case]:
-    """The cases of all joints built anew along motions sharpened with what was fitted to each (trials, in the order of
+    """The cases of all joints built anew along motions refined with what was fitted to each (trials, in the order of
     the cases). Where a joint's encoder was found not to show its position, the others are moved by where it is."""
     at = []
     for case, trial in zip(cases, fitted, strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
 
-# Hz at which the model is evaluated (along a sharpened motion); the series are interpolated between
+# Hz at which the model is evaluated (along a refined motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0
 TOGETHER = 64  # samples of a motion that are evaluated in one call
 

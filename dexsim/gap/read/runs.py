@@ -45,7 +45,7 @@ class Run:
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None
     as_: np.ndarray | None = None
-    # filled by `sharpen`: times [n], position, speed, acceleration [n, J]
+    # filled by `refine_motion`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
 
     @property

@@ -36,14 +36,14 @@ def disbelief(params: list[Param], x: np.ndarray) -> float:
 
 @dataclass
 class Residuals:
-    """How residuals are weighed: sigma_q rad, sigma_torque N.m (0: not used), spread of the initial state, Huber
-    knee."""
+    """How residuals are weighed: sigma_q rad, sigma_torque N.m (0: not used), spread of the initial state,
+    Huber threshold."""
 
     sigma_q: float
     sigma_torque: float = 0.0
     sigma_q0: float = 0.0
     sigma_v0: float = 0.0
-    knee: float = 0.0  # in sigmas; 0: plain squares
+    huber: float = 0.0  # threshold in sigmas from which a residual counts linearly (Huber 1964); 0: plain squares
     current_factor: float = 1.0
 
 
@@ -125,7 +125,7 @@ class Fitter:
 
     def loss(self, res: np.ndarray) -> np.ndarray:
         """[H] mean of Huber's square."""
-        k = self.r.knee
+        k = self.r.huber
         a = np.abs(res)
         if k > 0:
             a = np.where(a <= k, a * a, 2 * k * a - k * k)
@@ -135,7 +135,7 @@ class Fitter:
 
     def window_loss(self, res: np.ndarray) -> np.ndarray:
         """[W] sum of Huber's square by window."""
-        k = self.r.knee
+        k = self.r.huber
         a = np.abs(res)
         a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
         return np.bincount(self.window, a, self.count)
@@ -147,7 +147,7 @@ class Fitter:
         res, s = self.init_directions(params, x)
         return self.eliminated(res[None], s)[0]
 
-    def shake(
+    def perturbed_restarts(
         self, params: list[Param], f: Fitted, rng: np.random.Generator, rounds: int = 2, count: int = 20
     ) -> Fitted:
         """The fit again from the best of random guesses about it, where one is better: stick, play and limits make the
@@ -160,7 +160,7 @@ class Fitter:
         for _ in range(rounds):
             span = high - low
             J = f.jacobian * span
-            k = self.r.knee
+            k = self.r.huber
             w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
             A = (J * w[:, None]).T @ J + np.diag(believed * span**2)
             # what a rise of the loss by 5 % allows
@@ -181,7 +181,7 @@ class Fitter:
             f = again
         return f
 
-    def homeward(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
+    def toward_prior(self, params: list[Param], f: Fitted, rounds: int = 2) -> Fitted:
         """The fit again from where one belief, or all of them, are back at what is believed, all else following by its
         slopes, where that is better: in a valley of what acts alike (a damping in the loop, a viscous friction), and at
         kinks, steps end before they are there."""
@@ -193,7 +193,7 @@ class Fitter:
         span, centre, believed = high - low, np.array([p.start for p in params], float), prior_weight(params)
         score = lambda x, r: self.loss(r) + ((x - centre) ** 2 @ believed) / r.shape[-1]  # noqa: E731
         for _ in range(rounds):
-            k = self.r.knee
+            k = self.r.huber
             w = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
             J = f.jacobian * span
             A = (J * w[:, None]).T @ J
@@ -286,7 +286,7 @@ class Fitter:
                 loss = float(self.loss(res)) + float(believed @ (x - centre) ** 2) / len(res)
             if it >= iterations or P == 0:
                 break
-            k = self.r.knee
+            k = self.r.huber
             weight = np.ones_like(res) if k <= 0 else np.minimum(1.0, k / np.maximum(np.abs(res), 1e-12))
             A = (jac * weight[:, None]).T @ jac
             b = -(jac * weight[:, None]).T @ res - believed * (x - centre) * span
@@ -388,14 +388,14 @@ def slopes_of(f: Fitted) -> dict[str, np.ndarray]:
     return {p.key: f.jacobian[:, i] * p.span for i, p in enumerate(f.params)}
 
 
-def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, knee: float = 0.0) -> np.ndarray:
+def intervals(fitted: Fitted, blocks: np.ndarray, level: float = 1.645, huber: float = 0.0) -> np.ndarray:
     """[P, 2] 90 % intervals that let residuals be correlated inside a block: the sandwich over blocks [m] of each
     residual, with the small-sample factor of the number of blocks."""
     P = len(fitted.params)
     if P == 0:
         return np.zeros((0, 2))
     J, r = fitted.jacobian, fitted.residual
-    psi = r if knee <= 0 else np.clip(r, -knee, knee)
+    psi = r if huber <= 0 else np.clip(r, -huber, huber)
     low, high = np.array([p.low for p in fitted.params]), np.array([p.high for p in fitted.params])
     span = high - low
     Js = J * span

@@ -27,7 +27,7 @@ EXTREMES = (
 )  # regime variables whose largest values are never thinned out
 EXTREME, OF_RUN = 12, 3  # windows
 TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
-WAKE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
+PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
 MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
 
 
@@ -131,10 +131,10 @@ class JointHypotheses:
             self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > TRACE]
         keep = [i for i, p in enumerate(params) if p in self.nuisances]
         x = f.x[keep]
-        # large residuals are effects still to be named: the knee follows them down
-        self.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
+        # large residuals are effects still to be named: the threshold follows them down
+        self.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(f.residual**2))) / 0.67)
         fit = self.fitter.fit(self.nuisances, x0=x, iterations=8, lazy=True)
-        return Trial((), self.fitter.homeward(self.nuisances, self._shaken(self.nuisances, fit)))
+        return Trial((), self.fitter.toward_prior(self.nuisances, self._restarted(self.nuisances, fit)))
 
     def _begin(self, params: list[Param]) -> np.ndarray:
         """[P] starts; of what is unknown the size that follows best: of play or a dead zone no slope leads to the
@@ -161,9 +161,9 @@ class JointHypotheses:
                 ]
         return x
 
-    def _shaken(self, params: list[Param], fit: Fitted) -> Fitted:
+    def _restarted(self, params: list[Param], fit: Fitted) -> Fitted:
         """The fit, looked for nearby too, where it does not follow the data yet."""
-        return self.fitter.shake(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
+        return self.fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
 
     def _simulate(self, fitter: Fitter, plants: np.ndarray, s) -> np.ndarray:
         q, tau = self.case.plant.simulate(plants, fitter.w)
@@ -195,9 +195,9 @@ class JointHypotheses:
     def finish(
         self, members: tuple[Member, ...], x0: np.ndarray, short: Fitted, like: Trial | None = None, quick: bool = False
     ) -> Trial:
-        """The draft refitted on long windows. quick: fewer steps, and beliefs are not asked back home."""
-        woken, at = self._woken(members, short)
-        params, slopes = [*short.params, *woken], slopes_of(like.fit) if like is not None else None
+        """The draft refitted on long windows. quick: fewer steps, and beliefs are not drawn back to their prior."""
+        added, at = self._newly_identifiable(members, short)
+        params, slopes = [*short.params, *added], slopes_of(like.fit) if like is not None else None
         x0, x = np.concatenate([x0, at]), np.concatenate([short.x, at])
         with self._fix(members):
             a = self.fitter.fit(params, x0=x, iterations=4 if quick else 7, tolerance=5e-3, slopes=slopes, lazy=True)
@@ -206,31 +206,31 @@ class JointHypotheses:
                 a = b if b.loss < a.loss else a
         return Trial(members, a)
 
-    def _woken(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
+    def _newly_identifiable(self, members: tuple[Member, ...], short: Fitted) -> tuple[list[Param], np.ndarray]:
         """Beliefs that left no trace without any effect and leave one with these, and what is believed of them [n]: a
         drive that turns out to be slow may reach a limit that nothing was known of. Without them a hypothesis that
         imitates another by such a belief would be the only one that may."""
         taken = {c for p in short.params for c in p.columns}
-        asleep = [p for p in self.all_nuisances if not taken & set(p.columns)]
-        if not asleep:
+        without_trace = [p for p in self.all_nuisances if not taken & set(p.columns)]
+        if not without_trace:
             return [], np.zeros(0)
         base = self.case.plant.base()[0]
-        at = np.array([{"factor": 1.0, "add": 0.0}.get(p.mode, base[INDEX[p.columns[0]]]) for p in asleep])
-        params, n = [*short.params, *asleep], len(short.params)
-        x = np.repeat(np.concatenate([short.x, at])[None], len(asleep) + 1, 0)
-        for i, p in enumerate(asleep):
-            x[i + 1, n + i] += WAKE * p.span * (1.0 if at[i] < 0.5 * (p.low + p.high) else -1.0)
+        at = np.array([{"factor": 1.0, "add": 0.0}.get(p.mode, base[INDEX[p.columns[0]]]) for p in without_trace])
+        params, n = [*short.params, *without_trace], len(short.params)
+        x = np.repeat(np.concatenate([short.x, at])[None], len(without_trace) + 1, 0)
+        for i, p in enumerate(without_trace):
+            x[i + 1, n + i] += PROBE * p.span * (1.0 if at[i] < 0.5 * (p.low + p.high) else -1.0)
         with self._fix(members):
             r = self.scan_fitter.residuals(params, x)
-        trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / WAKE
+        trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / PROBE
         awake = trace > TRACE
-        return [p for p, on in zip(asleep, awake, strict=True) if on], at[awake]
+        return [p for p, on in zip(without_trace, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:
-        """The trial looked for nearby, and with its beliefs asked back home."""
+        """The trial fitted again from perturbed starts, and with its beliefs drawn back to their prior."""
         with self._fix(trial.members):
             return Trial(
-                trial.members, self.fitter.homeward(trial.fit.params, self._shaken(trial.fit.params, trial.fit))
+                trial.members, self.fitter.toward_prior(trial.fit.params, self._restarted(trial.fit.params, trial.fit))
             )
 
     def fit(

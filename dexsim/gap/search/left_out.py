@@ -56,7 +56,7 @@ class JointLosses(JointHypotheses):
         span = high - low
         folds = np.unique(self.fold_of)
         fold = self.fold_of[fitter.window]
-        k = self.r.knee
+        k = self.r.huber
         weight = np.minimum(1.0, k / np.maximum(np.abs(f.residual), 1e-12)) if k > 0 else np.ones(len(f.residual))
         guesses = [f.x]
         believed, centre = prior_weight(f.params), np.array([p.start for p in f.params], float)
@@ -108,7 +108,7 @@ class JointLosses(JointHypotheses):
                 known = {key: v[rows] for key, v in slopes_of(f).items()}
                 x = fitter.fit(f.params, x0=f.x, iterations=4, tolerance=1e-2, slopes=known, exact=False).x
                 r = self.fitter.evaluate(f.params, x)
-                a, k = np.abs(r), self.r.knee
+                a, k = np.abs(r), self.r.huber
                 a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
                 test = ~on[self.fitter.window]
                 out += np.bincount(self.blocks[test], a[test], len(out))

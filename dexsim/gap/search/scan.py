@@ -54,7 +54,7 @@ class JointScan(JointLosses):
                     owners.append((member, np.array(start)))
         rows, dots, squares, cross = [], [], [], []
         J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
-        k = self.r.knee
+        k = self.r.huber
         weight = np.minimum(1.0, k / np.maximum(np.abs(r0), 1e-9)) if k > 0 else np.ones_like(r0)
         sw = np.sqrt(weight)
         Jw, rw = J * sw[:, None], r0 * sw

@@ -82,12 +82,12 @@ class JointSearch(JointSelection):
             return trial
         plant = self.whole
         whole = plant.windows(None, self.train, span=self.span)
-        r = Residuals(self.r.sigma_q, self.r.sigma_torque, knee=max(self.r.knee, 3.0))
+        r = Residuals(self.r.sigma_q, self.r.sigma_torque, huber=max(self.r.huber, 3.0))
         fitter = Fitter(plant, whole, r)
         params = trial.fit.params
         with self._fix(trial.members, plant):
             here = fitter.residuals(params, trial.fit.x[None])[0]
-            fitter.r.knee = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
+            fitter.r.huber = 3.0 * max(1.0, float(np.sqrt(np.median(here**2))) / 0.67)
             # slopes in the windows' own steps serve for shorter ones
             slopes = slopes_of(
                 Fitter(self.case.plant, self.case.plant.windows(None, self.train, span=self.span), r).fit(
@@ -107,7 +107,7 @@ class JointSearch(JointSelection):
         """[R] mean Huber square of each run's windows where it was fitted; 0 for runs without."""
         with self._fix(trial.members):
             r = self.fitter.evaluate(trial.fit.params, trial.fit.x)
-        a, k = np.abs(r), self.r.knee
+        a, k = np.abs(r), self.r.huber
         a = np.where(a <= k, a * a, 2 * k * a - k * k) if k > 0 else a * a
         run, count = self.long.run[self.fitter.window], self.case.plant.runs
         return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)

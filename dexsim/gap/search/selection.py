@@ -17,7 +17,7 @@ from dexsim.gap.search.left_out import BOOTSTRAPS
 from dexsim.gap.search.scan import JointScan, expand_one
 from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
 
-CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs back home
+CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
 
 
@@ -130,7 +130,7 @@ class JointSelection(JointScan):
                 current, level = self._swap(current, pool, level)
         current = self._from_plain(current)
         if not self.deadline.over():
-            current = self._lawful(self._refine(self._drop(current)))
+            current = self._by_laws(self._refine(self._drop(current)))
         self._on(0.1)
         final = self.rivals(current, pool)
         for _ in range(len(current.members)):  # one that only seemed worse before it was fitted in full takes the place
@@ -175,7 +175,7 @@ class JointSelection(JointScan):
                 )
             if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best):
                 with self._fix(current.members):
-                    new = Trial(current.members, self.fitter.homeward(params, new.fit))
+                    new = Trial(current.members, self.fitter.toward_prior(params, new.fit))
             if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best) and not self._shrunk(new):
                 best = new
         return best
@@ -298,7 +298,7 @@ class JointSelection(JointScan):
                     break
         return current
 
-    def _lawful(self, current: Trial) -> Trial:
+    def _by_laws(self, current: Trial) -> Trial:
         """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the
         others kept beside it, so that intervals hold what the law is not known to be."""
         for i, member in enumerate(current.members):
@@ -390,7 +390,7 @@ class JointSelection(JointScan):
             out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
         return out
 
-    def idle(self) -> Outcome:
+    def without_search(self) -> Outcome:
         """No search: the nuisances alone."""
         self.fitted = {}
         none = self.start()

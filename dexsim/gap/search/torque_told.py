@@ -184,7 +184,7 @@ def hand_on(
         )
 
 
-def mute(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
+def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[str]) -> set[str]:
     """Joints of which the torque told, but whose logged torque is not what the believed law of the drive gives, hardly
     in part: their closed loop speaks of an unknown controller, and no effect of the joint is looked for in it. Said in
     `notes`."""
