@@ -372,9 +372,9 @@ class GraspEnv(HandEnv):
 
     def rows(self) -> list[tuple[str, int, str, str]]:
         """(name, width, unit, what it is on hardware) of the actor's observation."""
-        return self._rows(self.felt)
+        return self._observed(self.felt)
 
-    def _rows(self, pads: int) -> list[tuple[str, int, str, str]]:
+    def _observed(self, pads: int) -> list[tuple[str, int, str, str]]:
         return observations.rows(self.num_actions, self.fingers, pads, 1 if self.thumb_range is None else 2)
 
     def _privileged(self) -> list[torch.Tensor]:
@@ -402,7 +402,7 @@ class GraspEnv(HandEnv):
         """Tables for the first screen."""
         table = self.rows()
         groups = {"actor": [(name, width, f"{unit}; {text}") for name, width, unit, text in table]}
-        whole = self._rows(self.pads)
+        whole = self._observed(self.pads)
         critic = [(name, width, f"{unit}; clean") for name, width, unit, _ in whole]
         if self.task["critic"] == "privileged":
             critic += [(name, width, "privileged") for name, width in privileged(self.num_actions, self.fingers)]

@@ -1,0 +1,59 @@
+"""The grasp without touch in its observation, and with a thumb that has a command of its own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from worlds import grasp_env
+
+from dexsim.errors import UserError
+
+FEW = ("task.objects.train=[box]", "task.objects.held_out=[sphere]")
+
+
+def steps(env, count: int) -> list[dict]:
+    env.reset_all()
+    still = torch.zeros(env.num_envs, env.num_actions)
+    return [env.step(still)[0] for _ in range(count)]
+
+
+def test_without_touch_the_actor_lacks_its_rows_and_the_critic_does_not():
+    felt, blind = grasp_env(*FEW), grasp_env(*FEW, "task.observe.touch=false")
+    names = [row[0] for row in blind.rows()]
+    assert [row[0] for row in felt.rows() if row[0] not in names] == ["contact_force", "contact_centre"]
+    a, b = steps(felt, 2)[-1], steps(blind, 2)[-1]
+    assert b["actor"].shape[1] == sum(row[1] for row in blind.rows()) == a["actor"].shape[1] - 4 * felt.pads
+    assert b["critic"].shape == a["critic"].shape
+    assert ["contact_force" in [r[0] for r in blind.describe()["observations"][k]] for k in ("actor", "critic")] == [
+        False, True]  # fmt: skip
+    felt.close(), blind.close()
+
+
+def test_the_thumb_has_a_command_of_its_own():
+    env = grasp_env(*FEW, "task.command.thumb=[0.2,0.4]", "task.command.hold_s=[0.1,0.2]", worlds=16)
+    seen = torch.stack([obs["actor"][:, -2:] for obs in steps(env, 20)])  # [T, N, 2]
+    others, own = seen[..., 0], seen[..., 1]
+    assert 0.2 <= float(own.min()) and float(own.max()) <= 0.4 and float(others.max()) > 0.5
+    changed = [x[1:] != x[:-1] for x in (others, own)]
+    assert torch.equal(*changed) and 0 < int(changed[0].sum()) < changed[0].numel()  # drawn together
+    assert abs(float(torch.corrcoef(torch.stack([others.flatten(), own.flatten()]))[0, 1])) < 0.5
+    assert float(env.rewards()["thumb_near"].abs().max()) > 0
+    env.close()
+
+
+def test_without_one_it_is_paid_for_a_band():
+    env = grasp_env(*FEW)
+    steps(env, 1)
+    assert bool((env.thumb_command < 0).all()) and float(env.rewards()["thumb_near"].abs().max()) == 0
+    env.close()
+
+
+@pytest.mark.parametrize("value", ["0.5", "[0.5]", "[0.6,0.4]", "[0,1.5]", "[a,b]"])
+def test_a_range_that_is_none_is_refused(value):
+    with pytest.raises(UserError, match="task.command.thumb"):
+        grasp_env(*FEW, f"task.command.thumb={value}")
+
+
+def test_touch_is_or_is_not():
+    with pytest.raises(UserError, match="task.observe.touch=half"):
+        grasp_env(*FEW, "task.observe.touch=half")
