@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
 
@@ -55,7 +56,7 @@ def test_every_rule_says_what_it_is_and_its_test_exists():
         assert callable(TESTS[test]), name
 
 
-ROOMS = {"search": rules.SEARCH, "judge": rules.JUDGE, "touch": rules.TOUCH}
+ROOMS = {"search": rules.SEARCH, "judge": rules.JUDGE, "touch": rules.TOUCH, "torque": rules.TORQUE}
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
@@ -73,7 +74,7 @@ def test_a_rule_that_is_moved_fails_its_test(name, factor):
         object.__setattr__(ROOMS[room], rule, value)
 
 
-RATIOS = ("enough",)
+RATIOS = ("enough", "worse", "noise", "carries")
 
 
 def test_an_effect_must_remove_a_least_share():
@@ -546,7 +547,7 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
 
-TESTS = vars(test_gap_rules_touch) | globals()
+TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 
 def _rule(value: float, means: str, source: str, test: str) -> float:
     """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py (touch:
-    tests/test_gap_rules_touch.py)."""
+    tests/test_gap_rules_touch.py, torque: tests/test_gap_rules_torque.py)."""
     return field(default=value, metadata={"means": means, "source": source, "test": test})
 
 
@@ -443,13 +443,134 @@ class TouchRules:
     )
 
 
-SEARCH, JUDGE, TOUCH = SearchRules(), JudgeRules(), TouchRules()
+@dataclass(frozen=True)
+class TorqueRules:
+    """What is decided by where a joint's motor torque, duty or current was logged: pushes from outside, what the torque
+    route says, whether a drive does what is believed of it; and by the plain model beside every answer."""
+
+    much: float = _rule(
+        0.3,
+        "share of the torque's variance that a plain fit leaves, from which something else pushes",
+        "by judgement",
+        "test_a_plain_fit_must_leave_much_for_a_push",
+    )
+    quiet: float = _rule(
+        0.3,
+        "share of the quiet torque's variance that the trimmed fit may leave to be believed",
+        "by judgement: as `much`, of which it is the other side",
+        "test_pushes_are_clear_where_the_quiet_torque_fits",
+    )
+    far: float = _rule(
+        5.0,
+        "x the quiet residual: a push",
+        "by judgement: normal noise passes it once in a million samples",
+        "test_a_push_stands_far_out_of_the_quiet_residual",
+    )
+    least: float = _rule(
+        0.15,
+        "of the torque's rms: a push, whatever the quiet residual",
+        "by judgement",
+        "test_a_push_is_no_small_part_of_the_torque",
+    )
+    carries: float = _rule(
+        1.3,
+        "x its dry friction: what a joint at rest may carry of the drive's torque",
+        "by judgement",
+        "test_a_joint_at_rest_carries_some_more_than_its_friction",
+    )
+    slow: float = _rule(
+        0.25,
+        "of the residual's variance between half seconds: less is noise and no force",
+        "by judgement: of white noise at 100 Hz it is a fiftieth",
+        "test_a_force_lasts_and_noise_does_not",
+    )
+    most: float = _rule(
+        0.6,
+        "of the time: what pushes longer is no stretch",
+        "by judgement: more than half, which the trimmed fit needs, of what moves",
+        "test_what_pushes_most_of_the_time_is_no_stretch",
+    )
+    rest: float = _rule(
+        0.4,
+        "of the time that must be left without pushes for a joint to be judged by it",
+        "by judgement: the other side of `most`",
+        "test_a_joint_is_judged_without_pushes_where_enough_is_left",
+    )
+    join: float = _rule(
+        0.15,
+        "s: shorter gaps between pushes are no gaps",
+        "by judgement: a swing of a push through zero",
+        "test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out",
+    )
+    lasts: float = _rule(
+        0.05,
+        "s: the shortest push",
+        "by judgement: a few samples at 100 Hz",
+        "test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out",
+    )
+    told: float = _rule(
+        0.9,
+        "confidence of a push whose rest fits",
+        "by judgement: surer than any fit, since the torque itself shows it",
+        "test_a_push_is_named_surely_where_the_rest_fits",
+    )
+    hinted: float = _rule(
+        0.4,
+        "confidence of a push whose rest does not fit",
+        "by judgement: below `judge.firm`, above nothing",
+        "test_a_push_is_a_hint_where_the_rest_does_not_fit",
+    )
+    follows: float = _rule(
+        0.5,
+        "share of the logged torque's variance that a drive's believed law must give for its loop to tell of the joint",
+        "by judgement: half",
+        "test_a_loop_tells_of_the_joint_where_its_law_is_half_right",
+    )
+    fit: float = _rule(
+        0.95,
+        "share of a logged duty's variance that the believed law must give for a drive to be sound",
+        "by judgement",
+        "test_a_drive_is_sound_by_its_logged_duty",
+    )
+    slope: float = _rule(
+        0.05,
+        "by how much the gain of a sound drive may differ from what is believed",
+        "the tolerance within which beliefs are refitted",
+        "test_a_drive_is_sound_by_its_logged_duty",
+    )
+    late: float = _rule(
+        0.008,
+        "s by which a sound drive may act earlier or later than is believed",
+        "by judgement",
+        "test_a_drive_is_sound_by_its_logged_duty",
+    )
+    worse: float = _rule(
+        1.05,
+        "x the plain model's error on what was kept out: beyond it an answer is not handed on",
+        "by judgement",
+        "test_an_answer_that_follows_worse_than_the_plain_model_is_not_handed_on",
+    )
+    noise: float = _rule(
+        1.3,
+        "x the noise: an answer that follows what was kept out to it is as good as any",
+        "by judgement",
+        "test_an_answer_within_the_noise_is_handed_on",
+    )
+    surely: float = _rule(
+        0.95,
+        "share of the bootstraps in which an answer must be worse than the plain model not to be handed on",
+        "the customary 95 %",
+        "test_an_answer_must_surely_be_worse_than_the_plain_model",
+    )
+
+
+SEARCH, JUDGE, TOUCH, TORQUE = SearchRules(), JudgeRules(), TouchRules(), TorqueRules()
 
 
 def described() -> list[tuple[str, float, str, str, str]]:
     """(name such as "search.least", value, meaning, source, test) of every rule."""
     return [
         (f"{room}.{f.name}", getattr(rules, f.name), *(f.metadata[k] for k in ("means", "source", "test")))
-        for room, rules in (("search", SEARCH), ("judge", JUDGE), ("touch", TOUCH))
+        for room, rules in (("search", SEARCH), ("judge", JUDGE), ("touch", TOUCH), ("torque", TORQUE))
         for f in fields(rules)
     ]

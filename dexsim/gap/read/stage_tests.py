@@ -13,8 +13,7 @@ import numpy as np
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
-
-GOOD_FIT, GOOD_SLOPE = 0.95, 0.05
+from dexsim.gap.rules import TORQUE
 
 
 @dataclass
@@ -35,7 +34,7 @@ class Stage:
     @property
     def sound(self) -> bool:
         """The drive does what is believed: gain within 5 % and nearly all of the signal."""
-        return self.fit > GOOD_FIT and abs(self.slope - 1) < GOOD_SLOPE and abs(self.delay) < 0.008
+        return self.fit > TORQUE.fit and abs(self.slope - 1) < TORQUE.slope and abs(self.delay) < TORQUE.late
 
     @property
     def text(self) -> str:

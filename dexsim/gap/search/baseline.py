@@ -21,6 +21,7 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
+from dexsim.gap.rules import TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
@@ -29,12 +30,10 @@ GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside
 ITERATIONS = 8
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
-WORSE = 1.05  # x the plain model's error on what was kept out: beyond it an answer is worse
 MOVING = 0.05  # of the joint's large speed
 TRAVEL, LASTS = 0.02, 0.1  # of the joint's span, and s: shorter stretches may be noise
 BELIEVED = 1.1  # x the driving torque: gravity and limits are off by a few percent
-AT_NOISE = 1.3  # x the noise: what is followed to it is as good as anything
-BLOCK, DRAWS, SURE = 0.5, 400, 0.95  # s, and in how many of the bootstraps it has to be worse
+BLOCK, DRAWS = 0.5, 400  # s, bootstraps
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
 
 
@@ -235,7 +234,7 @@ def refused(
             out[joint] = reason
         elif (
             plain is not None
-            and after > max(WORSE * plain.error, AT_NOISE * max(joints[joint]["sigma"], floor))
+            and after > max(TORQUE.worse * plain.error, TORQUE.noise * max(joints[joint]["sigma"], floor))
             and _surely(squares, plain)
         ):
             k, unit = 1e3, "mm" if case.scales.slide else "mrad"
@@ -254,7 +253,7 @@ def _surely(squares: np.ndarray, plain: Baseline) -> bool:
     _, block = np.unique(plain.block, return_inverse=True)
     more = np.bincount(block, squares - plain.squares)
     draws = more[np.random.default_rng(0).integers(0, len(more), (DRAWS, len(more)))].sum(1)
-    return float(np.mean(draws > 0)) >= SURE
+    return float(np.mean(draws > 0)) >= TORQUE.surely
 
 
 def hand_on(given: Sequence[Baseline], servo: ServoTable, joints: Sequence[str]) -> list[str]:

@@ -18,20 +18,12 @@ import numpy as np
 
 from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.read.runs import Run
+from dexsim.gap.rules import TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import Columns, columns_of, moved, readable, solved, sums, unphysical
 
-MUCH = 0.3  # of the torque's variance: what a plain fit leaves where something else pushes
-QUIET = 0.3  # of the variance of the quiet torque: what the trimmed fit may leave there to be believed
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
-FAR, LEAST = 5.0, 0.15  # x the quiet residual, and of the torque's rms: a push
-JOIN, LASTS = 0.15, 0.05  # s: gaps that are joined, and the shortest push
 MOVING = 0.1  # of the joint's large speed
-CARRIES = 1.3  # x its dry friction: what a joint at rest may carry
-SLOW = 0.25  # of the residual's variance between half seconds: less is noise
-MOST = 0.6  # of the time: what pushes longer is no stretch
-REST = 0.4  # of the time: what must be left without pushes to judge a joint by it
-SURE, HINT = 0.9, 0.4
 
 
 @dataclass
@@ -62,7 +54,7 @@ class Push:
         )
         return {
             "effect": ExternalForce.id,
-            "confidence": SURE if self.clear else HINT,
+            "confidence": TORQUE.told if self.clear else TORQUE.hinted,
             "alternatives": [],
             "indistinguishable": [],
             "separating_experiment": None,
@@ -127,15 +119,16 @@ def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Gen
     cat = lambda f: np.concatenate([f(k)[moves[k]] for k in mine])  # noqa: E731
     A, u, torque = cat(lambda k: X[k]), cat(lambda k: pieces[k].u), cat(lambda k: pieces[k].torque)
     left = float(np.var(u - A @ solved(A.T @ A, A.T @ u))) / max(float(np.var(torque)), 1e-30)
-    if left < MUCH:
+    if left < TORQUE.much:
         return None
     ends = np.cumsum([0, *(pieces[k].blocks.max() + 1 for k in mine)])
     _, block = np.unique(cat(lambda k: pieces[k].blocks + ends[mine.index(k)]), return_inverse=True)
     x, quiet = _trimmed(A, u, block, int(block.max()) + 1, rng)
     on = quiet[block]
     noise = float(np.sqrt(np.mean((u - A @ x)[on] ** 2)))
-    fits = noise**2 < QUIET * float(np.var(torque[on])) and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
-    least = max(FAR * noise, LEAST * float(np.sqrt(np.mean(torque**2))))
+    quiet_torque = float(np.var(torque[on]))
+    fits = noise**2 < TORQUE.quiet * quiet_torque and not unphysical(_part(pieces[mine[0]], names, A[on], u[on]))
+    least = max(TORQUE.far * noise, TORQUE.least * float(np.sqrt(np.mean(torque**2))))
     residual = [
         _beyond(p.u, a, x, names.index("coulomb_friction"), m) for p, a, m in zip(pieces, X, moves, strict=True)
     ]
@@ -146,7 +139,7 @@ def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Gen
     top = max((float(r[np.argmax(np.abs(r))]) for r in residual if len(r)), key=abs)
     times = [np.concatenate([q.motion.t[q.keep] - q.motion.t[0] for q in p.pieces]) for p in pieces]
     # what the motor gives less, something else gives
-    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < MOST
+    return list(zip(times, pushed, strict=True)), -top, noise, left, fits and share < TORQUE.most
 
 
 def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np.ndarray) -> np.ndarray:
@@ -154,7 +147,7 @@ def _beyond(u: np.ndarray, A: np.ndarray, x: np.ndarray, coulomb: int, moves: np
     still = A.copy()
     still[:, coulomb] = 0.0
     held = u - still @ x
-    free = np.sign(held) * np.maximum(np.abs(held) - CARRIES * max(float(x[coulomb]), 0.0), 0.0)
+    free = np.sign(held) * np.maximum(np.abs(held) - TORQUE.carries * max(float(x[coulomb]), 0.0), 0.0)
     return np.where(moves, u - A @ x, free)
 
 
@@ -162,7 +155,7 @@ def _slow(residual: np.ndarray, block: np.ndarray) -> bool:
     """Whether residuals are alike over half a second, as forces are and noise is not."""
     count = np.maximum(np.bincount(block), 1)
     means = np.bincount(block, residual) / count
-    return float(np.sum(count * means**2)) > SLOW * float(np.sum(residual**2))
+    return float(np.sum(count * means**2)) > TORQUE.slow * float(np.sum(residual**2))
 
 
 def _part(of: Columns, names: list[str], A: np.ndarray, u: np.ndarray) -> Columns:
@@ -203,11 +196,11 @@ def _spans(given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run]) 
         merged: list[list[float]] = []
         for a, b in zip(edge[::2], edge[1::2], strict=True):
             start, end = float(t[a] + run.t[0]), float(t[b - 1] + run.t[0])
-            if merged and start - merged[-1][1] < JOIN:
+            if merged and start - merged[-1][1] < TORQUE.join:
                 merged[-1][1] = end
             else:
                 merged.append([start, end])
-        spans = [(a, b) for a, b in merged if b - a >= LASTS]
+        spans = [(a, b) for a, b in merged if b - a >= TORQUE.lasts]
         if spans:
             out[run.name] = out.get(run.name, []) + spans
     return out
@@ -232,7 +225,7 @@ def without(pushes: Sequence[Push], runs: list[Run], held: list[int], notes: lis
         "in which nothing does",
     )
     seconds = lambda given: sum(r.duration for r in given)  # noqa: E731
-    if not rest or bool(held) != bool(kept) or len(kept) == len(rest) or seconds(rest) < REST * seconds(runs):
+    if not rest or bool(held) != bool(kept) or len(kept) == len(rest) or seconds(rest) < TORQUE.rest * seconds(runs):
         return runs, held
     for p in clear:
         p.cut = True

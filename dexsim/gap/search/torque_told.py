@@ -10,14 +10,13 @@ import mujoco
 import numpy as np
 
 from dexsim.gap.effects.command_delay import CommandDelay
+from dexsim.gap.rules import TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import HEAVY, NAMES, PER_CUTOFF, columns_of, moved, readable
 from dexsim.gap.search.inverse_dynamics import BY_DIRECTION, LAG, LEAST, LOAD, STRIBECK, solve
 
 SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
 TRUSTED = 0.6  # of the torque's rms: what may be left for figures to be believed
-# of the logged torque's variance: what the drive's believed law must give for its closed loop to tell of the joint
-FOLLOWS = 0.5
 ALIKE = 1.05  # x the error of a free run in closed loop: within it the loop does not tell one from the other
 
 
@@ -189,7 +188,7 @@ def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[st
     in part: their closed loop speaks of an unknown controller, and no effect of the joint is looked for in it. Said in
     `notes`."""
     told = {case.joint for case, _, _ in given if case.told}
-    out = {x.joint for x in stages if x.joint in told and x.fit < FOLLOWS}
+    out = {x.joint for x in stages if x.joint in told and x.fit < TORQUE.follows}
     for x in stages:
         if x.joint in out:
             notes.append(

@@ -1,0 +1,192 @@
+"""Each figure of `rules.TORQUE` decides what it says: pushes from outside, drives whose torque or duty was logged, and
+the plain model beside every answer. `tests/test_gap_rules.py` moves each and sees its test fail."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dexsim.gap.read import inputs
+from dexsim.gap.read.stage_tests import Stage
+from dexsim.gap.rules import JUDGE
+from dexsim.gap.search import baseline, external_force, torque_told
+from dexsim.gap.search.body_torque import Columns, least
+
+NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
+STEP, BLOCKS, A_BLOCK = 0.01, 80, 50
+T = STEP * np.arange(BLOCKS * A_BLOCK)
+
+
+def recorded(push: np.ndarray, noise: float, own: float = 1.0, standing: int = 0) -> Columns:
+    """A joint that swings under friction of rms `own`, with uniform noise of rms `noise` and a push [m] on its torque;
+    in its last `standing` samples it stands and its torque is the push alone."""
+    rng = np.random.default_rng(4)
+    v = np.sin(2 * np.pi * 0.31 * T)
+    v[len(T) - standing :] = 0.0
+    X = np.stack([np.gradient(v, STEP), v, np.sign(v), np.ones(len(T))], 1)
+    torque = X @ np.array([0.02, 0.6, 0.4, 0.0])
+    torque *= own / np.std(torque[: len(T) - standing])
+    torque += push + noise * np.where(v == 0, 0.0, rng.uniform(-np.sqrt(3), np.sqrt(3), len(T)))
+    piece = SimpleNamespace(motion=SimpleNamespace(t=T), keep=np.ones(len(T), bool))
+    block = np.repeat(np.arange(BLOCKS), A_BLOCK)
+    return Columns([piece], NAMES, X, torque, v, np.zeros(len(T)), torque, block, 0.1, 2.0, False, float(T[-1]))
+
+
+def pushed(of: Columns):
+    """(samples that are pushed, the answer) of one recording; None where nothing is told."""
+    said = external_force._of_joint([of], [True], np.random.default_rng(0))
+    return said and (said[0][0][1], said)
+
+
+def stretches(share: float) -> np.ndarray:
+    """[m] 1 in `share` of the blocks, spread over the recording, else 0."""
+    on = np.zeros(BLOCKS)
+    on[np.random.default_rng(2).permutation(BLOCKS)[: round(share * BLOCKS)]] = 1.0
+    return np.repeat(on, A_BLOCK)
+
+
+def left_by_a_plain_fit(of: Columns) -> float:
+    return float(np.var(of.u - of.X @ least(of.X, of.u)) / np.var(of.torque))
+
+
+def test_a_plain_fit_must_leave_much_for_a_push():
+    for share, told in ((0.4, True), (0.22, False)):
+        tried = [recorded(h * stretches(0.3), 0.01) for h in np.geomspace(0.5, 5.0, 60)]
+        one = min(tried, key=lambda of: abs(left_by_a_plain_fit(of) - share))
+        assert left_by_a_plain_fit(one) == pytest.approx(share, abs=0.02)
+        assert (pushed(one) is not None) is told, share
+
+
+def test_pushes_are_clear_where_the_quiet_torque_fits():
+    for noise, clear in ((0.5, True), (0.9, False)):  # of the quiet torque's variance: 0.2 and 0.45
+        assert pushed(recorded(30.0 * stretches(0.3), noise))[1][-1] is clear, noise
+
+
+def test_a_push_stands_far_out_of_the_quiet_residual():
+    noise = 1 / np.sqrt(5)
+    assert pushed(recorded(2.8 * noise * stretches(0.4), noise)) is None
+    found = pushed(recorded(7.5 * noise * stretches(0.4), noise))
+    assert found is not None and (found[0] == (stretches(0.4) > 0)).mean() > 0.99
+
+
+def test_a_push_is_no_small_part_of_the_torque():
+    large, small = stretches(0.3), np.zeros(len(T))
+    free = [k for k in range(BLOCKS) if large[k * A_BLOCK] == 0]
+    spots = {share: slice(free[n] * A_BLOCK, (free[n] + 1) * A_BLOCK) for n, share in ((5, 0.1), (9, 0.22))}
+    rms = float(np.sqrt(np.mean(recorded(4.0 * large, 0.01).torque ** 2)))
+    for share, spot in spots.items():
+        small[spot] = share * rms
+    on, _ = pushed(recorded(4.0 * large + small, 0.01))
+    assert on[large > 0].all() and on[spots[0.22]].mean() > 0.8 and on[spots[0.1]].mean() < 0.1
+
+
+def test_a_joint_at_rest_carries_some_more_than_its_friction():
+    A, x = np.array([[0.0, 0.0, 1.0, 0.0]] * 2), np.array([0.0, 0.0, 2.0, 0.0])
+    for torque, beyond in ((2.0 * 1.2, False), (2.0 * 1.6, True)):
+        found = external_force._beyond(np.array([torque, -torque]), A, x, 2, np.zeros(2, bool))
+        assert (np.abs(found) > 0).all() == beyond == (np.abs(found) > 0).any(), torque
+
+
+def test_a_force_lasts_and_noise_does_not():
+    block = np.repeat(np.arange(20), 100)
+    noise = np.tile([1.0, -1.0], 1000)
+    for share, slow in ((0.35, True), (0.17, False)):  # of the variance that lies between the blocks
+        force = np.sqrt(share / (1 - share)) * np.where(block % 2, 1.0, -1.0)
+        assert external_force._slow(noise + force, block) is slow, share
+
+
+def test_what_pushes_most_of_the_time_is_no_stretch():
+    half = len(T) // 2
+    for share, clear in ((0.45, True), (0.75, False)):  # of all samples; at rest mostly
+        on = np.zeros(len(T))
+        on[half : half + round((share - 0.1) * len(T))] = 8.0 if share < 0.5 else 0.0
+        if share > 0.5:
+            on[len(T) - round((share - 0.1) * len(T)) :] = 8.0
+        standing = half if share < 0.5 else round((share - 0.1) * len(T))
+        moving = len(T) - standing
+        on[:moving] = 0.0
+        on[: moving // 3 if share > 0.5 else moving // 5] = 8.0
+        answer = pushed(recorded(on, 0.01, standing=standing))
+        assert answer is not None and answer[1][-1] is clear, share
+
+
+def test_a_joint_is_judged_without_pushes_where_enough_is_left():
+    run = SimpleNamespace(name="a", duration=10.0)
+    push = external_force.Push("j", 1.0, 0.1, 0.5, True, False, {"a": [(0.0, 1.0)]})
+    for seconds, cut in ((5.0, True), (3.0, False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(inputs, "merged_spans", lambda *_: {})
+            patch.setattr(inputs, "free_air", lambda *_, s=seconds: ([SimpleNamespace(name="a", duration=s)], []))
+            rest, _ = external_force.without([push], [run], [], [])
+        assert (rest[0].duration == seconds) is cut, seconds
+
+
+def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
+    run = SimpleNamespace(name="a", t=np.zeros(1))
+    t = 0.01 * np.arange(1000)
+
+    def found(*spans):
+        on = np.any([(t > a - 1e-6) & (t < b + 1e-6) for a, b in spans], 0)
+        return external_force._spans([(t, on)], [run]).get("a", [])
+
+    assert len(found((1.0, 2.0), (2.1, 3.0))) == 1 and len(found((1.0, 2.0), (2.25, 3.0))) == 2
+    assert len(found((1.0, 1.07))) == 1 and found((1.0, 1.03)) == []
+
+
+def push(clear: bool) -> float:
+    return external_force.Push("j", 1.0, 0.1, 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
+
+
+def test_a_push_is_named_surely_where_the_rest_fits():
+    assert JUDGE.sure <= push(True) <= 1.0
+
+
+def test_a_push_is_a_hint_where_the_rest_does_not_fit():
+    assert 0.5 * JUDGE.hinted < push(False) < JUDGE.firm
+
+
+def test_a_loop_tells_of_the_joint_where_its_law_is_half_right():
+    given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
+    for fit, tells in ((0.65, True), (0.4, False)):
+        unknown = torque_told.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
+        assert (unknown == set()) is tells, fit
+
+
+def test_a_drive_is_sound_by_its_logged_duty():
+    def sound(fit=0.99, slope=1.0, delay=0.0):
+        return Stage("j", "duty", slope, 0.9, 1.1, 0.0, delay, fit).sound
+
+    assert sound() and sound(fit=0.96) and not sound(fit=0.9)
+    assert sound(slope=1.04) and not sound(slope=1.08) and not sound(slope=0.92)
+    assert sound(delay=0.006) and not sound(delay=0.012) and not sound(delay=-0.012)
+
+
+def handed(after: float, plain: float, sigma: float) -> bool:
+    """Whether an answer with an error `after` on what was kept out is handed on beside the plain model's `plain`."""
+    scales = SimpleNamespace(nominal={"coulomb_friction": 1.0}, slide=False)
+    case = SimpleNamespace(joint="j", plant=None, scales=scales)
+    trial = SimpleNamespace(fit=SimpleNamespace(params=[], x=np.zeros(0)))
+    block = np.repeat(np.arange(20), 10)
+    model = baseline.Baseline("j", {}, 1.0, plain, np.ones(200), np.full(200, plain**2), block)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baseline, "expand", lambda *_: np.zeros((1, 1, len(baseline.INDEX))))
+        fits = [(case, trial, np.full(200, after**2))]
+        return not baseline.refused([model], {"j": {"after": after, "sigma": sigma}}, fits, [0], 0.0)
+
+
+def test_an_answer_that_follows_worse_than_the_plain_model_is_not_handed_on():
+    assert handed(1.04, 1.0, 0.01) and not handed(1.07, 1.0, 0.01)
+
+
+def test_an_answer_within_the_noise_is_handed_on():
+    assert handed(1.25, 1.0, 1.0) and not handed(1.5, 1.0, 1.0)
+
+
+def test_an_answer_must_surely_be_worse_than_the_plain_model():
+    block = np.repeat(np.arange(20), 10)
+    for worse, sure in ((12, False), (19, True)):  # of 20 stretches, all by as much: 75 %, all bootstraps
+        squares = np.where(block < worse, 1.5, 0.5)
+        plain = baseline.Baseline("j", {}, 1.0, 1.0, np.ones(200), np.ones(200), block)
+        assert baseline._surely(squares, plain) is sure, worse
