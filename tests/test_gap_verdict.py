@@ -102,6 +102,16 @@ def test_what_alone_visits_a_regime_is_not_kept_out_whole():
     assert parts.span_train[3][1] == parts.span_test[3][0] == 7.5 and parts.span_test[2][0] == 0.0
 
 
+def test_a_recording_whose_end_does_not_visit_a_regime_takes_no_others_place():
+    """The last is kept out and stays cold. Of two that are warm the first is at its begin alone: the second's end is
+    kept out, or nothing that drifts with temperature would show."""
+    case = Held([(0, 0), (0, 0), (1.0, 9.0), (0, 0), (1.0, 9.0)])
+    warm = Held([(0, 0), (1.0, 4.0), (0, 0), (0, 9.9), (0, 0)]).regimes["saturation"] > 0
+    case.regimes["temperature"] = 20.0 + 20.0 * warm
+    parts = keep_out.split(case.runs, [], [0, 1, 2, 3, 4], [case])
+    assert parts.test == [3, 4] and parts.span_test[3][0] == 7.5
+
+
 def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
     case = Held([(0, 0), (0, 0), (1.0, 9.0)])
     parts = keep_out.split(case.runs, [2], [0, 1, 2], [case])

@@ -13,7 +13,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
-from dexsim.gap.plant.columns import SERIES_INDEX, Param
+from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
 from dexsim.gap.rules import JUDGE
 
 
@@ -51,6 +51,33 @@ def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]
     return out
 
 
+LITTLE = 0.02  # of the model's friction: a smaller share of it stays where the model has it
+
+
+def on_motor(case: Case, trial) -> float:
+    """Share of the model's friction and damping of the joint that a trial has on the motor's side of a play or an
+    elasticity; 0 where nothing parts the two."""
+    params, x = trial.fit.params, trial.fit.x
+    share = next((float(v) for p, v in zip(params, x, strict=True) if p.columns == ("motor_share",)), 0.0)
+    if share < LITTLE:
+        return 0.0
+    row = expand(case.plant, params, x[None])[0, 0]
+    parted = row[PLANT_INDEX["backlash"]] > 0.0 or row[PLANT_INDEX["softness"]] > 0.0
+    return share if parted else 0.0
+
+
+def moved_friction(case: Case, trial) -> dict[str, float]:
+    """What goes from the model's joint to the servo's columns, which act on the motor, with `on_motor`: friction N.m,
+    damping N.m.s/rad."""
+    share = on_motor(case, trial)
+    if share <= 0.0:
+        return {}
+    return {
+        "coulomb_friction": share * case.constants.friction,
+        "viscous_friction": share * case.constants.damping,
+    }
+
+
 def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
     """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the
     table has no column for. Where something changes with temperature, training is given the temperatures that were
@@ -80,6 +107,9 @@ def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, join
         table.set(case.joint, "kd", *(round(max(x - lost, 0.0), 9) for x in (kd.value, kd.low, kd.high)))
     for name, value in columns_beside(case, trial, joints).items():
         table.set(case.joint, name, value)
+    for name, more in moved_friction(case, trial).items():
+        now = table.value(case.joint, name)
+        table.set(case.joint, name, *(round(x + more, 9) for x in (now.value, now.low, now.high)))
     if any(name.startswith("thermal_") for p in trial.fit.params for name in p.columns):
         warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
         table.set(case.joint, "warmth", *(round(float(v), 2) for v in (np.median(warmth), warmth.min(), warmth.max())))
@@ -125,9 +155,18 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
     """Writes effects that live in the model into its spec (by_member: fitted values by effect; trial: None for values
     alone); returns what was changed, in words."""
     notes = {m.id: m.variant.note for m in trial.members} if trial is not None else {}
-    return [
+    said = [
         x for e in CATALOGUE if e.id in by_member for x in e.to_model(spec, case, by_member[e.id], notes.get(e.id, {}))
     ]
+    share = on_motor(case, trial) if trial is not None else 0.0
+    if share > 0.0:
+        joint = spec.joint(case.joint)
+        joint.frictionloss = float(np.ravel(joint.frictionloss)[0]) * (1.0 - share)
+        joint.damping = np.asarray(joint.damping, float) * (1.0 - share)
+        said.append(
+            f"model.xml: {100 * share:.0f} % of the friction and damping of {case.joint} went to its motor (servo.yaml)"
+        )
+    return said
 
 
 MODEL_FILES = "model_files"  # folder beside model.xml

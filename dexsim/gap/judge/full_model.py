@@ -26,7 +26,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.errors import free_run
-from dexsim.gap.judge.findings import columns_beside, handed, model_changes, undamped
+from dexsim.gap.judge.findings import columns_beside, handed, model_changes, moved_friction, undamped
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run
@@ -144,6 +144,8 @@ def servo_rows(m: Mechanism, run: Run, index: int, cases: Sequence[Case], h: Hyp
         rows[j, kd] = max(rows[j, kd] - undamped(trial, rows[j, SERVO_INDEX["kp"]]), 0.0)
         for name, value in columns_beside(case, trial, m.joints).items():
             rows[j, SERVO_INDEX[name]] = value
+        for name, more in moved_friction(case, trial).items():
+            rows[j, SERVO_INDEX[name]] += more
     if run.supply is not None and run.servo.supply_voltage:
         rows[:, SERVO_INDEX["supply"]] *= float(np.mean(run.supply)) / run.servo.supply_voltage
     return rows

@@ -49,6 +49,13 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
         "speed that the torque limit falls with: 0 the motor's, 1 what the loop takes for it (they part with play, "
         "elasticity, scale, filter)",
     ),
+    (
+        "motor_share",
+        0.0,
+        "1",
+        "share of the model's friction and damping of the joint that acts on the motor where play or elasticity parts "
+        "the two; the rest acts on the joint",
+    ),
     ("bias", 0.0, "N.m", "constant torque on the joint"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),

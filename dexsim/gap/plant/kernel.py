@@ -94,6 +94,7 @@ P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["harden
 P_EXPONENT, P_SHAPE = INDEX["stribeck_exponent"], INDEX["ripple_shape"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
+P_MOTORSHARE = INDEX["motor_share"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
 
@@ -184,6 +185,8 @@ class Guess:  # the columns of one guess that every step asks for
     slide: bool
     open_: f64
     base_friction: f64
+    base_damping: f64
+    motor_share: f64  # of both, where rotor and link are two bodies
     low: f64
     high: f64
     stop: f64
@@ -300,6 +303,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.slide = c.consts[C_SLIDE] >= f64(0.5)
     p.open_ = c.consts[C_OPEN]
     p.base_friction = c.consts[C_FRICTION]
+    p.base_damping = c.consts[C_DAMPING]
+    p.motor_share = c.params[h, P_MOTORSHARE]
     p.low = c.consts[C_LOW]
     p.high = c.consts[C_HIGH]
     p.stop = c.consts[C_STIFF]
@@ -626,11 +631,14 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
     if p.loop_motor:
         d_m = d_l + d_m
         d_l = zero
+    # the model's own friction and damping: a share before the play, the rest behind it
+    link_share = f64(1.0) - p.motor_share
+    level += p.motor_share * p.base_friction
     # rotor:  a11 vm' + a12 v' = b1      link:  a21 vm' + a22 v' = b2
-    a11 = b.rotor_rate + p.viscous * n.friction + kh + d_m
+    a11 = b.rotor_rate + p.viscous * n.friction + p.motor_share * p.base_damping + kh + d_m
     a12 = -kh + d_l
     a21 = -kh
-    a22 = b.link_rate + c.consts[C_DAMPING] + kh + stop_d
+    a22 = b.link_rate + link_share * p.base_damping + kh + stop_d
     b1 = b.rotor_rate * x.vm + applied + d_m * x.vm + d_l * x.v - pull
     b2 = b.link_rate * x.v - load + pull
     if n.held:  # link held
@@ -651,8 +659,8 @@ def two_bodies(c: Recorded, x: State, t: Torque, applied: f64, load: f64, level:
     else:
         x1 -= wp.sign(x1) * gain * level
         x2 = (b2 - a21 * x1) / a22
-    if p.base_friction > zero and not n.held:
-        still = p.base_friction / a22
+    if link_share * p.base_friction > zero and not n.held:
+        still = link_share * p.base_friction / a22
         if wp.abs(x2) <= still:
             x2 = zero
         else:

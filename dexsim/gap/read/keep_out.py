@@ -130,18 +130,28 @@ def _ends(runs, train, test, time, found, plant) -> dict[int, float]:
     out: dict[int, float] = {}
     missing = [k for k in range(len(time)) if time[k, test].sum() < LEAST_TIME <= time[k, train].sum()]
     on = list(found.values())
-    while missing:
-        run = max(train, key=lambda i: sum(time[k, i] >= LEAST_TIME for k in missing))
-        served = [k for k in missing if time[k, run] >= LEAST_TIME]
-        if not served:
-            break
-        at = (1 - KEEP_OUT) * runs[run].duration
+    begins = {run: (1 - KEEP_OUT) * runs[run].duration for run in train}
+
+    def served(run: int) -> list[int]:
+        """Of the missing regimes those that the recording visits at its end and before: seen at its begin alone they
+        would not be judged."""
         t = runs[run].t - runs[run].t[0]
         step = float(np.median(np.diff(t)))
-        inside = [on[k][plant.rows(run)] for k in served]
-        if any(x[t >= at].sum() * step >= 0.5 * LEAST_TIME and x[t < at].sum() * step >= LEAST_TIME for x in inside):
-            out[run] = at
-        missing = [k for k in missing if k not in served]
+        late = t >= begins[run]
+        inside = {k: on[k][plant.rows(run)] for k in missing}
+        return [
+            k
+            for k, x in inside.items()
+            if x[late].sum() * step >= 0.5 * LEAST_TIME and x[~late].sum() * step >= LEAST_TIME
+        ]
+
+    while missing:
+        by_run = {run: served(run) for run in train}
+        run = max(train, key=lambda i: len(by_run[i]))
+        if not by_run[run]:
+            break
+        out[run] = begins[run]
+        missing = [k for k in missing if k not in by_run[run]]
     return out
 
 

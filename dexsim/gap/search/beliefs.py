@@ -181,6 +181,9 @@ def refitted(case: Case) -> list[Param]:
     if c.constants.damping > 0:
         d = BELIEF * c.constants.damping
         out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
+    if c.constants.friction > 0 or c.constants.damping > 0:
+        # on which side of a play a model's friction acts it does not say; without a play it makes no difference
+        out.append(Param("motor_share", ("motor_share",), "set", 0.0, 1.0, 0.5, nuisance=True))
     if s.apart:  # two encoders have two zeros, set to a count or two
         z = ZERO * max(c.quantum, c.sigma)
         out.append(Param("zero", ("readout_offset",), "add", -z, z, 0.0, nuisance=True, sd=0.5 * z))

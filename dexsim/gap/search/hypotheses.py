@@ -28,7 +28,7 @@ EXTREMES = (
 EXTREME, OF_RUN = 12, 3  # windows
 TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
 PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
-MAYBE = {"limit_speed": 0.0}  # beliefs about a drive near its limits that the simulator that trains has at these values
+MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
 
 class JointHypotheses:

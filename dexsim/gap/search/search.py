@@ -47,8 +47,8 @@ class JointSearch(JointSelection):
         self.polish(found.best), self.polish(found.none)  # kept for the judgement
 
     def _simpler(self, trial: Trial) -> Trial:
-        """The trial without what may be so or otherwise in a drive near its limits (`MAYBE`), where it follows as well
-        without: slopes stall at such kinks, and what was kept out may go beyond what told them."""
+        """The trial without what may be so or otherwise in a drive (`MAYBE`), where it follows as well without: slopes
+        stall at such kinks, and what was kept out may go beyond what told them."""
         params = trial.fit.params
         away = [
             p.key
