@@ -55,11 +55,11 @@ def plant_run(
     seed: int = 0,
     noisy: bool = True,
     servo: dict | None = None,
-    temperature: bool = False,
+    temperature: bool | float = False,
 ) -> Run:
     """A run of the gap's own plant with some plant parameters changed (`x` factors written as key '*name'). servo:
     believed columns and encoders other than SERVO's; temperature: from 20 to 50 degC, each run warmer than the one
-    before."""
+    before; a number: by so many degrees more."""
     t_cmd, cmd = motion(kind, seconds, seed)
     t = np.arange(0.0, seconds - 0.02, 0.01) + (
         np.random.default_rng(seed).uniform(0, 1e-3, len(np.arange(0.0, seconds - 0.02, 0.01)))
@@ -73,7 +73,8 @@ def plant_run(
         name, ("joint",), t_cmd, cmd[:, None], t, np.interp(t, t_cmd, cmd)[:, None], table, np.array([0, 0, -9.81])
     )
     if temperature:
-        rough.temperature = (20.0 + 7.0 * kind + 9.0 * t / seconds)[:, None]
+        warmer = 0.0 if temperature is True else temperature
+        rough.temperature = (20.0 + warmer + 7.0 * kind + 9.0 * t / seconds)[:, None]
     for _ in range(3):  # the series are those of the motion itself
         rough.qs = None
         rough.smooth()
@@ -226,6 +227,22 @@ def test_floor_from_repeats_of_the_same_commands():
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
     runs[1].name = "a"  # two pieces of one recording
     assert errors.floor(runs, build(model(), runs))[1] != "repeats"
+
+
+def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
+    """Two repeats, one 40 degC warmer, of a drive that weakens as it warms up: they differ by more than their noise,
+    and by no more once that is fitted."""
+    weakens = {"thermal_torque": -0.01}
+    runs = [plant_run(name, 0, 3.0, weakens, temperature=w) for name, w in (("cold", 1.0), ("warm", 41.0))]
+    for r in runs:
+        r.smooth()
+    case = build(model(), runs)[0]
+    apart = errors.floors(runs, [case])[0]["joint"]
+    thermal = EFFECTS["thermal"].variants(case.scales)[0].params
+    assert thermal[0].columns == ("thermal_torque",) and apart > 4 * case.sigma
+    assert errors.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
+    assert errors.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
+    assert errors.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
 
 
 def test_map_finds_the_regime_and_controls_false_discoveries():

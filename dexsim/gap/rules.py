@@ -242,10 +242,10 @@ class JudgeRules:
         "test_friction_at_one_load_is_a_set",
     )
     overstated: float = _rule(
-        2.0,
-        "x what is left with what was found: a floor from repeats that is larger holds what differs between them, not "
+        1.3,
+        "x what repeats differ by beyond what was found: a floor from repeats that is larger holds what was found, not "
         "noise",
-        "by judgement; a drive that warms up between two repeats gave 3.0",
+        "by judgement: as `within`, what is taken for the same floor",
         "test_repeats_that_differ_by_what_was_found_are_no_floor",
     )
     part: float = _rule(

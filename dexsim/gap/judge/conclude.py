@@ -26,7 +26,7 @@ from dexsim.recording.mechanism import Mechanism
 @dataclass
 class Noise:
     """The noise floor of the position error: over all joints [rad or m], where it comes from (repeats, split or
-    quantum), and of each joint; lowered: the joints whose floor is what a finding left instead."""
+    quantum), and of each joint; lowered: the joints whose floor is what repeats differ by beyond what was found."""
 
     floor: float
     how: str
@@ -34,8 +34,8 @@ class Noise:
     lowered: tuple[str, ...] = ()
 
     def at_most(self, left: dict[str, float]) -> Noise:
-        """The floor, where repeats differ by what was found (a drive that warms up between them): then what is left
-        with it [rad or m, by joint] is far less than they differ by, and is the floor."""
+        """The floor, where repeats differ by what was found (a drive that is warmer in one of them): what they differ
+        by beyond it [rad or m, by joint] is then less, and is the floor."""
         lower = {j: x for j, x in left.items() if JUDGE.overstated * x < self.joints[j]}
         if not lower:
             return self
@@ -75,10 +75,13 @@ def into_diagnosis(
             d.curves.append(curve)
     d.spots = locate.control([x for a in answers for x in a.spots])
     refuted = _take_back(d, answers, findings)
-    noise = noise.at_most({a.case.joint: rms(a.after) for a in answers if a.found and a.case.joint not in refuted})
+    if noise.how == "repeats":
+        found = [a for a in answers if a.found and a.case.joint not in refuted]
+        noise = noise.at_most({a.case.joint: a.floor_beyond() for a in found})
     if noise.lowered:
         notes.append(
-            f"noise floor of {', '.join(noise.lowered)}: what is left; recordings of the same commands differ by more"
+            f"noise floor of {', '.join(noise.lowered)}: what recordings of the same commands differ by beyond what "
+            "was found"
         )
     data["noise_floor"] = {
         "position_rad": float(noise.floor),

@@ -31,21 +31,50 @@ def floors(runs: list[Run], cases: list[Case]) -> tuple[dict[str, float], str]:
 
     Repeats hold what differs from run to run (friction, temperature, how it is mounted), which no effect can
     explain."""
-    sums, count = np.zeros(len(runs[0].joints)), 0
-    for i, a in enumerate(runs):
-        for b in runs[i + 1 :]:
-            # pieces of one recording are aligned only by where they were cut
-            if a.name == b.name or not same_commands(a, b):
-                continue
-            t = np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
-            # repeats are aligned by their commands, which were sent at the same times from the start
-            for j in range(len(a.joints)):
-                d = np.interp(a.t[0] + t, a.t, a.q[:, j]) - np.interp(b.t[0] + t, b.t, b.q[:, j])
-                sums[j] += float((d**2).sum()) / 2.0
-            count += len(t)
-    if not count:
+    pairs = repeats(runs)
+    if not any(len(_common(a, b)) for a, b in pairs):
         return {c.joint: c.sigma for c in cases}, "split"
-    return {c.joint: max(float(np.sqrt(sums[c.index] / count)), c.sigma) for c in cases}, "repeats"
+    apart = {c.joint: _apart([((a, a.t, a.q[:, c.index]), (b, b.t, b.q[:, c.index])) for a, b in pairs]) for c in cases}
+    return {c.joint: max(apart[c.joint], c.sigma) for c in cases}, "repeats"
+
+
+def repeats(runs: list[Run]) -> list[tuple[Run, Run]]:
+    """Pairs of runs of the same commands; pieces of one recording are aligned only by where they were cut."""
+    return [(a, b) for i, a in enumerate(runs) for b in runs[i + 1 :] if a.name != b.name and same_commands(a, b)]
+
+
+def floor_beyond(case: Case, runs: list[Run], params: list[Param], x: np.ndarray, fixed=()) -> float:
+    """Noise floor of a joint's position error [rad or m] from what repeats differ by beyond what a fit says that they
+    do (a drive that was warmer in one of them moves otherwise, and that is no noise); never below the noise of its
+    samples, inf without repeats."""
+    number = {id(run): k for k, run in enumerate(runs)}
+    pairs = [p for p in repeats(runs) if not {number[id(r)] for r in p} & case.plant.left_out]
+    if not any(len(_common(a, b)) for a, b in pairs):
+        return float("inf")
+    windows = case.plant.windows(None, sorted({number[id(r)] for p in pairs for r in p}))
+    rows = windows.sample_row
+    left = case.plant.q[rows] - free_run(case, params, x, windows, fixed, True)[0]
+
+    def of(run: Run) -> tuple[Run, np.ndarray, np.ndarray]:
+        mine = case.plant.run_of[rows] == number[id(run)]
+        return run, case.plant.t[rows][mine], left[mine]
+
+    return max(_apart([(of(a), of(b)) for a, b in pairs]), case.sigma)
+
+
+def _common(a: Run, b: Run) -> np.ndarray:
+    """Times since their starts [s] at which repeats are compared: they are aligned by their commands, which were sent
+    at the same times from the start."""
+    return np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
+
+
+def _apart(pairs) -> float:
+    """Standard deviation by which what (run, times [S] s, values [S]) have in pairs of repeats scatters."""
+    d = []
+    for (a, ta, xa), (b, tb, xb) in pairs:
+        t = _common(a, b)
+        d.append(np.interp(a.t[0] + t, ta, xa) - np.interp(b.t[0] + t, tb, xb))
+    return float(np.sqrt(np.mean(np.concatenate(d) ** 2) / 2.0))
 
 
 def free_run(

@@ -247,6 +247,11 @@ class JointAnswer:
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         return evidence
 
+    def floor_beyond(self) -> float:
+        """What repeats differ by beyond what was found [rad or m]; inf without repeats."""
+        fixed = [f for mm in self.best.members for f in mm.variant.fixed]
+        return errors.floor_beyond(self.whole, self.kept.runs, self.best.fit.params, self.best.fit.x, fixed)
+
     def locate(self, rng: np.random.Generator, seed: int) -> None:
         """Fills `spots`, where the believed simulator's residual lives, and `depends_on`, what the residual that is
         left depends on."""
