@@ -21,6 +21,7 @@ class SupplySag(Effect):
     shows = "while other joints work"
     experiment = "this joint moving alone, then with the others loaded"
     classes = ("drive weakens",)
+    kinds = 2
 
     def variants(self, s: Scales) -> list[Variant]:
         if not s.others or s.others_torque <= 0:
@@ -29,7 +30,15 @@ class SupplySag(Effect):
         sag = param(
             "sag", "sag", "set", 0.0, 1.5 * top, 0.0, "1/N.m"
         )  # at the others' peaks nothing of the supply may be left
-        return [Variant((sag,), tuple((f * top,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)))]
+        out = [Variant((sag,), tuple((f * top,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)))]
+        if not s.voltage:
+            # a drive that is described by torques but sets a voltage loses all of them with its supply, to itself too
+            weak = param("sag", "sag_torque", "set", 0.0, 1.5 * top, 0.0, "1/N.m")
+            most = 0.7 / max(s.tau, 1e-9)
+            own = param("own", "sag_own", "set", 0.0, most, 0.0, "1/N.m")
+            starts = tuple((f * top, min(f * top, 0.9 * most)) for f in (0.05, 0.1, 0.2, 0.4))
+            out.append(Variant((weak, own), starts, "gains and limits alike"))
+        return out
 
     def unseen(self, s: Scales) -> str:
         if not s.others:
@@ -42,4 +51,5 @@ class SupplySag(Effect):
         return case.regimes.get("_others", case.regimes["speed"])
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
-        return {"sag": fit.entry("sag", f"1/({fit.force})")}
+        keys = ["sag", *(["own"] if "own" in fit.value else [])]
+        return {k: fit.entry(k, f"1/({fit.force})") for k in keys}

@@ -50,6 +50,14 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
         "elasticity, scale, filter)",
     ),
     (
+        "sag_torque",
+        0.0,
+        "1/N.m",
+        "share of all that a torque drive gives (gains, limit, speed) lost per N.m of the other joints' motors: where "
+        "it sets a voltage it weakens with its supply",
+    ),
+    ("sag_own", 0.0, "1/N.m", "the same per N.m of its own motor"),
+    (
         "motor_share",
         0.0,
         "1",

@@ -42,6 +42,7 @@ from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
 ONE_BODY_STEPS = 1
+LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
@@ -95,6 +96,7 @@ P_EXPONENT, P_SHAPE = INDEX["stribeck_exponent"], INDEX["ripple_shape"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 P_MOTORSHARE = INDEX["motor_share"]
+P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
 XOC, XOS, XOI, XAC, XAS, XAI = (X[f"com_{a}_{b}"] for a in ("out", "across") for b in ("cos", "sin", "inertia"))
 
 
@@ -172,6 +174,7 @@ class Guess:  # the columns of one guess that every step asks for
     late: f64
     late_at: int
     late_group: int
+    weak_own: f64  # of what the drive gives, lost per N.m of its own
     feed_v: f64
     feed_a: f64
     rotor: f64  # kg.m2, before it is kept within the inertia
@@ -216,6 +219,7 @@ class Now:  # what holds in one step of the grid
     tau0: f64
     no_load: f64
     supply: f64
+    weak: f64  # of what the drive gives, lost to the other joints
     efficiency: f64
     friction: f64  # factor
     inertia: f64
@@ -290,6 +294,7 @@ def guess(c: Recorded, h: int, dt: f64):
     p.late = c.params[h, P_LATE]
     p.late_at = int(c.params[h, P_LATEAT])
     p.late_group = int(c.params[h, P_LATEGROUP])
+    p.weak_own = c.params[h, P_WEAKOWN]
     p.feed_v = c.params[h, P_FEEDV]
     p.feed_a = c.params[h, P_FEEDA]
     p.beyond = p.ki != f64(0.0) or p.feed_v != f64(0.0) or p.feed_a != f64(0.0)
@@ -416,6 +421,7 @@ def drive_now(c: Recorded, h: int, g: int, p: Guess, n: Now):
     else:
         n.efficiency = n.efficiency * constant
     n.supply = sagging(c.params[h, P_SUPPLY] * c.series[g, XSUP], c.params[h, P_SAG], c.series[g, XOTH])
+    n.weak = c.params[h, P_WEAK] * c.series[g, XOTH]
     if p.open_ > f64(0.0):
         n.drive = c.series[g, XDRIVE]
     n.enabled = c.series[g, XON] >= f64(0.5)
@@ -734,10 +740,13 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     v_lim = v_drive + p.limit_speed * (rate - v_drive)
     speed = zero  # over the no-load speed
     limits = wp.vec2d(f64(1.0), f64(1.0))  # of the duty, or of the torque
+    left = f64(1.0)  # of what the drive gives, where its supply sags
+    if n.weak != zero or p.weak_own != zero:
+        left = wp.max(f64(1.0) - n.weak - p.weak_own * wp.abs(x.last), f64(LEAST_SUPPLY))
     if not p.voltage:
-        speed = wp.abs(v_lim) / (n.no_load * n.supply)
-        limits = torque_limits(n.tau0, speed, v_lim, p.steep)
-    asked = wp.vec3d(u[0], u[1], u[2])
+        speed = wp.abs(v_lim) / (n.no_load * n.supply * left)
+        limits = torque_limits(n.tau0 * left, speed, v_lim, p.steep)
+    asked = wp.vec3d(left * u[0], left * u[1], left * u[2])
     if p.beyond:
         if x.fresh != zero and p.ki != zero:  # a drive that has been on before: its integral holds the load
             x.integral = load / wp.max(n.efficiency, f64(0.01))
