@@ -36,7 +36,7 @@ class SupplySag(Effect):
             weak = param("sag", "sag_torque", "set", 0.0, 1.5 * top, 0.0, "1/N.m")
             most = 0.7 / max(s.tau, 1e-9)
             own = param("own", "sag_own", "set", 0.0, most, 0.0, "1/N.m")
-            starts = tuple((f * top, min(f * top, 0.9 * most)) for f in (0.05, 0.1, 0.2, 0.4))
+            starts = tuple((f * top, min(f * top, 0.9 * most)) for f in (0.01, 0.03, 0.08, 0.2, 0.4))
             out.append(Variant((weak, own), starts, "gains and limits alike"))
         return out
 
