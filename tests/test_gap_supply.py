@@ -65,6 +65,16 @@ def test_a_supply_that_sags_under_the_drives_own_load_is_found():
     assert found.fit.value("supply_sag.sag") == pytest.approx(SAGS["sag_torque"], rel=0.15)
 
 
+def test_both_kinds_of_sag_are_tried_where_one_is_listed():
+    """What a scan's slopes say of a sag where limits are reached ranks its kinds badly."""
+    runs, case = sagging_case({})
+    search = JointSearch(case, [0, 1, 2], None, conditions(runs))
+    speed, all_ = (Member(EFFECTS["supply_sag"], v) for v in EFFECTS["supply_sag"].variants(case.scales))
+    other = Member(EFFECTS["payload"], EFFECTS["payload"].variants(case.scales)[0])
+    rows = [(0.5, 0.0, speed, None), (0.4, 0.0, other, None), (0.3, 0.0, all_, None)]
+    assert [row[2] for row in search._shortlist(rows, 1, 10.0, ())] == [speed, all_]
+
+
 def test_a_voltage_drives_supply_is_the_servos():
     _, case = sagging_case({})
     assert len(EFFECTS["supply_sag"].variants(replace(case.scales, voltage=True))) == 1

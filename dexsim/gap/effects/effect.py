@@ -112,6 +112,7 @@ class Effect:
     motions: ClassVar[tuple[str, ...]] = ("steps", "chirp", "triangles")  # kinds of `recording.excitation` that show it
     model_columns: ClassVar[tuple[str, ...]] = ()  # columns of the plant that are fields of the model
     kinds: ClassVar[int] = 1  # variants that one short list may hold
+    every_kind: ClassVar[bool] = False  # listed with one of its kinds, all are: the scan's slopes rank them badly
     fitted_anyway: ClassVar[dict[str, str]] = {}  # servo column that may be unknown -> the parameter that it is
     demo: ClassVar[dict[str, float]] = {}  # servo columns of a drive that hides it, for `demo=`
     demo_on_motor: ClassVar[bool] = False  # hidden behind a loop whose encoder sits on the motor

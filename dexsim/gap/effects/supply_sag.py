@@ -22,6 +22,7 @@ class SupplySag(Effect):
     experiment = "this joint moving alone, then with the others loaded"
     classes = ("drive weakens",)
     kinds = 2
+    every_kind = True  # where limits are reached it takes slopes far beyond what they hold for
 
     def variants(self, s: Scales) -> list[Variant]:
         if not s.others or s.others_torque <= 0:

@@ -162,7 +162,8 @@ class JointScan(JointLosses):
         return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)
 
     def _shortlist(self, scan, size, loss, members):
-        """The best variants of the best effects, and what the first is confused with."""
+        """The best variants of the best effects, every kind of those that ask for it, and what the first is confused
+        with."""
         seen: dict[str, int] = {}
         out = []
         for row in scan:
@@ -176,7 +177,8 @@ class JointScan(JointLosses):
             if any(not fits_beside(m, other) for other in members):
                 continue
             leader = out[0][2].id if out else None
-            if len(out) < size or (leader and confusable(leader, m.id) and len(out) < size + 2):
+            asked = m.id in seen and m.effect.every_kind
+            if len(out) < size or asked or (leader and confusable(leader, m.id) and len(out) < size + 2):
                 seen[m.id] = seen.get(m.id, 0) + 1
                 out.append(row)
         return out

@@ -53,7 +53,8 @@ class JointSelection(JointScan):
                 listed = self._hinted([] if enough else listed, current.members, SEARCH.hint)
             if not listed:
                 break
-            drafts = []
+            drafts: list = []
+            followed: dict[str, float] = {}
             for _, p, member, start in listed:
                 if drafts and self.deadline.over():
                     break
@@ -65,6 +66,10 @@ class JointSelection(JointScan):
                 if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
                     tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
                 drafts.append(min(tries, key=lambda d: d[2].loss))
+                if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
+                    if member.id in followed:
+                        pool[member.id] = (member, start)
+                    followed[member.id] = drafts[-1][2].loss
                 self._on(0.03)
             drafts.sort(key=lambda d: d[2].loss)
             good = [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
