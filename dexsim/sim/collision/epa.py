@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dexsim.sim.collision.gjk import DOUBT, GAIN, OVERLAP, difference
+from dexsim.sim.collision.gjk import GAIN, OVERLAP, difference
 from dexsim.sim.collision.shapes import Core, support
 
 POINTS = 32
@@ -20,6 +20,10 @@ EDGES = 48
 FAR = wp.constant(1.0e10)
 ATTEMPTS = wp.constant(3)
 """Searches at most: one is enough in all but one of some ten thousand overlapping poses."""
+PARALLEL = wp.constant(0.999)
+"""Cosine above which two triangles may be of one facet: one that rounding has turned round can lie as deep as the nearest."""
+SURE = wp.constant(1.0e-7)
+"""A facet beyond which A - B goes on by more than this [m] is not one of its facets."""
 LEVEL = wp.constant(2.0e-8)
 """How far [m] a corner must lie above a face to see it, more in each attempt: faces of one plane are seen together or not at
 all, whatever rounding says of each."""
@@ -131,7 +135,7 @@ def grown(
                 done = int(1)
         if reach - level <= GAIN:
             done = int(1)
-        if done == 1 and reach - level > DOUBT:
+        if done == 1 and reach - level > SURE:
             lost = int(1)
         if lost == 1 or done == 1 or points == POINTS:
             break
@@ -172,20 +176,21 @@ def grown(
             v = edge[h] >> 8
             face[faces] = u | (v << 8) | (points << 16)
             at[faces] = plane(pos[u], pos[v], w)
-            if at[faces][3] < level - DOUBT:
+            if at[faces][3] < level - SURE:
                 lost = int(1)  # inside out: what grows comes nowhere nearer to the origin
             faces += 1
         points += 1
     if done == 0 or lost == 1:
         return out
     # of several triangles of one facet, the one that the origin is below
-    depth = at[nearest][3]
+    n = wp.vec3(at[nearest][0], at[nearest][1], at[nearest][2])
     best = int(nearest)
     most = float(-FAR)
     for j in range(faces):
-        if at[j][3] - depth <= 2.0 * GAIN:
+        m = wp.vec3(at[j][0], at[j][1], at[j][2])
+        if at[j][3] - at[nearest][3] <= 2.0 * GAIN and wp.dot(m, n) > PARALLEL:
             t = three(face[j])
-            l = weights(wp.vec3(at[j][0], at[j][1], at[j][2]), pos[t[0]], pos[t[1]], pos[t[2]])
+            l = weights(m, pos[t[0]], pos[t[1]], pos[t[2]])
             least = wp.min(l[0], wp.min(l[1], l[2]))
             if least > most:
                 most = least
