@@ -321,6 +321,7 @@ def test_catalogue_is_that_of_the_specification():
         "braking_limit",
         "controller_term",
         "presliding",
+        "joint_spring",
         "external_force",
     }
     assert joint == set(EFFECTS)

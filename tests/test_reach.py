@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import recordings
 
+from dexsim.actuator.table import ServoTable
 from dexsim.gap.read import channels
 from dexsim.gap.read.runs import Run
 from dexsim.recording.audit import audit as audited
@@ -90,6 +91,9 @@ def test_what_a_joint_may_do_is_not(change):
     assert not [f for topic in (COMMANDS, STATES) for f in said(r, topic) if "none of this joint's" in f.text]
 
 
+SERVO = ServoTable.from_dict({"joints": {"*": {"kp": 1.0, "kd": 0.02, "torque_limit": 1.0}}})
+
+
 @pytest.mark.parametrize(
     "change, topics",
     [
@@ -106,7 +110,7 @@ def test_what_a_joint_may_do_is_not(change):
 def test_what_lies_far_outside_the_models_range_is_left_out(change, topics):
     r = recordings.signal()
     run = Run("x.mcap", r.joints, r.commands.t, r.commands.value.copy(), r.states.position.t.copy(),
-              r.states.position.value.copy(), None, r.gravity, notes=[], counted=r.joints)  # fmt: skip
+              r.states.position.value.copy(), SERVO, r.gravity, notes=[], counted=r.joints)  # fmt: skip
     change(run)
     found, out, _ = channels.inspect([run], mujoco.MjModel.from_xml_string(MODEL), {})
     far = [f for f in found if "the model allows" in f["regime"]]

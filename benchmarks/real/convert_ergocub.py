@@ -28,6 +28,7 @@ FINGERS = {
 }
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
 CLIP = 2.0  # s
+BEFORE = 1.0  # s of duty before a clip
 KEPT = 4  # every so many of a run's clips is kept out
 CLOSES = -1.0  # sign of the duty that turns the joint to larger angles (0 is the open stop)
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
@@ -56,6 +57,8 @@ SERVO = {
             "no_load_speed": {"value": 6.0, "low": 1.5, "high": 60.0},
             "coulomb_friction": "unknown",
             "viscous_friction": "unknown",
+            # the position comes from another board, 20 times a second; how old it is then nobody says
+            "delay": {"value": 0.05, "low": 0.0, "high": 0.2},
         }
     },
 }
@@ -94,8 +97,9 @@ def convert(data: Path, out: Path) -> Ergocub:
         q = np.radians(raw["theta_deg"])
         made[name] = []
         for k, (a, b) in enumerate(_clips(t, set_, q)):
-            on = slice(a, b)
-            changed = a + np.flatnonzero(np.r_[True, np.diff(set_[on]) != 0])
+            # what was asked for before still acts when the clip begins
+            early = int(np.searchsorted(t, t[a] - BEFORE))
+            changed = early + np.flatnonzero(np.r_[True, np.diff(set_[early:b]) != 0])
             keep = slice(a, b, EVERY)
             made[name].append(
                 save(

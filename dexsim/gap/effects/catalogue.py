@@ -26,6 +26,7 @@ from dexsim.gap.effects.external_force import ExternalForce
 from dexsim.gap.effects.gain_mismatch import GainMismatch
 from dexsim.gap.effects.inertia import Inertia
 from dexsim.gap.effects.joint_coupling import JointCoupling
+from dexsim.gap.effects.joint_spring import JointSpring
 from dexsim.gap.effects.lag import Lag
 from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.payload import Payload
@@ -75,6 +76,7 @@ CATALOGUE: tuple[Effect, ...] = (
     BrakingLimit(),
     ControllerTerm(),
     Presliding(),
+    JointSpring(),
     ExternalForce(),
 )
 """Effects of a joint and its drive."""

@@ -85,6 +85,7 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     ripple = p("torque_ripple") * np.sin(p("ripple_per_turn") * q + p("ripple_phase"))
     inertia = s("inertia") * p("inertia_scale") + p("armature")
     needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
+    needed += p("spring") * q + p("spring_preload")
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
     )

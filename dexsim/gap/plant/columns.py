@@ -65,6 +65,8 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
         "the two; the rest acts on the joint",
     ),
     ("bias", 0.0, "N.m", "constant torque on the joint"),
+    ("spring", 0.0, "N.m/rad", "stiffness of a spring at the joint, beyond the model's"),
+    ("spring_preload", 0.0, "N.m", "its torque at joint zero, towards smaller positions"),
     ("effort_gain", 1.0, "1", "shown effort over motor torque (used by the fit, not by the motion)"),
     ("effort_offset", 0.0, "N.m", "added to the shown effort"),
     (

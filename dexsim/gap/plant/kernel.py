@@ -94,6 +94,7 @@ P_PRESLIDE, P_BRAKING, P_DEADKIND = INDEX["presliding"], INDEX["braking_slope"],
 P_COUT, P_CACROSS, P_HARD = INDEX["com_out"], INDEX["com_across"], INDEX["hardening"]
 P_EXPONENT, P_SHAPE = INDEX["stribeck_exponent"], INDEX["ripple_shape"]
 P_FEEDV, P_FEEDA, P_KI = INDEX["speed_feedforward"], INDEX["acceleration_feedforward"], INDEX["integral_gain"]
+P_SPRING, P_PRELOAD = INDEX["spring"], INDEX["spring_preload"]
 P_LATE, P_LATEAT, P_LATEGROUP = INDEX["late_by"], INDEX["late_at"], INDEX["late_group"]
 P_MOTORSHARE = INDEX["motor_share"]
 P_WEAK, P_WEAKOWN = INDEX["sag_torque"], INDEX["sag_own"]
@@ -171,6 +172,8 @@ class Guess:  # the columns of one guess that every step asks for
     back: f64  # back-driven
     uneven: f64  # half the friction's asymmetry
     bias: f64
+    spring: f64
+    preload: f64
     late: f64
     late_at: int
     late_group: int
@@ -291,6 +294,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.back = c.params[h, P_BACK]
     p.uneven = f64(0.5) * c.params[h, P_ASYM]
     p.bias = c.params[h, P_BIAS]
+    p.spring = c.params[h, P_SPRING]
+    p.preload = c.params[h, P_PRELOAD]
     p.late = c.params[h, P_LATE]
     p.late_at = int(c.params[h, P_LATEAT])
     p.late_group = int(c.params[h, P_LATEGROUP])
@@ -717,7 +722,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     if not p.slide:
         dq = x.q - n.q  # the model was evaluated at the measured pose
         load = turned(n.gravity_cos, n.gravity_sin, dq)
-    load += n.load
+    load += n.load + p.preload + p.spring * (x.q + half * dt * x.v)
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)

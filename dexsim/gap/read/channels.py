@@ -22,6 +22,8 @@ import mujoco
 import numpy as np
 from scipy import signal
 
+from dexsim.actuator.columns import INDEX
+from dexsim.gap.read import rhythm
 from dexsim.gap.read.runs import Run
 from dexsim.recording.audit_values import repeats
 from dexsim.recording.schema import COMMANDS, STATES, Recording
@@ -101,6 +103,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     out = dict(known)
     long = {joint: repeated_stretches(runs, joint) for joint in {j for run in runs for j in run.joints}}
     blind: dict[str, list[tuple[float, float]]] = {}
+    beat = {joint: rhythm.common(runs, joint) for joint in long}
 
     def add(
         kind: str,
@@ -120,7 +123,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     for i, run in enumerate(runs):
         if (spans := _pauses(run)):
             blind[run.name] = spans
-        stale = np.zeros(len(run.t), bool)
+        stale, between = np.zeros(len(run.t), bool), np.ones(len(run.t), bool)
         for j, joint in enumerate(run.joints):
             if (run.name, joint) in out:
                 continue
@@ -143,6 +146,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                 (what, topic, _farthest(x, limits))
                 for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
                 if _outside(x, limits) > max(FAR * (limits[1] - limits[0]), 2 * np.pi)
+                and not (what == "target" and _within_drive(run, j))
             ]
             if far:
                 add(
@@ -191,6 +195,18 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                     0.7,
                 )
                 continue
+            if beat[joint] > 0:
+                between &= rhythm.between(run.t, q, beat[joint])  # joints of one bus are read one after the other
+                add(
+                    "stale",
+                    f"{joint} is read every {1e3 * beat[joint]:.3g} ms only; the samples between repeat it",
+                    run,
+                    joint,
+                    [STATES],
+                    whole,
+                    drop=False,
+                )
+                continue
             held, single = _held(run.t, q), repeated_samples(run.t, q)
             for a, b in long[joint][i]:
                 held[a + 1 : b + 1] = True
@@ -220,6 +236,8 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
                     drop=False,
                 )
             stale |= held | single
+        if not between.all():
+            stale |= between
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
     return list(found.values()), out, blind
@@ -303,6 +321,14 @@ def _range(model: mujoco.MjModel, joint: str) -> np.ndarray | None:
 def _outside(x: np.ndarray, limits: np.ndarray) -> float:
     """How far beyond a range the values go, 0 or less where they do not."""
     return float(max(x.max() - limits[1], limits[0] - x.min()))
+
+
+def _within_drive(run: Run, j: int) -> bool:
+    """Whether the believed drive can give what its gain makes of every target: one without a loop of its own is told
+    its torque so, as a target far off through a small gain."""
+    row = run.servo.nominal(run.joints)[j]
+    asked = row[INDEX["kp"]] * (float(np.abs(run.cmd[:, j]).max()) + float(np.abs(run.q[:, j]).max()))
+    return bool(0 < asked <= (1.0 if run.servo.drive == "voltage" else row[INDEX["torque_limit"]]))
 
 
 def _farthest(x: np.ndarray, limits: np.ndarray) -> float:
