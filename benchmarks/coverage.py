@@ -33,8 +33,9 @@ from dexsim.assets import xhand
 from dexsim.cli import machine, start
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import hand_layout
 
 CONTACT = 0.1  # N
 CELL = 0.002  # m
@@ -70,7 +71,7 @@ class Plane:
 
 def planes() -> list[Plane]:
     """One of each finger's pad."""
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     return [Plane(layout.point[f, : layout.count[f]]) for f in range(layout.pads)]
 
 
@@ -116,7 +117,7 @@ def recorded(path: str, meta: dict[str, str]) -> list[Contacts]:
     from dexsim.recording.reader import read
 
     touch = read(path, meta=meta, audit=False).tactile_newtons()
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     if touch is None or touch.value.shape[1:3] != layout.point.shape[:2]:
         raise UserError(f"recording={path}: has no touch of {layout.pads} pads with {layout.taxels} taxels")
     normal = np.nan_to_num(touch.value[..., 2]).clip(min=0)
@@ -198,7 +199,7 @@ def draw(ours: list, theirs: list, label: str, found: dict, path: Path) -> None:
 
     figure = Figure(figsize=(13, 5.2), layout="constrained")
     axes = figure.subplots(2, 5)
-    layout, rng = xhand_layout(), np.random.default_rng(0)
+    layout, rng = hand_layout(load_hand()), np.random.default_rng(0)
     for f, (finger, plane) in enumerate(zip(xhand.FINGERS, planes(), strict=True)):
         top, bottom = axes[0, f], axes[1, f]
         top.scatter(*(1000 * plane(layout.point[f, : layout.count[f]])).T, s=2, color="0.8")

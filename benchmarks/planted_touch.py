@@ -75,7 +75,12 @@ def main(argv: list[str]) -> int:
                     ""
                     if not out.findings
                     else _felt_again(
-                        Path(folder), paths, touch_handed.handed(out.findings, out.facts), planted, 10 + seed, again
+                        Path(folder),
+                        paths,
+                        touch_handed.handed(out.findings, out.facts, out.names),
+                        planted,
+                        10 + seed,
+                        again,
                     )
                 )
             first = out.findings[0] if out.findings else None

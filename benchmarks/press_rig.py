@@ -1,5 +1,5 @@
-"""A press rig with hidden effects, for tests and benchmarks of touch: one xHand fingertip, a ball on two slides, 120
-taxels, a load cell.
+"""A press rig with hidden effects, for tests and benchmarks of touch: one fingertip of a hand with its taxels, a ball
+on two slides, a load cell.
 
 The ball's motion and the contact's depth come from MuJoCo's geometry (the tip's hull), the readings from the touch
 kernels that train policies (`dexsim.tactile`): neither is the diagnosis's own plant.
@@ -13,42 +13,47 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from dexsim.hand import Hand, load_hand
+from dexsim.hand.skin import geom_points
 from dexsim.recording import write
 from dexsim.recording.schema import COMMANDS, DEFAULTS, EXTERNAL_FORCE, STATES, TACTILE, Recording, Series, States
+from dexsim.tactile.sensors import Sensors
 
 RADIUS = 0.012  # m
 SERVO = {"drive": "torque", "joints": {"*": {"kp": 4000.0, "kd": 40.0, "torque_limit": 60.0, "no_load_speed": 0.5}}}
 LSB, RATE = 0.1, 90.0
+TIP = "tip"  # name of the tip's first geom
 
 
-def spec(finger: str = "index") -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
-    """The rig: the finger's distal body fixed at the origin, a ball on a slide against the pad's middle and one along
-    it. Also the pressed point [3] m, the direction in which the ball presses [3] and the one in which it slides [3]."""
-    from dexsim.assets import xhand
-
-    f = xhand.FINGERS.index(finger)
-    table = xhand.taxel_table(finger)
-    k = 5 * xhand.ROWS + 6
-    point, normal, along = table["position"][k], table["normal"][k], table["tangent"][k]
+def spec(
+    finger: str = "index", hand: Hand | None = None
+) -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, np.ndarray]:
+    """The rig: the distal body of a hand's finger (the xHand's) fixed at the origin, a ball on a slide against the
+    pad's middle and one along it. Also the pressed point [3] m, the direction in which the ball presses [3] and the one
+    in which it slides [3]."""
+    hand = hand or load_hand()
+    f = hand.finger_names.index(finger)
+    sensors = Sensors(hand)
+    pads, k = sensors.layout, sensors.middle(f)
+    point, normal, along = pads.point[f, k], pads.normal[f, k], pads.tx[f, k]
     out = mujoco.MjSpec()
     out.modelname = "press_rig"
     out.compiler.degree = False
     out.option.gravity = [0, 0, -9.81]
-    hand = xhand.hand_spec()
-    tip = next(g for b in hand.bodies if b.name == xhand.TIP_BODIES[f] for g in b.geoms if g.name == f"tip_{finger}")
-    # the body's frame is the taxels' frame
-    out.add_mesh(name="tip", uservert=_vertices(hand, tip))
-    pad = out.worldbody.add_body(name=xhand.TIP_BODIES[f], pos=[0, 0, 0.1])
-    # the hand's tip is a hull inside the skin, rounded by its margin
-    pad.add_geom(
-        name="tip",
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname="tip",
-        margin=float(hand.compile().geom(f"tip_{finger}").margin[0]),
-        contype=0,
-        conaffinity=0,
-        mass=0.01,
-    )
+    pad = out.worldbody.add_body(name=hand.tip_bodies[f], pos=[0, 0, 0.1])
+    for name in hand.fingers[f].geoms:  # the body's frame is the taxels' frame
+        called = TIP if name == hand.fingers[f].geoms[0] else name
+        out.add_mesh(name=called, uservert=geom_points(hand, (name,)).ravel().tolist())
+        # the hand's tip is a hull inside the skin, rounded by its margin
+        pad.add_geom(
+            name=called,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=called,
+            margin=float(hand.compiled.geom(name).margin[0]),
+            contype=0,
+            conaffinity=0,
+            mass=0.01,
+        )
     at = point + normal * (RADIUS + 2e-3) + [0, 0, 0.1]
     side = out.worldbody.add_body(name="slider", pos=at.tolist())
     side.add_joint(name="slide", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=along.tolist(), range=[-0.01, 0.01])
@@ -67,12 +72,6 @@ def spec(finger: str = "index") -> tuple[mujoco.MjSpec, np.ndarray, np.ndarray, 
         name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], mass=0.1, contype=0, conaffinity=0
     )
     return out, point, -normal, along
-
-
-def _vertices(hand: mujoco.MjSpec, tip) -> list[float]:
-    from dexsim.tactile.layout import tip_points
-
-    return tip_points(hand.compile(), [tip.name])[0].ravel().tolist()
 
 
 def path(kind: int, seconds: float, rng: np.random.Generator, slides: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -116,6 +115,7 @@ def record(
     slides: bool = False,
     shear: bool = False,
     pressed: Sequence[np.ndarray] = (),
+    hand: Hand | None = None,
 ) -> tuple[list[Path], Path, Path]:
     """Writes `count` recordings, the rig's model and its servo; returns their paths.
 
@@ -123,12 +123,13 @@ def record(
     -> gain; swapped: pairs of taxels; stuck: taxel -> N; crosstalk: share of its force that a taxel gives its
     neighbours; rubber: (c10, c01) Pa of a Mooney-Rivlin skin in place of the linear contact; drift: relative gain lost
     or won a second over all recordings. pressed: contact forces [T] N of each recording that are given, in place of
-    what the spring makes of the depth.
+    what the spring makes of the depth. hand: whose finger it is (the xHand).
     """
     import yaml
 
     folder.mkdir(parents=True, exist_ok=True)
-    s, _, direction, along = spec(finger)
+    hand = hand or load_hand()
+    s, *_ = spec(finger, hand)
     model = s.compile()
     (folder / "rig.xml").write_text(s.to_xml(), encoding="utf-8")
     (folder / "rig.yaml").write_text(yaml.safe_dump(SERVO, sort_keys=False), encoding="utf-8")
@@ -138,7 +139,7 @@ def record(
         t, q = path(k, seconds, rng, slides)
         recording = _one(
             model,
-            s,
+            hand,
             finger,
             t,
             q,
@@ -153,7 +154,7 @@ def record(
             pressed[k] if len(pressed) else None,
         )
         z = recording.tactile.value
-        f = _finger(finger)
+        f = hand.finger_names.index(finger)
         z[:, f] *= 1 + drift * (recording.tactile.t + k * seconds)[:, None, None]
         for taxel, g in (gains or {}).items():
             z[:, f, taxel] *= g
@@ -186,25 +187,17 @@ def as_trained(content: dict) -> dict:
     return out
 
 
-def _finger(finger: str) -> int:
-    from dexsim.assets import xhand
-
-    return xhand.FINGERS.index(finger)
-
-
 def _one(
-    model, s, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk, pressed
+    model, hand, finger, t, q, rng, load_cell, stiffness, friction, sensor, rubber, shear, crosstalk, pressed
 ) -> Recording:
     import torch
 
-    from dexsim.assets import xhand
     from dexsim.assets.objects import library
-    from dexsim.tactile.layout import xhand_layout
     from dexsim.tactile.posed import PosedEngine
     from dexsim.tactile.shapes import ShapeSet
     from dexsim.tactile.tactile import Tactile
 
-    f = _finger(finger)
+    f, sensors = hand.finger_names.index(finger), Sensors(hand)
     # the drives follow with a lag of 20 ms
     a = 1 - np.exp(-0.01 / 0.02)
     real = np.zeros_like(q)
@@ -214,35 +207,35 @@ def _one(
     now = np.stack([np.interp(seen, t, x) for x in real.T], 1)
     n = len(seen)
     data = mujoco.MjData(model)
-    tip, ball = model.geom("tip").id, model.geom("ball").id
+    body, ball = model.body(hand.tip_bodies[f]).id, model.geom("ball").id
+    tips = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
     force = np.zeros(n)
-    pads = [f"tip_{x}" for x in xhand.FINGERS]
-    posed = PosedEngine(1, [*xhand.TIP_BODIES, "indenter"], pads)
+    pads = [f"tip_{x}" for x in hand.finger_names]
+    posed = PosedEngine(1, [*hand.tip_bodies, "indenter"], pads)
     settings = {"raw": True, "others": False, "period": 0.5 / RATE, "friction": friction, "shear": shear} | sensor
     if rubber:
-        kind = "thumb" if finger == "thumb" else "finger"
         settings |= {
             "sum": "spring",
             "law": "mooney_rivlin",
             "rubber": {"c10": rubber[0], "c01": rubber[1], "thickness": 2e-3},
-            "stiffness": {"mooney_rivlin": {kind: 1.0, "thumb": 1.0, "finger": 1.0}},
+            "stiffness": {"mooney_rivlin": dict.fromkeys(sensors.layout.kinds, 1.0)},
         }
-    touch = Tactile(posed, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "indenter", settings, pairs=pads,
-                    tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS])  # fmt: skip
+    touch = Tactile(posed, sensors.layout, ShapeSet([library()["sphere"]], "cpu"), "indenter", settings, pairs=pads,
+                    tips=sensors.tips)  # fmt: skip
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
-    posed.t.xpos[0, :5] = 10.0 * torch.arange(1, 6)[:, None]
-    body, away = model.body(xhand.TIP_BODIES[f]).id, np.zeros(6)
-    out = np.zeros((n, 5, xhand.TAXELS_PER_FINGER, 3))
+    F, away = len(hand.fingers), np.zeros(6)
+    posed.t.xpos[0, :F] = 10.0 * torch.arange(1, F + 1)[:, None]
+    out = np.zeros((n, *sensors.shape, 3))
     cell = np.zeros((n, 6))
     for i in range(n):
         data.qpos[:] = now[i]
         mujoco.mj_kinematics(model, data)
-        gap = mujoco.mj_geomDistance(model, data, tip, ball, 0.01, away) - model.geom_margin[tip]
+        gap = min(mujoco.mj_geomDistance(model, data, g, ball, 0.01, away) - model.geom_margin[g] for g in tips)
         force[i] = stiffness * max(-gap, 0.0) if pressed is None else pressed[i]
         posed.t.xpos[0, f] = torch.as_tensor(data.xpos[body], dtype=torch.float32)
         posed.t.xmat[0, f] = torch.as_tensor(data.xmat[body].reshape(3, 3), dtype=torch.float32)
-        posed.t.xpos[0, 5] = torch.as_tensor(data.geom_xpos[ball], dtype=torch.float32)
+        posed.t.xpos[0, F] = torch.as_tensor(data.geom_xpos[ball], dtype=torch.float32)
         posed.t.pair_normal[0] = 0.0
         posed.t.pair_normal[0, f] = float(force[i])
         posed.t.time[0] = float(seen[i])
@@ -255,9 +248,9 @@ def _one(
             out[i, ..., 2] = touch.raw[0].numpy()
         cell[i, 0] = force[i]
     if crosstalk:
-        from dexsim.gap.touch.plant import BESIDE
-
-        out[:, f] = (1 - crosstalk) * out[:, f] + crosstalk * np.einsum("kl,tlc->tkc", BESIDE, out[:, f])
+        mixed = np.einsum("kl,tlc->tkc", sensors.mixing(f), out[:, f, : sensors.layout.count[f]])
+        out[:, f, : mixed.shape[1]] *= 1 - crosstalk
+        out[:, f, : mixed.shape[1]] += crosstalk * mixed
     joints = ("slide", "press")
     lsb = 1e-5
     value = np.round(now / lsb) * lsb

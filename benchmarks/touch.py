@@ -31,8 +31,9 @@ from benchmarks.touch_cost import Cost, cost_of
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile import ShapeSet, Tactile, xhand_layout
+from dexsim.tactile import ShapeSet, Tactile, hand_layout
 from dexsim.tactile.posed import PosedEngine
 from dexsim.tactile.shapes import TouchShape, bake_convex
 
@@ -53,7 +54,7 @@ class Scene:
     """Worlds whose hands hold one shape; the solver has a contact wherever the springs would."""
 
     def __init__(self, worlds: int, shape: str, cfg: dict, device: str, shapes: ShapeSet, poses: tuple):
-        self.layout, self.shapes = xhand_layout(), shapes
+        self.layout, self.shapes = hand_layout(load_hand()), shapes
         self.tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
         name, size = SHAPES[shape]
         self.shape, self.size = shapes.index(name), torch.tensor(size)

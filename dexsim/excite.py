@@ -23,8 +23,10 @@ position, speed and torque and no two bodies come near each other.
 settings (key=default):
   joints=all        comma-separated names of the joints to move
   kinds=all         comma-separated: triangles, ladder, chirp, steps, holds, random
-  model=            MuJoCo or URDF file of another mechanism, or a hand's folder (default: the xHand)
-  servo=            servo.yaml believed of its drives (default: the xHand's)
+  model=            MuJoCo or URDF file of another mechanism, or a hand's folder (default: hand=)
+  hand=xhand        a hand that comes with dexsim, or a folder
+  hand_mirror=false its mirror image: a left hand of a right one
+  servo=            servo.yaml believed of its drives (default: the hand's)
   seed=0            of the order and the random motion
   rate=100          commands a second
   repeats=1         motions of each group of joints that come twice
@@ -44,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
         return 0 if argv else 2
     given = _settings(argv)
     from dexsim.recording.excitation import Limits, plan, write_plan
-    from dexsim.recording.mechanism import mechanism
+    from dexsim.recording.mechanism import mechanism, stated_hand
     from dexsim.recording.schema import numbers
     from dexsim.sim.quiet import quiet_warp
 
@@ -52,7 +54,10 @@ def main(argv: Sequence[str]) -> int:
         raise UserError("say where to write: out=DIR")
     quiet_warp("cpu")
     gravity = numbers(given["gravity"], 3, "gravity", "excite") if "gravity" in given else None
-    m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity)
+    hand = stated_hand(given.get("hand"), _flag(given, "hand_mirror"))
+    if hand is not None and given.get("model"):
+        raise UserError(f"model={given['model']}: is not moved beside hand=; say one of them")
+    m = mechanism(given.get("model") or None, given.get("servo") or None, gravity=gravity, hand=hand)
     limits = Limits(
         **{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
     )
@@ -99,6 +104,8 @@ KEYS = (
     "joints",
     "kinds",
     "model",
+    "hand",
+    "hand_mirror",
     "servo",
     "seed",
     "rate",
@@ -125,6 +132,12 @@ def _settings(argv: Sequence[str]) -> dict[str, str]:
 def _list(given: dict[str, str], key: str) -> list[str] | None:
     value = given.get(key, "all")
     return None if value in ("all", "") else [v.strip() for v in value.split(",") if v.strip()]
+
+
+def _flag(given: dict[str, str], key: str) -> bool:
+    if given.get(key, "false") not in ("true", "false"):
+        raise UserError(f"{key}={given[key]}: must be true or false")
+    return given.get(key) == "true"
 
 
 def _number(given: dict[str, str], key: str, default: float = 0.0) -> float:

@@ -86,7 +86,7 @@ def _number(key: str, text: str) -> float:
 
 def hull_obj(points: np.ndarray) -> str:
     """OBJ text of the convex hull of points [V, 3]."""
-    from dexsim.assets.xhand.shells import hull_mesh
+    from dexsim.assets.objects.geometry import hull_mesh
 
     vertices, faces = hull_mesh(points)
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices + 0.0]

@@ -4,6 +4,8 @@ simulated deployment."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -135,6 +137,12 @@ def test_the_whole_chain(hands, tmp_path, task, pads, capsys):
     evaluation = ["task.evaluation.cap_s=0.5"] if task == "rotate" else []
     played = ["episodes=2", "worlds=2", "device=cpu", "video=false", f"out={tmp_path}/played", *evaluation]
     assert play([f"checkpoint={policy}", *played]) == 0
+    if task == "grasp":  # its hand carried along, as well as turned
+        (tmp_path / "path.csv").write_text("t,x,y,z\n0,0,0,0\n0.3,0,0,0.05\n0.6,0.05,0,0.1\n0.9,0,0,0.1\n")
+        for base, said in (("lift", "hold_rate_shaken"), (f"{tmp_path}/path.csv", "hold_rate_path")):
+            out = tmp_path / said
+            assert play([f"checkpoint={policy}", *played[:4], f"out={out}", f"task.evaluation.base={base}"]) == 0
+            assert json.loads((out / "metrics.json").read_text())[said] is not None, base
     made = export.export(str(policy), tmp_path / "bundle", steps=8)
     assert export.check(made)
     b = bundle.load(made)

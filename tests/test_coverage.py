@@ -9,8 +9,9 @@ import pytest
 
 from benchmarks import coverage
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import hand_layout
 
 
 def samples(n: int, force: tuple, centre: tuple, seed: int = 0, blocks: int = 20) -> coverage.Contacts:
@@ -51,7 +52,7 @@ def test_a_region_of_too_few_samples_is_seen_in_trainings_own_halves():
 
 def test_contact_centres_lie_on_the_pad():
     """A force on one taxel alone gives its own position in the pad's plane, exactly."""
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     force, local = np.array([[0.0, 2.0, 0.05, 0.0, 3.0]]), layout.point[None, :, 7]
     out = coverage.of_contact(force, local, np.array([3]))
     # a force at rest is no contact

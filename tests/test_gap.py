@@ -275,7 +275,9 @@ def test_stage_test_reads_the_drives_gain(factor):
 def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
     from pathlib import Path
 
+    from dexsim.hand import load_hand
     from dexsim.recording import Recording, Series, States
+    from dexsim.tactile.sensors import Sensors
 
     t = np.arange(0, 2, 0.02)
     grid = np.exp(-0.5 * ((np.arange(10)[:, None] - 5) ** 2 + (np.arange(12)[None] - 6) ** 2) / 4).reshape(-1)
@@ -283,7 +285,8 @@ def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
     z[:, 1, :, 2] = np.round(100 * np.abs(np.sin(t))[:, None] * grid)
     z[:, 1, 5 * 12 + 7, 2] = 0.0
     empty = Series.empty("x", 1)
-    found = constant_taxels.found([Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))])
+    made = Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))
+    found = constant_taxels.found([made], Sensors(load_hand()))
     assert [f["where"]["taxels"] for f in found] == [["1:67"]]
 
 

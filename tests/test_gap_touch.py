@@ -32,7 +32,7 @@ def plain(tmp_path_factory):
 def collected(paths, model, servo):
     m = mechanism(model, servo)
     recordings = [read(p, joints=m.joints, audit=False) for p in paths]
-    return touch_read.collect(recordings, m), recordings, m
+    return touch_read.collect(recordings, m, m.sensors), recordings, m
 
 
 def found(folder, seconds=7.0, **planted):
@@ -92,7 +92,7 @@ def test_foundation_and_neighbours_keep_their_sums(plain):
     g = int(np.argmax(run.depth))
     expected = ref.mooney_rivlin_force(np.maximum(-run.dist[g], 0), run.area, touch_plant.THICKNESS, 8e4, 1e4)
     assert force[g] == pytest.approx(expected.sum(), rel=1e-9) and share[g].sum() == pytest.approx(1.0)
-    assert np.allclose(touch_plant.BESIDE.sum(0), 1.0)  # what a taxel gives its neighbours is what it loses
+    assert np.allclose(run.mixing.sum(0), 1.0)  # what a taxel gives its neighbours is what it loses
 
 
 def test_a_slipping_bristle_stops_at_friction_times_force(plain):

@@ -17,7 +17,8 @@ from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
-from dexsim.gap.touch.handed_on import HEAD, chord, handed
+from dexsim.gap.touch import handed_on
+from dexsim.gap.touch.handed_on import HEAD, chord
 from dexsim.gap.touch.handed_on import save as write
 from dexsim.gap.touch.result import PadFacts
 from dexsim.paths import CONFIGS
@@ -25,6 +26,10 @@ from dexsim.recording import read
 from dexsim.tactile.file import load
 
 INDEX, MID = 1, 2
+
+
+def handed(findings, facts):
+    return handed_on.handed(findings, facts, xhand.FINGERS)
 
 
 def diagnosed(folder, **planted):

@@ -18,8 +18,9 @@ from browser import CHROMIUM, Page
 
 from dexsim.cli import start as start_up
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import hand_layout
 from dexsim.view import live_panels as panels
 from dexsim.view.live_meshes import body_meshes
 
@@ -75,7 +76,7 @@ def test_colours_darken_with_force():
 
 
 def test_a_pressed_taxel_shows_on_its_own_fingertip_only():
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     shown = panels.TaxelMap(layout)
     force = np.zeros(layout.area.shape)
     calm = shown.image(force, 1.0)
@@ -92,7 +93,7 @@ def test_a_pressed_taxel_shows_on_its_own_fingertip_only():
 
 
 def test_the_end_of_the_finger_is_up():
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     shown = panels.TaxelMap(layout)
     force = np.zeros(layout.area.shape)
     calm = shown.image(force, 1.0)

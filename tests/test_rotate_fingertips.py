@@ -12,8 +12,9 @@ import torch
 from dexsim import rotation
 from dexsim.cli import start
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile.layout import xhand_layout
+from dexsim.tactile.layout import hand_layout
 from dexsim.tasks import make_env
 from dexsim.tasks.make_fingertip_grasps import DRIFT, OTHER, TURN
 from dexsim.tasks.patches import Patches
@@ -249,7 +250,7 @@ def test_a_trials_facts_are_of_its_own_episode():
 
 @pytest.mark.parametrize("count", [1, 5, 24, 120])
 def test_patches_keep_the_force_and_lose_the_place(count):
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     p = Patches(layout, count, "cpu")
     assert (p.member.sum(2).sum(1) == torch.as_tensor(layout.count)).all()  # every taxel in one patch
     assert (p.member.sum(1) > 0).all()  # none is empty
@@ -263,7 +264,7 @@ def test_patches_keep_the_force_and_lose_the_place(count):
 
 
 def test_bits_say_only_whether():
-    p = Patches(xhand_layout(), "bits", "cpu")
+    p = Patches(hand_layout(load_hand()), "bits", "cpu")
     raw = torch.zeros(1, 5, 120)
     raw[0, 1, :4] = 2.5
     force, centre = p.read(raw)

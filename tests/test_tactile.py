@@ -15,8 +15,9 @@ from tactile_fixtures import SPRING, flat_layout, primitives, random_rotation, t
 from dexsim.assets import xhand
 from dexsim.assets.objects import Grid, library
 from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
-from dexsim.tactile import ShapeSet, TaxelLayout, load_layout, xhand_layout
+from dexsim.tactile import ShapeSet, TaxelLayout, hand_layout, load_layout
 from dexsim.tactile import reference as ref
 from dexsim.tactile.lanes import lane_ballot, lane_from, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.pressing import presses, skin_of
@@ -28,7 +29,7 @@ SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0, 0), "capsule": (0.019, 
 
 @cache
 def hand() -> TaxelLayout:
-    return xhand_layout()
+    return hand_layout(load_hand())
 
 
 @cache

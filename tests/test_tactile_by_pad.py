@@ -14,11 +14,13 @@ from worlds import grasp_cfg, grasp_env
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.gap.touch import plant as touch_plant
-from dexsim.tactile import ShapeSet, Tactile, xhand_layout
+from dexsim.hand import load_hand
+from dexsim.tactile import ShapeSet, Tactile, hand_layout
 from dexsim.tactile import reference as ref
 from dexsim.tactile.config import tactile_config
 from dexsim.tactile.pads import THICKNESS, pad_configs, value_range
 from dexsim.tactile.posed import PosedEngine
+from dexsim.tactile.sensors import Sensors
 
 RADIUS, MIDDLE, FORCE = 0.012, 66, 3.0
 INDEX, MID = 1, 2
@@ -27,7 +29,7 @@ INDEX, MID = 1, 2
 def ball(cfg: dict, n: int = 2, **kw):
     """A ball at the middle of every pad of N hands, each 20 cm from the next; `press(depth, time)` moves it over the
     index's and feels."""
-    layout = xhand_layout()
+    layout = hand_layout(load_hand())
     pads = [f"tip_{f}" for f in xhand.FINGERS]
     engine = PosedEngine(n, [*xhand.TIP_BODIES, "object"], pads)
     tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
@@ -72,7 +74,8 @@ def test_crosstalk_is_the_law_of_the_diagnosis_and_keeps_the_sum():
     press()
     x = clean()
     assert (x > 0.05).sum() > 4
-    np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), 0.7 * x + 0.3 * touch_plant.BESIDE @ x, atol=1e-6)
+    mixed = Sensors(load_hand()).mixing(INDEX) @ x
+    np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), 0.7 * x + 0.3 * mixed, atol=1e-6)
     assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-5) and touch.force_clean[
         0, INDEX
     ].item() == pytest.approx(FORCE, rel=1e-5)
@@ -162,7 +165,7 @@ def test_rubber_spreads_the_force_as_it_presses(feel_others):
         }
     )
     press()
-    area = xhand_layout().area[INDEX]
+    area = hand_layout(load_hand()).area[INDEX]
     w = ref.mooney_rivlin_force(np.maximum(-distance(), 0.0), area, THICKNESS, c10, c01)
     np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), FORCE * w / w.sum(), atol=2e-4)
     assert touch.force[0, INDEX].item() == pytest.approx(FORCE, rel=1e-4) and not np.allclose(
@@ -179,7 +182,8 @@ def test_rubber_by_springs_is_its_own_force():
         {"sum": "spring", "law": "linear", "stiffness": {"linear": 2e8}, "pads": {"index": {"rubber": {"c10": 8e4}}}}
     )
     press()
-    want = ref.mooney_rivlin_force(np.maximum(-distance(), 0.0), xhand_layout().area[INDEX], THICKNESS, 8e4, 0.0)
+    area = hand_layout(load_hand()).area[INDEX]
+    want = ref.mooney_rivlin_force(np.maximum(-distance(), 0.0), area, THICKNESS, 8e4, 0.0)
     np.testing.assert_allclose(touch.raw[0, INDEX].numpy(), want, rtol=2e-3, atol=1e-6)
 
 

@@ -104,7 +104,8 @@ class Sensor:
         from benchmarks.press_rig import RADIUS
         from dexsim.assets import xhand
         from dexsim.assets.objects import library
-        from dexsim.tactile.layout import xhand_layout
+        from dexsim.hand import load_hand
+        from dexsim.tactile.layout import hand_layout
         from dexsim.tactile.posed import PosedEngine
         from dexsim.tactile.shapes import ShapeSet
         from dexsim.tactile.tactile import Tactile
@@ -120,8 +121,8 @@ class Sensor:
         if not pinched:  # nothing but the ball comes near, and the work is spared
             settings |= {"feel_others": False, "others": False}
         settings |= {"raw": True, "period": 0.5 / (RATE * INNER)}
-        self.touch = Tactile(self.engine, xhand_layout(), ShapeSet([library()["sphere"]], "cpu"), "indenter", settings,
-                             pairs=pads,
+        self.touch = Tactile(self.engine, hand_layout(load_hand()), ShapeSet([library()["sphere"]], "cpu"), "indenter",
+                             settings, pairs=pads,
                              tips=[xhand.tip_skin_mesh(x)[0] for x in xhand.FINGERS],
                              seed=int(world["seed"]))  # fmt: skip
         self.touch.shape_id.fill_(0)

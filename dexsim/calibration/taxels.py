@@ -11,22 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim.tactile.layout import neighbours
+
 AT_ONCE = 6  # taxels that answer together where something presses; noise wakes fewer
-
-
-def neighbours(columns: int, rows: int) -> list[list[int]]:
-    """Taxels beside each taxel of the lattice."""
-    out = []
-    for k in range(columns * rows):
-        c, r = divmod(k, rows)
-        out.append(
-            [
-                a * rows + b
-                for a, b in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1))
-                if 0 <= a < columns and 0 <= b < rows
-            ]
-        )
-    return out
 
 
 @dataclass

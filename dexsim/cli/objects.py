@@ -17,8 +17,11 @@ def apply(plain: dict[str, Any]) -> None:
         return
     task = plain["task"]
     if task.get("name") != "grasp":
+        key = next(k for k, value in given.items() if value is not None)
+        why = " (each trial begins with a held cube, and such poses are only known of cubes)"
         raise UserError(
-            f"objects={given['objects']}: task={task.get('name')} has its own object; they are for task=grasp"
+            f"{key}={given[key]}: task={task.get('name')} has its own object"
+            f"{why if task.get('name') == 'rotate' else ''}; {key}= is for task=grasp"
         )
     for key, into in (("objects", "train"), ("kept_out", "held_out")):
         names = given[key]

@@ -19,6 +19,8 @@ KEYS = (
     "out",
     "video",
     "timestep",
+    "hand",
+    "hand_mirror",
     "object",
     "object_size",
     "object_mass",
@@ -28,9 +30,11 @@ USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
 
 
 def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
-    """The settings of a replay: {"replay": path, "model", "servo": path or None, "out", "video", "timestep", "object":
+    """The settings of a replay: {"replay": path, "model", "servo": path or None, "hand": a
+    Hand or None, "out", "video", "timestep", "object":
     a `led_object.Stated` or None, "remap", "meta"}."""
     from dexsim.recording.arguments import read_arguments
+    from dexsim.recording.mechanism import stated_hand
 
     own: dict[str, str] = {}
     rest: list[str] = []
@@ -43,8 +47,11 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
         else:
             raise UserError(f"'{argument}' does not go with replay=FILE; {USAGE}")
     _, remap, meta = read_arguments([own["replay"], *rest])
-    if own.get("video", "true") not in ("true", "false"):
-        raise UserError(f"video={own['video']}: must be true or false")
+    for key in ("video", "hand_mirror"):
+        if own.get(key, "true") not in ("true", "false"):
+            raise UserError(f"{key}={own[key]}: must be true or false")
+    if own.get("model") and ("hand" in own or "hand_mirror" in own):
+        raise UserError(f"model={own['model']}: is not simulated beside hand=; say one of them")
     try:
         timestep = float(own["timestep"]) if "timestep" in own else None
     except ValueError:
@@ -61,6 +68,7 @@ def settings(argv: list[str], config_dir: Path) -> dict[str, Any]:
     return {
         "replay": own["replay"],
         "model": own.get("model") or None,
+        "hand": stated_hand(own.get("hand"), own.get("hand_mirror") == "true"),
         "servo": servo,
         "out": own.get("out") or None,
         "video": own.get("video", "true") == "true",
@@ -108,13 +116,14 @@ def run(play: dict[str, Any]) -> int:
 
     quiet_warp("cpu")
     path = Path(play["replay"]).expanduser()
-    model = play["model"]
-    hand = None if model is None else mechanism.mechanism(model, play["servo"] or {}).joints
-    recording = read(path, play["remap"], play["meta"], joints=hand)
+    model, hand = play["model"], play["hand"]
+    known = model is not None or hand is not None
+    joints = mechanism.mechanism(model, play["servo"] or {}, hand=hand).joints if known else None
+    recording = read(path, play["remap"], play["meta"], joints=joints, hand=hand)
     print(audit.summary(recording))
     if recording.findings:
         print(audit.table(recording.findings))
-    m = mechanism.for_recording(recording, model, play["servo"])
+    m = mechanism.for_recording(recording, model, play["servo"], hand)
     config = yaml_text.parse(recording.config, f"{recording.path}: attached config") if recording.config else {}
     timestep = play["timestep"] or float((config or {}).get("sim", {}).get("timestep", 0.002))
     placed = led_object.add_object(m, recording, play["object"])
@@ -146,7 +155,7 @@ def run(play: dict[str, Any]) -> int:
     print("\n" + table("recorded against simulated", ("joint", "position RMSE mrad", "torque RMSE N.m"), rows) + "\n")
     about = {
         "replay": str(path),
-        "model": model or "xhand_right",
+        "model": model or m.robot,
         "timestep_s": timestep,
         "object": placed,
         "position_rmse_rad": _plain(c.joints, position),

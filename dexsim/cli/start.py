@@ -248,9 +248,9 @@ def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
     a checkpoint carries it."""
     servo, tactile, hand = (_last(request, k) for k in ("servo_file", "tactile_file", "hand"))
     OmegaConf.set_struct(cfg, False)
-    if hand is not None and servo is None and "servo" not in request.choices:
-        from dexsim.hand import load_hand
+    from dexsim.hand import load_hand
 
+    if hand is not None and servo is None and "servo" not in request.choices:
         servo = str(load_hand(hand).servo_path)
     if servo is not None:
         from dexsim.actuator.table import ServoTable
@@ -262,6 +262,6 @@ def _files(cfg: DictConfig, request: settings.Request) -> DictConfig:
     if tactile is not None:
         from dexsim.tactile.file import lay_over
 
-        lay_over(cfg, tactile)
+        lay_over(cfg, tactile, load_hand(hand or cfg.get("hand") or "xhand"))
     OmegaConf.set_struct(cfg, True)
     return cfg

@@ -48,7 +48,10 @@ settings (key=default):
                               a pattern 'runs/*.mcap'
   held_out=                   recordings kept out of the fit; without them a condition, or the last quarter of the
                               time, is kept out
-  model=                      MuJoCo or URDF file, or the folder of a hand; the xHand by default
+  model=                      MuJoCo or URDF file, or the folder of a hand; hand= by default
+  hand=xhand                  a hand that comes with dexsim, or a folder; beside model=, the hand whose fingertips and
+                              touch pads that model carries
+  hand_mirror=false           its mirror image: a left hand of a right one
   servo=                      servo.yaml believed of its drives; the xHand's by default
   out=out/diagnosis           folder for the results
   effects=                    consider only these effects: [backlash,lag,tactile_hysteresis,...]; all by default
@@ -72,6 +75,8 @@ KEYS = (
     "recordings",
     "held_out",
     "model",
+    "hand",
+    "hand_mirror",
     "servo",
     "out",
     "effects",
@@ -111,7 +116,7 @@ def parse(argv: list[str]) -> dict:
             out[key] = [i.strip().strip("'\"") for i in items if i.strip()]
         elif key == "demo":
             out[key] = _hidden(text)
-        elif key in ("columns", "next"):
+        elif key in ("columns", "next", "hand_mirror"):
             value = yaml.safe_load(text)
             if not isinstance(value, bool):
                 raise UserError(f"{key}={text}: must be true or false")
@@ -251,6 +256,8 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
         remap=given["remap"],
         limit=given.get("limit"),
         joints=set(given["joints"]) if given.get("joints") else None,
+        hand=given.get("hand"),
+        hand_mirror=given.get("hand_mirror", False),
     )
 
 
@@ -321,7 +328,7 @@ def verdict(d) -> str:
     if plain := baseline.text(data["baseline"], "mm" if data["held_out"]["error"].endswith("_m") else "mrad"):
         lines.append(f"  {plain}")
     for f in data["findings"][: 4 - bool(plain)]:
-        where = place(f)
+        where = place(f, d.mechanism)
         sizes = ", ".join(
             f"{k} {number(p['value'], 4)} ({number(p['low'])} to {number(p['high'])}) {p['unit']}"
             for k, p in f["parameters"].items()

@@ -101,10 +101,11 @@ class Steps(ABC):
 def read_files(w: Inquiry) -> None:
     """The mechanism and the recordings, as far as they can be read."""
     from dexsim.recording import read
-    from dexsim.recording.mechanism import mechanism
+    from dexsim.recording.mechanism import mechanism, stated_hand
 
+    s = w.settings
     try:
-        w.m = mechanism(w.settings.model, w.settings.servo)
+        w.m = mechanism(s.model, s.servo, hand=stated_hand(s.hand, s.hand_mirror))
     except UserError as error:
         raise UserError(f"{error}{_still(w.settings)}") from None
     overlap = {p.resolve() for p in w.settings.recordings} & {p.resolve() for p in w.settings.held_out or []}
@@ -117,7 +118,7 @@ def read_files(w: Inquiry) -> None:
     w.names = _unique_names(paths)
     for path in paths:
         try:
-            r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints)
+            r = read(path, w.settings.remap, w.settings.meta, joints=w.m.joints, hand=w.m.hand)
             r.path = Path(w.names[path])
             w.recordings.append(r)
         except UserError as error:

@@ -20,7 +20,8 @@ from dexsim.recording.mechanism import Mechanism
 
 @dataclass
 class Settings:
-    """What was asked. recordings, held_out: paths; model, servo: files, None for the xHand's; allowed: effect ids to
+    """What was asked. recordings, held_out: paths; model, servo: files, None for
+    the hand's; hand, hand_mirror: as `load_hand` takes them, None for the xHand; allowed: effect ids to
     consider, joints: those to judge (the others' motion is only prescribed); None for all."""
 
     recordings: list[Path]
@@ -39,6 +40,8 @@ class Settings:
     # made from `limit` where it is not given; its `stop()` ends the search with the best so far
     time_limit: TimeLimit | None = None
     replay: str = "mujoco"  # see `confirm.REPLAY`
+    hand: str | None = None
+    hand_mirror: bool = False
 
 
 @dataclass

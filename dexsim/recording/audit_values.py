@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.recording.schema import STATES, TACTILE, Finding, Recording, Series
 from dexsim.recording.spikes import of_effort, spiked
 
@@ -423,7 +422,7 @@ def _drive(r: Recording, j: int, t: np.ndarray) -> np.ndarray:
 def units(r: Recording) -> Iterator[Finding]:
     """Numbers that cannot be of the unit that is stated."""
     s, c = r.states, r.commands
-    limits = dict(zip(xhand.JOINTS, xhand.joint_limits(), strict=True)) if set(r.joints) <= set(xhand.JOINTS) else {}
+    limits = {} if r.hand is None else dict(zip(r.hand.joints, r.hand.limits, strict=True))
 
     def finding(series: Series, text: str, joint: str = "", severity: str = "error") -> Finding:
         return Finding(
@@ -547,7 +546,7 @@ def _effort_units(r: Recording, finding) -> Iterator[Finding]:
     e = r.states.effort
     if e is None:
         return
-    limit = dict(zip(xhand.JOINTS, xhand.efforts(), strict=True)) if set(r.joints) <= set(xhand.JOINTS) else {}
+    limit = {} if r.hand is None else dict(zip(r.hand.joints, r.hand.efforts, strict=True))
     for j, joint in enumerate(r.joints):
         x = e.value[:, j]
         if not np.isfinite(x).any():

@@ -8,8 +8,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -25,6 +26,9 @@ from dexsim.hand.schema import FILE as HAND_FILE
 from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
+if TYPE_CHECKING:
+    from dexsim.tactile.sensors import Sensors
+
 XHAND = "xhand"  # the hand where no model is given
 MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 
@@ -32,13 +36,26 @@ MAX_SPEED = 2.0  # rad/s (m/s) where the servo states no no_load_speed
 @dataclass
 class Mechanism:
     """A model and what is believed of its drives. joints: the driven ones, in the order of every [J] array; hand: where
-    the model is one."""
+    the model is one; part_of: the hand whose fingertips a model carries that is none itself (a press rig)."""
 
     spec: mujoco.MjSpec
     joints: tuple[str, ...]
     table: ServoTable
     robot: str
     hand: Hand | None = None
+    part_of: Hand | None = None
+
+    @property
+    def whose(self) -> Hand:
+        """The hand that it is, or whose parts it carries: where nothing is said, the xHand."""
+        return self.hand or self.part_of or load_hand(XHAND)
+
+    @cached_property
+    def sensors(self) -> Sensors:
+        """The touch sensors that it may carry."""
+        from dexsim.tactile.sensors import Sensors
+
+        return Sensors(self.whose)
 
     @property
     def limits(self) -> np.ndarray:
@@ -76,16 +93,18 @@ def mechanism(
     servo: str | Path | dict | None = None,
     joints: Sequence[str] | None = None,
     gravity: Sequence[float] | None = None,
+    hand: Hand | None = None,
 ) -> Mechanism:
     """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a hand
-    (its hand.yaml names servo and joints); by default the xHand and its own.
+    (its hand.yaml names servo and joints); by default `hand`, or the xHand, and its own.
 
-    joints: the driven ones; by default those of the xHand, else every hinge and slide of the model. gravity: [3] m/s2,
-    world frame. Raises UserError for a model or servo that does not serve.
+    joints: the driven ones; by default those of the hand, else every hinge and slide of the model. gravity: [3] m/s2,
+    world frame. hand: beside a model, the one whose fingertips it carries. Raises UserError for a model or servo that
+    does not serve.
     """
-    hand = None
+    part_of, hand = (hand, None) if model is not None else (None, hand)
     if (folder := XHAND if model is None else _hand_folder(model)) is not None:
-        own = of_hand(load_hand(folder), servo)
+        own = of_hand(hand or load_hand(folder), servo)
         spec, robot, table, hand = own.spec, own.robot, own.table, own.hand
         joints = own.joints if joints is None else joints
     else:
@@ -107,7 +126,12 @@ def mechanism(
             raise UserError(f"joint '{joint}' is not in {model or 'the xHand'}; its joints: {', '.join(hinges)}")
     if not chosen:
         raise UserError(f"model={model}: has no named hinge or slide joint to drive")
-    return Mechanism(spec, chosen, table, robot, hand)
+    return Mechanism(spec, chosen, table, robot, hand, None if hand else part_of)
+
+
+def stated_hand(name: str | None, mirror: bool = False) -> Hand | None:
+    """The hand of a command's settings hand= and hand_mirror=; None where neither is stated. Raises UserError."""
+    return load_hand(name or XHAND, mirror) if name or mirror else None
 
 
 def _hand_folder(model: str | Path) -> Path | None:
@@ -163,11 +187,14 @@ def _physical(model: mujoco.MjModel, where: str) -> None:
 
 
 def for_recording(
-    recording: Recording, model: str | Path | None = None, servo: str | Path | dict | None = None
+    recording: Recording,
+    model: str | Path | None = None,
+    servo: str | Path | dict | None = None,
+    hand: Hand | None = None,
 ) -> Mechanism:
     """The mechanism that a recording was made with: its gravity, its `servo` over the believed table, its joints driven
     (the model's others stay where they are, driven to their initial position)."""
-    out = mechanism(model, servo, None, recording.gravity)
+    out = mechanism(model, servo, None, recording.gravity, hand)
     missing = [j for j in recording.joints if j not in out.joints]
     if missing:
         raise UserError(
@@ -334,6 +361,7 @@ def recorded(
         Series(commands.t, value, COMMANDS, commands.t.copy()),
         States(series(run.position, STATES), series(run.velocity, STATES), series(run.torque, STATES)),
         start_ns=start_ns,
+        hand=m.hand,
     )
 
 

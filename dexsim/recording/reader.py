@@ -11,8 +11,8 @@ import numpy as np
 from mcap.records import Channel, Message
 from mcap.records import Schema as McapSchema
 
-from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.hand import Hand, load_hand
 from dexsim.recording import attached, columns, decode, metadata, names, schema, timeline
 from dexsim.recording.container import Container, open_container
 from dexsim.recording.schema import Finding, Recording, Series, States
@@ -28,6 +28,7 @@ def read(
     meta: Mapping[str, Any] | None = None,
     joints: Sequence[str] | None = None,
     audit: bool = True,
+    hand: Hand | None = None,
 ) -> Recording:
     """The recording in an MCAP file, in a folder that `ros2 bag record -s mcap` wrote, or in a CSV or NPZ file with
     named columns (`columns.py`).
@@ -38,9 +39,10 @@ def read(
             differ only by a prefix, are found without. Of a CSV or NPZ file: "position.elbow" (or "time") -> the
             column.
         meta: metadata values that win over what the recording says.
-        joints: names of the model's joints: their order, and others are left out. None: the xHand's where the names
+        joints: names of the model's joints: their order, and others are left out. None: the hand's where the names
             fit, else those of the recording.
         audit: also look for faults of the signals (`audit.py`).
+        hand: whose joints, limits and pads it is likely to hold. None: the xHand.
 
     Everything readable is returned; what is lost, assumed or suspicious is in `findings`. Nothing is repaired but what
     a finding says. Raises UserError where there is no recording in the file, or the request does not fit it.
@@ -49,11 +51,11 @@ def read(
     remap, meta = dict(remap or {}), dict(meta or {})
     if path.suffix.lower() in columns.SUFFIXES:
         stated, findings = metadata.collect(path, {}, meta)
-        reading: _Reading = _TableReading(path, columns.read_table(path, remap, stated), remap)
+        reading: _Reading = _TableReading(path, columns.read_table(path, remap, stated), remap, hand)
         stated = reading.stated(stated)
     else:
         containers = [open_container(p) for p in _files(path)]
-        reading = _Reading(path, containers, remap)
+        reading = _Reading(path, containers, remap, hand)
         stated, findings = metadata.collect(
             path, metadata.own_record([m for c in containers for m in c.metadata]), meta
         )
@@ -88,8 +90,8 @@ class _Stream:
 class _Reading:
     """One file (or bag folder) being turned into a Recording."""
 
-    def __init__(self, path: Path, containers: list[Container], remap: dict[str, str]):
-        self.path, self.findings, self.breaks = path, [], []
+    def __init__(self, path: Path, containers: list[Container], remap: dict[str, str], hand: Hand | None = None):
+        self.path, self.findings, self.breaks, self.hand = path, [], [], hand or load_hand()
         self.streams: dict[str, list[_Stream]] = {}
         for c in containers:
             self._damage(c)
@@ -304,7 +306,7 @@ class _Reading:
             raise UserError(f"recording {self.path}: names {len(theirs)} joints; at most {MAX_JOINTS} are read")
         mapping = self._match(theirs, joints)
         ours = tuple(dict.fromkeys(mapping[n] for n in theirs if n in mapping))
-        order = joints if joints is not None else xhand.JOINTS if set(ours) <= set(xhand.JOINTS) else ours
+        order = joints if joints is not None else self.hand.joints if set(ours) <= set(self.hand.joints) else ours
         there = set(ours)
         ours = tuple(j for j in order if j in there)
         # where each of their unnamed columns goes
@@ -345,11 +347,12 @@ class _Reading:
             ),
             start_ns=self.start_ns,
             config=self.config,
+            hand=self.hand if ours and set(ours) <= set(self.hand.joints) else None,
         )
         for topic, name in ((schema.TEMPERATURES, "temperature"), (schema.DUTY, "duty"), (schema.ENABLED, "enabled")):
             setattr(out, name, self._joint_array(topic, place))
         out.supply_voltage = self._array(schema.SUPPLY, lambda dims, v: v[0] if len(v) == 1 else None)
-        out.tactile = self._array(schema.TACTILE, _tactile_shape)
+        out.tactile = self._array(schema.TACTILE, self._tactile_shape)
         for topic, name in (
             (schema.EXTERNAL_FORCE, "external_force"),
             (schema.OBJECT_POSE, "object_pose"),
@@ -362,6 +365,13 @@ class _Reading:
         out.findings = self.findings
         out.breaks = sorted(self.breaks)
         return out
+
+    def _tactile_shape(self, dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
+        """[fingers, taxels, 3]: as the message says, else the hand's."""
+        if len(dims) == 3 and int(np.prod(dims)) == len(values):
+            return values.reshape(dims)
+        fingers = len(self.hand.fingers)
+        return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
 
     def _their_joints(
         self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
@@ -389,8 +399,8 @@ class _Reading:
             names_ = list(joints)
         else:
             names_ = (
-                list(xhand.JOINTS)
-                if unnamed == len(xhand.JOINTS) and joints is None
+                list(self.hand.joints)
+                if unnamed == len(self.hand.joints) and joints is None
                 else [f"joint{i}" for i in range(unnamed)]
             )
         self.findings.append(
@@ -416,14 +426,14 @@ class _Reading:
                     f" ({', '.join(joints)});"
                     " say which they are with remap.OURS=THEIRS"
                 )
-        elif self.joint_remap and not set(self.joint_remap) <= set(xhand.JOINTS):
+        elif self.joint_remap and not set(self.joint_remap) <= set(self.hand.joints):
             mapping = {their: their for their in theirs}
             for our, their in self.joint_remap.items():
                 names.match(theirs, [our], {our: their}, where)
                 mapping[their] = our
         else:
-            mapping = names.match(theirs, xhand.JOINTS, self.joint_remap, where, shorter=False)
-            if len(mapping) < len(theirs) and len(mapping) < 8:  # not an xHand
+            mapping = names.match(theirs, self.hand.joints, self.joint_remap, where, shorter=False)
+            if len(mapping) < len(theirs) and 3 * len(mapping) < 2 * len(self.hand.joints):  # not that hand
                 mapping = {their: their for their in theirs}
         renamed = [f"{a} is {b}" for a, b in mapping.items() if a != b]
         left = [n for n in theirs if n not in mapping]
@@ -532,8 +542,9 @@ class _Reading:
 class _TableReading(_Reading):
     """A file with named columns being turned into a Recording: its columns stand for the messages of a topic."""
 
-    def __init__(self, path: Path, table: columns.Table, remap: dict[str, str]):
+    def __init__(self, path: Path, table: columns.Table, remap: dict[str, str], hand: Hand | None = None):
         self.path, self.table, self.findings, self.breaks = path, table, list(table.findings), []
+        self.hand = hand or load_hand()
         topics = [k for k in remap if _is_topic(k)]
         if topics:
             raise UserError(
@@ -595,6 +606,13 @@ class _TableReading(_Reading):
             out = [((len(x),), x) for x in rows]
         return self._in_order(ours, t, out)
 
+    def _tactile_shape(self, dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
+        """[fingers, taxels, 3]: as the message says, else the hand's."""
+        if len(dims) == 3 and int(np.prod(dims)) == len(values):
+            return values.reshape(dims)
+        fingers = len(self.hand.fingers)
+        return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
+
     def _their_joints(
         self, stated: dict[str, str], commands: list, states: list, joints: Sequence[str] | None
     ) -> list[str]:
@@ -625,14 +643,6 @@ class _Placer:
         if size != (len(key) if key else len(self.theirs)):
             return None
         return self._known[key]
-
-
-def _tactile_shape(dims: tuple[int, ...], values: np.ndarray) -> np.ndarray | None:
-    """[fingers, taxels, 3]: as the message says, else the xHand's."""
-    if len(dims) == 3 and int(np.prod(dims)) == len(values):
-        return values.reshape(dims)
-    fingers = len(xhand.FINGERS)
-    return values.reshape(fingers, -1, 3) if len(values) % (3 * fingers) == 0 else None
 
 
 def _is_topic(name: str) -> bool:

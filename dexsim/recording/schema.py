@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dexsim.errors import UserError
+from dexsim.hand import Hand
 
 COMMANDS, STATES = "/joint_commands", "/joint_states"
 TEMPERATURES, DUTY, ENABLED = "/joint_temperatures", "/joint_duty", "/joint_enabled"
@@ -210,7 +211,8 @@ class Recording:
     w x y z, palm frame; imu [T, 10] orientation w x y z, angular velocity, linear acceleration.
     Effort is as recorded: `effort_sign` is not applied (`signed_effort` does).
     breaks: stretches [s] over which host time cannot be trusted: what came after is of another time.
-    meta: every key of `KEYS`, defaults filled in. start_ns: host time of t = 0. findings: of reading and audit.
+    meta: every key of `KEYS`, defaults filled in. start_ns: host time of t = 0. findings: of reading and audit. hand:
+    the one whose joints these are, where that is known.
     """
 
     path: Path
@@ -230,6 +232,7 @@ class Recording:
     findings: list[Finding] = field(default_factory=list)
     config: str | None = None  # the resolved config attached to it, YAML
     breaks: list[tuple[float, float]] = field(default_factory=list)
+    hand: Hand | None = None
 
     @property
     def duration(self) -> float:

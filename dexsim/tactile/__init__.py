@@ -14,10 +14,10 @@ Stated once, for all of dexsim:
 - Units: m, N, s.
 """
 
-from dexsim.tactile.layout import TaxelLayout, hand_layout, load_layout, tip_layout, tip_points, xhand_layout
+from dexsim.tactile.layout import TaxelLayout, hand_layout, load_layout, tip_layout, tip_points
 from dexsim.tactile.shapes import ShapeSet
 from dexsim.tactile.tactile import Tactile
 
 __all__ = [
-    "ShapeSet", "Tactile", "TaxelLayout", "hand_layout", "load_layout", "tip_layout", "tip_points", "xhand_layout",
+    "ShapeSet", "Tactile", "TaxelLayout", "hand_layout", "load_layout", "tip_layout", "tip_points",
 ]  # fmt: skip

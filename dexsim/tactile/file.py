@@ -20,9 +20,10 @@ from typing import Any
 import msgspec
 
 from dexsim import typed, yaml_text
-from dexsim.assets import xhand
 from dexsim.errors import UserError
+from dexsim.hand import Hand, load_hand
 from dexsim.tactile.config import COLUMNS
+from dexsim.tactile.layout import hand_layout
 from dexsim.tactile.pads import Pad, Value, pad_configs, value_range
 
 RANGES: dict[str, tuple[str, float, float]] = {
@@ -41,8 +42,9 @@ File = msgspec.defstruct("File", _parts, forbid_unknown_fields=True)
 """What may stand in the file; limits: `COLUMNS`, `RANGES`, `dexsim.tactile.pads`."""
 
 
-def load(path: str | Path) -> dict[str, dict[str, Any]]:
-    """The file as {"tactile": settings, "randomize": {name: [low, high]}}, checked for the xHand's fingertips.
+def load(path: str | Path, hand: Hand | None = None) -> dict[str, dict[str, Any]]:
+    """The file as {"tactile": settings, "randomize": {name: [low, high]}}, checked for a hand's fingertips (the
+    xHand's).
 
     Raises UserError in one line naming the file, the field, its value and what is allowed."""
     path = Path(path).expanduser()
@@ -54,15 +56,15 @@ def load(path: str | Path) -> dict[str, dict[str, Any]]:
     raw = yaml_text.load(path, "tactile file")
     typed.convert(raw, File, where, "it must map tactile and randomize to what was found")
     try:
-        return _checked(raw)
+        return _checked(raw, hand or load_hand())
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
 
 
-def lay_over(cfg: MutableMapping[str, Any], path: str | Path) -> None:
+def lay_over(cfg: MutableMapping[str, Any], path: str | Path, hand: Hand | None = None) -> None:
     """Puts the file's content into a config with `tactile` and `randomize`, so that a checkpoint carries it. Raises
     UserError as `load` does, and where the task has no such range."""
-    found = load(path)
+    found = load(path, hand)
     for key, value in found["tactile"].items():
         cfg["tactile"][key] = value
     for name, value in found["randomize"].items():
@@ -74,11 +76,11 @@ def lay_over(cfg: MutableMapping[str, Any], path: str | Path) -> None:
         cfg["randomize"][part][last] = value
 
 
-def _checked(raw: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _checked(raw: Mapping[str, Any], hand: Hand) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {"tactile": {}, "randomize": {}}
     for key, value in (raw.get("tactile") or {}).items():
         if key == "pads":
-            out["tactile"]["pads"] = _pads(value)
+            out["tactile"]["pads"] = _pads(value, hand)
         else:
             out["tactile"][key] = list(value_range(f"tactile.{key}", value, *COLUMNS[key][:3]))
     for name, value in (raw.get("randomize") or {}).items():
@@ -86,14 +88,16 @@ def _checked(raw: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return out
 
 
-def _pads(value: Any) -> dict[str, Any]:
-    """As given, once every pad and taxel is one of the xHand's."""
+def _pads(value: Any, hand: Hand) -> dict[str, Any]:
+    """As given, once every pad and taxel is one of the hand's."""
+    layout = hand_layout(hand)
+    if value and layout is None:
+        raise UserError(f"tactile.pads: hand={hand.name} has no touch pads; take it out of the file")
     for name, pad in pad_configs(value).items():
-        if name not in xhand.FINGERS:
-            raise UserError(f"tactile.pads.{name}: no such fingertip; fingertips: {', '.join(xhand.FINGERS)}")
+        if name not in layout.names:
+            raise UserError(f"tactile.pads.{name}: no such fingertip; fingertips: {', '.join(layout.names)}")
+        taxels = int(layout.count[layout.names.index(name)])
         for k in (*pad.taxels, *pad.stuck, *(k for pair in pad.swapped for k in pair)):
-            if k >= xhand.TAXELS_PER_FINGER:
-                raise UserError(
-                    f"tactile.pads.{name}: no taxel {k}; a fingertip has {xhand.TAXELS_PER_FINGER}, counted from 0"
-                )
+            if k >= taxels:
+                raise UserError(f"tactile.pads.{name}: no taxel {k}; a fingertip has {taxels}, counted from 0")
     return dict(value)

@@ -14,11 +14,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dexsim.errors import UserError
+from dexsim.hand import load_hand
 from dexsim.tactile import reference as ref
 from dexsim.tactile.config import TactileConfig
 from dexsim.tactile.kernel import LAWS
-from dexsim.tactile.layout import TaxelLayout, xhand_layout
-from dexsim.tactile.pressing import Press, presses, skin_of
+from dexsim.tactile.layout import TaxelLayout
+from dexsim.tactile.pressing import Press, presses
+from dexsim.tactile.sensors import Sensors
 
 CONTACT_STIFFNESS = 7000.0  # N/m
 DEPTHS = (0.3e-3, 0.7e-3, 1.0e-3)  # m
@@ -26,13 +29,12 @@ RUBBER = TactileConfig().rubber
 SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0.0, 0.0), "capsule": (0.019, 0.011, 0.0)}
 
 
-def press_library(layout: TaxelLayout, pad: int, tip: np.ndarray, count: int, seed: int = 0) -> list[Press]:
-    """`count` presses of every shape at each of `DEPTHS`, on pad number `pad` with tip corners `tip` [V, 3] (m)."""
-    from dexsim.assets import xhand
+def press_library(sensors: Sensors, pad: int, count: int, seed: int = 0) -> list[Press]:
+    """`count` presses of every shape at each of `DEPTHS`, on pad number `pad`."""
     from dexsim.assets.objects import library
 
     rng = np.random.default_rng(seed)
-    skin = skin_of(layout, pad, xhand.COLUMNS, xhand.ROWS, tip)
+    layout, skin = sensors.lifted, sensors.skin(pad, fine=6)
     out: list[Press] = []
     for name, shape in library().items():
         size = np.array(SIZES.get(name, (1.0, 0.0, 0.0)))
@@ -60,20 +62,20 @@ def calibrate_stiffness(
 
 
 def main() -> None:
-    from dexsim.assets import xhand
-
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=30, help="presses of each shape")
     parser.add_argument("--contact", type=float, default=CONTACT_STIFFNESS, help="K of the physics, N/m")
+    parser.add_argument("--hand", default="xhand", help="a hand that comes with dexsim, or a folder")
     args = parser.parse_args()
-    tips = [xhand.tip_skin_mesh(f)[0] for f in xhand.FINGERS]
-    layout = xhand_layout().lifted(tips)
+    sensors = Sensors(load_hand(args.hand))
+    if (layout := sensors.layout) is None:
+        raise UserError(f"--hand {args.hand}: has no touch pads")
     report: dict = {"contact": args.contact}
     for kind in dict.fromkeys(layout.kinds):
         pad = layout.kinds.index(kind)
-        pressed = press_library(layout, pad, tips[pad], args.count)
+        pressed = press_library(sensors, pad, args.count)
         for law in LAWS:
-            k, spread = calibrate_stiffness(layout, pad, pressed, law, args.contact)
+            k, spread = calibrate_stiffness(sensors.lifted, pad, pressed, law, args.contact)
             by_depth = {f"{d * 1e3:.1f} mm": np.round(s, 3).tolist() for d, s in spread.items()}
             report[f"{law}.{kind}"] = {"stiffness": k, **by_depth}
             print(f"{kind:7s} {law:14s} stiffness {k:.4g}; spring sum / (K depth), 5 25 50 75 95 %:")

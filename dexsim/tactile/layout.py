@@ -157,6 +157,21 @@ def _gap(point: bytes, normal: bytes, corners: bytes) -> np.ndarray:
     return np.where(along > 0.05, gap / np.where(along > 0.05, along, 1.0), np.inf).min(1)
 
 
+def neighbours(columns: int, rows: int) -> list[list[int]]:
+    """Taxels beside each taxel of a lattice, k = column * rows + row."""
+    out = []
+    for k in range(columns * rows):
+        c, r = divmod(k, rows)
+        out.append(
+            [
+                a * rows + b
+                for a, b in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1))
+                if 0 <= a < columns and 0 <= b < rows
+            ]
+        )
+    return out
+
+
 def tangents(
     normal: np.ndarray, x: Sequence[float] = (1.0, 0.0, 0.0), y: Sequence[float] = (0.0, 1.0, 0.0)
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -262,13 +277,6 @@ def tip_layout(hand: Hand) -> TaxelLayout:
         {"name": f.name, "body": f.body, "kind": "finger", "point": [f.position], "normal": [f.normal]}
         for f in hand.fingers
     ])  # fmt: skip
-
-
-def xhand_layout() -> TaxelLayout:
-    """The xHand's 5 x 120 taxels (`dexsim/assets/xhand/taxels_*.csv`)."""
-    from dexsim.hand import load_hand
-
-    return hand_layout(load_hand("xhand"))
 
 
 def tip_points(model: object, geoms: Sequence[str]) -> list[np.ndarray]:

@@ -53,6 +53,8 @@ def skin_of(
     # the thumb's outermost corners have no well-defined normal: leave such points out
     good = size > 0.2 * np.linalg.norm(du, axis=-1) * np.linalg.norm(dv, axis=-1)
     point, n, area = point[good], (n / size[..., None])[good], size[good] / size[good].sum()
+    if n.mean(0) @ layout.normal[pad, : layout.count[pad]].mean(0) < 0:  # of a mirrored pad the lattice is left-handed
+        n = -n
     if tip is not None:
         point = point + n * gap_to_hull(point, n, tip)[:, None]
     return Skin(point, n, area)

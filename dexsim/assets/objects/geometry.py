@@ -21,6 +21,18 @@ def hull_vertices(points: np.ndarray) -> np.ndarray:
     return points[np.sort(ConvexHull(points).vertices)]
 
 
+def hull_mesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Convex hull of points [V, 3] as a closed mesh: vertices [n, 3], outward facing triangles [m, 3]."""
+    hull = ConvexHull(points)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = hull.points[used]
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces
+
+
 def hull_planes(vertices: np.ndarray) -> np.ndarray:
     """Planes [F, 4] (outward unit normal n, offset d; inside is n . x + d <= 0), coplanar triangles merged."""
     hull = ConvexHull(vertices)

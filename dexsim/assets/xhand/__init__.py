@@ -115,7 +115,7 @@ def tip_skin_mesh(finger: str) -> tuple[np.ndarray, np.ndarray]:
 @cache
 def _tip_skin(name: str) -> tuple[np.ndarray, np.ndarray]:
     """`tip_skin_mesh` of all fingers with this pad."""
-    from dexsim.assets.xhand.shells import hull_mesh
+    from dexsim.assets.objects.geometry import hull_mesh
     from dexsim.assets.xhand.surface import PADS, Lattice, tip_points, to_link, to_sensor
 
     pad = PADS[name]

@@ -8,21 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.spatial import ConvexHull
+
+from dexsim.assets.objects.geometry import hull_mesh
 
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices [n, 3] m, triangles [m, 3]
-
-
-def hull_mesh(points: np.ndarray) -> Mesh:
-    """Convex hull as a closed mesh with outward facing triangles."""
-    hull = ConvexHull(points)
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    vertices = hull.points[used]
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return vertices, faces
 
 
 def _ball(radius: float, around: int = 20, levels: int = 7) -> np.ndarray:

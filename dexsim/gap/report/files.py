@@ -31,7 +31,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             d.servo.save(stage / "servo.yaml")
             names.append("servo.yaml")
         if d.touch is not None and touch_handed.save(
-            touch_handed.handed(d.touch.findings, d.touch.facts), stage / "tactile.yaml"
+            touch_handed.handed(d.touch.findings, d.touch.facts, d.touch.names), stage / "tactile.yaml"
         ):
             names.append("tactile.yaml")
         if d.standins:

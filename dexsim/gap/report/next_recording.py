@@ -107,7 +107,7 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
     object."""
     names = " from ".join(dict.fromkeys(f["indistinguishable"] or [f["effect"]]))
     why = (
-        f"to tell {names} on {place(f)}: {entry(f).experiment}; the same commands, with /external_force of a load "
+        f"to tell {names} on {place(f, m)}: {entry(f).experiment}; the same commands, with /external_force of a load "
         "cell recorded beside /tactile"
     )
     d.data["next_recording"] = {"why": why, "commands": None}

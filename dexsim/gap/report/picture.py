@@ -8,24 +8,26 @@ import mujoco
 import numpy as np
 
 from dexsim.gap.report.charts import INK, SOFT, number, text
+from dexsim.tactile.sensors import Sensors
 
 PALE, HOT = (247, 243, 236), (196, 38, 46)
+UNKNOWN = 12  # taxels drawn in a column where no lattice is known
 
 
-def pad(error: np.ndarray, marked: set[int], size: float = 15.0) -> str:
-    """One pad's taxels [K] N as its lattice, rows from the joint (below) to the tip, coloured by error; the marked
-    ringed."""
-    from dexsim.assets.xhand import COLUMNS, ROWS
-
+def pad(error: np.ndarray, marked: set[int], lattice: tuple[int, int] | None, size: float = 15.0) -> str:
+    """One pad's taxels [K] N as its lattice of (columns, rows), rows from the joint (below) to the tip, coloured by
+    error; the marked ringed. Without a lattice in rows of twelve, by number."""
+    columns, rows = lattice or (-(-len(error) // UNKNOWN), UNKNOWN)
+    error = error[: columns * rows]  # a smaller pad's end before the largest's
     most = max(float(error.max()), 1e-9)
-    width, height = COLUMNS * size + 2, ROWS * size + 2
+    width, height = columns * size + 2, rows * size + 2
     out = [
         f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error '
         'of each taxel">'
     ]
     for k, e in enumerate(error):
-        c, r = divmod(k, ROWS)
-        x, y = 1 + c * size, 1 + (ROWS - 1 - r) * size
+        c, r = divmod(k, rows)
+        x, y = 1 + c * size, 1 + (rows - 1 - r) * size
         ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
         out.append(
             f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" '
@@ -97,6 +99,7 @@ def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
 
 def mechanism(
     model: mujoco.MjModel,
+    sensors: Sensors,
     error: dict[str, float],
     found: set[str],
     taxels: np.ndarray | None = None,
@@ -106,10 +109,9 @@ def mechanism(
     height: int = 400,
 ) -> str:
     """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
-    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model carries the pads."""
+    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model
+    carries the pads of `sensors`."""
     from scipy.spatial import ConvexHull, QhullError
-
-    from dexsim.assets import xhand
 
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -127,13 +129,13 @@ def mechanism(
     pads = []
     facing = None
     bodies = [model.body(i).name for i in range(model.nbody)]
-    if taxels is not None or any(b in bodies for b in xhand.TIP_BODIES):
-        for f, (finger, body) in enumerate(zip(xhand.FINGERS, xhand.TIP_BODIES, strict=True)):
-            if body in bodies:
-                table, b = xhand.taxel_table(finger), data.body(body)
-                R = b.xmat.reshape(3, 3)
-                pads.append((f, table["position"] @ R.T + b.xpos))
-                facing = (0 if facing is None else facing) + (table["normal"] @ R.T).mean(0)
+    layout = sensors.layout
+    for f, body in enumerate(() if layout is None else layout.bodies):
+        if body in bodies:
+            b, n = data.body(body), layout.count[f]
+            R = b.xmat.reshape(3, 3)
+            pads.append((f, layout.point[f, :n] @ R.T + b.xpos))
+            facing = (0 if facing is None else facing) + (layout.normal[f, :n] @ R.T).mean(0)
     axes = _view(cloud, facing)
     flat = cloud @ axes.T
     low, high = flat[:, :2].min(0), flat[:, :2].max(0)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from markupsafe import Markup
 
-from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import entry
 from dexsim.gap.judge.full_model import TASKS
 from dexsim.gap.report import charts
@@ -91,10 +90,8 @@ class Where(Section):
         taxels = d.touch.error if d.touch is not None else None
         before = {j: v["before"] for j, v in d.joints.items()}
         height = 400 if d.joints else 240
-        picture, words = (
-            mechanism(d.mechanism.spec.compile(), before, named, taxels, marked, self.unit, height=height),
-            [],
-        )
+        m, words = d.mechanism, []
+        picture = mechanism(m.spec.compile(), m.sensors, before, named, taxels, marked, self.unit, height=height)
         if d.joints:
             words.append("Joints by their error before; ringed where something was found.")
             picture += scale(max(before.values()), self.unit)
@@ -128,9 +125,10 @@ class Where(Section):
     def _pads(self, taxels: np.ndarray, marked: set[str]) -> list[dict[str, Any]]:
         out = []
         for name in list(self.d.touch.pads)[:3]:
-            number_ = xhand.FINGERS.index(name)
+            number_ = self.d.touch.names.index(name)
             ringed = {int(t.split(":")[1]) for t in marked if int(t.split(":")[0]) == number_}
-            out.append({"name": name, "map": Markup(pad(taxels[number_], ringed))})
+            lattice = self.d.mechanism.sensors.lattice(number_)
+            out.append({"name": name, "map": Markup(pad(taxels[number_], ringed, lattice))})
         return out
 
     def _bars(self) -> dict[str, Any] | None:
@@ -168,7 +166,7 @@ class Findings(Section):
     def _card(self, f: dict[str, Any]) -> dict[str, Any]:
         """One finding."""
         e, h = entry(f), f["held_out"]
-        where = place(f)
+        where = place(f, self.d.mechanism)
         unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
         doubtful = f["indistinguishable"] or f.get("hint")
         return {
@@ -176,7 +174,7 @@ class Findings(Section):
             "name": _name(f["effect"]),
             "where": where,
             "confidence": f"{100 * f['confidence']:.0f}",
-            "words": f"{_capital(spoken(f))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}."
+            "words": f"{_capital(spoken(f, self.d.mechanism))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}."
             if e is not None
             else f"{where}: {f['regime']}.",
             "parameters": [_parameter(key, p) for key, p in f["parameters"].items() if p["value"] is not None],
@@ -384,7 +382,7 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, st
             _row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}")
         )
     for finger, v in (d.touch.pads if d.touch else {}).items():
-        mine = f"{xhand.FINGERS.index(finger)}:"
+        mine = f"{d.touch.names.index(finger)}:"
         names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
         rows.append(_row(f"pad of the {finger}", names, v, "", f"{1e3 * v['noise']:.2g} mN"))
     return rows

@@ -37,7 +37,9 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         if bad
         else ""
     )
-    prefix += "".join(f"{spoken(f)[:1].upper() + spoken(f)[1:]} {words_of(f, d.mechanism)}{_size(f)}. " for f in pushed)
+    for f in pushed:
+        said = spoken(f, d.mechanism)
+        prefix += f"{said[:1].upper() + said[1:]} {words_of(f, d.mechanism)}{_size(f)}. "
     if data["verdict"] == "none":
         return (
             prefix
@@ -71,11 +73,10 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     for f in named[:2]:
         words = words_of(f, d.mechanism)
         others = " or ".join(x.replace("_", " ") for x in f["indistinguishable"] if x != f["effect"])
-        parts.append(
-            f"{spoken(f)} {words}{_size(f)}" + (f", or it is {others}: these recordings cannot tell" if others else "")
-        )
+        doubt = f", or it is {others}: these recordings cannot tell" if others else ""
+        parts.append(f"{spoken(f, d.mechanism)} {words}{_size(f)}{doubt}")
     first = named[0]["where"]["joints"]
-    if not first or first[0] in spoken(named[0])[1:]:
+    if not first or first[0] in spoken(named[0], d.mechanism)[1:]:
         parts[0] = parts[0][:1].upper() + parts[0][1:]
     left_out = len(named) - len(parts)
     more = f" ({left_out} more, below)" if left_out else ""
@@ -89,30 +90,25 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
 
 
-ORDER = {"1": "first", "2": "second"}
+ORDER = ("first", "second", "third", *(f"{n}th" for n in range(4, 40)))
+FINGERS = {"thumb": "the thumb", "mid": "the middle finger", "pinky": "the little finger"}
 
 
-def spoken(f: dict) -> str:
-    """Where a finding sits as a person says it: the xHand's joints by finger, another mechanism's by name."""
-    from dexsim.assets import xhand
-
+def spoken(f: dict, m: Mechanism | None) -> str:
+    """Where a finding sits as a person says it: a hand's joints by finger, another mechanism's by name."""
     if len(f["where"]["joints"]) != 1:
-        return place(f)
+        return place(f, m)
     joint = f["where"]["joints"][0]
-    if joint not in xhand.JOINTS:
+    hand = None if m is None else m.whose
+    owner = hand.finger_of_joint[hand.joints.index(joint)] if hand is not None and joint in hand.joints else -1
+    if owner < 0:
         return joint if "joint" in joint.lower() else f"joint {joint}"
-    finger, _, rest = joint.partition("_")
-    whose = {"thumb": "the thumb's", "mid": "the middle finger's", "pinky": "the little finger's"}.get(
-        finger, f"the {finger} finger's"
-    )
-    kind = (
-        "sideways joint"
-        if "bend" in rest and finger != "thumb"
-        else "bending joint"
-        if "bend" in rest
-        else f"{ORDER.get(rest[-1], '')} joint".strip()
-    )
-    return f"{whose} {kind} ({joint})"
+    finger, number_ = hand.fingers[owner], hand.joints.index(joint)
+    bends = number_ in finger.flexion
+    alike = finger.flexion if bends else tuple(j for j in finger.joints if j not in finger.flexion)
+    order = ORDER[alike.index(number_)] if bends or len(alike) > 1 else ""
+    kind = " ".join(w for w in (order, "" if bends else "sideways", "joint") if w)
+    return f"{FINGERS.get(finger.name, f'the {finger.name} finger')}'s {kind} ({joint})"
 
 
 def words_of(f: dict, m: Mechanism | None) -> str:
@@ -128,16 +124,14 @@ def words_of(f: dict, m: Mechanism | None) -> str:
     return entry(f).said(f, believed)
 
 
-def place(f: dict) -> str:
+def place(f: dict, m: Mechanism | None) -> str:
     """Where a finding sits, in words."""
     if f["where"]["joints"]:
         return ", ".join(f["where"]["joints"])
-    if f["where"]["taxels"]:
-        from dexsim.assets import xhand
-
+    if f["where"]["taxels"] and m is not None:
         pads = sorted({int(t.split(":")[0]) for t in f["where"]["taxels"]})
         count = len(f["where"]["taxels"])
-        fingers = " and ".join(xhand.FINGERS[p] for p in pads)
+        fingers = " and ".join(m.sensors.names[p] for p in pads)
         return (
             f"the {fingers}'s pad"
             if count > 12 or "taxels" not in f["parameters"]

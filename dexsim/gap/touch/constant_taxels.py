@@ -6,18 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.gap.effects.tactile_gain import TactileGain
 from dexsim.gap.touch.read import newtons
 from dexsim.recording.schema import TACTILE, Recording
+from dexsim.tactile.sensors import Sensors
 
-ROWS = xhand.ROWS  # k = column * 12 + row
 
-
-def found(recordings: list[Recording]) -> list[dict[str, Any]]:
+def found(recordings: list[Recording], sensors: Sensors) -> list[dict[str, Any]]:
     """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the
     pad feel many counts. Their gain is 0."""
+    if sensors.layout is None:
+        return []
     worst: dict[int, set[int]] = {}
+    beside = [sensors.beside(f) for f in range(sensors.layout.pads)]
     seen = False
     for r in recordings:
         if r.tactile is None or r.tactile.value.ndim != 4 or len(r.tactile) < 20:
@@ -25,8 +26,8 @@ def found(recordings: list[Recording]) -> list[dict[str, Any]]:
         seen = True
         z = np.nan_to_num(r.tactile.value[..., 2])  # [T, F, K]
         span = z.max(0) - z.min(0)
-        for f in range(span.shape[0]):
-            bad = _constant(span[f])
+        for f in range(min(span.shape[0], len(beside))):
+            bad = _constant(span[f], beside[f])
             worst[f] = worst[f] & bad if f in worst else bad
     if not seen:
         return []
@@ -34,19 +35,13 @@ def found(recordings: list[Recording]) -> list[dict[str, Any]]:
             for f, taxels in sorted(worst.items()) if taxels]  # fmt: skip
 
 
-def _constant(span: np.ndarray) -> set[int]:
+def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
     """Taxels [K] with no change although three neighbours changed by a tenth of the pad's largest."""
     top = float(span.max())
-    if top <= 0 or len(span) % ROWS:
+    if top <= 0 or len(span) < len(beside):
         return set()
-    grid = span.reshape(-1, ROWS)
-    felt = (grid > 0.1 * top).astype(int)
-    neighbours = np.zeros_like(felt)
-    neighbours[1:] += felt[:-1]
-    neighbours[:-1] += felt[1:]
-    neighbours[:, 1:] += felt[:, :-1]
-    neighbours[:, :-1] += felt[:, 1:]
-    return {int(k) for k in np.flatnonzero(((grid == 0) & (neighbours >= 3)).reshape(-1))}
+    felt = span > 0.1 * top
+    return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= 3}
 
 
 def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, float]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.gap.inquiry import Steps
 from dexsim.gap.judge import confidence
 from dexsim.gap.judge.errors import rms_interval
@@ -40,7 +39,7 @@ class Pad:
 
     @property
     def name(self) -> str:
-        return xhand.FINGERS[self.number]
+        return self.runs[0].name
 
 
 class Touch(Steps):
@@ -58,7 +57,9 @@ class Touch(Steps):
     ):
         self.m, self.held, self.seed, self.allowed, self.progress = m, held, seed, allowed, progress
         self.recordings = [r for r in recordings if r.tactile is not None]
-        self.result = TouchResult(contact={r.path.name: s for r in recordings if (s := stretches(r))})
+        self.sensors = m.sensors
+        contact = {r.path.name: s for r in recordings if (s := stretches(r))}
+        self.result = TouchResult(names=self.sensors.names, contact=contact)
         self.data = TouchData()
         self.constant: list[dict] = []
         self.pads: list[Pad] = []
@@ -67,8 +68,8 @@ class Touch(Steps):
         """Every pad that is pressed with the geometry of its contact; taxels that are constant."""
         self.result.tactile = bool(self.recordings)
         if self.recordings:
-            self.data = collect(self.recordings, self.m)
-            self.constant = constant_taxels.found(self.recordings)
+            self.data = collect(self.recordings, self.m, self.sensors)
+            self.constant = constant_taxels.found(self.recordings, self.sensors)
             self.result.notes += self.data.notes
         self.pads = [Pad(k, [r for r in self.data.runs if r.pad == k]) for k in self.data.pads()]
 
@@ -104,10 +105,11 @@ class Touch(Steps):
 
     def locate(self) -> None:
         """Where the believed simulator is off: taxel by taxel."""
-        error = np.zeros((len(xhand.FINGERS), xhand.TAXELS_PER_FINGER))
+        error = np.zeros(self.sensors.shape)
         for pad in self.pads:
             if pad.outcome is not None:
-                error[pad.number] = locate.by_taxel(pad.search, pad.outcome.none)
+                off = locate.by_taxel(pad.search, pad.outcome.none)
+                error[pad.number, : len(off)] = off
                 self.result.error = error
 
     def judge(self) -> None:
@@ -127,14 +129,14 @@ class Touch(Steps):
             if number not in searched:
                 out.findings.append(f)
                 readings = constant_taxels.readings_of(self.recordings, f["where"]["taxels"])
-                out.facts[xhand.FINGERS[number]] = PadFacts(readings, judged=False)
+                out.facts[out.names[number]] = PadFacts(readings, judged=False)
         if judged:
             times = [a.times for a in judged]
             out.before = rms_interval([a.before for a in judged], times, self.seed)
             out.after = rms_interval([a.after for a in judged], times, self.seed)
             out.floor = float(np.sqrt(np.mean(np.square([a.floor for a in judged]))))
             out.notes += confidence.of_touch(out.findings, out.before[0], out.floor)
-        out.notes += handed(out.findings, out.facts).doubts
+        out.notes += handed(out.findings, out.facts, out.names).doubts
 
     def _take(self, answer: PadAnswer) -> None:
         """What one pad answers, into the result."""

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.plant.case import noise
 from dexsim.gap.rules import TOUCH
-from dexsim.gap.touch.plant import NEAR, PARAMS, cell, neutral, readings, shear
+from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
 BLOCK = 0.5  # s
@@ -49,7 +49,7 @@ class TouchTrial:
 
 class PadFit:
     """One pad's readings and the plant fitted to them. held: names of recordings kept out; with none, the last quarter
-    of each recording's time."""
+    of each recording's time; name: the pad's."""
 
     def __init__(
         self,
@@ -61,6 +61,7 @@ class PadFit:
         allowed: set[str] | None = None,
     ):
         self.runs, self.scale_known, self.allowed = runs, scale_known, allowed
+        self.name = runs[0].name
         self.rng = np.random.default_rng(seed)
         self.load = all(r.load is not None for r in runs)
         if not self.load:
@@ -112,7 +113,7 @@ class PadFit:
         # the object may touch beside where the joints say: neighbours on both sides must feel it
         near = [
             sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside))
-            for beside in NEAR[: z.shape[1]]
+            for beside in self.runs[0].beside
         ]
         pressed &= np.array(near)
         stuck = still & (z[0] > 2 * step)

@@ -9,6 +9,7 @@ believed as well.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch.result import Fit, PadFacts, PadSettings, ranged, times
@@ -47,13 +47,13 @@ def doubted(finding: dict[str, Any]) -> bool:
     return finding["confidence"] < JUDGE.sure or bool(finding["indistinguishable"])
 
 
-def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts]) -> Handed:
-    """The settings that findings of touch ask for. facts: by name of pad."""
+def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
+    """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
     out, pads, drifts = Handed(), {}, {}
     for f in findings:
         if not f["where"]["taxels"]:
             continue
-        name, effect = xhand.FINGERS[int(f["where"]["taxels"][0].split(":")[0])], TOUCH_EFFECTS[f["effect"]]
+        name, effect = names[int(f["where"]["taxels"][0].split(":")[0])], TOUCH_EFFECTS[f["effect"]]
         pad = pads.setdefault(name, PadSettings(facts.get(name) or PadFacts(judged=False)))
         doubt, drift = doubted(f), effect.drift(f, pad.fact)
         if drift is not None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.assets import xhand
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
 from dexsim.gap.effects.effect import word
 from dexsim.gap.judge.confidence import kept
@@ -31,7 +30,7 @@ class PadAnswer:
 
     def __init__(self, search: PadSearch, outcome: PadOutcome, kept: set[str]):
         self.search, self.outcome, self.kept = search, outcome, kept
-        self.pad, self.name = outcome.pad, xhand.FINGERS[outcome.pad]
+        self.pad, self.name = outcome.pad, search.name
         self.none, self.best = outcome.none, outcome.best
         self.notes: list[str] = []
         self.bounds = search.intervals(self.best) if self.best.keys else {}

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from dexsim.assets import xhand
-from dexsim.calibration.taxels import neighbours
 from dexsim.gap.touch.read import SHIFT, PadRun
 from dexsim.tactile import reference as ref
 
@@ -68,21 +66,6 @@ PARAMS: dict[str, TouchParam] = {
 def neutral() -> dict[str, float]:
     """What is believed: every effect absent."""
     return {k: p.neutral for k, p in PARAMS.items()}
-
-
-NEAR = neighbours(xhand.COLUMNS, xhand.ROWS)
-"""Taxels beside each taxel of a pad."""
-
-
-def _beside() -> np.ndarray:
-    """[K, K]: a taxel's force shared equally by the taxels beside it (rows: who feels it)."""
-    out = np.zeros((xhand.TAXELS_PER_FINGER, xhand.TAXELS_PER_FINGER))
-    for k, beside in enumerate(NEAR):
-        out[beside, k] = 1.0 / len(beside)
-    return out
-
-
-BESIDE = _beside()
 
 
 CONTACT_KEYS = ("zero", "along", "across", "stiffness", "c10", "c01", "spread")
@@ -145,7 +128,7 @@ def readings(
     dt = run.grid[1] - run.grid[0]
     x = relaxed(x, dt, v["fraction"], v["time_constant"])
     if v["neighbours"]:
-        x = (1 - v["neighbours"]) * x + v["neighbours"] * (x @ BESIDE.T[: x.shape[1], : x.shape[1]])
+        x = (1 - v["neighbours"]) * x + v["neighbours"] * (x @ run.mixing.T)
     if order is not None:
         x = x[:, order]
     x = x * (v["gain"] * v["scale"] * (1 + v["drift"] * run.warm))[:, None]

@@ -1,6 +1,6 @@
 """What a recording says of touch: each pad's readings beside the distances of its taxels to what it presses.
 
-Where pads are is in the model: bodies named as the taxel layout names them (`dexsim.tactile.layout`). What is pressed
+Where pads are is in the model: bodies named as the hand names them (`dexsim.tactile.sensors`). What is pressed
 is either led along `/object_pose` (shape from the recording's attached config) or a body of the model with a primitive
 geom.
 """
@@ -19,6 +19,7 @@ from dexsim.gap.read.runs import local_polynomial, spans
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
 from dexsim.tactile import reference as ref
+from dexsim.tactile.sensors import Sensors
 
 STIFFNESS, FRICTION = (
     7000.0,
@@ -42,6 +43,7 @@ KINDS = {
 class PadRun:
     """One pad in one recording, K taxels, on a regular grid of G times and at the S readings.
 
+    pad, name: its number and name; beside [K], mixing [K, K]: as `Sensors` has them;
     grid [G] s; dist [G, K] m signed distance of each taxel to the object (NaN where nothing is known of it); along,
     across [G, K]: the same with the object moved by SHIFT along the pad's two directions; depth [G] m of the skin's
     deepest point; slide [G, 2] m: the object's path over the pad, in its tangent plane; t [S] s; z [S, K] N normal
@@ -52,6 +54,9 @@ class PadRun:
 
     recording: str
     pad: int
+    name: str
+    beside: list[list[int]]
+    mixing: np.ndarray
     grid: np.ndarray
     dist: np.ndarray
     along: np.ndarray
@@ -120,13 +125,15 @@ def newtons(r: Recording) -> tuple[np.ndarray, bool]:
     return r.tactile.value * ((ASSUMED_LSB if lsb is None else lsb) * r.tactile_axis_sign), lsb is not None
 
 
-def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
+def collect(recordings: list[Recording], m: Mechanism, sensors: Sensors) -> TouchData:
     """Every pad that is pressed in the recordings, with the geometry of its contact where it is known."""
     out = TouchData()
     model = m.spec.compile()
-    from dexsim.tactile.layout import xhand_layout
-
-    layout = None
+    layout = sensors.layout
+    if layout is None:
+        if any(r.tactile is not None for r in recordings):
+            out.notes.append(f"/tactile is recorded, but {sensors.hand.robot} has no touch pads: touch is not judged")
+        return out
     origin = min((r.start_ns for r in recordings), default=0)
     temps = [r.temperature for r in recordings if r.tactile is not None]
     out.thermometer = bool(temps) and all(x is not None and np.isfinite(x.value).any() for x in temps)
@@ -134,12 +141,11 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
     for r in recordings:
         if r.tactile is None or r.tactile.value.ndim != 4 or len(r.tactile) < 20:
             continue
-        layout = layout or xhand_layout()
         if r.tactile.value.shape[1:3] != (layout.pads, layout.taxels):
             out.notes.append(
                 f"{r.path.name}: /tactile has {r.tactile.value.shape[1]} x {r.tactile.value.shape[2]} taxels, the "
                 "layout "
-                f"{r.meta['tactile_layout']} has {layout.pads} x {layout.taxels}: touch is not judged"
+                f"{sensors.hand.robot} has {layout.pads} x {layout.taxels}: touch is not judged"
             )
             continue
         force, known = newtons(r)
@@ -152,7 +158,7 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
             force = np.where(finite, force, 0.0)
         lsb = (ASSUMED_LSB if not known else r.tactile_lsb) if r.meta["tactile_unit"] == "count" else 0.0
         pressed = [f for f in range(layout.pads) if (force[:, f, :, 2].max(1) > max(2 * lsb, 0.05)).mean() > 0.01]
-        things = _things(r, model)
+        things = _things(r, model, sensors)
         on = [f for f in pressed if layout.bodies[f] in [model.body(i).name for i in range(model.nbody)]]
         for f in set(pressed) - set(on):
             out.notes.append(
@@ -163,7 +169,7 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
             out.blind += [(r.path.name, f) for f in pressed]
             continue
         for f in on:
-            run = _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest if out.thermometer else None)
+            run = _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest if out.thermometer else None)
             if run is None:
                 out.blind.append((r.path.name, f))
             else:
@@ -181,7 +187,7 @@ def collect(recordings: list[Recording], m: Mechanism) -> TouchData:
     return out
 
 
-def _things(r: Recording, model: mujoco.MjModel) -> list[_Thing]:
+def _things(r: Recording, model: mujoco.MjModel, sensors: Sensors) -> list[_Thing]:
     """What may press a pad, in this recording."""
     if r.object_pose is not None and len(r.object_pose) > 5 and r.config:
         try:
@@ -200,17 +206,16 @@ def _things(r: Recording, model: mujoco.MjModel) -> list[_Thing]:
     out = []
     for g in range(model.ngeom):
         name = model.body(int(model.geom_bodyid[g])).name
-        if name and not name.startswith("right_hand") and int(model.geom_type[g]) in KINDS:
+        if name and name not in sensors.bodies and int(model.geom_type[g]) in KINDS:
             out.append(_Thing(KINDS[mujoco.mjtGeom(int(model.geom_type[g]))], model.geom_size[g].copy(), None, name, g))
     return out
 
 
-def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> PadRun | None:
-    from dexsim.assets import xhand
-    from dexsim.tactile.pressing import skin_of
-
+def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> PadRun | None:
+    layout = sensors.layout
+    K = int(layout.count[f])
     t = r.tactile.t
-    z = force[:, f, :, 2]
+    z = force[:, f, :K, 2]
     start, stop = _stretch(t, z.sum(1))
     keep = (t >= start) & (t <= stop)
     t, z = t[keep], z[keep]
@@ -218,11 +223,8 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     rot, pos = _poses(r, m, model, grid, things, layout.bodies[f])
     if rot is None:
         return None
-    tip = xhand.tip_skin_mesh(layout.names[f])[0]
-    lifted = layout.lifted([xhand.tip_skin_mesh(n)[0] for n in layout.names])
-    K = int(layout.count[f])
-    point, normal = lifted.point[f, :K], layout.normal[f, :K]
-    skin = skin_of(layout, f, xhand.COLUMNS, xhand.ROWS, tip, fine=4)
+    point, normal = sensors.lifted.point[f, :K], layout.normal[f, :K]
+    skin = sensors.skin(f, fine=4)
     thing, R, p = _nearest(things, rot, pos, point)
     if thing is None:
         return None
@@ -247,7 +249,7 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
         counted = z >= GRIP * lsb
         sheared = np.einsum(
             "ski,kij->sj",
-            force[keep][:, f, :, :2] * counted[..., None],
+            force[keep][:, f, :K, :2] * counted[..., None],
             np.stack([layout.tx[f, :K], layout.ty[f, :K]], 1),
         )
         # the taxel shows what the finger exerts on the object, against the object's path
@@ -256,7 +258,7 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     if r.external_force is not None and len(r.external_force) > 5:
         load = np.interp(grid, r.external_force.t, np.linalg.norm(r.external_force.value[:, :3], axis=1))
     full = (
-        np.abs(r.tactile.value[keep][:, f, :, 2]) >= 255
+        np.abs(r.tactile.value[keep][:, f, :K, 2]) >= 255
         if r.meta["tactile_unit"] == "count"
         else np.zeros(z.shape, bool)
     )
@@ -271,6 +273,9 @@ def _pad_run(r, m, model, layout, f, force, lsb, things, origin, coldest) -> Pad
     return PadRun(
         r.path.name,
         f,
+        sensors.names[f],
+        sensors.beside(f),
+        sensors.mixing(f),
         grid,
         dist,
         along,

@@ -59,7 +59,7 @@ class TouchResult:
     """findings as `diagnosis.json` has them; before, after: [N] held-out rms of the taxels' readings (of all judged
     pads) with 90 % intervals (value, low, high), None where no force could be predicted; floor [N]; error [F, K] N rms
     of each taxel before; structured: whether something is left that no effect explains; pads: by name (before, after,
-    noise)."""
+    noise); names: of all pads [F]."""
 
     findings: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -68,6 +68,7 @@ class TouchResult:
     floor: float | None = None
     error: np.ndarray | None = None
     structured: bool = False
+    names: tuple[str, ...] = ()
     pads: dict[str, dict[str, float]] = field(default_factory=dict)
     curves: list[PadCurve] = field(default_factory=list)
     nuisance: dict[str, float] = field(default_factory=dict)
