@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
+WORD, MESSAGE = 300, 2000
+"""Characters of a word, and of a message, at most: what a file says may be of any length."""
+
 
 class UserError(ValueError):
     """Bad input: the message alone must name the file, field, value, allowed range and the fix.
@@ -10,5 +15,19 @@ class UserError(ValueError):
     """
 
     def __init__(self, message: object = "") -> None:
-        """message: kept to one line, whatever line breaks a value in it has."""
-        super().__init__(" ".join(str(message).split()))
+        """message: kept to one line that a terminal prints as it stands, whatever line breaks, control characters or
+        lengths a value in it has."""
+        super().__init__(_plain(str(message)))
+
+
+def _plain(text: str) -> str:
+    text = " ".join(text.split())
+    # not printable: escapes that move a cursor, marks that turn the direction of writing, halves of a character
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    text = re.sub(rf"\S{{{WORD},}}", lambda word: _short(word.group(), WORD), text)
+    return _short(text, MESSAGE)
+
+
+def _short(text: str, most: int) -> str:
+    """Its beginning and its end, where it is longer."""
+    return text if len(text) <= most else f"{text[: most * 2 // 3]}...{text[-most // 4 :]}"

@@ -10,11 +10,15 @@ import shutil
 import socket
 import stat
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dexsim.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 LEFT_S = 86400.0
 """Age [s] from which an unfinished file is nobody's."""
@@ -52,6 +56,37 @@ def text(path: Path, most: int, what: str) -> str:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise UserError(f"{what} {path} is not UTF-8 text (byte {error.start})") from None
+
+
+def place(text: Any) -> Path:
+    """A path as it was typed or stored, `~` being its user's folder where there is such a user. Raises UserError for a
+    text that no path can be."""
+    if "\0" in str(text):
+        raise UserError(f"'{text}': a path holds no zero character")
+    path = Path(str(text))
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        return path
+
+
+def arrays(path: Path, most: int) -> dict[str, np.ndarray]:
+    """The arrays of a NumPy archive by name; nothing pickled is read. Raises ValueError, in one line, where it is no
+    plain file, none that can be read, or larger than `most` bytes, as it is or unpacked."""
+    import numpy as np
+
+    try:
+        check(path, most, "file")
+        with zipfile.ZipFile(path) as archive:
+            size = sum(i.file_size for i in archive.infolist())
+        if size > most:
+            raise ValueError(f"it unpacks to {size / 2**30:.3g} GiB; at most {most / 2**30:.3g} GiB is read")
+        with np.load(path, allow_pickle=False) as stored:
+            return {str(k): stored[k] for k in stored.files}
+    except Exception as error:  # readers of archives, headers and arrays raise whatever they like
+        text = " ".join(str(error).split())[:200] or type(error).__name__
+        hint = "; save plain arrays of numbers, no objects" if "pickle" in text.lower() else ""
+        raise ValueError(f"{text}{hint}") from None
 
 
 def unfinished(path: Path) -> Path:

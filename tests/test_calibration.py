@@ -395,6 +395,8 @@ def test_bad_files_are_named(change, says):
 def test_what_is_assumed_is_said():
     texts = Calibration.default().assumed
     assert any("2.7 A per N.m" in t for t in texts) and any("0.1 N a count" in t for t in texts)
+    unknown = {"schema": 1, "normalization": "matched", "joints": {"mid_joint1": {"torque_max": "unknown"}}}
+    assert any("torque_max of mid_joint1 is unknown" in t for t in Calibration.from_dict(unknown).assumed)
     assert (Calibration.default().current_per_torque == CURRENT_PER_TORQUE).all(), "one figure in the whole package"
 
 

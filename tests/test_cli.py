@@ -206,6 +206,10 @@ def test_cfg_prints_the_settings_and_does_nothing(configs, place, capfd):
     ("seed=-1", "seed=-1"),
     ("seed=abc", "seed=abc: must be a number"),
     ("sim=5", "sim is a group of settings (sim.engine"),
+    ("+sim=5", "+sim: is there already, a group of settings (sim.engine"),
+    ("+task=true", "+task: is there already"),
+    ("++task={a: 1}", "+task: is there already"),
+    ("+sim.timestep=x", "sim.timestep=x: must be a number"),
     ("sim.deterministic=3", "must be true or false"),
     ("sim.timestep=0", "sim.timestep=0: must be a number from"),
     ("sim.timestep=-0.1", "sim.timestep=-0.1"),
@@ -324,6 +328,12 @@ def test_full_disk_elsewhere(configs, place, capfd, monkeypatch):
 
     monkeypatch.setattr(folder.ProgressFile, "add", add)
     assert "the disk is full at progress.csv" in refused(capfd, configs, *QUICK)
+
+
+@pytest.mark.parametrize("name", ["a" * 400, "~nobody_of_this_name/run"])
+def test_a_path_that_cannot_be_is_one_line(configs, place, capfd, name):
+    err = refused(capfd, configs, *QUICK, f'out="{name}"')
+    assert "a" * 60 in err and "too long" in err or "no such user" in err
 
 
 def test_full_memory_is_one_line(configs, place, capfd, monkeypatch):

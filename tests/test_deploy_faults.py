@@ -178,6 +178,9 @@ HAND = {
     "a taxel of NaN": change(tactile=taxel(NAN)),
     "a taxel of 1e9": change(tactile=taxel(1e9)),
     "taxels of another shape": change(tactile=np.zeros((5, 12, 3))),
+    "complex positions": change(position=np.full(12, 0.05j)),
+    "a complex stamp": change(time=np.complex128(1j)),
+    "a position that is none": change(position=None),
     "a velocity of 1e9": change(velocity=one(1e9)),
     "error codes": change(error=one(7)),
     "an error of NaN": change(error=np.full(12, NAN)),
@@ -204,6 +207,15 @@ def test_a_fault_from_the_start_moves_nothing(b, fault):
     except UserError as error:
         assert "no good reading of the hand within 2 s" in str(error) and not [x for x in hand.sent if x[3] != PASSIVE]
     assert hand.relaxed_at and hand.begun is None
+
+
+def test_taxels_that_are_gone_relax_the_hand(b):
+    """A driver may have none from the start; one that had them has them still, or its readings are not the hand's."""
+    gone = np.zeros((0, 0, 3), np.int16)
+    hand = Spoiled(VirtualClock(100.0), change(tactile=gone))
+    report = run(b, hand)
+    assert "tactile is not 5 x 120 x 3" in report.ended and hand.relaxed_at[0] - hand.since < 0.15, report.ended
+    assert run(b, Spoiled(VirtualClock(100.0), change(tactile=gone), at=None)).ended == "done"
 
 
 def test_one_bad_reading_in_ten_is_left_out_and_counted(b):

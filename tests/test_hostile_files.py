@@ -608,3 +608,59 @@ def test_a_model_that_would_hang_or_fill_the_memory_is_refused(kind, reader, tmp
         read()
     assert said in (text := one_line(error)) and "xhand_right.xml" in text, text
     assert time.process_time() - begun < 5
+
+
+NAMES = ("a" * 5000, "a/" * 3000, "~nobody_of_this_name/x.obj", "x\0y.obj", "/proc/1/map_files", "\x1b[2J\u202e\ud800")
+
+
+@pytest.mark.parametrize("name", NAMES, ids=["long", "deep", "nobody's", "a zero", "not ours", "not printable"])
+@pytest.mark.parametrize("key", ["objects", "kept_out", "hand", "model_file", "task.evaluation.base"])
+def test_a_name_that_no_file_can_have_is_one_line(payload, tmp_path, key, name):
+    """In a checkpoint's settings, as they are built."""
+    from dexsim.assets.objects import own
+    from dexsim.cli import start
+    from dexsim.hand import load_hand
+    from dexsim.paths import CONFIGS
+    from dexsim.tasks import base_path
+    from dexsim.tasks.env import model_of
+
+    config = start.for_train(["task=grasp", "device=cpu", "worlds=2"], CONFIGS).cfg
+    uses = {"objects": lambda: own.own_shape(name), "kept_out": lambda: own.own_shape(name),
+            "hand": lambda: load_hand(name), "model_file": lambda: model_of(load_hand("xhand"), name),
+            "task.evaluation.base": lambda: base_path.of(name if name.endswith(".csv") else f"{name}.csv")}  # fmt: skip
+    with pytest.raises(UserError) as error:
+        uses[key]()
+    assert one_line(error).isprintable()
+    if key in ("objects", "kept_out", "hand"):
+        config[key] = name if key == "hand" else [name]
+        checkpoint.save(tmp_path / "x.pt", payload | {"config": config})
+        try:
+            start.for_play([f"checkpoint={tmp_path / 'x.pt'}", "device=cpu"], CONFIGS)
+        except UserError as error:
+            assert str(error).isprintable() and "x.pt" in str(error) and len(str(error)) < 700
+
+
+@pytest.mark.parametrize("kind", ["unpacks to 600 MiB", "cut off", "no archive", "a pipe", "objects"])
+def test_archives_of_objects_poses_and_dumps_have_limits(kind, tmp_path):
+    from dexsim.assets.objects import own
+    from dexsim.tasks import nan_dump
+    from dexsim.tasks.stable_grasps import GraspSet
+
+    path = tmp_path / "object.npz"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    elif kind == "no archive":
+        path.write_text("nothing")
+    elif kind == "objects":
+        np.savez(path, **{k: np.array([{}], object) for k in ("format", "edge", "config", "hulls")})
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("edge.npy", "w") as file:
+            np.lib.format.write_array(file, np.zeros((1, 600 << 17), np.float64) if kind[0] == "u" else np.zeros(9))
+        if kind == "cut off":
+            path.write_bytes(path.read_bytes()[:-30])
+    begun = time.process_time()
+    for read in (lambda: own.own_shape(str(tmp_path)), lambda: GraspSet.load(path), lambda: nan_dump.load(path)):
+        with pytest.raises(UserError) as error:
+            read()
+        assert "object.npz" in one_line(error)
+    assert time.process_time() - begun < 10

@@ -173,6 +173,9 @@ class Calibration:
             assumed.append(
                 f"current_per_torque of {names} is not measured: {ASSUMED_CURRENT_PER_TORQUE} A per N.m assumed"
             )
+        left = [j for j, e in (content.joints or {}).items() if e is not None and e.torque_max == "unknown"]
+        if left and how == "matched":
+            assumed.append(f"torque_max of {', '.join(left)} is unknown: what training normalised by is taken")
         missing = ~np.isfinite(out["current_per_torque"])
         out["current_per_torque"][missing] = ASSUMED_CURRENT_PER_TORQUE
         unmeasured = ~np.isfinite(out["current_max"])

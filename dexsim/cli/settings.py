@@ -127,7 +127,12 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
             node.pop(last)
             continue
         value = item.value()
-        if item.type == OverrideType.CHANGE:
+        if item.type != OverrideType.CHANGE and isinstance(group := cfg.get(key), DictConfig):
+            raise UserError(
+                f"+{key}: is there already, a group of settings ({', '.join(f'{key}.{k}' for k in group)}): give those"
+                " one by one, or choose another group without the +"
+            )
+        if item.type == OverrideType.CHANGE or _there(cfg, key):
             _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
         try:
             OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
@@ -222,6 +227,13 @@ def _guess(name: str, valid: list[str]) -> str:
         last = {v.rpartition(".")[2]: v for v in reversed(valid)}
         near = [last[n] for n in difflib.get_close_matches(name.rpartition(".")[2], list(last), n=1, cutoff=0.75)]
     return f" (did you mean {near[0]}?)" if near else ""
+
+
+def _there(cfg: DictConfig, key: str) -> bool:
+    try:
+        return OmegaConf.select(cfg, key) is not None
+    except OmegaConfBaseException:  # a name where a list has numbers
+        return False
 
 
 def _check_type(key: str, old: Any, new: Any) -> None:

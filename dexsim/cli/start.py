@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from dexsim import yaml_text
+from dexsim import files, yaml_text
 from dexsim.assets.objects.own import PARTS
 from dexsim.cli import checks, objects, settings
 from dexsim.cli import help as help_page
@@ -214,7 +214,7 @@ def _preset(cfg: DictConfig, device: str) -> str:
 def _finish(cfg: DictConfig, device: str) -> dict[str, Any]:
     plain = settings.resolve(cfg)
     plain["device"] = device
-    hand = Path(str(plain["hand"])).expanduser()
+    hand = files.place(plain["hand"])
     # os.path: a name that is too long for a file is none
     if os.path.exists(hand) and hand.parts != (str(plain["hand"]),):  # from wherever a checkpoint is played later
         plain["hand"] = str(hand.resolve())

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dexsim.errors import UserError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
+PLACES = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.ELOOP)
+"""Of paths that cannot be used, whoever named them."""
 
 
 def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None = None) -> int:
@@ -29,6 +31,8 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (RuntimeError, MemoryError) as error:
+        if "home directory" in str(error):  # pathlib's, of ~NAME/...
+            return _say("a path begins with ~NAME, and this machine has no such user; write the whole path", 2)
         if not out_of_memory(error):
             raise
         return _say(
@@ -37,6 +41,8 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
             2,
         )
     except OSError as error:
+        if error.errno in PLACES and error.filename:
+            return _say(f"{str(error.filename)[:200]}: {error.strerror}; give another path, or its rights", 2)
         if error.errno not in FULL:
             raise
         where = f" at {error.filename}" if error.filename else ""

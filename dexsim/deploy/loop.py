@@ -172,6 +172,7 @@ class Loop:
         self._beat, self._lock = None, threading.Lock()
         self._tripped: str | None = None
         self._sequence: int | None = None  # of the last reading that the driver gave, taken or not
+        self._felt = False  # the first reading had taxels
         self._wrong: str | None = None  # why readings since the last good one were not taken
         self._coded_since: float | None = None  # since when every reading has an error code
         self._nonsense_since: float | None = None  # since when no action was finite
@@ -236,6 +237,7 @@ class Loop:
             self._beat = now
             self.clock.sleep_until(now + self.read_period)
         self.state, self._sequence, self._good_at, self._checked = state, state.sequence, now, now
+        self._felt = np.size(state.tactile) > 0
         self.target = np.asarray(state.position, float).copy()
         if self.settings.home:
             self._begin_homing(self.clock.now())
@@ -337,7 +339,7 @@ class Loop:
         if state is None or state.sequence == self._sequence:
             return False
         self._sequence = state.sequence
-        self._wrong = implausible(state, now, self.bundle.hand, self._taxels)
+        self._wrong = implausible(state, now, self.bundle.hand, self._taxels, self._felt)
         if self._wrong is not None:
             self.report.counts["bad_readings"] += 1
             return False

@@ -33,10 +33,13 @@ _JOINT = (
 _TOUCH = 1e5  # counts; the wire's are at most 255, a replay's are not rounded or cut
 
 
-def implausible(state: HandState, now: float, hand: Hand, taxels: tuple[int, int]) -> str | None:
+def implausible(
+    state: HandState, now: float, hand: Hand, taxels: tuple[int, int], felt: bool = False
+) -> str | None:
     """Why a reading [driver.HandState] cannot be true at time now [s], or None: a stamp that is no time or lies ahead,
     an array of another shape, a value that is not finite or beyond what the hand can show. How old it is, is not judged
-    here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`)."""
+    here. hand: whose; taxels: pads and taxels of each (`tactile.layout.touch_shape`); felt: whether readings before had
+    taxels, which a hand does not lose."""
     J, (low, high) = len(hand.joints), hand.limits.T
     if (wrong := bad_stamp(state.time, now)) is not None:
         return wrong
@@ -52,7 +55,7 @@ def implausible(state: HandState, now: float, hand: Hand, taxels: tuple[int, int
     if error is None or error.shape != (J,):
         return f"error is not {J} codes"
     touch = _array(state.tactile)
-    if touch is None or (touch.size and touch.shape != (*taxels, 3)):
+    if touch is None or ((touch.size or felt) and touch.shape != (*taxels, 3)):
         return f"tactile is not {' x '.join(map(str, (*taxels, 3)))} numbers"
     top = float(np.abs(touch).max(initial=0.0))
     if not top <= _TOUCH:
@@ -69,7 +72,7 @@ def implausible(state: HandState, now: float, hand: Hand, taxels: tuple[int, int
 
 def bad_stamp(stamp: Any, now: float) -> str | None:
     """Why a stamp [s] cannot be a time of the loop's clock, or None."""
-    if not isinstance(stamp, (int, float, np.number)) or not np.isfinite(stamp):
+    if not isinstance(stamp, (int, float, np.integer, np.floating)) or not np.isfinite(stamp):
         return f"its stamp is {stamp}, no time"
     if stamp > now + AHEAD:
         return f"its stamp lies {stamp - now:.3g} s ahead"
@@ -93,8 +96,8 @@ def bad_orientation(q: Any) -> str | None:
 
 
 def _array(x: Any) -> np.ndarray | None:
-    """float64, None where it is not numbers."""
+    """float64, None where it is not (real) numbers."""
     try:
-        return np.asarray(x, float)
+        return None if np.iscomplexobj(x) else np.asarray(x, float)
     except (TypeError, ValueError):
         return None

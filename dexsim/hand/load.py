@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand import derive, model, schema
 from dexsim.hand.hand import Finger, Hand
@@ -44,7 +45,7 @@ def _file(which: str | Path) -> Path:
     text = str(which)
     if text in known():
         return HANDS / text / FILE
-    path = Path(text).expanduser()
+    path = files.place(text)
     if os.path.isfile(path / FILE):  # not Path's, which raises where a name is too long for a file
         return (path / FILE).resolve()
     if path.name == FILE and os.path.isfile(path):

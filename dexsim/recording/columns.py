@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import re
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -394,21 +393,10 @@ def _npz(path: Path) -> tuple[dict[str, np.ndarray], list[Finding]]:
     """Columns of a NumPy archive: arrays [T], or [T, J] with `joint_names` [J]. Nothing pickled is read."""
     files.check(path, MAX_BYTES, "recording")
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(i.file_size for i in archive.infolist())
-        if size > MAX_BYTES:
-            raise UserError(
-                f"recording {path}: unpacks to {size / 2**30:.3g} GiB; at most {MAX_BYTES / 2**30:g} GiB is read: cut "
-                "it into several files"
-            )
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {str(k): archive[k] for k in archive.files}
-    except UserError:
-        raise
-    except Exception as error:  # zip, header and array readers raise whatever they like
-        text = " ".join(str(error).split())[:200] or type(error).__name__
-        hint = "; save plain arrays of numbers, no objects" if "pickle" in text.lower() else ""
-        raise UserError(f"recording {path}: is not an NPZ file that can be read: {text}{hint}") from None
+        arrays = files.arrays(path, MAX_BYTES)
+    except ValueError as error:
+        fix = ": cut it into several files" if "unpacks" in str(error) else ""
+        raise UserError(f"recording {path}: is not an NPZ file that can be read: {error}{fix}") from None
     names = next(
         (arrays.pop(k) for k in ("joint_names", "joints", "names") if k in arrays and arrays[k].dtype.kind in "US"),
         None,

@@ -73,7 +73,7 @@ def of(setting: str) -> Base:
         )
     if not str(setting).lower().endswith(".csv"):
         raise UserError(f"task.evaluation.base={setting}: must be turn, lift, or a path: a .csv file of t,x,y,z")
-    gravity, seconds = along(Path(setting).expanduser())
+    gravity, seconds = along(files.place(setting))
     return Base(("hold_rate_path_half", "hold_rate_path"), (seconds / 2, seconds / 2), gravity)
 
 

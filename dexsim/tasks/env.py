@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -20,7 +21,7 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from dexsim import model_file
+from dexsim import files, model_file
 from dexsim.actuator.servo import Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.assets.objects.own import named
@@ -667,9 +668,9 @@ def model_of(hand: Hand, path: str | None) -> mujoco.MjSpec:
     hand."""
     if path is None:
         return hand.spec()
-    if not Path(path).expanduser().is_file():
+    if not os.path.isfile(files.place(path)):
         raise UserError(f"model_file={path}: no such file")
-    spec = model_file.read(Path(path).expanduser(), f"model_file={path}")
+    spec = model_file.read(files.place(path), f"model_file={path}")
     has = {x.name for x in (*spec.joints, *spec.bodies, *spec.geoms)}
     missing = [n for n in (*hand.joints, *hand.tip_bodies, *hand.tip_geoms) if n not in has]
     if missing:

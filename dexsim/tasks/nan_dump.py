@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import json
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 import warp as wp
 
+from dexsim import files
 from dexsim.errors import UserError
 
 KEEP = 10
 """Files a run writes at most; `nan_count` goes on counting."""
+MOST_BYTES = 1 << 30
+"""Of a file, packed or not."""
 
 
 _NONE = 2**31 - 1
@@ -136,11 +138,10 @@ def _row(source: torch.Tensor, kept: torch.Tensor) -> list[int]:
 def load(path: Path) -> dict[str, np.ndarray]:
     """Arrays of a dump by name. Raises UserError for a file that is not one."""
     try:
-        with np.load(path, allow_pickle=False) as f:
-            data = {k: f[k] for k in f.files}
+        data = files.arrays(path, MOST_BYTES)
         json.loads(str(data["config"]))
         data["qpos"], data["servo_state"]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError) as error:
         raise UserError(f"{path}: not a dump of a world ({type(error).__name__}: {error})") from None
     return data
 

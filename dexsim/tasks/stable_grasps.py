@@ -12,11 +12,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 
 FOUND = "held_cubes.npz"
 """File of a hand's folder in which a search keeps what it found."""
+MOST_BYTES = 256 << 20
+"""Of a file of held poses, packed or not."""
 FINGERTIPS = Path(__file__).parents[1] / "assets" / "grasps" / "fingertips.npz"
 """Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
 
@@ -34,11 +37,11 @@ class GraspSet:
     @classmethod
     def load(cls, path: str | Path) -> GraspSet:
         """Read a file that this module wrote. Raises UserError."""
-        path = Path(path).expanduser()
+        path = files.place(path)
         try:
-            with np.load(path) as data:
-                return cls(**{f.name: torch.as_tensor(data[f.name], dtype=torch.float32) for f in fields(cls)})
-        except (OSError, KeyError, ValueError) as error:
+            data = files.arrays(path, MOST_BYTES)
+            return cls(**{f.name: torch.as_tensor(data[f.name], dtype=torch.float32) for f in fields(cls)})
+        except (KeyError, ValueError, TypeError) as error:
             raise UserError(f"held poses {path}: cannot read them ({error}); make them with "
                             "dexsim stable-grasps out=PATH") from None
 

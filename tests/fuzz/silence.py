@@ -68,6 +68,8 @@ def of_settings(said: Any, taken: Any, path: str = "") -> str:
         said = [said.get("low"), said.get("high")]
     if isinstance(said, Mapping) and set(said) == {"value"} and not isinstance(taken, Mapping):
         said = said["value"]
+    if isinstance(taken, (list, tuple)) and len(taken) == 2 and taken[0] == taken[1] and isinstance(said, (int, float)):
+        taken = taken[0]  # a range of one number
     if isinstance(taken, Mapping) and isinstance(said, (list, tuple)):
         taken = [taken.get("low"), taken.get("high")]
     if isinstance(said, Mapping):

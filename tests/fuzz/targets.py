@@ -99,9 +99,13 @@ def servo(path: Path) -> str:
 def calibration(path: Path) -> str:
     c = Calibration.load(path)
     assert np.isfinite(c.torque_norm(np.ones(12))).all() and np.isfinite(c.normal_force(np.ones((5, 120, 3)))).all()
-    taken = c.to_dict()
+    taken, said = c.to_dict(), _said(path)
     Calibration.from_dict(taken)
-    return silence.of_settings(_said(path), taken)
+    for joint, entry in (said.get("joints") or {}).items():  # what is unknown is assumed, and that is told
+        for key in [k for k, v in (entry or {}).items() if v == "unknown"]:
+            if c.normalization == "paper" or any(key in a and (joint in a or "every" in a) for a in c.assumed):
+                del entry[key]
+    return silence.of_settings(said, taken)
 
 
 def tactile(path: Path) -> str:

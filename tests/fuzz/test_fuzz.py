@@ -92,6 +92,11 @@ FOUND = [
     ("checkpoint", 1008330),
     ("checkpoint", 1011057),
     ("overrides", 1017359),
+    ("calibration", 3000179),
+    ("tactile", 3005553),
+    ("tactile", 3012168),
+    ("overrides", 3017267),
+    ("checkpoint", 4000029),
 ]
 """Cases of long runs that once broke something."""
 
@@ -107,6 +112,8 @@ def test_settings_taken_for_others_are_found():
     assert silence.of_settings(said, taken) == ""
     assert silence.of_settings({"a": {"kp": 9.0}}, {"a": {"kp": 5.0}}) == "a.kp=9.0 was taken for 5.0"
     assert silence.of_settings({"a": 1, "b": 2}, {"a": 1}) == "b=2 was left out"
+    assert silence.of_settings({"a": 1}, {"a": [1.0, 1.0]}) == ""
+    assert silence.of_settings({"a": 1}, {"a": [1.0, 2.0]}) and silence.of_settings({"a": 1}, {"a": [2.0, 2.0]})
 
 
 @pytest.mark.parametrize(

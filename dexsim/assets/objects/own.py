@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -55,10 +54,11 @@ def expand(names: list[str]) -> list[str]:
     objects."""
     out: list[str] = []
     for name in names:
-        path = Path(str(name)).expanduser()
-        if not is_own(str(name)) and not (path.is_dir() and _listed(path)):
+        path = files.place(name)
+        folder = os.path.isdir(path)  # not Path's, which raises where a name is too long for a file
+        if not is_own(str(name)) and not (folder and _listed(path)):
             out.append(str(name))
-        elif path.is_dir() and not (path / FILE).is_file():
+        elif folder and not (path / FILE).is_file():
             found = _listed(path)
             if not found:
                 raise UserError(
@@ -72,14 +72,17 @@ def expand(names: list[str]) -> list[str]:
 
 
 def _listed(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES or (p / FILE).is_file())
+    try:
+        return sorted(p for p in folder.iterdir() if p.suffix.lower() in MESHES or os.path.isfile(p / FILE))
+    except OSError as error:
+        raise UserError(f"objects: {folder}: cannot be listed: {error.strerror}") from None
 
 
 def own_shape(name: str, scale: float = 1.0, parts: int = PARTS) -> Shape:
     """The shape of a mesh file (scale: metres per unit; parts: convex ones at most) or of an imported folder (as it was
     imported), called `name`. Raises UserError as `load_mesh` does."""
-    path = Path(name).expanduser()
-    if path.is_dir():
+    path = files.place(name)
+    if os.path.isdir(path):
         files.check(path / FILE, MOST_BYTES, "object")
         return replace(_read(path / FILE), name=name)
     files.check(path, MOST_BYTES, "mesh")
@@ -138,23 +141,23 @@ def save(shape: Shape, path: Path) -> None:
 def _read(path: Path) -> Shape:
     """What `save` wrote. Raises UserError for anything else."""
     try:
-        with np.load(path, allow_pickle=False) as d:
-            if int(d["format"]) != FORMAT:
-                raise ValueError(f"format {int(d['format'])}, must be {FORMAT}")
-            hulls = np.split(d["hulls"].astype(float), np.cumsum(d["hull_sizes"])[:-1])
-            shape = Shape(
-                name=str(d["name"]), kind="grid", held_out=False, hulls=hulls,
-                grid=Grid(d["origin"].astype(float), float(d["spacing"]), d["data"].astype(np.float32)),
-                volume=float(d["volume"]), inertia_unit=d["inertia_unit"].astype(float),
-                extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=tuple(float(x) for x in d["grid_error"]),
-                true_size=True, notes=tuple(str(x) for x in np.atleast_1d(d["notes"])), file_centre=d["file_centre"],
-                file_axes=d["file_axes"], file_scale=float(d["file_scale"]),
-            )  # fmt: skip
+        d = files.arrays(path, MOST_BYTES)
+        if int(d["format"]) != FORMAT:
+            raise ValueError(f"format {int(d['format'])}, must be {FORMAT}")
+        hulls = np.split(d["hulls"].astype(float), np.cumsum(d["hull_sizes"])[:-1])
+        shape = Shape(
+            name=str(d["name"]), kind="grid", held_out=False, hulls=hulls,
+            grid=Grid(d["origin"].astype(float), float(d["spacing"]), d["data"].astype(np.float32)),
+            volume=float(d["volume"]), inertia_unit=d["inertia_unit"].astype(float),
+            extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=tuple(float(x) for x in d["grid_error"]),
+            true_size=True, notes=tuple(str(x) for x in np.atleast_1d(d["notes"])), file_centre=d["file_centre"],
+            file_axes=d["file_axes"], file_scale=float(d["file_scale"]),
+        )  # fmt: skip
         whole = shape.grid is not None and shape.grid.data.ndim == 3 and len(hulls) >= 1
         good = all(h.ndim == 2 and h.shape[1] == 3 and np.isfinite(h).all() for h in hulls)
         if not (whole and good and np.isfinite(shape.grid.data).all() and shape.inertia_unit.shape == (3, 3)):
             raise ValueError("its arrays do not make a shape")
         return shape
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         said = " ".join(str(error).split())[:160]
         raise UserError(f"object {path}: not a file of dexsim import-object ({said}); import the mesh again") from None
