@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from worlds import grasp_env
 
+from dexsim.calibration.file import Calibration
+from dexsim.deploy import observations
+from dexsim.deploy.driver import HandState
+from dexsim.deploy.measure import for_bundle
 from dexsim.errors import UserError
 
 FEW = ("task.objects.train=[box]", "task.objects.held_out=[sphere]")
@@ -57,3 +62,25 @@ def test_a_range_that_is_none_is_refused(value):
 def test_touch_is_or_is_not():
     with pytest.raises(UserError, match="task.observe.touch=half"):
         grasp_env(*FEW, "task.observe.touch=half")
+
+
+@pytest.mark.parametrize(("pads", "commands"), [(5, 1), (0, 1), (5, 2)])
+def test_a_robots_loop_builds_what_the_policy_was_trained_with(pads, commands):
+    """Of a hand at rest that presses one taxel with 10 counts."""
+    table, at = [], 0
+    for name, width, *_ in observations.rows(12, 5, pads, commands):
+        table.append({"name": name, "start": at, "stop": at + width})
+        at += width
+    manifest = {"task": "grasp", "observation": table, "normalization": {"force_max_N": 10.0},
+                "rates": {"policy_period_s": 0.02}}  # fmt: skip
+    measure = for_bundle(manifest, Calibration.default())
+    tactile = np.zeros((5, 120, 3), np.int16)
+    tactile[1, 7, 2] = 10
+    state = HandState(0.0, 0, np.zeros(12), np.zeros(12), tactile=tactile)
+    built, force = measure.observe(state, np.array([0.05, 0.0, 0.1]), 0.7, np.zeros(12), np.zeros(12))
+    assert built.shape == (1, at) and built[0, -commands:] == pytest.approx(0.7)
+    assert force.shape == (5,) and force[1] > 0 and force[[0, 2, 3, 4]].max() == 0  # known to the loop all the same
+    row = next((r for r in table if r["name"] == "contact_force"), None)
+    assert (row is None) == (pads == 0)
+    if row is not None:
+        assert built[0, row["start"] : row["stop"]] == pytest.approx(force / 10.0)
