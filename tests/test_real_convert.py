@@ -59,6 +59,16 @@ def test_a_fingers_run_becomes_clips_of_whole_cycles_with_the_duty_as_command(tm
         convert_ergocub.convert(tmp_path, tmp_path / "out2")
 
 
+def test_stretches_in_which_a_fingers_motor_was_off_are_left_out():
+    t = np.arange(0.0, 10.0, 0.001)
+    set_ = np.where(t % 1 < 0.5, 30.0, -30.0)
+    given = np.where((t >= 2.0) & (t < 5.0), 0.0, set_)
+    late = np.where((t >= 7.0) & (t < 7.05), 0.0, given)  # read late
+    assert convert_ergocub.driven(t, set_, late, 33.6 * late) == [(0, 2000), (5000, 10000)]
+    # given but not read back: it was on
+    assert convert_ergocub.driven(t, set_, given, 33.6 * set_) == [(0, 10000)]
+
+
 def test_the_pandas_plain_least_squares_reads_off_a_friction(tmp_path):
     text = "".join(LINK.format(k=k, axis="0 0 1" if k % 2 else "0 1 0") for k in range(1, 8))
     (tmp_path / "panda.xml").write_text(PANDA.format(open=text, close="</body>" * 7))

@@ -9,6 +9,10 @@ know: each run is cut into clips of whole cycles of `CLIP` s and more, each of t
 Kept out, chosen by name before anything was looked at: of the runs of a finger in the order of their names every third,
 beginning with the third; of each run alone every fourth clip, beginning with the fourth. (First it was the last quarter
 of the clips; of the first run that was tried, middle1, that was one clip at a duty that no other clip has.)
+
+For 10 to 34 s at the begin of four of the middle finger's runs the motor was off: nothing was read back of the duty
+that was set, and the controller gave none. Those stretches are left out before clips are cut and counted; that was seen
+in the duties alone, when the four runs could not be explained.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ FINGERS = {
 EVERY = 4  # of some 930 samples a second: the finger turns by less than half a step of its encoder between them
 CLIP = 2.0  # s
 BEFORE = 1.0  # s of duty before a clip
+OFF = 0.1  # s without duty where one was set: longer than any that was read late
 KEPT = 4  # every so many of a run's clips is kept out
 CLOSES = -1.0  # sign of the duty that turns the joint to larger angles (0 is the open stop)
 INERTIA = 1e-3  # kg.m2 about the joint, the motor's reflected: assumed, it only sets the unit
@@ -96,9 +101,11 @@ def convert(data: Path, out: Path) -> Ergocub:
         t, set_, read = raw["t"], CLOSES * raw["pwm_set"] / 100.0, CLOSES * raw["pwm_read"] / 100.0
         q = np.radians(raw["theta_deg"])
         made[name] = []
-        for k, (a, b) in enumerate(_clips(t, set_, q)):
+        on = driven(t, raw["pwm_set"], raw["pwm_read"], raw["pid_out"])
+        clips = [(a + i, a + k) for a, b in on for i, k in _clips(t[a:b], set_[a:b], q[a:b])]
+        for k, (a, b) in enumerate(clips):
             # what was asked for before still acts when the clip begins
-            early = int(np.searchsorted(t, t[a] - BEFORE))
+            early = max(int(np.searchsorted(t, t[a] - BEFORE)), max(i for i, _ in on if i <= a))
             changed = early + np.flatnonzero(np.r_[True, np.diff(set_[early:b]) != 0])
             keep = slice(a, b, EVERY)
             made[name].append(
@@ -115,6 +122,16 @@ def convert(data: Path, out: Path) -> Ergocub:
                 )
             )
     return Ergocub(made, model, servo)
+
+
+def driven(t: np.ndarray, set_: np.ndarray, read: np.ndarray, given: np.ndarray) -> list[tuple[int, int]]:
+    """First and last samples (exclusive) of the stretches in which the motor was on: but for those longer than `OFF` in
+    which a duty was set, and none was given nor read back."""
+    off = (np.abs(read) < 1) & (np.abs(given) < 1) & (set_ != 0)
+    edges = np.flatnonzero(np.diff(np.r_[0, off.astype(int), 0]))
+    cut = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if t[min(b, len(t) - 1)] - t[a] > OFF]
+    ends = [0, *(int(x) for pair in cut for x in pair), len(t)]
+    return [(a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1]
 
 
 def _clips(t: np.ndarray, duty: np.ndarray, q: np.ndarray) -> list[tuple[int, int]]:
@@ -137,10 +154,11 @@ def repeat_noise(data: Path, name: str) -> float:
     raw = np.load(data / f"{name}.npz")
     t, duty, q = raw["t"], raw["pwm_set"], np.radians(raw["theta_deg"])
     edges = np.r_[0, np.flatnonzero(np.diff(duty) != 0) + 1, len(t)]
+    on = driven(t, duty, raw["pwm_read"], raw["pid_out"])
     last: dict[float, np.ndarray] = {}
     squares = []
     for a, b in zip(edges[1:-2], edges[2:-1], strict=True):  # neither the first nor the last, which are cut
-        if t[b - 1] - t[a] < 0.05:
+        if t[b - 1] - t[a] < 0.05 or not any(i < a and b < k for i, k in on):
             continue
         even = np.arange(t[a], t[b - 1], 0.005)
         stroke = np.interp(even, t[a:b], q[a:b]) - q[a]
