@@ -78,7 +78,7 @@ def test_there_and_back_again(tmp_path, model):
 def test_what_cannot_be_said_is_one_line(tmp_path):
     path = tmp_path / "m.json"
     for change, said in (
-        ({"model": "m6"}, "model ('m6')"), ({"kt": -1.0}, "kt (-1.0)"), ({"R": "a"}, "R ('a')"),
+        ({"model": "m7"}, "model ('m7')"), ({"kt": -1.0}, "kt (-1.0)"), ({"R": "a"}, "R ('a')"),
     ):  # fmt: skip
         path.write_text(json.dumps(M2 | change))
         with pytest.raises(UserError, match="m.json") as error:
@@ -92,6 +92,24 @@ def test_what_cannot_be_said_is_one_line(tmp_path):
     table.set("*", "backlash", 0.01)
     with pytest.raises(UserError, match="backlash"):
         bam.to_bam(table, "*", 0.002)
+
+
+@pytest.mark.parametrize(
+    ("model", "term"),
+    [("m3", "load_friction_base"), ("m4", "load_friction_stribeck"), ("m5", "load_friction_motor"),
+     ("m5", "load_friction_external_stribeck"), ("m6", "load_friction_motor_quad")],
+)  # fmt: skip
+def test_a_load_term_is_refused_by_its_name_and_read_where_it_is_0(tmp_path, model, term):
+    """m3 to m6 with no load are m1 and m2; nothing of a term that the servo table lacks is left out in silence."""
+    path, servo = tmp_path / "m.json", tmp_path / "servo.yaml"
+    path.write_text(json.dumps(M2 | {"model": model, term: 0.12}))
+    with pytest.raises(UserError) as error:
+        bam.main([f"in={path}", f"out={servo}", f"kp={KP}", f"supply_voltage={VOLT}"])
+    assert f"m.json: {term} (0.12): model {model}" in str(error.value) and "\n" not in str(error.value)
+    assert not servo.exists()
+    path.write_text(json.dumps(M2 | {"model": model, term: 0.0}))
+    alike = M2 | {"model": "m1" if model == "m3" else "m2"}
+    assert bam.to_servo(bam.read(path), KP, VOLT) == bam.to_servo(bam.Bam(**alike), KP, VOLT)
 
 
 @pytest.mark.parametrize("name", ["xl330_m288", "xc330_m288"])

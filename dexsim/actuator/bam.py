@@ -3,8 +3,9 @@ python -m dexsim.actuator.bam in=m2.json out=servo.yaml kp=1.15 supply_voltage=5
 
 BAM: torque = kt U / R - kt^2 / R dq, U = supply * duty, duty = kp (goal - q), friction at most friction_base +
 friction_stribeck exp(-|dq / dtheta_stribeck|^alpha) + friction_viscous |dq|. Here: drive: voltage with torque_limit =
-kt supply / R, no_load_speed = supply / kt, and columns of the same laws. Models m1 and m2 are the same in both; the
-load dependence of m3 to m6 is another law than `load_friction` and is refused.
+kt supply / R, no_load_speed = supply / kt, and columns of the same laws. Models m1 and m2 are the same in both. The
+load terms of m3 to m6 act on what the gear carries, |external torque - motor torque|, the torque from outside known
+apart from friction; `load_friction` acts on the motor's torque alone. They are refused by name unless they are 0.
 
 settings (key=default):
   in=               a BAM file (.json) or a servo table (.yaml)
@@ -42,13 +43,27 @@ SAME = {
     "command_delay": "delay",
 }
 """Parameters that are a column as they stand."""
-FIX = "BAM writes such a file with its fit; only models m1 and m2 are read"
+FIX = "BAM writes such a file with its fit"
+STRIBECK = ("m2", "m4", "m5", "m6")
+LOAD = (
+    "load_friction_base",
+    "load_friction_stribeck",
+    "load_friction_motor",
+    "load_friction_external",
+    "load_friction_motor_stribeck",
+    "load_friction_external_stribeck",
+    "load_friction_motor_quad",
+    "load_friction_external_quad",
+)
+"""Parameters of m3 to m6 that have no column: friction by what the gear carries, at all speeds, near standstill, and
+its square."""
 
 
 class Bam(msgspec.Struct):
-    """A parameter file of model m1 or m2. kt N m/A, R ohm, armature kg m2, friction N m and N m s/rad, speeds rad/s."""
+    """A parameter file. kt N m/A, R ohm, armature kg m2, friction N m and N m s/rad, speeds rad/s, shares of a load 1
+    and 1/(N m)."""
 
-    model: Literal["m1", "m2"]
+    model: Literal["m1", "m2", "m3", "m4", "m5", "m6"]
     actuator: str
     kt: typed.Positive
     R: typed.Positive
@@ -60,17 +75,33 @@ class Bam(msgspec.Struct):
     alpha: typed.Positive = 2.0
     q_offset: typed.Real = 0.0
     command_delay: Zero = 0.0
+    load_friction_base: Zero = 0.0
+    load_friction_stribeck: Zero = 0.0
+    load_friction_motor: Zero = 0.0
+    load_friction_external: Zero = 0.0
+    load_friction_motor_stribeck: Zero = 0.0
+    load_friction_external_stribeck: Zero = 0.0
+    load_friction_motor_quad: Zero = 0.0
+    load_friction_external_quad: Zero = 0.0
 
 
 def read(path: str | Path) -> Bam:
-    """A BAM parameter file. Raises UserError: not JSON, another model, a parameter missing or impossible."""
+    """A BAM parameter file. Raises UserError: not JSON, a parameter missing or impossible, or a load term
+    that is not 0."""
     path = Path(path).expanduser()
     text = files.text(path, files.MAX_YAML, "BAM file")
     try:
         raw = json.loads(text)
     except ValueError as error:
         raise UserError(f"BAM file {path}: not JSON ({error})") from None
-    return typed.convert(raw, Bam, f"BAM file {path}", FIX)
+    bam = typed.convert(raw, Bam, f"BAM file {path}", FIX)
+    for name in LOAD:
+        if getattr(bam, name) and bam.model not in ("m1", "m2"):
+            raise UserError(
+                f"BAM file {path}: {name} ({getattr(bam, name):g}): model {bam.model}'s friction by what the gear"
+                " carries is no law of the servo table; must be 0: fit m1 or m2 with BAM (python -m bam.fit --model m2)"
+            )
+    return bam
 
 
 def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> dict[str, Any]:
@@ -83,7 +114,7 @@ def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> di
     }
     for theirs, ours in SAME.items():
         value = getattr(bam, theirs)
-        if bam.model == "m2" or theirs not in ("friction_stribeck", "dtheta_stribeck", "alpha"):
+        if bam.model in STRIBECK or theirs not in ("friction_stribeck", "dtheta_stribeck", "alpha"):
             columns[ours] = float(value)
     table = {
         "drive": "voltage",
