@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.real import sage_clock, sage_speed
+from benchmarks.real import bam_saturation, finger_spring, sage_clock, sage_speed
 from dexsim.errors import UserError
 
 
@@ -60,3 +60,45 @@ def test_motions_whose_commands_were_logged_a_period_late_are_told_by_the_curren
     found = sage_clock.late(tmp_path)
     assert {n for n, evidence in found.items() if evidence > sage_clock.SURE} == {"b", "d"}
     assert found["a"] < -sage_clock.SURE and found["c"] < -sage_clock.SURE and found["still"] == 0
+
+
+def test_a_pendulum_that_hangs_stays_and_one_that_falls_swings_through():
+    n = 1000  # 2 s
+    row = lambda x: np.full((2, n), x)  # noqa: E731
+    given = bam_saturation.Recorded(row(0.0), row(1.0), row(0.0), row(0.0), np.ones(2), np.array([100, 200]),
+                                    np.array([0.0, 0.3]), np.zeros(2))  # fmt: skip
+    free = np.array([[0.7, 25.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    still, swings = bam_saturation.errors(free, given)[0]
+    assert still == 0.0 and swings == pytest.approx(0.3 * 2 / np.pi, rel=0.06)  # mean of |cos|
+
+
+def test_torque_that_saturates_holds_a_pendulum_lower():
+    n = 2500
+    row = lambda x: np.full((1, n), x)  # noqa: E731
+    given = bam_saturation.Recorded(row(1.5), row(1.0), row(1.0), row(0.0), np.ones(1), np.array([100]),
+                                    np.zeros(1), np.zeros(1))  # fmt: skip
+    x = np.array([[1.0, 25.0, 1e-3, 0.0, 0.02, 0.0, 0.0, r] for r in (0.0, 1.0)])
+    plain, soft = bam_saturation.errors(x, given)[:, 0]
+    assert 0.7 < plain and soft < 0.85 * plain
+
+
+def clips(x, seconds=3.0):
+    """A finger of these parameters, as its readings show it."""
+    n, before = int(seconds / finger_spring.STEP), round(finger_spring.OLDEST / finger_spring.STEP)
+    duty = np.where(np.arange(n + before) // 200 % 2, -0.5, 0.5)[None]
+    step = np.arange(0, n, 25)
+    given = finger_spring.Clips(duty, np.zeros(1), np.zeros(1), np.zeros(len(step), int), step, np.zeros(len(step)))
+    return given, step
+
+
+def test_a_fingers_spring_and_the_age_of_its_readings_are_told_from_friction():
+    true = np.array([2.0, 1.3, 0.5, 1.5, 1.0, 0.1])
+    given, step = clips(true)
+    # its path, off one reading at a time
+    for k in range(len(step)):
+        one = finger_spring.Clips(given.duty, given.q0, given.v0, np.zeros(1, int), step[k : k + 1], np.zeros(1))
+        given.q[k] = finger_spring.errors(true[None], one)[0]
+    assert np.ptp(given.q) > 0.1 and finger_spring.errors(true[None], given)[0] < 1e-12
+    without = true.copy()
+    without[3:] = -9.0, -9.0, 0.0
+    assert finger_spring.errors(without[None], given)[0] > 0.05

@@ -62,8 +62,9 @@ SERVO = {
             "no_load_speed": {"value": 6.0, "low": 1.5, "high": 60.0},
             "coulomb_friction": "unknown",
             "viscous_friction": "unknown",
-            # the position comes from another board, 20 times a second; how old it is then nobody says
-            "delay": {"value": 0.05, "low": 0.0, "high": 0.2},
+            # the position comes from another board, 20 times a second; how old it is then nobody says, and after a
+            # reversal of the duty it goes on for two readings (in what is fitted as in the rest)
+            "delay": {"value": 0.1, "low": 0.0, "high": 0.2},
         }
     },
 }
@@ -98,14 +99,12 @@ def convert(data: Path, out: Path) -> Ergocub:
     made = {}
     for name in names:
         raw = np.load(data / f"{name}.npz")
-        t, set_, read = raw["t"], CLOSES * raw["pwm_set"] / 100.0, CLOSES * raw["pwm_read"] / 100.0
-        q = np.radians(raw["theta_deg"])
+        read = CLOSES * raw["pwm_read"] / 100.0
+        t, set_, q, clips = cycles(data / f"{name}.npz")
         made[name] = []
-        on = driven(t, raw["pwm_set"], raw["pwm_read"], raw["pid_out"])
-        clips = [(a + i, a + k) for a, b in on for i, k in _clips(t[a:b], set_[a:b], q[a:b])]
         for k, (a, b) in enumerate(clips):
             # what was asked for before still acts when the clip begins
-            early = max(int(np.searchsorted(t, t[a] - BEFORE)), max(i for i, _ in on if i <= a))
+            early = int(np.searchsorted(t, t[a] - BEFORE))
             changed = early + np.flatnonzero(np.r_[True, np.diff(set_[early:b]) != 0])
             keep = slice(a, b, EVERY)
             made[name].append(
@@ -122,6 +121,20 @@ def convert(data: Path, out: Path) -> Ergocub:
                 )
             )
     return Ergocub(made, model, servo)
+
+
+def cycles(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
+    """Times [s], duty (positive towards larger angles, 0 where the motor was off), angles [rad] [n] of a run, and the
+    first and last samples (exclusive) of its clips."""
+    raw = np.load(path)
+    t, q = raw["t"].astype(float), np.radians(raw["theta_deg"].astype(float))
+    duty = CLOSES * raw["pwm_set"].astype(float) / 100.0
+    on = driven(t, raw["pwm_set"], raw["pwm_read"], raw["pid_out"])
+    clips = [(a + i, a + k) for a, b in on for i, k in _clips(t[a:b], duty[a:b], q[a:b])]
+    ran = np.zeros(len(t), bool)
+    for a, b in on:
+        ran[a:b] = True
+    return t, np.where(ran, duty, 0.0), q, [(a, b) for a, b in clips if t[b - 1] - t[a] >= 0.9 * CLIP]
 
 
 def driven(t: np.ndarray, set_: np.ndarray, read: np.ndarray, given: np.ndarray) -> list[tuple[int, int]]:
