@@ -376,6 +376,22 @@ def fetch(
     return answer.status, dict(answer.getheaders())
 
 
+def test_what_the_gate_makes_of_odd_headers():
+    """An Upgrade within a list still needs its Origin; a token of bytes that are no text is another token."""
+    from websockets.datastructures import Headers
+
+    from dexsim.view.live_gate import Gate
+
+    here = Gate("127.0.0.1")
+    for upgrade in ("websocket", "WebSocket", "websocket,", "h2c, websocket", " ,websocket ; x"):
+        foreign = Headers({"Host": "127.0.0.1:8080", "Upgrade": upgrade, "Origin": "http://evil.example"})
+        assert here.reason("/", foreign)[0] == 403, upgrade
+    far = Gate("0.0.0.0")
+    for path, cookie in (("/", "dexsim=\xe4"), ("/?token=%E4", ""), ("/?token=%ED%A0%80", "dexsim="), ("/?token=", "")):
+        assert far.reason(path, Headers({"Host": "x:8080", "Cookie": cookie}))[0] == 401, (path, cookie)
+    assert far.reason(f"/?token={far.token}", Headers({"Host": "x:8080"})) is None
+
+
 def test_only_the_page_that_is_served_may_connect(view):
     port = view.port
     assert status(port) == 101 and fetch(port)[0] == 200

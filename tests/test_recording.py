@@ -682,3 +682,11 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path):
     r = read(tmp_path / "a.mcap")
     (bad,) = [f for f in r.findings if f.kind == "unreadable"]
     assert bad.count == 2 and bad.time == pytest.approx(0.07) and len(r.states.position) == 28
+
+
+def test_a_recording_whose_name_leaves_no_room_for_the_file_beside_it(tmp_path):
+    from dexsim.recording import read, write
+
+    write(tmp_path / "x.mcap", recordings.signal(1.0))
+    long = (tmp_path / "x.mcap").rename(tmp_path / ("a" * 248 + ".mcap"))
+    assert len(read(long).states.position) == 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -40,7 +41,8 @@ def collect(path: Path, own: Mapping[str, str], given: Mapping[str, Any]) -> tup
     Each key that one source overrides in another is a finding. Raises UserError for unknown keys or a bad file.
     """
     beside_path = path.with_name(path.name + ".yaml")
-    beside = _read(beside_path) if beside_path.is_file() else {}
+    # not Path's, which raises where a recording's name leaves no room for the ending
+    beside = _read(beside_path) if os.path.isfile(beside_path) else {}
     stated = {k: str(v) for k, v in own.items() if k in VALID}
     findings = [
         Finding("metadata_unknown", "", NAN, 1, f"metadata key '{k}' is not one of this format's; ignored", "info")
