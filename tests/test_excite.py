@@ -206,11 +206,28 @@ def test_the_recording_that_a_diagnosis_asks_for(tmp_path):
     (["out=x", "speed=2"], r"speed=2.0: must lie in \[0.01, 1.0\]"),
     (["out=x", "seed=a"], "seed=a: must be a number"),
     (["out=x", "model=nowhere.xml"], "nowhere.xml does not exist"),
+    (["out=x", "hand_mirror=left"], "hand_mirror=left: must be true or false"),
+    (["out=x", "model=a.xml", "hand=xhand"], "model=a.xml: is not moved beside hand="),
 ])  # fmt: skip
 def test_bad_settings(argv, text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=text):
         excite.main(argv)
+
+
+def test_a_left_hand_is_moved_and_its_recording_replayed(tmp_path, capsys):
+    """hand_mirror: the left xHand's commands, simulated by the left one, and compared with it again."""
+    from dexsim.cli import recorded
+    from dexsim.paths import CONFIGS
+
+    out = tmp_path / "out"
+    argv = ["hand_mirror=true", "joints=index_joint1", "kinds=steps", "repeats=0", f"out={out}"]
+    assert excite.main(argv) == 0
+    made = read(out / "excite_simulated.mcap")
+    assert made.meta["robot"] == "xhand_left" and "index_joint1" in made.joints
+    replay = [f"replay={out}/excite_simulated.mcap", "hand_mirror=true", "video=false", f"out={tmp_path}/again"]
+    assert recorded.run(recorded.settings(replay, CONFIGS)) == 0
+    assert "of xhand_left" in capsys.readouterr().out
 
 
 def test_a_joint_without_limits_is_refused():

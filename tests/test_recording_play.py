@@ -227,6 +227,9 @@ def test_an_unknown_current_constant_is_fitted_and_said():
     (["replay=x.mcap", "servo=idael"], "must be a servo.yaml file, or one of ideal"),
     (["replay=x.mcap", "timestep=1"], "from 0.0001 to 0.02"),
     (["replay=x.mcap", "video=maybe"], "must be true or false"),
+    (["replay=x.mcap", "hand_mirror=1"], "hand_mirror=1: must be true or false"),
+    (["replay=x.mcap", "hand=xhnd"], "hand=xhnd: must be one of xhand"),
+    (["replay=x.mcap", "model=a.xml", "hand=xhand"], "model=a.xml: is not simulated beside hand="),
 ])  # fmt: skip
 def test_bad_replay_settings(argv, text):
     with pytest.raises(UserError, match=text):
