@@ -23,10 +23,11 @@ from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.recording import led_object, mechanism, read
 from dexsim.recording.compare import compare
-from dexsim.tasks import make_env
+from dexsim.tasks import grasp_eval, make_env
 from dexsim.tasks.env import UNIT_SPAN
 from dexsim.tasks.make_grasps import generate
 from dexsim.tasks.simulated_hand import SimulatedXHand
+from dexsim.view import plots
 from tests.made_hand import made_hand
 
 FEW = ("device=cpu", "worlds=4", "sim.threads=1")
@@ -55,6 +56,22 @@ def hands(tmp_path_factory):
     for folder in folders.values():
         poses.save(folder / "held_cubes.npz")
     return folders
+
+
+@pytest.fixture(autouse=True)
+def no_curves(monkeypatch):
+    """Curves of each term take seconds, and know nothing of the hand."""
+    monkeypatch.setattr(plots, "curves", lambda columns, path, title: path)
+
+
+@pytest.fixture
+def moment(monkeypatch, tmp_path):
+    """Settings of a grasp's evaluation that is over in 1.5 s of simulation instead of 10.5 s."""
+    monkeypatch.setattr(grasp_eval, "SETTLE", 0.5)
+    monkeypatch.setattr(grasp_eval, "HOLD", 0.8)
+    path = tmp_path / "moment.csv"
+    path.write_text("t,x,y,z\n" + "".join(f"{0.05 * k:.2f},0,0,0\n" for k in range(5)))
+    return [f"task.evaluation.base={path}"]
 
 
 @pytest.mark.parametrize("pads", [True, False])
@@ -129,12 +146,12 @@ def test_held_poses_are_looked_for_where_there_are_none(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("task, pads", [("rotate", True), ("grasp", False)])
-def test_the_whole_chain(hands, tmp_path, task, pads, capsys):
+def test_the_whole_chain(hands, moment, tmp_path, task, pads, capsys):
     """Trained, played, exported, checked, and run in real time's loop on the simulated hand."""
     out = tmp_path / "run"
     assert train([f"task={task}", f"hand={hands[pads]}", *FEW, "iterations=2", "final_episodes=0", f"out={out}"]) == 0
     policy = out / "policy.pt"
-    evaluation = ["task.evaluation.cap_s=0.5"] if task == "rotate" else []
+    evaluation = ["task.evaluation.cap_s=0.5"] if task == "rotate" else moment
     played = ["episodes=2", "worlds=2", "device=cpu", "video=false", f"out={tmp_path}/played", *evaluation]
     assert play([f"checkpoint={policy}", *played]) == 0
     if task == "grasp":  # its hand carried along, as well as turned
@@ -165,13 +182,13 @@ def test_a_hand_that_a_policy_was_not_trained_for_is_refused(hands, tmp_path):
         play([f"checkpoint={out}/policy.pt", "hand=xhand", "episodes=1", "device=cpu", "video=false"])
 
 
-def test_a_play_of_another_hand_is_replayed_with_its_object(hands, tmp_path):
+def test_a_play_of_another_hand_is_replayed_with_its_object(hands, moment, tmp_path):
     """Recorded in the task, replayed by the commands alone: the object is led, and each fingertip's force is there."""
     out, folder = tmp_path / "run", hands[True]
     train(["task=grasp", f"hand={folder}", *FEW, "iterations=1", "final_episodes=0", f"out={out}"])
     record = tmp_path / "play.mcap"
     assert play([f"checkpoint={out}/policy.pt", "episodes=2", "worlds=2", "device=cpu", "video=false",
-                 f"record={record}", f"out={tmp_path}/played"]) == 0  # fmt: skip
+                 f"record={record}", f"out={tmp_path}/played", *moment]) == 0  # fmt: skip
     r = read(record)
     m = mechanism.for_recording(r, folder)
     assert led_object.add_object(m, r) == "led" and m.hand.name == "made"

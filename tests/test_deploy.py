@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from types import SimpleNamespace
 
@@ -403,35 +404,24 @@ def test_a_slow_disk_costs_samples_not_time(tmp_path, monkeypatch):
     rec.close()
 
 
-KILLED = """
-import sys, time, numpy as np
-sys.path.insert(0, {tests!r})
-from test_deploy import FakeHand, recorder_at
-from dexsim.deploy.driver import Clock
-rec = recorder_at({path!r})
-rec.zero = time.monotonic()
-print("begun", flush=True)
-for k in range(2000):
-    rec.put("state", time.monotonic(), np.full(12, k * 1e-3), None, np.zeros(12), time.monotonic())
-    rec.put("command", time.monotonic(), np.zeros(12))
-    time.sleep(0.005)
-"""
+def record_for_ever(path):
+    rec = recorder_at(path)
+    rec.zero = time.monotonic()
+    for k in range(100_000):
+        rec.put("state", time.monotonic(), np.full(12, k * 1e-3), None, np.zeros(12), time.monotonic())
+        rec.put("command", time.monotonic(), np.zeros(12))
+        time.sleep(0.005)
 
 
 def test_a_killed_loop_leaves_its_finished_chunks(tmp_path):
-    import os
-    import signal
-    import subprocess
-    import sys
-    from pathlib import Path
-
     path = tmp_path / "killed.mcap"
-    code = KILLED.format(tests=str(Path(__file__).parent), path=str(path))
-    p = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert p.stdout.readline().strip() == b"begun"
+    p = multiprocessing.get_context("fork").Process(target=record_for_ever, args=(path,))
+    p.start()
+    while not path.exists():
+        time.sleep(0.01)
     time.sleep(2.5)
-    os.kill(p.pid, signal.SIGKILL)
-    p.wait()
+    p.kill()
+    p.join()
     r = read(path, audit=False)
     assert r.duration > 1.2, "all but the last half second or so"
     q = r.states.position.value[:, 0]

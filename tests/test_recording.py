@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import signal as signals
+import multiprocessing
 import struct
-import subprocess
-import sys
-import textwrap
 import time
 
 import numpy as np
@@ -648,21 +644,25 @@ def test_the_first_chunk_lost_still_names_the_channels(chunked, tmp_path):
 
 
 def test_a_killed_writer_leaves_its_finished_chunks(tmp_path):
-    code = textwrap.dedent(f"""
-        import time, numpy as np
-        from dexsim.recording import Writer
-        w = Writer({str(tmp_path / "k.mcap")!r}, ("a",))
+    fork = multiprocessing.get_context("fork")
+    now = fork.Event()
+
+    def write_for_ever():
+        w = Writer(tmp_path / "k.mcap", ("a",))
         for i in range(100000):
             w.add_state(0.01 * i, np.array([0.01 * i]))
             w.add_command(0.01 * i, np.array([0.01 * i]))
-            if i == 1250: print("now", flush=True)
-            if i > 1250: time.sleep(0.01)
-        """)
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"now\n"
+            if i == 1250:
+                now.set()
+            if i > 1250:
+                time.sleep(0.01)
+
+    process = fork.Process(target=write_for_ever)
+    process.start()
+    assert now.wait(60)
     time.sleep(0.05)
-    os.kill(process.pid, signals.SIGKILL)
-    process.wait()
+    process.kill()
+    process.join()
     r = read(tmp_path / "k.mcap")
     assert 1150 <= len(r.states.position) <= 1400 and r.states.position.t[-1] >= 11.5
     assert "damage" in kinds(r, "error")
