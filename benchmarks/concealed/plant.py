@@ -201,9 +201,12 @@ def dynamics(
         I = (R @ rig.spread[:, d] @ np.swapaxes(R, -1, -2)) * mass[:, :, d, None, None]  # noqa: E741
         if radius is not None:
             I = I + (0.4 * extra[:, :, d] * radius[:, :, d] ** 2)[..., None, None] * np.eye(3)  # noqa: E741
-        force = m[..., None] * (acc + _cross(a, arm) + _cross(w, _cross(w, arm)) - gravity[:, None])
-        Iw = np.einsum("bcij,bcj->bci", I, w)
-        moment = np.einsum("bcij,bcj->bci", I, a) + _cross(w, Iw)
+        pulled = _cross(w, _cross(w, arm))
+        moment = _cross(w, np.einsum("bcij,bcj->bci", I, w))
+        if d:  # the first hinge's own turning is all that moves the first link
+            pulled = acc + _cross(a, arm) + pulled
+            moment = np.einsum("bcij,bcj->bci", I, a) + moment
+        force = m[..., None] * (pulled - gravity[:, None])
         J = [_cross(z[i], here - at[i]) for i in range(d + 1)]
         Iz = [np.einsum("bcij,bcj->bci", I, z[i]) for i in range(d + 1)]
         for i in range(d + 1):
@@ -271,6 +274,7 @@ def simulate(
     spring = np.minimum(P["spring"], reduced / (16 * DT * DT))  # the mode stays slow beside the step
     loss = 0.6 * np.sqrt(spring * reduced) * P["impact"]
     half = 0.5 * P["play"]
+    flank = -half
     strongest = P["coulomb"] + P["peak"] + P["dwell"] + 1e-6
     sigma0 = np.clip(strongest / 4e-4, 5.0, 0.05 * P["rotor"] / (DT * DT))
     sigma1 = 0.5 * np.sqrt(sigma0 * P["rotor"])
@@ -341,11 +345,12 @@ def simulate(
         room = np.maximum(supply - np.abs(filtered) / P["no_load_speed"], 0.0)
         if has["corner"]:
             room = np.where(P["corner"] > 0.5, np.minimum(2 * room, 1.0), room)
-        duty, given = np.clip(raw, -1, 1), np.clip(raw, -P["torque_limit"] * room, P["torque_limit"] * room)
+        most = P["torque_limit"] * room
+        duty, given = np.minimum(np.maximum(raw, -1), 1), np.minimum(np.maximum(raw, -most), most)
         if has["knee"]:
             is_soft, knee = P["knee"] > 0, np.maximum(P["knee"], 1.0)
             duty = np.where(is_soft, soft_limit(raw, 1.0, knee), duty)
-            given = np.where(is_soft, soft_limit(raw, P["torque_limit"] * room, knee), given)
+            given = np.where(is_soft, soft_limit(raw, most, knee), given)
         asked = np.where(P["voltage"] > 0.5, P["torque_limit"] * (duty * supply - vm / P["no_load_speed"]), given)
         if has["lag_order"]:
             stage = stage + rate * (asked - stage)
@@ -385,7 +390,7 @@ def simulate(
                     pulls = np.where(lever, np.cos(drag), 1.0)
                     drag, drag_v = np.where(lever, np.sin(drag), drag), pulls * drag_v
                 twist, rate_of = twist + P["couple"] * drag, rate_of + P["couple"] * drag_v
-            deep = twist - np.clip(twist, -half, half)
+            deep = twist - np.minimum(np.maximum(twist, flank), half)
             elastic = spring * deep
             if has["hardening"]:
                 stiffer = (elastic / np.where(P["hardening"] > 0, P["hardening"], np.inf)) ** 2
@@ -414,7 +419,7 @@ def simulate(
             z = z_next
             if some_ideal:
                 held = P["rotor"] * vm / DT + drive - push
-                friction = np.where(ideal, np.clip(held, -level, level), friction)
+                friction = np.where(ideal, np.minimum(np.maximum(held, -level), level), friction)
             net = drive - push - friction
             if has["ripple"]:
                 angle = P["per_turn"] * motor + P["phase"]

@@ -17,7 +17,9 @@ def lines(half: Half, path: Path, title: str) -> Path:
     """Force over effort of every joint: loading, unloading, the line and the paper's line through zero."""
     across = min(4, len(half.joints))
     down = -(-len(half.joints) // across)
-    figure = Figure(figsize=(3.5 * across, 3 * down), layout="constrained")
+    width, height = 3.5 * across, 3.0 * down  # inches; margins by hand: a layout engine doubles the time
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.12 / width, 1 - 0.65 / height, wspace=0.28, hspace=0.36)
     axes = figure.subplots(down, across, squeeze=False).flat
     for ax in axes[len(half.joints) :]:
         ax.set_visible(False)
@@ -51,7 +53,7 @@ def lines(half: Half, path: Path, title: str) -> Path:
         ax.set_xlabel(half.unit, fontsize=8)
         ax.set_ylabel("N", fontsize=8)
         ax.grid(alpha=0.25)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10, y=1 - 0.12 / height, va="top")
     files.picture(figure, path, dpi=110)
     return path
 

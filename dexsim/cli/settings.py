@@ -7,7 +7,9 @@ a config from the files and on one out of a checkpoint, and because a wrong name
 
 from __future__ import annotations
 
+import copy
 import difflib
+import functools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,7 +82,16 @@ def _option(item: Override, options: list[str]) -> str:
 def from_files(config_dir: Path, choices: dict[str, str]) -> DictConfig:
     """Compose ``dexsim/configs/config.yaml`` with these group choices; ``choices`` in the result records all of
     them."""
-    overrides = [f"{group}={option}" for group, option in choices.items()]
+    found = [(str(f), f.stat()) for f in sorted(config_dir.rglob("*.yaml")) if f.is_file()]
+    stamps = tuple((name, s.st_mtime_ns, s.st_size) for name, s in found)
+    return copy.deepcopy(_composed(config_dir, tuple(choices.items()), stamps))
+
+
+@functools.lru_cache(maxsize=16)
+def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tuple) -> DictConfig:
+    """What files of these stamps give: reading them takes some tenths of a second, and who trains or plays several
+    times in one process chooses the same again."""
+    overrides = [f"{group}={option}" for group, option in choices]
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(config_dir.resolve())):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,8 +18,8 @@ _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little endian; alignment counts fro
 class Cdr:
     """A message being written: fields in order, each aligned to its size."""
 
-    def __init__(self) -> None:
-        self._b = bytearray(_ENCAPSULATION)
+    def __init__(self, begun: bytes = _ENCAPSULATION) -> None:
+        self._b = bytearray(begun)
 
     def _align(self, size: int) -> None:
         self._b += b"\0" * (-(len(self._b) - 4) % size)
@@ -58,9 +59,22 @@ class Cdr:
         self.pack("I", stamp_ns % 1_000_000_000)
         self.string(frame)
 
+    def stamp(self, stamp_ns: int) -> None:
+        """Another time in the header of a message that begins with one."""
+        struct.pack_into("<iI", self._b, len(_ENCAPSULATION), *divmod(stamp_ns, 1_000_000_000))
+
     def bytes(self) -> bytes:
         """The message."""
         return bytes(self._b)
+
+
+@lru_cache(maxsize=16)
+def _named(names: tuple[str, ...]) -> bytes:
+    """Header and names of a joint state: of the thousands in a recording they differ in the stamp alone."""
+    c = Cdr()
+    c.header(0)
+    c.strings(names)
+    return c.bytes()
 
 
 def joint_state(
@@ -71,9 +85,8 @@ def joint_state(
     effort: np.ndarray | None = None,
 ) -> bytes:
     """sensor_msgs/JointState: names [J] and up to three arrays [J] (None: left empty)."""
-    c = Cdr()
-    c.header(stamp_ns)
-    c.strings(names)
+    c = Cdr(_named(tuple(names)))
+    c.stamp(stamp_ns)
     for values in (position, velocity, effort):
         c.sequence(values, "<f8")
     return c.bytes()

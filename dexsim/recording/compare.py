@@ -155,7 +155,9 @@ def _panels(path: Path, title: str, names: tuple[str, ...], t: np.ndarray, lines
 def _grid(count: int) -> tuple[Figure, list]:
     across = min(3, count)
     down = -(-count // across)
-    figure = Figure(figsize=(4.6 * across, 2.3 * down + 0.6), layout="constrained")
+    width, height = 4.6 * across, 2.3 * down + 0.6  # inches; margins by hand: a layout engine doubles the time
+    figure = Figure(figsize=(width, height))
+    figure.subplots_adjust(0.5 / width, 0.5 / height, 1 - 0.12 / width, 1 - 0.6 / height, wspace=0.16, hspace=0.3)
     return figure, list(figure.subplots(down, across, squeeze=False).flat)
 
 
@@ -168,5 +170,5 @@ def _finish(figure: Figure, axes: list, count: int, title: str, path: Path) -> N
     for ax in axes[max(0, count - 3) : count]:
         ax.set_xlabel("time [s]", fontsize=8)
     axes[0].legend(fontsize=7)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10, y=1 - 0.1 / figure.get_figheight(), va="top")
     files.picture(figure, path, dpi=110)
