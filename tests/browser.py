@@ -12,6 +12,7 @@ import urllib.request
 from pathlib import Path
 
 CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
+SCALE = 0.5  # pixels of a screenshot over those of the page
 
 
 class Page:
@@ -51,8 +52,9 @@ class Page:
         self._count = 0
         self.log: list[str] = []
         self.call("Runtime.enable")
+        # half of the pixels each way: WebGL is drawn by the processor
         self.call(
-            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=SCALE, mobile=False
         )
         self.call("Page.navigate", url=url)
 

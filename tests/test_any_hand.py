@@ -59,9 +59,10 @@ def hands(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def no_curves(monkeypatch):
-    """Curves of each term take seconds, and know nothing of the hand."""
+def no_pictures(monkeypatch):
+    """Curves of each term and of an evaluation take seconds, and know nothing of the hand."""
     monkeypatch.setattr(plots, "curves", lambda columns, path, title: path)
+    monkeypatch.setattr(plots, "draw", lambda functions, folder: [])
 
 
 @pytest.fixture

@@ -91,7 +91,7 @@ def plant_run(
     return rough
 
 
-def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds=(0, 1, 3), seconds: float = 6.0):
+def search(changes: dict[str, float], off: dict[str, float] | None = None, kinds=(0, 1, 3), seconds: float = 4.0):
     """The search's outcome on runs of our own plant, its nominal a few percent off."""
     off = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96} if off is None else off
     runs = [plant_run(f"run{k}", k, seconds, off | changes, seed=k) for k in kinds]

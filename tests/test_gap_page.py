@@ -68,7 +68,15 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     out = {}
     paths, model, servo, _ = demo.make(folder / "joint", "command_delay", seconds=4.0, joint="knuckle")
-    out["joint"] = Settings(paths, folder / "joint_out", None, str(model), str(servo), next_recording=False)
+    out["joint"] = Settings(
+        paths,
+        folder / "joint_out",
+        None,
+        str(model),
+        str(servo),
+        next_recording=False,
+        allowed={"command_delay", "lag", "coulomb_friction"},  # others are more rows of the same tables
+    )
     paths, model, servo = press_rig.record(folder / "touch", 2, 5.0, gains={54: 0.4, 66: 0.0})
     out["touch"] = Settings(paths, folder / "touch_out", None, str(model), str(servo), next_recording=False)
     from dexsim.recording import read, write

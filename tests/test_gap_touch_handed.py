@@ -32,9 +32,10 @@ def handed(findings, facts):
     return handed_on.handed(findings, facts, xhand.FINGERS)
 
 
-def diagnosed(folder, **planted):
+def diagnosed(folder, allowed=None, **planted):
     paths, model, servo = press_rig.record(folder / "rig", 3, 7.0, seed=5, **planted)
-    d = diagnose(Settings(paths, folder / "out", [], str(model), str(servo), next_recording=False), say=lambda _: None)
+    settings = Settings(paths, folder / "out", [], str(model), str(servo), next_recording=False, allowed=allowed)
+    d = diagnose(settings, say=lambda _: None)
     save(d, folder / "out")
     return d, folder / "out" / "tactile.yaml"
 
@@ -42,7 +43,8 @@ def diagnosed(folder, **planted):
 @pytest.fixture(scope="module")
 def late(tmp_path_factory):
     """The diagnosis of an index finger whose touch is late, and its tactile.yaml."""
-    return diagnosed(tmp_path_factory.mktemp("late"), sensor={"delay": 0.06})
+    few = {"tactile_delay", "tactile_hysteresis", "contact_stiffness"}
+    return diagnosed(tmp_path_factory.mktemp("late"), few, sensor={"delay": 0.06})
 
 
 def within(drawn: torch.Tensor, p: dict) -> bool:

@@ -462,7 +462,7 @@ def test_pushes_have_no_favoured_direction_and_the_stated_size(env):
     forces, length = [], torch.zeros(N)
     weight = env.objects.mass * 9.81
     lengths = []
-    for _ in range(6000):
+    for _ in range(3000):
         env.before_physics()
         f = env.engine.t.xfrc_applied[:, env.objects.body].clone()
         assert not f[:, 3:].any()

@@ -23,7 +23,7 @@ from dexsim.console.stop import Stop
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 
-STARTS = 24
+STARTS = 12
 QUICK = (
     "task=dummy",
     "device=cpu",
