@@ -170,12 +170,13 @@ def test_servo_file_goes_into_the_config(configs, place):
 
 @pytest.mark.parametrize("name", ["train", "play"])
 def test_help_names_settings_and_groups_and_is_quick(name):
-    start = time.perf_counter()
+    before = os.times()
     done = subprocess.run([sys.executable, f"{name}.py", "--help"], cwd=shell.ROOT, capture_output=True, text=True)
+    after = os.times()
     assert done.returncode == 0 and done.stderr == ""
     assert "device=null" in done.stdout and "agent=" in done.stdout and "worlds" in done.stdout
     assert ("checkpoint=" if name == "play" else "resume=") in done.stdout
-    assert time.perf_counter() - start < 20
+    assert after.children_user + after.children_system - before.children_user - before.children_system < 10  # CPU
 
 
 def test_cfg_prints_the_settings_and_does_nothing(configs, place, capfd):
