@@ -42,6 +42,7 @@ from dexsim.tasks.nan_dump import NanDump
 from dexsim.tasks.objects import Objects
 from dexsim.tasks.randomize import Sampler
 from dexsim.tasks.reality import Reality, present
+from dexsim.tasks.structs import filled
 
 MOST_NAN = 0.2
 """Share of world-steps that may be not finite between two calls of `HandEnv.check`."""
@@ -508,23 +509,23 @@ class HandEnv(VecEnv):
     def _kernels(self) -> None:
         """What `read_state` and `_clear_touch` launch."""
         e, state = self.engine, self.engine.wp
-        places = [wp.from_torch(x.to(torch.int32)) for x in (self.joint_q, self.joint_v, self.tip_body)]
-        joint_q, joint_v, tip_body = places
         self._read = state_kernels.read_kernel(e.real)
         self._read_dim = self.num_envs, self.num_actions + state_kernels.OBJECT_NUMBERS + self.fingers + 1
-        out = [self.nan, self.q, self.qd, self.torque, self.object_pose, self.object_velocity, self.tip_force]
-        out += [self.finger_force, self.self_force, self.palm_force]
+        object_q, object_v = self._object_at
+        at = filled(
+            state_kernels.Places, joint_q=self.joint_q, joint_v=self.joint_v, object_q=object_q, object_v=object_v,
+            tip_body=self.tip_body, tip_offset=self.tip_offset,
+        )  # fmt: skip
+        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in state_kernels.Seen.vars})
         self._read_args = [
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
-            state.xmat, joint_q, joint_v, *self._object_at, tip_body,
-            wp.from_torch(self.tip_offset, dtype=wp.vec3), *map(wp.from_torch, out),
-            wp.from_torch(self.tips, dtype=wp.vec3),
+            state.xmat, at, seen,
         ]  # fmt: skip
         own = (self.q, self.q_low, self.q_high, self.q_mid, self.q_half, self.action, self.last_action, self.target)
         self._act_args = [wp.from_torch(x) for x in own]
         touch = self.touch
         self._touch_args = [
-            tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
+            at.tip_body, wp.from_torch(self.pad_centre, dtype=wp.vec3),
             *map(wp.from_torch, (touch.force, touch.force_clean, touch.force_other)),
             *(wp.from_torch(x, dtype=wp.vec3) for x in (touch.centre, touch.centre_clean)),
         ]  # fmt: skip

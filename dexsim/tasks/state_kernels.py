@@ -12,6 +12,35 @@ OBJECT_NUMBERS = 13
 """Of a free body: position, quaternion, linear and angular velocity."""
 
 
+@wp.struct
+class Places:
+    """Where in the engine's arrays an environment's joints, object and fingertips are."""
+
+    joint_q: wp.array(dtype=int)  # [J] address in qpos
+    joint_v: wp.array(dtype=int)  # [J] in qvel
+    object_q: int  # first address in qpos
+    object_v: int
+    tip_body: wp.array(dtype=int)  # [F]
+    tip_offset: wp.array(dtype=wp.vec3)  # [F] m, of the tip in its body
+
+
+@wp.struct
+class Seen:
+    """What an environment knows of its engine's state, as float32."""
+
+    nan: wp.array(dtype=wp.bool)  # [N]
+    q: wp.array2d(dtype=float)  # [N, J] rad
+    qd: wp.array2d(dtype=float)
+    torque: wp.array2d(dtype=float)  # N.m, of the motors
+    object_pose: wp.array2d(dtype=float)  # [N, 7]
+    object_velocity: wp.array2d(dtype=float)  # [N, 6]
+    tip_force: wp.array2d(dtype=float)  # [N, F] N
+    finger_force: wp.array2d(dtype=float)
+    self_force: wp.array2d(dtype=float)
+    palm_force: wp.array(dtype=float)  # [N]
+    tips: wp.array2d(dtype=wp.vec3)  # [N, F] m
+
+
 @cache
 def read_kernel(real):
     """Joints, object, contact forces and fingertips of N worlds as float32; of a world that is not finite, zeros."""
@@ -25,51 +54,35 @@ def read_kernel(real):
         pair_normal: wp.array2d(dtype=float),
         xpos: wp.array2d(dtype=wp.vec3),
         xmat: wp.array2d(dtype=wp.mat33),
-        joint_q: wp.array(dtype=int),
-        joint_v: wp.array(dtype=int),
-        object_q: int,  # its first address in qpos
-        object_v: int,
-        tip_body: wp.array(dtype=int),
-        tip_offset: wp.array(dtype=wp.vec3),
-        # out
-        nan: wp.array(dtype=wp.bool),
-        q: wp.array2d(dtype=float),
-        qd: wp.array2d(dtype=float),
-        torque: wp.array2d(dtype=float),
-        object_pose: wp.array2d(dtype=float),
-        object_velocity: wp.array2d(dtype=float),
-        tip_force: wp.array2d(dtype=float),
-        finger_force: wp.array2d(dtype=float),
-        self_force: wp.array2d(dtype=float),
-        palm_force: wp.array(dtype=float),
-        tips: wp.array2d(dtype=wp.vec3),
+        at: Places,
+        out: Seen,
     ):
         w, k = wp.tid()
         bad = (flags[w] & wp.static(FLAG_NAN)) != 0
-        joints = joint_q.shape[0]
+        joints = at.joint_q.shape[0]
         if k < joints:  # a joint
-            q[w, k] = wp.where(bad, float(0.0), float(qpos[w, joint_q[k]]))
-            qd[w, k] = wp.where(bad, float(0.0), float(qvel[w, joint_v[k]]))
-            torque[w, k] = wp.where(bad, float(0.0), float(motor[w, k]))
+            out.q[w, k] = wp.where(bad, float(0.0), float(qpos[w, at.joint_q[k]]))
+            out.qd[w, k] = wp.where(bad, float(0.0), float(qvel[w, at.joint_v[k]]))
+            out.torque[w, k] = wp.where(bad, float(0.0), float(motor[w, k]))
             return
         i = k - joints
         if i < 7:  # a number of the object
-            object_pose[w, i] = wp.where(bad, float(0.0), float(qpos[w, object_q + i]))
+            out.object_pose[w, i] = wp.where(bad, float(0.0), float(qpos[w, at.object_q + i]))
             return
         if i < wp.static(OBJECT_NUMBERS):
-            object_velocity[w, i - 7] = wp.where(bad, float(0.0), float(qvel[w, object_v + i - 7]))
+            out.object_velocity[w, i - 7] = wp.where(bad, float(0.0), float(qvel[w, at.object_v + i - 7]))
             return
         f = i - wp.static(OBJECT_NUMBERS)
-        fingers = tip_body.shape[0]
+        fingers = at.tip_body.shape[0]
         if f < fingers:
-            tip_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, f])
-            finger_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, fingers + f])
-            self_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers + 1 + f])
-            b = tip_body[f]
-            tips[w, f] = wp.where(bad, wp.vec3(0.0, 0.0, 0.0), xpos[w, b] + xmat[w, b] * tip_offset[f])
+            out.tip_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, f])
+            out.finger_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, fingers + f])
+            out.self_force[w, f] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers + 1 + f])
+            b = at.tip_body[f]
+            out.tips[w, f] = wp.where(bad, wp.vec3(0.0, 0.0, 0.0), xpos[w, b] + xmat[w, b] * at.tip_offset[f])
             return
-        palm_force[w] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers])
-        nan[w] = bad
+        out.palm_force[w] = wp.where(bad, float(0.0), pair_normal[w, 2 * fingers])
+        out.nan[w] = bad
 
     return read
 
