@@ -363,8 +363,8 @@ MORE = [
 ]
 
 
-def check_planted(effect, changes, key, value):
-    outcome = search(changes)
+def check_planted(effect, changes, key, value, seconds=4.0):
+    outcome = search(changes, seconds=seconds)
     assert outcome.best.members, f"{effect}: nothing found; scan {outcome.scanned[:4]}"
     first = outcome.best.members[0]
     rivals = [e for e, share in outcome.rivals[first.id] if share > 0.1 and confusable(e, first.id)]
@@ -383,13 +383,13 @@ def check_planted(effect, changes, key, value):
     [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
 )
 def test_planted_effect_is_named_and_sized(effect, changes, key, value):
-    check_planted(effect, changes, key, value)
+    check_planted(effect, changes, key, value, 6.0 if effect == "deadband" else 4.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("effect", "changes", "key", "value"), MORE, ids=[p[0] for p in MORE])
 def test_more_planted_effects(effect, changes, key, value):
-    check_planted(effect, changes, key, value)
+    check_planted(effect, changes, key, value, 6.0)
 
 
 def test_nothing_planted_nothing_found():
