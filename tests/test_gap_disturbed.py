@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rig")
-    paths, model, servo, _ = demo.make(folder, "command_delay", seconds=4.0)
+    paths, model, servo, _ = demo.make(folder, "command_delay")
     return [read(p, joints=["joint"], audit=False) for p in paths], model, servo, {}
 
 
@@ -31,7 +31,7 @@ def named(rig, folder, change, which):
         else:
             write(paths[-1], copy)
     d = diagnose(Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False, replay="none",
-                          allowed={"command_delay", "lag"}), say=lambda _: None)
+                          allowed={"command_delay", "viscous_friction", "coulomb_friction", "lag"}), say=lambda _: None)
     return [f for f in d.data["findings"] if f["effect"] != "bad_channel"][0], d
 
 
