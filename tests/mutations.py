@@ -128,15 +128,15 @@ MUTATIONS = (
     Mutation(
         "the grasp's actor is told the true force",
         GRASP,
-        "touch_force=self.touch.force[:, : self.pads],",
-        "touch_force=self.touch.force_clean[:, : self.pads],",
+        "touch_force=self.touch.force[:, : self.felt],",
+        "touch_force=self.touch.force_clean[:, : self.felt],",
         "tests/test_grasp.py::test_the_actor_feels_what_the_sensor_measured",
     ),
     Mutation(
         "the grasp's actor is told the true centres",
         GRASP,
-        "touch_centre=self.touch.centre[:, : self.pads],",
-        "touch_centre=self.touch.centre_clean[:, : self.pads],",
+        "touch_centre=self.touch.centre[:, : self.felt],",
+        "touch_centre=self.touch.centre_clean[:, : self.felt],",
         "tests/test_grasp.py::test_the_actor_feels_what_the_sensor_measured",
     ),
     Mutation(

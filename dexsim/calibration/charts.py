@@ -19,7 +19,7 @@ def lines(half: Half, path: Path, title: str) -> Path:
     down = -(-len(half.joints) // across)
     width, height = 3.5 * across, 3.0 * down  # inches; margins by hand: a layout engine doubles the time
     figure = Figure(figsize=(width, height))
-    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.12 / width, 1 - 0.65 / height, wspace=0.28, hspace=0.36)
+    figure.subplots_adjust(0.65 / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.65 / height, wspace=0.28, hspace=0.36)
     axes = figure.subplots(down, across, squeeze=False).flat
     for ax in axes[len(half.joints) :]:
         ax.set_visible(False)
