@@ -176,8 +176,9 @@ def grown(
             v = edge[h] >> 8
             face[faces] = u | (v << 8) | (points << 16)
             at[faces] = plane(pos[u], pos[v], w)
-            if at[faces][3] < level - SURE:
-                lost = int(1)  # inside out: what grows comes nowhere nearer to the origin
+            # Inside out: what grows comes nowhere nearer to the origin, unless that lies just outside, of cores that touch.
+            if at[faces][3] < wp.where(level > OVERLAP, level - SURE, -2.0 * OVERLAP):
+                lost = int(1)
             faces += 1
         points += 1
     if done == 0 or lost == 1:
