@@ -413,7 +413,7 @@ def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:
         for p in params
         for c in [INDEX[p.columns[0]]]
     ]
-    r = Residuals(noise, knee=5.0)
+    r = Residuals(noise, huber=5.0)
     fitter, all_four = Fitter(plant, plant.windows(None, [0, 1, 2]), r), plant.windows(None)
     fitter.q = q[fitter.w.sample_row]
     best = min(

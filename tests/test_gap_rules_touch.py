@@ -57,9 +57,9 @@ def test_taxels_that_agree_speak_for_the_rest():
 
 def test_a_pad_must_be_touched_for_a_while():
     for seconds, judged_ in ((2.9, False), (3.1, True)):
-        touch = Touch([], None, set())
+        touch = Touch([], SimpleNamespace(sensors=SimpleNamespace(names=["a", "b"])), set())
         t = np.arange(0.0, seconds, 0.01)
-        touch.pads = [Pad(1, [SimpleNamespace(recording="a", t=t, z=np.ones((len(t), 4)))])]
+        touch.pads = [Pad(1, [SimpleNamespace(recording="a", name="index", t=t, z=np.ones((len(t), 4)))])]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("dexsim.gap.touch.diagnosis.PadSearch", lambda *_: "search")
             touch.model()

@@ -613,7 +613,7 @@ def test_play_prints_the_papers_columns_of_the_grasp():
         "moved": np.zeros(n),
         "untouched": np.zeros(n),
     }
-    stage = SimpleNamespace(f_max=2.0, hand=load_hand(), task={})
+    stage = SimpleNamespace(f_max=2.0, hand=load_hand(), task={}, thumb_range=None)
     metrics = grasp_eval._metrics(r, r, stage)
     (title, header, rows), (_, _, intervals) = grasp_eval._papers_columns(metrics)
     assert "paper's columns" in title and header[0] == "contact forces N" and len(rows) == 1

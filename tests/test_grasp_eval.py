@@ -30,7 +30,8 @@ class Stage:
         self.objects = SimpleNamespace(mass=MASS, friction=torch.ones(N), variant=torch.zeros(N, dtype=torch.long))
         self.hand, self.unit, self.task = load_hand(), 1.0, {}
         self.opposing, self.others = torch.tensor([0]), torch.tensor([1, 2, 3, 4])
-        self.fixed_command, self.outside_force, self.f_max = None, torch.zeros(N, 3), 8.0
+        self.fixed_command, self.outside_force, self.f_max, self.thumb_range = None, torch.zeros(N, 3), 8.0, None
+        self.thumb_command = self.fixed_thumb = torch.zeros(N)
         self.fields = {"opt.gravity": torch.zeros(N, 3)}
         self.engine = SimpleNamespace(field=self.fields.__getitem__)
         self.away, self.object_pose = away, torch.zeros(N, 7)

@@ -202,7 +202,8 @@ def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, 
     rng, draw = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     pads = Pads(hand_of(cfg), rng)
     first = candidates(worlds, sizes, pads, rng)
-    cfg = {**cfg, "task": {**cfg["task"], "perception": "imu"}}  # nothing is observed: physics and drives alone
+    # physics and drives alone: nothing is observed, and nothing paid (the fingertip task has a reward more)
+    cfg = {**cfg, "task": {**cfg["task"], "perception": "imu", "rewards": {}}}
     env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=first[0])
     found: list[GraspSet] = []
     total = tried = 0
