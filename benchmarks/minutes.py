@@ -80,7 +80,9 @@ def shown(name: str, metrics: dict[str, Any]) -> str:
         value, interval = value["average"], value["average_interval"]
     if value is None:
         return "none"
-    return f"{value:.4g}" + (f" ({interval[0]:.4g} to {interval[1]:.4g})" if interval else "")
+    if interval is None or None in interval:  # of few trials
+        return f"{value:.4g}"
+    return f"{value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})"
 
 
 def main(argv: list[str]) -> dict[str, Any]:

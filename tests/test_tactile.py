@@ -22,6 +22,7 @@ from dexsim.tactile import reference as ref
 from dexsim.tactile.lanes import lane_ballot, lane_from, lanes_min, lanes_sum, lanes_sum4, lowest_bit
 from dexsim.tactile.pressing import presses, skin_of
 from dexsim.tactile.sdf import Shapes, distance, normal
+from dexsim.tactile.sensors import Sensors
 from dexsim.tactile.shapes import TouchShape, bake_convex
 
 SIZES = {"box": (0.03, 0.024, 0.02), "sphere": (0.03, 0, 0), "capsule": (0.019, 0.011, 0), "cylinder": (0.02, 0.03, 0)}
@@ -487,7 +488,7 @@ def test_spring_sum_agrees_with_the_contact_law_in_the_median():
     path = CONFIGS / "tactile" / "default.yaml"
     cfg = tactile_config(yaml.safe_load(path.read_text()))
     for pad in (0, 1):
-        pressed = press_library(hand().lifted(tips()), pad, tips()[pad], 20, seed=3)
+        pressed = press_library(Sensors(load_hand()), pad, 20, seed=3)
         k = cfg.stiffness["hertz"][hand().kinds[pad]]
         for depth in (0.7e-3, 1.0e-3):
             at = [p for p in pressed if p.depth == depth]
