@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import tools
-from benchmarks.touch_matters import analysis, rows
+from benchmarks.touch_matters import analysis, rows, unpaired
 from benchmarks.touch_matters.__main__ import chosen, common
 from benchmarks.touch_matters.judge import columns, metrics_of
 from dexsim.errors import UserError
@@ -90,9 +90,51 @@ def judged(folder, row, seed, world, successes):
     folder.mkdir(parents=True, exist_ok=True)
     trial = [[n, 60.0, "capped", "up", 0.05, 0.1, 0.8] for n in successes]
     metrics = {"trials": trial, "ends": {"dropped": 0, "leaned": 0, "nan": 0, "capped": len(trial)},
-               "seconds_to_fall": 60.0, "touched_by_others": 0.01}  # fmt: skip
+               "seconds_to_fall": 60.0, "touched_by_others": 0.01,
+               "seconds_per_success": 60.0 / float(np.mean(successes))}  # fmt: skip
     data = {"row": row, "seed": seed, "world": world, "steps": 10, "iteration": 1, "metrics": metrics}
     (folder / f"{world}.json").write_text(json.dumps(data))
+
+
+def test_trainings_of_several_folders_are_one_set_without_pairs(tmp_path):
+    for folder, seed, n in (("a", 11, 30), ("a", 12, 34), ("b", 11, 32)):
+        judged(tmp_path / folder, "full", seed, "training", [n] * 4)
+    for folder, seed, n in (("a", 11, 4), ("b", 12, 8)):
+        judged(tmp_path / folder, "no_pose", seed, "training", [n] * 4)
+    found = unpaired.gathered([tmp_path / "a", tmp_path / "b"], "training")
+    assert sorted(found["full"]["successes"]) == [30, 32, 34] and sorted(found["no_pose"]["seconds"]) == [7.5, 15]
+    text = unpaired.markdown(found, unpaired.claimed("no_pose:successes,no_pose:seconds"))
+    line = next(x for x in text.splitlines() if x.startswith("| no pose"))
+    # Welch's, by hand: errors 2/sqrt(3) and 2, 1.69 degrees of freedom, t = 5.18
+    more = 26 - 5.18 * np.sqrt(4 / 3 + 4), 26 + 5.18 * np.sqrt(4 / 3 + 4)
+    assert unpaired.welch(np.array([30.0, 34, 32]), np.array([4.0, 8]))["interval"] == pytest.approx(more, rel=0.01)
+    # times: geometric means 10.61 s and (60^3 / (30 * 34 * 32))^(1/3) s
+    assert "| 10.61 | 5.65 (" in line and "no_pose:successes` p =" in text and "no_pose:seconds` p =" in text
+
+
+def test_trainings_of_other_steps_are_not_compared(tmp_path):
+    judged(tmp_path, "full", 1, "training", [30] * 4)
+    judged(tmp_path, "no_pose", 1, "training", [3] * 4)
+    path = tmp_path / "no_pose" / "seed1" / "training.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"steps": 5_000_000}))
+    with pytest.raises(UserError, match="5.0 M in .*no_pose/seed1"):
+        unpaired.gathered([tmp_path], "training")
+    with pytest.raises(UserError, match="nothing judged there in world=wide"):
+        unpaired.gathered([tmp_path], "wide")
+    with pytest.raises(UserError, match="claims=no_pose:time: must be ROW:successes or ROW:seconds"):
+        unpaired.claimed("no_pose:time")
+
+
+def test_successes_a_doubling_of_the_taxels_are_a_line_through_all_trainings():
+    """Exact line: 2 successes a doubling from 5 taxels on, the same to either side of it."""
+    at = {k: 10 + 2 * np.log2(n / 5) for k, n in (("taxels_5", 5), ("taxels_25", 25), ("full", 600))}
+    found = unpaired.slope({k: np.array([v - 1, v + 1]) for k, v in at.items()})
+    assert found["slope"] == pytest.approx(2) and found["trainings"] == 6
+    # Student's, 4 degrees of freedom: residuals of 1 each
+    x = np.repeat(np.log2([5, 25, 600]), 2)
+    half = 2.776 * np.sqrt(6 / 4 / ((x - x.mean()) ** 2).sum())
+    assert found["interval"] == pytest.approx([2 - half, 2 + half], rel=1e-3)
+    assert unpaired.slope({"full": np.ones(5)}) is None and unpaired.slope({"bits": np.ones(5)}) is None
 
 
 def test_the_page_is_made_of_what_was_judged(tmp_path):

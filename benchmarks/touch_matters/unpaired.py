@@ -1,0 +1,129 @@
+"""Rows whose trainings are not paired: python -m benchmarks.touch_matters.unpaired out=FOLDER[,FOLDER,..]
+[world=training] [claims=no_pose:successes,no_pose:seconds].
+
+A seed does not repeat on a GPU, so trainings of the same seed share no more than others do. Of every row against the
+one with everything, over trainings and with Welch's 95 % interval: the difference in successes in a row, and the ratio
+of seconds a success (of logarithms: a row that takes six times as long varies six times as much); Holm's correction
+over `claims`, the ones fixed before. Rows that differ in the number of taxels alone also give a slope: successes over
+the binary logarithm of that number. Trainings of several folders count as one set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from benchmarks import tools
+from benchmarks.touch_matters import analysis, rows
+from dexsim.errors import UserError
+
+OWN = {"out": "out/touch_matters", "world": "training", "claims": "no_pose:successes,no_pose:seconds"}
+GRADED = ("taxels_5", "taxels_25", "taxels_120", rows.FULL.key)
+"""Rows that have nothing but the number of taxels between them."""
+
+
+def gathered(folders: list[Path], world: str) -> dict[str, dict[str, np.ndarray]]:
+    """Row -> successes and seconds: averages [S] of its S trainings. Raises UserError where nothing is judged, or not
+    all at the same steps."""
+    found: dict[str, dict[str, list[float]]] = {}
+    steps: dict[int, str] = {}
+    for folder in folders:
+        for (key, where), seeds in analysis.read(folder).items():
+            if where != world:
+                continue
+            for seed, data in seeds.items():
+                steps.setdefault(data["steps"], f"{folder}/{key}/seed{seed}")
+                row = found.setdefault(key, {"successes": [], "seconds": []})
+                row["successes"].append(float(analysis.trials(data).mean()))
+                row["seconds"].append(float(data["metrics"]["seconds_per_success"] or np.inf))
+    if not found:
+        raise UserError(f"out={','.join(map(str, folders))}: nothing judged there in world={world}")
+    if len(steps) > 1:
+        told = "; ".join(f"{n / 1e6:.1f} M in {where}" for n, where in sorted(steps.items()))
+        raise UserError(f"out: trainings of different steps cannot be compared: {told}. Judge all at one iteration")
+    return {key: {k: np.array(v) for k, v in row.items()} for key, row in found.items()}
+
+
+def welch(a: np.ndarray, b: np.ndarray) -> dict:
+    """Difference of the means of a [S] and b [T], each of at least two trainings, with Welch's 95 % interval and p."""
+    test = stats.ttest_ind(a, b, equal_var=False)
+    interval = test.confidence_interval()
+    return {"difference": float(a.mean() - b.mean()), "interval": [float(interval.low), float(interval.high)],
+            "p": float(test.pvalue)}  # fmt: skip
+
+
+def slope(by: dict[str, np.ndarray]) -> dict | None:
+    """Successes a doubling of the number of taxels, by least squares over all trainings of GRADED rows, with Student's
+    95 % interval; None with fewer than three trainings or one number of taxels."""
+    number = {r.key: r.sensors for r in rows.EVERY}
+    pairs = [(np.log2(number[k]), v) for k in GRADED if k in by for v in by[k]]
+    if len(pairs) < 3 or len({x for x, _ in pairs}) < 2:
+        return None
+    fit = stats.linregress(*zip(*pairs, strict=True))
+    half = stats.t.ppf(0.975, len(pairs) - 2) * fit.stderr
+    return {"slope": float(fit.slope), "interval": [float(fit.slope - half), float(fit.slope + half)],
+            "trainings": len(pairs)}  # fmt: skip
+
+
+def claimed(text: str) -> list[tuple[str, str]]:
+    """ROW:successes and ROW:seconds. Raises UserError."""
+    keys = [r.key for r in rows.EVERY]
+    pairs = []
+    for item in filter(None, text.split(",")):
+        key, _, what = item.partition(":")
+        if key not in keys or what not in ("successes", "seconds"):
+            raise UserError(f"claims={item}: must be ROW:successes or ROW:seconds, ROW of {', '.join(keys)}")
+        pairs.append((key, what))
+    return pairs
+
+
+def spoken(value: float, interval: Sequence[float] | None, form: str) -> str:
+    """'24.6 (20.5 to 28.7)'."""
+    return f"{value:{form}}" + ("" if interval is None else f" ({interval[0]:{form}} to {interval[1]:{form}})")
+
+
+def markdown(found: dict[str, dict[str, np.ndarray]], claims: list[tuple[str, str]]) -> str:
+    """Table of the rows, Holm's correction and the slope."""
+    lines = ["| row | trainings | successes in a row (95 %) | by training | `full` makes more by (95 %) |"
+             " s a success | times that of `full` (95 %) |", "|---" * 7 + "|"]  # fmt: skip
+    p = {}
+    for row in rows.EVERY:
+        if row.key not in found:
+            continue
+        each, full = found[row.key], found.get(rows.FULL.key)
+        more = times = ""
+        if row != rows.FULL and full is not None and min(len(v["successes"]) for v in (each, full)) >= 2:
+            by = {"successes": welch(full["successes"], each["successes"]),
+                  "seconds": welch(np.log(each["seconds"]), np.log(full["seconds"]))}  # fmt: skip
+            more = spoken(by["successes"]["difference"], by["successes"]["interval"], "+.1f")
+            times = spoken(np.exp(by["seconds"]["difference"]), np.exp(by["seconds"]["interval"]), ".2f")
+            p |= {f"{row.key}:{what}": w["p"] for what, w in by.items() if (row.key, what) in claims}
+        own = each["successes"]
+        average = spoken(own.mean(), analysis.over_seeds(own) if len(own) > 1 else None, ".1f")
+        lines.append(f"| {row.label} | {len(own)} | {average} | {', '.join(f'{v:.1f}' for v in own)} | {more} |"
+                     f" {np.exp(np.log(each['seconds']).mean()):.2f} | {times} |")  # fmt: skip
+    if p:
+        lines += ["", "Holm's correction over what was fixed before: "
+                  + ", ".join(f"`{k}` p = {v:.2g}" for k, v in analysis.holm(p).items()) + "."]  # fmt: skip
+    graded = slope({k: v["successes"] for k, v in found.items()})
+    if graded is not None:
+        lines += ["", f"A doubling of the taxels: {spoken(graded['slope'], graded['interval'], '+.2f')} successes"
+                  f" ({graded['trainings']} trainings)."]  # fmt: skip
+    return "\n".join(lines)
+
+
+def main(argv: list[str]) -> None:
+    own, rest = tools.split(argv, OWN)
+    if rest:
+        raise UserError(f"{rest[0]!r}: the settings are {', '.join(OWN)}")
+    if own["world"] not in rows.WORLDS:
+        raise UserError(f"world={own['world']}: must be {', '.join(rows.WORLDS)}")
+    claims = claimed(own["claims"])
+    print(markdown(gathered([Path(p).expanduser() for p in own["out"].split(",")], own["world"]), claims))
+
+
+if __name__ == "__main__":
+    tools.command(main, __doc__)
