@@ -203,3 +203,23 @@ def test_numbers_and_settings_are_split():
     with pytest.raises(UserError, match="worlds=8,x"):
         tools.numbers("8,x", "worlds")
     assert tools.split(["a=1", "b=2", "c"], {"a": "0"}) == ({"a": "1"}, ["b=2", "c"])
+
+
+def test_replayed_metrics_are_compared_seed_by_seed():
+    """A metric that moves with the seed alone is the same; one that is off by as much in each seed differs."""
+    from benchmarks import replayed
+
+    metrics = {"capped": 30, "successes": {"average": 4.0, "all": [1, 2]}, "range_N": [1.0, 3.0], "rate": 0.5,
+               "rate_interval": [0.4, 0.6], "episodes": 60, "policy": "x.pt", "commands": ["a", "b"]}  # fmt: skip
+    flat = replayed.numbers(metrics, 60)
+    assert flat == {"capped": 0.5, "successes average": 4.0, "range_N low": 1.0, "range_N high": 3.0, "rate": 0.5}
+    mujoco = {str(s): {"seed's": float(s), "moved": float(s)} for s in range(5)}
+    hand = {str(s): {"seed's": s + 0.01 * (-1) ** s, "moved": s + 0.5 + 0.01 * (-1) ** s} for s in range(5)}
+    rows = replayed.compare(hand, mujoco, {"seed's": 2.0, "moved": 40.0}, 0.25)
+    assert rows["seed's"]["same"] and rows["seed's"]["as_before"]
+    assert not rows["moved"]["same"] and not rows["moved"]["as_before"]
+    assert rows["moved"]["difference"][0] == pytest.approx(0.502)
+    assert "differs not as before" in replayed.table(rows)
+    for task, said in (("grasp", "hold_rate_pushed"), ("rotate", "seconds_per_success")):
+        kept = json.loads((tools.ROOT / "checkpoints" / f"{task}.metrics.json").read_text())
+        assert replayed.numbers(kept, kept["episodes"])[said] == kept[said]
