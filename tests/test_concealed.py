@@ -353,6 +353,37 @@ def test_size_is_what_was_asked(tmp_path, monkeypatch):
         assert truth["effects"][0]["facts"]["ratio"] == pytest.approx(ratio, rel=0.4) and truth["tier"] == tier
 
 
+def test_a_drive_whose_encoder_is_off_begins_where_it_reads_its_target(monkeypatch):
+    """Else it jumps, and the jump is counted as the effect although a replay from the first reading has it too."""
+    rng = np.random.default_rng(4)
+    off = [rng.uniform(*x, 200) for x in ((0.7, 1.3), (-0.5, 0.5), (0.0, 0.2), (-3, 3), (0.0, 0.5))]
+    angle = rng.uniform(-2, 2, 200)
+    np.testing.assert_allclose(plant.angle_read_as(plant.encoded(angle, *off), *off), angle, atol=1e-12)
+    monkeypatch.setattr(generate, "SECONDS", 0.3)
+    d = rigs.draw(np.random.default_rng(1), "one")
+    jumps = []
+    for settled in (True, False):
+        bench = generate.Bench(d, np.full((4, 1, 300), 0.1), np.full(4, 30.0), 5e-4, 0, settled)
+        q = bench.run([bench.changed(0, {"offset": 0.2, "scale": 1.1})])["position"]
+        jumps.append(float(np.abs(q - q[..., :1]).max()))
+        assert settled == (abs(q[0, 0, 0, 0] - 0.1) < 1e-9)
+    assert jumps[0] < 0.25 * jumps[1]  # what is left is the weight that it sinks under
+
+
+def test_a_large_effect_is_planted_where_it_shows():
+    bench, reached = object.__new__(generate.Bench), {4: 1.1, 2: 2.5, 0: 8.0, 1: 11.0}
+    tried = []
+
+    def sized(kind, joint, ratio, seed, law):
+        tried.append((joint, law))
+        return 0.1 * joint, {"ratio": reached[joint]}, {}
+
+    bench.sized = sized
+    kind = effects.KINDS["offset"]
+    assert bench.largest(kind, [4, 2, 0, 1], 10.0, 1, str)[0] == 0 and tried == [(4, "4"), (2, "2"), (0, "0")]
+    assert bench.largest(kind, [4, 2], 10.0, 1, str) == (2, (0.2, {"ratio": 2.5}, {}))
+
+
 def test_scores_by_hand():
     def finding(effect, confidence=0.9, group=(), joint="joint0", **parameters):
         return {

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ BELIEF = 0.05  # how far each may be refitted
 NOISE_OF_EFFORT = 0.02  # of a joint's typical torque
 DECOYS = ("poor", "touched", "wrong_mass", "confounded", "bad_channel")
 MIX = {"effect": 14, "none": 4, "noise": 2, "pair": 2, "outside": 2, "decoy": 2, "hand": 6, "touch": 0, "large": 0}
+ELSEWHERE = 4  # other joints at which a large effect is tried where the drawn one does not show it
 SEVERAL = ("bench2", "bench4", "arm2", "arm3", "finger")  # shapes of more than one joint
 
 
@@ -43,9 +45,9 @@ def plan(mix: dict[str, int], seed: int, one_joint: bool = False) -> list[dict]:
 
     mix: number of cases by group: effect (one of the catalogue), none (one joint, nothing missing), noise (the same,
     noise doubled), pair (two effects), outside (the catalogue), decoy, hand (a hand: of every six two with nothing
-    missing, three with an effect, one with effects at two joints), large (a hand, always one large effect), touch (a
-    fingertip under a ball: of every four one with nothing missing). Effects, tiers and shapes take turns; one_joint:
-    only rigs of one joint. Raises ValueError for a group that there is not.
+    missing, three with an effect, one with effects at two joints), large (a hand, always one large effect, at a joint
+    that shows it), touch (a fingertip under a ball: of every four one with nothing missing). Effects, tiers and shapes
+    take turns; one_joint: only rigs of one joint. Raises ValueError for a group that there is not.
     """
     rng = np.random.default_rng([seed, 1])
     effects, tiers = [str(e) for e in rng.permutation(list(BY_EFFECT))], ("easy", "medium", "hard")
@@ -141,10 +143,14 @@ def motions(rng: np.random.Generator, d: rigs.Drawn, poor: bool) -> np.ndarray:
 
 
 class Bench:
-    """A rig with its motions: runs variants of its parameters, as measured."""
+    """A rig with its motions: runs variants of its parameters, as measured. settled: whether a joint begins where its
+    encoder reads the first target, else at the target itself, from where a drive whose encoder is off jumps."""
 
-    def __init__(self, d: rigs.Drawn, command: np.ndarray, warm: np.ndarray, noise: float, source: int):
+    def __init__(
+        self, d: rigs.Drawn, command: np.ndarray, warm: np.ndarray, noise: float, source: int, settled: bool = False
+    ):
         self.d, self.command, self.warm, self.noise, self.source = d, command, warm, noise, source
+        self.settled = settled
         self.base = {
             k: np.broadcast_to(d.true.get(k, v), (d.joints,)).astype(float).copy() for k, v in plant.DEFAULTS.items()
         }
@@ -163,9 +169,11 @@ class Bench:
         command = np.tile(self.command, (V, 1, 1)) if commands is None else np.concatenate(commands)
         # at rest at the first target, so that nothing swings in
         start = command[:, :, 0]
+        encoder = ("scale", "offset", "eccentric", "eccentric_at", "second_harmonic")
+        if self.settled:
+            start = plant.angle_read_as(start, *(values[k] for k in encoder))
         out = plant.simulate(self.d.rig, plant.rows(V * R, self.d.joints, **values), command, q0=start, **kw)
         out["link"] = out["position"]
-        encoder = ("scale", "offset", "eccentric", "eccentric_at", "second_harmonic")
         out["position"] = plant.encoded(out["link"], *(values[k][..., None] for k in encoder))
         return {k: x.reshape(V, R, *x.shape[1:]) for k, x in out.items()}
 
@@ -239,6 +247,19 @@ class Bench:
         }
         return float(sizes[pick]), facts, of(1 + pick if moves else 0)
 
+    def largest(
+        self, kind: Kind, joints: list[int], ratio: float, seed: int, draw: Callable[[int], laws.Law | None]
+    ) -> tuple[int, tuple[float, dict, dict]]:
+        """(joint, what `sized` says of it): the first at which the effect can be made about as large as the ratio, else
+        that at which it becomes largest: an encoder's offset is nothing on a link that weighs nothing. draw: the law
+        that it follows at a joint."""
+        found: dict[int, tuple[float, dict, dict]] = {}
+        for joint in joints:
+            found[joint] = self.sized(kind, joint, ratio, seed, draw(joint))
+            if tier_of(found[joint][1]["ratio"]) == tier_of(ratio):
+                return joint, found[joint]
+        return max(found.items(), key=lambda item: item[1][1]["ratio"])
+
     def stalls(self, size: float, seed: int) -> np.ndarray:
         """The commands as they arrive on a bus that stalls; the same stalls whatever their length."""
         return np.stack([stalled(c, size, np.random.default_rng([seed, 7, k])) for k, c in enumerate(self.command)])
@@ -276,7 +297,8 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     noise = float(np.hypot(quantum / np.sqrt(12), extra))
     kinds = [ALL[k] for k in entry["kinds"]]
     effort = bool(rng.uniform() < 0.5) | any(k.signal == "effort" for k in kinds)
-    joint, source = (int(x) for x in rng.permutation(d.joints)[:2]) if d.joints > 1 else (0, 0)
+    order = [int(x) for x in rng.permutation(d.joints)] if d.joints > 1 else [0, 0]
+    joint, source = order[:2]
     joints = [joint] * len(kinds)
     if len(kinds) == 2 and d.joints > 1 and (rng.uniform() < 0.7 or group == "hand"):
         joints[1] = source
@@ -284,13 +306,19 @@ def build(entry: dict, number: int, seed: int, seen: Path, truth: Path, which: s
     confounding = decoy == "confounded"
     if confounding:
         warm = np.sort(warm)
-    bench = Bench(d, command, warm, noise, source)
+    bench = Bench(d, command, warm, noise, source, settled=group == "large")
     facts, new, sent, current = [], bench.base, command, dict(laws.HEALTHY)
+    of_joint = lambda at: {k: float(v[at]) for k, v in bench.base.items()}  # noqa: E731
+    ratio, found = TIERS.get(entry["tier"], 1.0), None
+    if group == "large":
+        draw = lambda at: laws.draw(entry["kinds"], [of_joint(at)], which, seed, number)[0]  # noqa: E731
+        joint, found = bench.largest(kinds[0], [joint, *order[2 : 2 + ELSEWHERE]], ratio, number, draw)
+        joints = [joint]
     current_at = joint
-    own = [{k: float(v[at]) for k, v in bench.base.items()} for at in joints]
+    own = [of_joint(at) for at in joints]
     drawn = laws.draw(entry["kinds"], own, which, seed, number)
     for kind, label, at, law, old in zip(kinds, entry["kinds"], joints, drawn, own, strict=True):
-        size, fact, run = bench.sized(kind, at, TIERS.get(entry["tier"], 1.0), number, law)
+        size, fact, run = found or bench.sized(kind, at, ratio, number, law)
         facts.append(fact)
         apply = law.apply if law is not None else kind.apply
         new = bench.changed(at, apply(old, size, float(d.unit[at]), float(d.inertia[at])), new)

@@ -155,6 +155,22 @@ def encoded(
     return seen + eccentric * second * np.sin(2 * (q + at)) if np.any(second) else seen
 
 
+def angle_read_as(
+    seen: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    eccentric: np.ndarray,
+    at: np.ndarray,
+    second: np.ndarray,
+) -> np.ndarray:
+    """The angle [rad] of which such an encoder makes `seen`: the inverse of `encoded`, by Newton's method."""
+    q = (seen - offset) / scale
+    for _ in range(20):
+        slope = scale + eccentric * (np.cos(q + at) + 2 * second * np.cos(2 * (q + at)))
+        q = q - (encoded(q, scale, offset, eccentric, at, second) - seen) / slope
+    return q
+
+
 def arrivals(delay: float, jitter: float, start: int, count: int) -> np.ndarray:
     """[count] times [s] at which messages sent every MESSAGE ms arrive: late by the delay, more or less by a share of
     it that varies evenly from message to message, and never before an earlier one (a queue)."""
