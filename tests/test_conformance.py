@@ -4,16 +4,15 @@ Free trajectories diverge (contact is chaotic), so after each step the second en
 state: positions, velocities, warm start, servo queues, random numbers. What is left is one control step of difference:
 
 - C MuJoCo works in float64 and MuJoCo-Warp in float32: a position of 0.1 m resolves to 7e-9 m, 0.02 um of contact depth
-at
-  7 kN/m are 1e-4 N, and Newton stops at 1e-6 instead of 1e-8 of its scale. Without contact the engines agree to that.
+  at 7 kN/m are 1e-4 N, and Newton stops at 1e-6 instead of 1e-8 of its scale. Without contact the engines agree to
+  that.
 - In contact, a contact point of two convex parts can flip between equally near features, which moves a force; so the
-worst
-  is compared only loosely.
+  worst is compared only loosely.
 - Firm contacts (links at `solimp` 0.99) need up to some 20 Newton and 30 line-search iterations in an impact.
-MuJoCo-Warp stops at
-  8 and 20 in training (configs/config.yaml), and where a solver is cut off depends on rounding: 5 % of impacts then
-  differ by 0.3 mm and more. Here both solvers may finish.
-- C MuJoCo must not be cut off there: at 8 iterations it throws an object out of a firm grasp now and then (last tests).
+  MuJoCo-Warp stops at 8 and 20 in training (configs/config.yaml), and where a solver is cut off depends on rounding: 5
+  % of impacts then differ by 0.3 mm and more. Here both solvers may finish.
+- C MuJoCo must not be cut off there: at 8 iterations it throws an object out of a firm grasp now and then (last tests),
+  so it gets 50 (`sim.iterations_mujoco`).
 Measured over 24 steps of 12 worlds (median, 95 %, worst): hand 8e-8, 2e-7, 2e-6 rad; object 7e-9, 7e-8, 2e-7 m; contact
 forces 1e-5, 8e-4, 2e-3 N; reward 1e-7, 2e-6, 1e-5.
 """
@@ -229,8 +228,7 @@ def test_contact_sums_agree_more_than_single_contacts(record):
     assert got[0] < 3e-4 and got[1] < 1e-2, got
 
 
-# -- where C MuJoCo's solver is cut off
-# ------------------------------------------------------------------------------------------
+# -- where C MuJoCo's solver is cut off --------------------------------------------------------------------------------
 
 
 def thrown(steps: int, *settings: str) -> set[int]:
