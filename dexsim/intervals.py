@@ -1,5 +1,5 @@
 """Intervals of what was counted or averaged: Wilson's of a share, the bootstrap's percentiles of anything else. Both
-are SciPy's."""
+are SciPy's, but for stretches of neighbouring units, which SciPy does not draw."""
 
 from __future__ import annotations
 
@@ -57,6 +57,29 @@ def bootstrap(
     for nothing."""
     ends = 50 * np.array([1 - level, 1 + level])
     return np.nanpercentile(draws(samples, statistic, seed, count), ends, axis=-1)
+
+
+def weights(units: int, seed, count: int = 1000) -> np.ndarray:
+    """[count, units] how often each unit is in each resample. Times sums by unit they give the sums of all resamples in
+    one matrix product, for statistics of many sums over the same resamples."""
+
+    def times(index: np.ndarray, axis: int = -1) -> np.ndarray:
+        drawn = np.apply_along_axis(np.bincount, axis, index.astype(int), minlength=units)
+        return np.moveaxis(drawn, axis, 0).astype(float)
+
+    return np.ascontiguousarray(draws((np.arange(units),), times, seed, count).T)
+
+
+def stretches(units: int, length: int, seed, count: int = 1000) -> np.ndarray:
+    """[count, at least units] index of the units of each resample of a circular block bootstrap (Politis and Romano,
+    1992): whole stretches of `length` neighbours (all units where they are fewer), as many as it takes, from the last
+    unit on with the first. For units that are not independent of their neighbours.
+
+    Not by SciPy, whose bootstrap draws single units only; `arch`, which has one, cuts the last stretch short, loops in
+    Python and brings pandas and statsmodels along."""
+    length = min(length, units)
+    starts = np.random.default_rng(seed).integers(0, units, (count, -(-units // length)))
+    return ((starts[..., None] + np.arange(length)) % units).reshape(count, -1)
 
 
 def of_rows(rows: np.ndarray, statistic: Callable) -> tuple[tuple[np.ndarray], Callable]:

@@ -55,3 +55,36 @@ def test_one_unit_and_what_is_no_number():
 
     low, high = intervals.bootstrap((np.array([0.0, 1.0, 1.0, 1.0]),), broken, 0)
     assert 0.5 < low < high == 1.0
+
+
+def test_weights_count_the_units_that_the_same_seed_draws():
+    x = np.random.default_rng(3).normal(size=13)
+    times = intervals.weights(13, 5, 200)
+    assert times.shape == (200, 13) and (times.sum(1) == 13).all() and times.max() > 1
+    np.testing.assert_allclose(times @ x, intervals.draws((x,), np.sum, 5, 200))
+    assert intervals.weights(1, 0, 3).tolist() == [[1.0]] * 3
+
+
+def test_a_generator_is_drawn_from_on_as_by_hand():
+    """Results that were published with resamples drawn by hand stay what they were."""
+    x, (ours, hand) = np.arange(9.0) ** 2, (np.random.default_rng(4) for _ in range(2))
+    for _ in range(2):
+        assert (intervals.draws((x,), np.sum, ours, 50) == x[hand.integers(0, 9, (50, 9))].sum(1)).all()
+
+
+def test_stretches_are_neighbours_in_a_circle():
+    index = intervals.stretches(10, 4, 0, 500)
+    assert index.shape == (500, 12) and set(np.unique(index)) == set(range(10))
+    assert (np.diff(index.reshape(500, 3, 4)) % 10 == 1).all()
+    assert intervals.stretches(3, 4, 0, 2).shape == (2, 3), "fewer units than a stretch has: one of all of them"
+
+
+def test_stretches_see_that_neighbours_are_alike():
+    """The standard error of the average of an autoregression: by theory 1 / (1 - a) of the innovations'."""
+    rng, n, a = np.random.default_rng(5), 4000, 0.8
+    x = rng.normal(size=n)
+    for i in range(1, n):
+        x[i] += a * x[i - 1]
+    by_stretch = x[intervals.stretches(n, 60, 0, 1000)].mean(1).std()
+    by_unit = intervals.draws((x,), np.mean, 0, 1000).std()
+    assert by_stretch == pytest.approx(1 / (1 - a) / math.sqrt(n), rel=0.15) and by_unit < 0.5 * by_stretch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.real import bam_saturation, finger_spring, sage_clock, sage_speed
+from benchmarks.real import bam_saturation, common, finger_spring, sage_clock, sage_speed
 from dexsim.errors import UserError
 
 
@@ -102,3 +102,9 @@ def test_a_fingers_spring_and_the_age_of_its_readings_are_told_from_friction():
     without = true.copy()
     without[3:] = -9.0, -9.0, 0.0
     assert finger_spring.errors(without[None], given)[0] > 0.05
+
+
+def test_the_fit_of_the_checks_finds_what_they_hold_free():
+    far = lambda x: ((x - np.array([0.3, -2.0, 1.0])) ** 2).sum(1)  # noqa: E731
+    x = common.fitted(far, [(-1.0, 1.0), (-5.0, 5.0), (0.5, 0.5)], 60)
+    assert x == pytest.approx([0.3, -2.0, 0.5], abs=0.05) and x[2] == 0.5

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import differential_evolution
 
+from benchmarks.real.common import fitted
 from benchmarks.real.convert_bam import DUTY_PER_RAD
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
@@ -35,7 +35,7 @@ BOUNDS = {
     "backdriven": (0.0, 3.0),
     "saturation": (0.0, 3.0),  # 1/N.m
 }
-CANDIDATES, GENERATIONS = 8, 45  # a parameter; how often
+GENERATIONS = 45
 
 
 @dataclass
@@ -111,18 +111,8 @@ def fold(r: Recorded, register: int, plain: bool, seed: int = 0) -> tuple[np.nda
     """(parameters [8] fitted on the other gains, errors [4] rad on the one that is left out)."""
     rest = r.part(r.register != register)
     bounds = [(0.0, 0.0) if plain and n == "saturation" else b for n, b in BOUNDS.items()]
-    found = differential_evolution(
-        lambda x: errors(x.T, rest).mean(1),
-        bounds,
-        vectorized=True,
-        updating="deferred",
-        popsize=CANDIDATES,
-        maxiter=GENERATIONS,
-        tol=1e-4,
-        polish=False,
-        seed=seed,
-    )
-    return found.x, errors(found.x[None], r.part(r.register == register))[0]
+    x = fitted(lambda c: errors(c, rest).mean(1), bounds, GENERATIONS, seed)
+    return x, errors(x[None], r.part(r.register == register))[0]
 
 
 def main(argv: list[str]) -> int:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import differential_evolution
 
+from benchmarks.real.common import fitted
 from benchmarks.real.convert_ergocub import FINGERS, KEPT, cycles
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
@@ -26,7 +26,7 @@ from dexsim.gap.read import rhythm
 STEP = 2e-3  # s
 PERIOD = 0.05  # s from one reading of the position to the next
 OLDEST = 0.2  # s
-CANDIDATES, GENERATIONS = 8, 60  # a parameter; how often
+GENERATIONS = 60
 BOUNDS = {  # exponents of ten, but for the age
     "drive": (0.7, 3.4),  # A, rad/s2 at full duty
     "damping": (0.0, 2.9),  # B, 1/s
@@ -94,20 +94,10 @@ def errors(x: np.ndarray, c: Clips) -> np.ndarray:
     return np.sqrt(((path[np.minimum(c.step, n - 1), :, c.clip] - c.q[:, None]) ** 2).mean(0))
 
 
-def fitted(c: Clips, names: tuple[str, ...], seed: int = 0) -> np.ndarray:
+def parameters(c: Clips, names: tuple[str, ...], seed: int = 0) -> np.ndarray:
     """[6] the parameters of these names fitted, the others absent."""
     bounds = [BOUNDS[n] if n in names else (0.0, 0.0) if n == "age" else (-9.0, -9.0) for n in BOUNDS]
-    return differential_evolution(
-        lambda x: errors(x.T, c),
-        bounds,
-        vectorized=True,
-        updating="deferred",
-        popsize=CANDIDATES,
-        maxiter=GENERATIONS,
-        tol=1e-4,
-        polish=False,
-        seed=seed,
-    ).x
+    return fitted(lambda x: errors(x, c), bounds, GENERATIONS, seed)
 
 
 def main(argv: list[str]) -> int:
@@ -120,7 +110,7 @@ def main(argv: list[str]) -> int:
         fit, kept = load(folder, name, False), load(folder, name, True)
         rows[name] = {}
         for label, names in (("plain", PLAIN), ("spring", tuple(BOUNDS))):
-            x = fitted(fit, names)
+            x = parameters(fit, names)
             rows[name][label] = {
                 "fitted_mrad": round(1e3 * float(errors(x[None], fit)[0]), 1),
                 "kept_out_mrad": round(1e3 * float(errors(x[None], kept)[0]), 1),

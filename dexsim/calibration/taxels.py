@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.tactile.layout import neighbours
 
 AT_ONCE = 6  # taxels that answer together where something presses; noise wakes fewer
@@ -187,10 +188,9 @@ def _fits(
         spread = np.sqrt(np.outer(np.maximum(xx - sx**2 / n, 0), np.maximum(yy - sy**2 / n, 0)))
         return np.where(spread > 1e-12, (xy - np.outer(sx, sy) / n) / np.maximum(spread, 1e-12), 0.0)
 
-    rng = np.random.default_rng(0)
     tried = []
-    for _ in range(draws):
-        c = correlation(np.bincount(rng.integers(len(sums), size=len(sums)), minlength=len(sums)))
+    for weight in intervals.weights(len(sums), 0, draws):
+        c = correlation(weight)
         d = c - np.diag(c)[:, None]
         tried.append(np.minimum(d, d.T))
     return correlation(np.ones(len(sums))), np.std(tried, axis=0)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dexsim import intervals
+
 BINS = 4
-DRAWS = 300
+DRAWS = 300  # of the bootstrap
 
 
 @dataclass
@@ -72,8 +74,7 @@ def spots(
         return out
     square = residual**2
     total_s, total_n = np.bincount(block, square, count), np.bincount(block, minlength=count).astype(float)
-    pick = rng.integers(0, count, (DRAWS, count))
-    weight = np.stack([np.bincount(row, minlength=count) for row in pick]).astype(float)
+    weight = intervals.weights(count, rng, DRAWS)
     all_s, all_n = weight @ total_s, weight @ total_n
     for name, x in regimes.items():
         if name.startswith("_") or np.ptp(x) < 1e-12:

@@ -211,54 +211,31 @@ def pressed(w: int, s: State, shape: Shape):
 
 
 @wp.func
-def aside(i: int, w: int, s: State, shape: Shape):
-    """How far the force of the i-th of the others is from the command, as a fraction of F_max."""
-    return wp.abs(s.tip_force[w, shape.others[i]] / shape.f_max - s.command[w])
-
-
-@wp.func
-def force_near(w: int, s: State, shape: Shape):
-    """Ours, dense where R_force is flat: 1 - |F_i - F_cmd F_max| / F_max, not below 0, mean of the others."""
-    total = float(0.0)
-    for i in range(shape.others.shape[0]):
-        total += at_least(1.0 - aside(i, w, s, shape), 0.0)
-    return total / float(shape.others.shape[0])
-
-
-@wp.func
-def worst(w: int, s: State, shape: Shape):
-    """Ours: `force_near` of the finger that is furthest off; the mean hides one that presses on nothing."""
-    furthest = float(0.0)
-    for i in range(shape.others.shape[0]):
-        off = aside(i, w, s, shape)
-        if off > furthest or wp.isnan(off):
-            furthest = off
-    return at_least(1.0 - furthest, 0.0)
-
-
-@wp.func
-def slack(i: int, w: int, s: State, shape: Shape):
-    """How far the torque of the i-th of the others is from the command, as a fraction of its maximum."""
+def aside(i: int, by_torque: bool, w: int, s: State, shape: Shape):
+    """How far the force of the i-th of the others is from the command, as a fraction of F_max; or, by_torque, the
+    torque of its first joint, as a fraction of that one's maximum."""
     f = shape.others[i]
-    x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
+    x = s.tip_force[w, f] / shape.f_max
+    if by_torque:
+        x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
     return wp.abs(x - s.command[w])
 
 
 @wp.func
-def torque_near(w: int, s: State, shape: Shape):
-    """Ours, `force_near` for R_torque: 1 - |tau_i / tau_max - F_cmd|, not below 0, mean of the others."""
+def near(by_torque: bool, w: int, s: State, shape: Shape):
+    """Ours, dense where R_force (or R_torque) is flat: 1 - `aside`, not below 0, mean of the others."""
     total = float(0.0)
     for i in range(shape.others.shape[0]):
-        total += at_least(1.0 - slack(i, w, s, shape), 0.0)
+        total += at_least(1.0 - aside(i, by_torque, w, s, shape), 0.0)
     return total / float(shape.others.shape[0])
 
 
 @wp.func
-def torque_worst(w: int, s: State, shape: Shape):
-    """Ours: `torque_near` of the finger that is furthest off."""
+def worst(by_torque: bool, w: int, s: State, shape: Shape):
+    """Ours: `near` of the finger that is furthest off; the mean hides one that presses on nothing."""
     furthest = float(0.0)
     for i in range(shape.others.shape[0]):
-        off = slack(i, w, s, shape)
+        off = aside(i, by_torque, w, s, shape)
         if off > furthest or wp.isnan(off):
             furthest = off
     return at_least(1.0 - furthest, 0.0)
@@ -335,14 +312,14 @@ def rewards(weight: Weights, period: float, s: State, shape: Shape, out: wp.arra
     value[5] = action(w, s)
     value[6] = velocity(w, s)
     value[7] = wp.where(thumb, fingers / float(shape.others.shape[0]), float(0.0))
-    value[8] = force_near(w, s, shape)
+    value[8] = near(False, w, s, shape)
     value[9] = reach(w, s, shape)
     value[10] = at_most(squeeze / shape.f_max, 5.0)
     value[11] = still(w, s)
-    value[12] = worst(w, s, shape)
+    value[12] = worst(False, w, s, shape)
     value[13] = centre(w, s, shape)
-    value[14] = torque_near(w, s, shape)
-    value[15] = torque_worst(w, s, shape)
+    value[14] = near(True, w, s, shape)
+    value[15] = worst(True, w, s, shape)
     value[16] = thumb_near(w, s, shape)
     for k in range(wp.static(len(TERMS))):
         out[k, w] = weight[k] * value[k]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param, expand
@@ -12,6 +13,7 @@ from dexsim.gap.read.runs import Run, same_commands, spans
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
 FIRST = 0.1  # s tell where and how fast: within
 START_NOISE, START_SPEED = 10.0, 0.2  # x the noise, and of a joint's speed, of what the samples about its first say
+DRAWS = 400  # of a bootstrap
 
 
 def floor(runs: list[Run], cases: list[Case]) -> tuple[float, str]:
@@ -120,7 +122,6 @@ def rms_interval(
     squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = 0.5
 ) -> tuple[float, float, float]:
     """(rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all joints."""
-    rng = np.random.default_rng(seed)
     sums, counts = [], []
     for s, t in zip(squares, times, strict=True):
         b = ((t - t[0]) / block).astype(int) if len(t) else np.zeros(0, int)
@@ -131,9 +132,8 @@ def rms_interval(
         return 0.0, 0.0, 0.0
     sums, counts = np.concatenate(sums), np.concatenate(counts)
     sums, counts = sums[counts > 0], counts[counts > 0]
-    n = len(sums)
-    pick = rng.integers(0, n, (400, n))
-    values = np.sqrt(sums[pick].sum(1) / counts[pick].sum(1))
+    mean = lambda s, n, axis=-1: np.sqrt(s.sum(axis) / n.sum(axis))  # noqa: E731
+    values = intervals.draws((sums, counts), mean, seed, DRAWS)
     return float(np.sqrt(sums.sum() / counts.sum())), float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))
 
 

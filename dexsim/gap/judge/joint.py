@@ -20,6 +20,7 @@ from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import jitter
 from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
 
@@ -180,8 +181,8 @@ class JointAnswer:
         runs = np.flatnonzero(lost > 0)
         if len(runs) < 3:
             return ""
-        pick = np.random.default_rng(0).integers(0, len(runs), (400, len(runs)))
-        gained, of = (lost - mine)[runs][pick].sum(1), lost[runs][pick].sum(1)
+        sums = lambda *x, axis=-1: np.stack([one.sum(axis) for one in x])  # noqa: E731
+        gained, of = draws(((lost - mine)[runs], lost[runs]), sums, 0, errors.DRAWS)
         harms = float(np.mean(gained < -JUDGE.slack * of)) > JUDGE.harm
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.actuator.reference import torque_along
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
@@ -21,7 +22,7 @@ from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 
 COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")
-BLOCK = 0.5  # s
+BLOCK, DRAWS = 0.5, 200  # s, bootstraps
 
 
 @dataclass
@@ -146,9 +147,8 @@ def fit(
     ridge = 1e-3 * len(y) * np.eye(4)
     solve = lambda k: np.linalg.solve(gram[k].sum(0) + ridge, right[k].sum(0)) / scale  # noqa: E731
     value = solve(np.arange(count))
-    rng = np.random.default_rng(seed)
-    draws = np.array([solve(rng.integers(0, count, count)) for _ in range(200)])
-    low, high = np.quantile(draws, 0.05, 0), np.quantile(draws, 0.95, 0)
+    each = lambda index, axis=-1: np.moveaxis(np.apply_along_axis(solve, axis, index.astype(int)), axis, 0)  # noqa: E731
+    low, high = np.quantile(intervals.draws((np.arange(count),), each, seed, DRAWS), [0.05, 0.95], axis=-1)
     before, after = _held_out(case, runs, trial, value, test, span_test)
     if not after < (1 - JUDGE.standin) * before:
         return None

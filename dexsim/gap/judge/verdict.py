@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.rules import JUDGE
+
+DRAWS, STRETCH = 400, 4  # bootstraps, of stretches of so many neighbouring blocks
 
 
 def settle(findings: Sequence[dict[str, Any]], quiet: set[str]) -> None:
@@ -75,8 +78,6 @@ def gain_interval(
     b = ((times - times.min()) / block).astype(int)
     _, b = np.unique(b, return_inverse=True)
     a, c = np.bincount(b, without), np.bincount(b, with_it)
-    n, size = len(a), min(4, len(a))
-    starts = np.random.default_rng(seed).integers(0, n, (400, -(-n // size)))
-    index = ((starts[..., None] + np.arange(size)) % n).reshape(400, -1)
+    index = intervals.stretches(len(a), STRETCH, seed, DRAWS)
     share = (a - c)[index].sum(1) / max(float(a.sum()), 1e-300)
     return float(np.quantile(share, 0.05)), float(np.quantile(share, 0.95))

@@ -10,10 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import TORQUE
+
+DRAWS = 300  # of the bootstrap
 
 
 @dataclass
@@ -97,10 +100,8 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
         best = int(np.argmax(correlation))
         p = law[best]
         count = int(blocks.max()) + 1
-        sums = np.stack([np.bincount(blocks, v, count) for v in (np.ones_like(p), p, logged, p * p, p * logged)])
-        pick = rng.integers(0, count, (300, count))
-        n, sx, sy, sxx, sxy = sums[:, pick].sum(-1)
-        slopes = (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)
+        sums = [np.bincount(blocks, v, count) for v in (np.ones_like(p), p, logged, p * p, p * logged)]
+        slopes = intervals.draws(sums, _slope, rng, DRAWS)
         slope, offset = np.polyfit(p, logged, 1)
         fit = 1 - np.var(logged - slope * p - offset) / np.var(logged)
         out.append(
@@ -116,3 +117,9 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
             )
         )
     return out
+
+
+def _slope(n, sx, sy, sxx, sxy, axis=-1):
+    """Slopes of the lines through resampled blocks, of the blocks' sums: samples, x, y, x x and x y."""
+    n, sx, sy, sxx, sxy = (s.sum(axis) for s in (n, sx, sy, sxx, sxy))
+    return (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)

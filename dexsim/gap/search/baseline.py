@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import BELIEF, Case
@@ -252,7 +253,7 @@ def _surely(squares: np.ndarray, plain: Baseline) -> bool:
         return False
     _, block = np.unique(plain.block, return_inverse=True)
     more = np.bincount(block, squares - plain.squares)
-    draws = more[np.random.default_rng(0).integers(0, len(more), (DRAWS, len(more)))].sum(1)
+    draws = intervals.draws((more,), np.sum, 0, DRAWS)
     return float(np.mean(draws > 0)) >= TORQUE.surely
 
 

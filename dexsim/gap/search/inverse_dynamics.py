@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
 from dexsim.gap.search import body_torque
@@ -25,7 +26,7 @@ from dexsim.gap.search.body_torque import WEIGHT, Columns, columns_of, least, mi
 SHED = 0.8  # of the misfit: what halving the cutoff leaves, where what it sheds is noise of derivatives
 # what gravity's factor must be known to by the recordings, to be fitted beside the friction and not believed
 WEIGHED = 0.03
-DRAWS = 300
+DRAWS = 300  # of a bootstrap
 QUARTERS = 4
 LEAST = 0.12  # of the squared residual on the quarters left out: what a further effect must remove
 MOST = 4
@@ -173,12 +174,12 @@ def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
         if not tried:
             break
         best = min(tried, key=lambda n: tried[n].sum())
-        pick = rng.integers(0, count, (DRAWS, count))
-        if tried[best].sum() > (1 - LEAST) * now.sum() or np.quantile((now - tried[best])[pick].sum(1), 0.03) <= 0:
-            break
         kinds = {k: min((n for n in tried if _kind(n) == k), key=lambda n: tried[n].sum()) for k in map(_kind, tried)}
-        table = np.stack([tried[n][pick].sum(1) for n in kinds.values()])
-        wins = dict(zip(kinds, (table.argmin(0)[None] == np.arange(len(kinds))[:, None]).mean(1), strict=True))
+        each = (now - tried[best], *(tried[n] for n in kinds.values()))
+        gained, *table = intervals.draws(each, lambda *x, axis: np.stack([one.sum(axis) for one in x]), rng, DRAWS)
+        if tried[best].sum() > (1 - LEAST) * now.sum() or np.quantile(gained, 0.03) <= 0:
+            break
+        wins = dict(zip(kinds, (np.argmin(table, 0)[None] == np.arange(len(kinds))[:, None]).mean(1), strict=True))
         rival = max((k for k in wins if k != _kind(best)), key=wins.get, default="")
         out.append((best, float(wins[_kind(best)]), kinds.get(rival, "")))
         chosen.append(best)
@@ -223,8 +224,7 @@ def _intervals(
     """Least squares and 90 % by a block bootstrap."""
     count = int(blocks.max()) + 1
     grams, sides = sums(X, u, blocks, count)
-    pick = rng.integers(0, count, (DRAWS, count))
-    weight = np.stack([np.bincount(i, minlength=count) for i in pick]).astype(float)
+    weight = intervals.weights(count, rng, DRAWS)
     draws = solved(np.einsum("db,bkl->dkl", weight, grams), weight @ sides)
     return least(X, u), *np.quantile(draws, [0.05, 0.95], axis=0)
 

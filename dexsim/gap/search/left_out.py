@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.plant.columns import SHAPES, at_bound
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Fitter, disbelief, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, subset
 from dexsim.gap.search.trial import Trial, dear_of
 
-BOOTSTRAPS = 300
+BOOTSTRAPS, STRETCH = 300, 4  # and of how many neighbouring half-second blocks a stretch of theirs is
 
 
 class JointLosses(JointHypotheses):
@@ -135,11 +136,7 @@ class JointLosses(JointHypotheses):
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
         """Sums of a block bootstrap of x [B]: 2-s stretches of neighbouring half-second blocks."""
-        n = len(x)
-        size = min(4, n)
-        starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
-        index = (starts[..., None] + np.arange(size)) % n
-        return x[index.reshape(BOOTSTRAPS, -1)].sum(1)
+        return x[intervals.stretches(len(x), STRETCH, self.rng, BOOTSTRAPS)].sum(1)
 
     def _by_condition(self, lost: np.ndarray, mine: np.ndarray) -> list[float]:
         """Relative gain of `mine` over `lost` (losses by block [B]) on each condition that was left out."""

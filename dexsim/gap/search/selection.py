@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import slopes_of
-from dexsim.gap.search.left_out import BOOTSTRAPS
+from dexsim.gap.search.left_out import BOOTSTRAPS, STRETCH
 from dexsim.gap.search.scan import JointScan, expand_one
 from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
 
@@ -379,11 +380,7 @@ class JointSelection(JointScan):
                     self.cross(trial)
                     others.append(trial)
             table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
-            n = table.shape[1]
-            size = min(4, n)
-            starts = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
-            index = ((starts[..., None] + np.arange(size)) % n).reshape(BOOTSTRAPS, -1)
-            sums = table[:, index].sum(-1)
+            sums = table[:, intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)].sum(-1)
             # a rival within 3 % of the best counts for half: finer than the plant is to be trusted
             weight = np.exp(-np.clip((sums / sums.min(0) - 1) / 0.03, 0, 50))
             shares = (weight / weight.sum(0)).mean(1)

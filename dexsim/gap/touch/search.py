@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim import intervals
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
 from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.effects.tactile_gain import TactileGain
@@ -13,7 +14,7 @@ from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.plant import PARAMS, readings
 
-BOOTSTRAPS = 300
+BOOTSTRAPS, STRETCH = 300, 3  # and of how many neighbouring blocks a stretch of theirs is
 
 
 @dataclass
@@ -207,10 +208,8 @@ class PadSearch(PadFit):
         return bool(np.quantile(self._boot(a - b), TOUCH.chance) > 0)
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
-        n = len(x)
-        size = min(3, n)
-        start = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
-        return x[((start[..., None] + np.arange(size)) % n).reshape(BOOTSTRAPS, -1)].sum(1)
+        """Sums of a block bootstrap of x [B], in stretches of neighbouring blocks."""
+        return x[intervals.stretches(len(x), STRETCH, self.rng, BOOTSTRAPS)].sum(1)
 
     def _drop(self, current: TouchTrial, trials) -> TouchTrial:
         changed = True
@@ -259,11 +258,7 @@ class PadSearch(PadFit):
                 self.cross(t)
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[t.left_out for _, t in others], self.cross(base)])
-        n = table.shape[1]
-        size = min(3, n)
-        start = self.rng.integers(0, n, (BOOTSTRAPS, -(-n // size)))
-        index = ((start[..., None] + np.arange(size)) % n).reshape(BOOTSTRAPS, -1)
-        sums = table[:, index].sum(-1)
+        sums = table[:, intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)].sum(-1)
         weight = np.exp(-np.clip((sums / sums.min(0) - 1) / TOUCH.told_apart, 0, 50))
         shares = (weight / weight.sum(0)).mean(1)
         rows = sorted(
