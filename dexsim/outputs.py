@@ -44,6 +44,13 @@ def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Pat
     return folder
 
 
+def new(path: Path, setting: str) -> Path:
+    """The path, where nothing is yet. Raises UserError: recordings are never overwritten."""
+    if path.exists() or path.is_symlink():
+        raise UserError(f"{setting}{path}: is there already, and would be overwritten: give another, or move it away")
+    return path
+
+
 @contextmanager
 def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
     """A folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and noted as

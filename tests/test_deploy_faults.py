@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import gc
 import os
 import signal
 import socket
@@ -349,6 +350,103 @@ def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_pat
     assert ("nobody thought" if at == "thread" else "No space left") in rec.error and rec.writer._file.closed
     if at == "close":
         assert len(read(tmp_path / "run.mcap", audit=False).commands) > 10, "what was written before is there"
+
+
+def test_a_hand_that_cannot_be_opened_leaves_no_recording_open(b, tmp_path):
+    hand = Spoiled(VirtualClock(100.0))
+
+    def nobody():
+        raise UserError("no hand answers on the bus")
+
+    hand.open = nobody
+    rec = recorder_at(tmp_path / "run.mcap")
+    with pytest.raises(UserError, match="no hand answers"):
+        run(b, hand, recorder=rec)
+    assert rec.writer._file.closed and not rec._thread.is_alive() and not list(tmp_path.iterdir()) and not hand.sent
+
+
+def test_a_disk_that_is_full_from_the_first_byte_is_one_line_with_the_place(tmp_path):
+    (tmp_path / "run.mcap").symlink_to("/dev/full")
+    with pytest.raises(UserError, match="cannot write recording .*run.mcap: No space left on device"):
+        recorder_at(tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"), [("margin=0.6", "smaller margin="), ("seconds=1", "is there already"), ("tor_max=0", "tor_max")]
+)
+def test_a_recording_that_is_there_is_not_overwritten(b, tmp_path, setting, said, capsys):
+    from dexsim.cli.main import main
+
+    path = tmp_path / "of_yesterday.mcap"
+    path.write_bytes(b"an hour of a real hand")
+    assert main(["deploy", f"bundle={b.path}", f"record={path}", setting]) == 2
+    assert said in capsys.readouterr().err and path.read_bytes() == b"an hour of a real hand"
+    assert main(["deploy", f"bundle={b.path}", f"record={tmp_path / 'new.mcap'}", "margin=0.6"]) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["of_yesterday.mcap"], "what is refused leaves no file"
+
+
+class Interrupting:
+    """A lock on which the first signal comes at the worst moment: while the hand is let go, or its bus is waited for."""
+
+    def __init__(self, lock):
+        self.lock, self.hits = lock, 0
+
+    def acquire(self, timeout):
+        self.hits += 1
+        if self.hits == 1:
+            raise KeyboardInterrupt
+        return self.lock.acquire(timeout=timeout)
+
+    def __getattr__(self, name):
+        return getattr(self.lock, name)
+
+    def __enter__(self):
+        return self.lock.__enter__()
+
+    def __exit__(self, *error):
+        return self.lock.__exit__(*error)
+
+
+@pytest.mark.parametrize("where", ["lock", "recorder"])
+def test_a_signal_after_the_end_breaks_nothing_off(b, tmp_path, where):
+    """The first signal may come when the policy is done: the hand is relaxed and its recording whole all the same."""
+    hand = Spoiled(VirtualClock(100.0))
+    rec = recorder_at(tmp_path / "run.mcap")
+    loop = Loop(b, hand, FixedPlace(PLACE), Calibration.default(), LoopSettings(seconds=0.5, tor_max=300.0,
+                home_speed=3.0), hand.clock, rec)  # fmt: skip
+    if where == "lock":
+        loop._lock = Interrupting(loop._lock)
+    else:
+        close, hits = rec.close, []
+
+        def interrupted():
+            hits.append(1)
+            if len(hits) == 1:
+                raise KeyboardInterrupt
+            close()
+
+        rec.close = interrupted
+    report = loop.run()
+    assert report.ended == "done" and hand.relaxed_at and rec.writer._file.closed and gc.isenabled()
+    assert not [f for f in read(tmp_path / "run.mcap", audit=False).findings if f.kind == "damage"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_the_bus_is_closed_waits(b, number, monkeypatch, capsys):
+    from dexsim.cli import deploy
+
+    clock, closed = VirtualClock(100.0), []
+    hand = Spoiled(clock)
+
+    def close():
+        os.kill(os.getpid(), number)
+        closed.append(True)
+
+    hand.close = close
+    monkeypatch.setattr(deploy, "_hand", lambda *_: (hand, FixedPlace(PLACE)))
+    monkeypatch.setattr("dexsim.deploy.loop.Clock", lambda: clock)
+    assert deploy.main([f"bundle={b.path}", "record=none", "seconds=0.2", "home_speed=3"]) == 0
+    assert closed and "the hand is relaxed" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -25,7 +25,8 @@ settings (key=default):
   seconds=10          of the policy, after homing
   command=0.5         grasp: commanded force, 0..1 of F_max
   calibration=        calibration.yaml instead of the bundle's
-  record=             FILE.mcap of everything seen and sent (default: out/deploy_<date>.mcap; record=none: nothing)
+  record=             FILE.mcap, a new one, of everything seen and sent (default: out/deploy_<date>.mcap;
+                      record=none: nothing)
   vision=truth        driver=sim: truth, or camera (a rendered depth image and mask); driver=xhand: place="x y z" [m]
   place=              the object's place in the palm frame where nothing sees it, e.g. place="0.055 0 0.04"
   imu=                rotate with an IMU in the cube, driver=xhand: udp:PORT, on which a program of yours
@@ -80,18 +81,18 @@ def main(argv: Sequence[str]) -> int:
     driver, eye = _hand(given, b, calibration)
     for text in calibration.assumed:
         print(f"note     {text}")
-    recorder = _recorder(given, b, settings, calibration)
+    loop = Loop(b, driver, eye, calibration, settings, say=lambda text: print(text, flush=True))
+    loop.recorder = recorder = _recorder(given, b, settings, calibration)
     print(
         f"bundle   {b.path}, policy {1 / b.manifest['rates']['policy_period_s']:.1f} Hz, readings {settings.read_hz:g}"
         " Hz"
     )
     print(f"driver   {driver.name}; starting ...", flush=True)
-    loop = Loop(b, driver, eye, calibration, settings, recorder=recorder, say=lambda text: print(text, flush=True))
-
     with _Stop() as stop:
         try:
             loop.run()
         finally:
+            stop.ending = True
             try:
                 driver.close()
             finally:
@@ -106,7 +107,7 @@ class _Stop:
     SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
 
     def __init__(self) -> None:
-        self.status = 0
+        self.status, self.ending = 0, False  # ending: the hand is relaxed, and what is left to do is done to its end
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> _Stop:
@@ -120,7 +121,7 @@ class _Stop:
             signal.signal(number, handler)
 
     def _handle(self, number: int, _frame: Any) -> None:
-        if not self.status:
+        if not self.status and not self.ending:
             self.status = 128 + number
             raise KeyboardInterrupt(f"stopped by {self.SIGNALS[signal.Signals(number)]}")
 
@@ -135,7 +136,8 @@ def _ending(report: Any, recorder: Any) -> None:
     print("counts   " + (", ".join(f"{k} {v}" for k, v in sorted(report.counts.items())) or "none"))
     if recorder is not None:
         lost = f"; {recorder.error}" if recorder.error else ""
-        print(f"mcap     {recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}", flush=True)
+        what = f"{recorder.path} ({recorder.written} samples, {recorder.dropped} dropped){lost}"
+        print(f"mcap     {what if recorder.written or lost else 'none: there was nothing to record'}", flush=True)
 
 
 def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
@@ -224,6 +226,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
 
     from dexsim.console import folders
     from dexsim.deploy.recorder import Recorder
+    from dexsim.outputs import new
 
     where = given.get("record") or f"out/deploy_{time.strftime('%Y-%m-%d_%H-%M-%S')}.mcap"
     if where == "none":
@@ -231,6 +234,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     path = Path(where).expanduser()
     path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
     folders.make(path.parent, "record=")
+    new(path, "record=")
     sign = ",".join(f"{int(s):+d}" for s in calibration.current_sign)
     meta = {
         "source": "sim" if given.get("driver", "sim") == "sim" else "real", "robot": b.hand.robot,

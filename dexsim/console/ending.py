@@ -46,7 +46,7 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
         if error.errno not in FULL:
             raise
         where = f" at {error.filename}" if error.filename else ""
-        return _say(f"the disk is full{where}; free some space, then continue with resume=<run folder>/last.pt", 2)
+        return _say(f"the disk is full{where}; free some space (training goes on with resume=<run folder>/last.pt)", 2)
 
 
 def _silent() -> bool:

@@ -184,7 +184,11 @@ class Loop:
         """Home, run the policy for `seconds`, relax. Ctrl-C, an error and every watchdog relax the hand first."""
         c = self.clock
         interval = sys.getswitchinterval()
-        self.driver.open()
+        try:
+            self.driver.open()
+        except BaseException:
+            self._close_recording()
+            raise
         gc.collect()
         gc.freeze()
         gc.disable()  # a collection takes milliseconds; the loop makes no cycles
@@ -205,21 +209,31 @@ class Loop:
             self.report.ended = f"failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
             raise
         finally:
-            self._relax(self.report.ended or "the loop failed")
-            self.stop.set()
-            gc.enable()
-            gc.unfreeze()
-            sys.setswitchinterval(interval)
-            if watch is not None:
-                watch.join(1.0)
-            if self.recorder is not None:
-                self.recorder.close()  # says in its `error` what went wrong, and raises nothing
-                if self.recorder.dropped:
-                    self.report.counts["not_recorded"] += self.recorder.dropped
-            self.report.counts.update(self.guard.counts)
+            try:
+                _to_its_end(lambda: self._relax(self.report.ended or "the loop failed"))
+            finally:
+                _to_its_end(lambda: self._shut(interval, watch))
         if getattr(self.measure, "goals", 0):
             self.report.counts["goals_reached"] += self.measure.goals
         return self.report
+
+    def _shut(self, interval: float, watch: threading.Thread | None) -> None:
+        """What the run had changed is as it was, and its recording whole."""
+        self.stop.set()
+        gc.enable()
+        gc.unfreeze()
+        sys.setswitchinterval(interval)
+        if watch is not None:
+            watch.join(1.0)
+        self._close_recording()
+        self.report.counts.update(self.guard.counts)
+        self.guard.counts.clear()
+
+    def _close_recording(self) -> None:
+        if self.recorder is not None:
+            self.recorder.close()  # says in its `error` what went wrong, and raises nothing
+            if self.recorder.dropped:
+                self.report.counts["not_recorded"] = self.recorder.dropped
 
     def _first_reading(self) -> None:
         limit = self.clock.now() + 2.0
@@ -513,8 +527,9 @@ class Loop:
         """Tell the driver to relax until it does; an interrupt in the middle changes nothing. Between tries the passive
         mode is sent, which a driver whose relaxing fails may still pass on."""
         for _ in range(RELAX_TRIES):
-            held = lock and self._lock.acquire(timeout=0.02)  # whoever holds it longer hangs
+            held = False
             try:
+                held = lock and self._lock.acquire(timeout=0.02)  # whoever holds it longer hangs
                 self.driver.relax()
                 self.report.not_relaxed = ""
                 return
@@ -542,6 +557,15 @@ class Loop:
                 self._tripped = f"the loop did not turn for {1e3 * silent:.0f} ms, allowed {1e3 * limit:.0f}"
                 self.report.counts["watchdog"] += 1
                 self._let_go(lock=False)  # whoever holds it hangs
+
+
+def _to_its_end(work: Callable[[], None]) -> None:
+    """Work that may be done twice, begun again where Ctrl-C or another signal breaks it off."""
+    for _ in range(RELAX_TRIES):
+        try:
+            return work()
+        except KeyboardInterrupt:
+            continue
 
 
 def _smooth(share: float) -> float:

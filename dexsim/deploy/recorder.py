@@ -64,8 +64,8 @@ class Recorder:
             self._queue.put((kind, t - self.zero, values))
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and the index. Raises nothing: what went wrong is said in `error`, and a run's report
-        outlives its recording."""
+        """Write what waits, and the index; a file in which there is nothing goes. Raises nothing: what went wrong is
+        said in `error`, and a run's report outlives its recording."""
         self._queue.put(None)
         self._thread.join(timeout)
         if self._thread.is_alive():
@@ -82,6 +82,9 @@ class Recorder:
             )
             with contextlib.suppress(Exception):
                 self.writer._file.close()
+        if not self.written and self.error is None:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
 
     def _run(self) -> None:
         w = self.writer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +51,21 @@ class Writer:
             raise UserError(f"{self.path}: metadata key '{unknown[0]}' does not exist; valid: {', '.join(schema.KEYS)}")
         try:
             self._file = open(self.path, "wb")  # noqa: SIM115 (lives as long as the writer)
+            try:
+                self._mcap = McapWriter(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+                self._mcap.start(profile="ros2", library="dexsim")
+                self._mcap.add_metadata(schema.METADATA, self.meta)
+                if config is not None:
+                    self._mcap.add_attachment(
+                        self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode()
+                    )
+                self._file.flush()
+            except OSError:
+                with suppress(OSError):
+                    self._file.close()
+                raise
         except OSError as error:
             raise UserError(f"cannot write recording {self.path}: {error.strerror}; choose another place") from None
-        self._mcap = McapWriter(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
-        self._mcap.start(profile="ros2", library="dexsim")
-        self._mcap.add_metadata(schema.METADATA, self.meta)
-        if config is not None:
-            self._mcap.add_attachment(
-                self.start_ns, self.start_ns, schema.ATTACHMENT, "application/yaml", config.encode()
-            )
-        self._file.flush()
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._count: dict[str, int] = {}
