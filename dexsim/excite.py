@@ -45,7 +45,9 @@ def main(argv: Sequence[str]) -> int:
         print(USAGE, end="")
         return 0 if argv else 2
     given = _settings(argv)
-    from dexsim.recording.excitation import Limits, plan, write_plan
+
+    from dexsim import files, outputs
+    from dexsim.recording.excitation import FILES, Limits, plan, write_plan
     from dexsim.recording.mechanism import mechanism, stated_hand
     from dexsim.recording.schema import numbers
     from dexsim.sim.quiet import quiet_warp
@@ -61,15 +63,18 @@ def main(argv: Sequence[str]) -> int:
     limits = Limits(
         **{k: _number(given, k) for k in ("speed", "torque", "margin", "clearance", "current") if given.get(k)}
     )
+    seed, rate, repeats = (_within(given, k) for k in RANGES)
+    out = files.place(given["out"])
+    outputs.claim(out, "out=", FILES)
     start = time.perf_counter()
     p = plan(
         m,
         _list(given, "joints"),
         _list(given, "kinds"),
-        int(_number(given, "seed", 0)),
-        _number(given, "rate", 100.0),
+        int(seed),
+        rate,
         limits,
-        int(_number(given, "repeats", 1)),
+        int(repeats),
         say=lambda text: print(f"  {text}", flush=True),
     )
     print(f"\n{'start s':>9}{'end s':>9}  {'kind':<11}{'scale':>6}  joints")
@@ -83,8 +88,10 @@ def main(argv: Sequence[str]) -> int:
         f" torque at most {100 * p.peaks.torque.max():.0f} % of stall{_current(m, p.peaks)},"
         f" no contact; {p.t[-1]:.0f} s of commands, made in {time.perf_counter() - start:.0f} s"
     )
-    for path in write_plan(p, given["out"]):
-        print(path)
+    with outputs.staged(out) as stage:
+        made = write_plan(p, stage)
+    for path in made:
+        print(out / path.name)
     return 0
 
 
@@ -119,6 +126,12 @@ KEYS = (
 )
 
 
+RANGES: dict[str, tuple[float, float, float, bool]] = {
+    "seed": (0, 0, 2**63, True), "rate": (100.0, 20.0, 5000.0, False), "repeats": (1, 0, 20, True)
+}  # fmt: skip
+"""Of numbers that are no limit of the motion: what they are where nothing is said, lowest, highest, whether whole."""
+
+
 def _settings(argv: Sequence[str]) -> dict[str, str]:
     out = {}
     for argument in argv:
@@ -145,6 +158,14 @@ def _number(given: dict[str, str], key: str, default: float = 0.0) -> float:
         return float(given.get(key, default))
     except ValueError:
         raise UserError(f"{key}={given[key]}: must be a number") from None
+
+
+def _within(given: dict[str, str], key: str) -> float:
+    default, low, high, whole = RANGES[key]
+    value = _number(given, key, default)
+    if not low <= value <= high or (whole and value != int(value)):
+        raise UserError(f"{key}={given[key]}: must be a {'whole ' * whole}number in [{low:g}, {high:g}]")
+    return value
 
 
 if __name__ == "__main__":

@@ -63,6 +63,10 @@ def place(text: Any) -> Path:
     text that no path can be."""
     if "\0" in str(text):
         raise UserError(f"'{text}': a path holds no zero character")
+    try:
+        os.fsencode(str(text))
+    except UnicodeEncodeError as error:
+        raise UserError(f"'{text}': no path holds its character {error.start}") from None
     path = Path(str(text))
     try:
         return path.expanduser()

@@ -51,6 +51,11 @@ def new(path: Path, setting: str) -> Path:
     return path
 
 
+def ours(folder: Path, name: str) -> bool:
+    """Whether a file is there as we wrote it."""
+    return _is(folder, folder / name, _known(folder).get(name, ""))
+
+
 @contextmanager
 def staged(folder: Path, setting: str = "out=") -> Iterator[Path]:
     """A folder beside the results: what is in it when the block ends is moved into `folder`, file by file, and noted as

@@ -372,7 +372,8 @@ def test_a_disk_that_is_full_from_the_first_byte_is_one_line_with_the_place(tmp_
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"), [("margin=0.6", "smaller margin="), ("seconds=1", "is there already"), ("tor_max=0", "tor_max")]
+    ("setting", "said"),
+    [("margin=0.6", "smaller margin="), ("seconds=1", "is there already"), ("tor_max=0", "tor_max")],
 )
 def test_a_recording_that_is_there_is_not_overwritten(b, tmp_path, setting, said, capsys):
     from dexsim.cli.main import main
@@ -386,7 +387,7 @@ def test_a_recording_that_is_there_is_not_overwritten(b, tmp_path, setting, said
 
 
 class Interrupting:
-    """A lock on which the first signal comes at the worst moment: while the hand is let go, or its bus is waited for."""
+    """A lock on which the first signal comes at the worst moment: while the hand is let go."""
 
     def __init__(self, lock):
         self.lock, self.hits = lock, 0

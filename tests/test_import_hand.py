@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -16,11 +15,12 @@ import trimesh
 import yaml
 from scipy.spatial import ConvexHull
 
+from dexsim import outputs
 from dexsim.cli import stable_grasps
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.hand.places import places
-from dexsim.import_hand import command, folder, geometry, moves, shapes, taxels
+from dexsim.import_hand import command, geometry, moves, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
 from dexsim.tactile.layout import hand_layout
 from dexsim.tasks import make_fingertip_grasps
@@ -225,10 +225,8 @@ def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
     (hand / "hand.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     (hand / "servo.yaml").write_text((hand / "servo.yaml").read_text() + "# measured\n")
     (hand / "notes.txt").write_text("mine")
-    note = json.loads((hand / ".import.json").read_text())
-    (hand / "check.png").write_bytes(b"a picture")
-    note["files"]["check.png"] = folder.sha(hand / "check.png")  # as `check` notes it
-    (hand / ".import.json").write_text(json.dumps(note))
+    with outputs.staged(hand) as stage:  # as `check` does
+        (stage / "check.png").write_bytes(b"a picture")
     result = import_hand(tmp_path / "all" / "robot" / "claw.urdf", hand, picture=False)
     now = yaml.safe_load((hand / "hand.yaml").read_text())
     assert now["joints"][-3] == {"name": "thumb_turn", "effort": pytest.approx(effort + 0.3), "speed": 7}

@@ -160,7 +160,7 @@ def test_a_signal_in_play_keeps_what_was_recorded(place, configs, monkeypatch, c
     saved = []
 
     class Tap:
-        place = staticmethod(lambda path: None)
+        claim = staticmethod(lambda path: None)
 
         def __init__(self, *_):
             pass

@@ -7,7 +7,6 @@ import dataclasses
 import signal
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from dexsim.errors import UserError
@@ -224,6 +223,7 @@ def _imu(given: dict[str, str], b: Any) -> Any:
 def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) -> Any:
     import yaml
 
+    from dexsim import files
     from dexsim.console import folders
     from dexsim.deploy.recorder import Recorder
     from dexsim.outputs import new
@@ -231,7 +231,7 @@ def _recorder(given: dict[str, str], b: Any, settings: Any, calibration: Any) ->
     where = given.get("record") or f"out/deploy_{time.strftime('%Y-%m-%d_%H-%M-%S')}.mcap"
     if where == "none":
         return None
-    path = Path(where).expanduser()
+    path = files.place(where)
     path = path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
     folders.make(path.parent, "record=")
     new(path, "record=")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from dexsim.cli import build, folder, machine
-from dexsim.cli.replay import replay
+from dexsim import outputs
+from dexsim.cli import build, machine
+from dexsim.cli.replay import METRICS, VIDEO, replay
 from dexsim.cli.start import Start
 from dexsim.console.stop import Stop
 from dexsim.learning import checkpoint
@@ -20,7 +21,7 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
         from dexsim.cli import recorded
 
         return recorded.run(play)
-    out = folder.make(results(start), "out=")
+    out = outputs.claim(results(start), "out=", () if play["view"] else (METRICS, *((VIDEO,) if play["video"] else ())))
     what = start.source or f"policy {play['policy']}"
     env = build.build_env(cfg, make_env, {"policy": what, "results": out})
     env.dump_folder = out  # for worlds that were not finite
@@ -50,8 +51,8 @@ def run(start: Start, make_env: build.MakeEnv | None = None) -> int:
     if play["record"] is not None:
         from dexsim.recording.tap import PlayRecorder
 
-        PlayRecorder.place(play["record"])  # a place that cannot be written is answered before the play
         recorder = PlayRecorder(env, play["record_worlds"], cfg)
+        recorder.claim(play["record"])  # a place that cannot be written is answered before the play
     with Stop() as stop, contextlib.ExitStack() as open_:
         open_.callback(build.close, env)
         try:

@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from dexsim import yaml_text
-from dexsim.cli import folder
+from dexsim import outputs, yaml_text
 from dexsim.console.tables import table
 from dexsim.errors import UserError
 
@@ -26,6 +25,7 @@ KEYS = (
     "object_mass",
     "object_friction",
 )
+RESULTS = ("metrics.json", "simulated.mcap", "position.png", "effort.png", "force.png", "video.mp4")
 USAGE = f"keys: {', '.join(KEYS)}, remap.OURS=THEIRS, meta.KEY=VALUE"
 
 
@@ -133,7 +133,9 @@ def run(play: dict[str, Any]) -> int:
             f"object={play['object'].shape}: recording {path} has no /object_pose in the palm frame"
             " for it, or model= is not a hand"
         )
-    out = folder.make(Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=")
+    out = outputs.claim(
+        Path(play["out"]).expanduser() if play["out"] else Path("out") / f"replay_{path.stem}", "out=", RESULTS, [path]
+    )
     print(
         f"\nsimulating {recording.duration:.1f} s of {m.robot}, physics step {timestep * 1e3:g} ms"
         + {
@@ -164,14 +166,18 @@ def run(play: dict[str, Any]) -> int:
         "current_per_torque_fitted": [j for j, f in zip(c.joints, c.fitted, strict=True) if f],
         "findings": [f"{f.severity}: {f.kind} {f.topic} {f.text}".strip() for f in recording.findings],
     }
-    (out / "metrics.json").write_text(json.dumps(about, indent=2) + "\n")
-    print(f"metrics  {out / 'metrics.json'}")
-    write(out / "simulated.mcap", mechanism.recorded(result, m, recording.commands, recording.joints))
-    print(f"mcap     {out / 'simulated.mcap'}")
-    for drawn in compare.plots(c, out, path.name):
-        print(f"plot     {drawn}")
+    with outputs.staged(out) as stage:
+        (stage / "metrics.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+        write(stage / "simulated.mcap", mechanism.recorded(result, m, recording.commands, recording.joints))
+        drawn = compare.plots(c, stage, path.name)
+    print(f"metrics  {out / 'metrics.json'}\nmcap     {out / 'simulated.mcap'}")
+    for plot in drawn:
+        print(f"plot     {out / plot.name}")
     if play["video"]:
-        _video(recording, result, m, c, out / "video.mp4")
+        with outputs.staged(out) as stage:
+            made = _video(recording, result, m, c, stage / "video.mp4")
+        if made:
+            print(f"video    {out / 'video.mp4'}")
     return 0
 
 
@@ -179,8 +185,8 @@ def _plain(joints: tuple[str, ...], values: Any) -> dict[str, float | None]:
     return {j: float(v) if v == v else None for j, v in zip(joints, values, strict=True)}
 
 
-def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
-    """The recorded posture beside the simulated one."""
+def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
+    """The recorded posture beside the simulated one; whether it could be made."""
     import mujoco
     import numpy as np
 
@@ -219,6 +225,7 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> None:
         }
     try:
         render(clips, path, result.frame_s, names, camera=camera, progress=Ticker("frames"))
-        print(f"video    {path}")
     except NoRenderer as error:  # the numbers stand without it
         print(error)
+        return False
+    return True

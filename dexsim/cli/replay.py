@@ -9,15 +9,18 @@ from typing import Any
 
 import torch
 
+from dexsim import outputs
 from dexsim.console.tables import table
 from dexsim.console.ticker import Ticker
 from dexsim.learning.ppo import Policy
 
+METRICS, VIDEO = "metrics.json", "video.mp4"
 
 def replay(
     env: Any, policy: Policy, out: Path, episodes: int, seed: int, video: bool, about: dict[str, Any]
 ) -> dict[str, Any]:
-    """Play and write ``metrics.json``, PNG plots and ``video.mp4`` into ``out``; returns the metrics.
+    """Play and write ``metrics.json``, PNG plots and ``video.mp4`` into ``out``, each whole or not at all; returns the
+    metrics. Raises UserError where one of them would go over a file that is not ours.
 
     Args:
         about: what was played (checkpoint, versions, ...), kept in metrics.json under "about".
@@ -26,23 +29,31 @@ def replay(
         result = env.evaluate(policy, episodes=episodes, seed=seed, progress=Ticker("episodes"))
     env.check()  # figures of worlds that lost contacts are worth nothing
     metrics = result["metrics"]
-    (out / "metrics.json").write_text(json.dumps(_plain(metrics | {"about": about | {"seed": seed}}), indent=2) + "\n")
+    with outputs.staged(out) as stage:
+        text = json.dumps(_plain(metrics | {"about": about | {"seed": seed}}), indent=2) + "\n"
+        (stage / METRICS).write_text(text, encoding="utf-8")
     rows = [(name, value) for name, value in metrics.items() if not isinstance(value, (list, dict))]
     print("\n" + table("metrics", ("name", "value"), rows))
     for title, header, lines in result.get("tables") or []:
         print("\n" + table(title, header, lines))
-    print(f"\nmetrics  {out / 'metrics.json'}")
+    print(f"\nmetrics  {out / METRICS}")
     if result.get("plots"):
         from dexsim.view.plots import draw
 
-        for path in draw(result["plots"], out):
-            print(f"plot     {path}")
+        with outputs.staged(out) as stage:
+            drawn = draw(result["plots"], stage)
+        for path in drawn:
+            print(f"plot     {out / path.name}")
     if video and result.get("frames"):
-        _video(env, result["frames"], out / "video.mp4")
+        with outputs.staged(out) as stage:
+            made = _video(env, result["frames"], stage / VIDEO)
+        if made:
+            print(f"video    {out / VIDEO}")
     return metrics
 
 
-def _video(env: Any, frames: dict[str, Any], path: Path) -> None:
+def _video(env: Any, frames: dict[str, Any], path: Path) -> bool:
+    """Whether it could be made."""
     from dexsim.view.video import NoRenderer, clips_of, render
 
     try:
@@ -55,9 +66,10 @@ def _video(env: Any, frames: dict[str, Any], path: Path) -> None:
             camera=frames.get("camera"),
             progress=Ticker("frames"),
         )
-        print(f"video    {path}")
     except NoRenderer as error:  # the metrics stand without it
         print(error)
+        return False
+    return True
 
 
 def _plain(value: Any) -> Any:

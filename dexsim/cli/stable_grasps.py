@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import yaml
-
+from dexsim import files, outputs, yaml_text
 from dexsim.cli import start
-from dexsim.console import folders
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
 
@@ -33,6 +30,9 @@ settings (key=default):
 TASK = {"palm": ("rotate", [0.045, 0.06]), "fingertips": ("rotate_fingertips", [0.04, 0.065])}
 """What carries the cube -> task whose episodes start so, usual edges of the cubes [m]."""
 
+WHOLE = {"count": (1, 10**6), "worlds": (1, 10**5), "seed": (0, 2**63 - 1)}
+"""Lowest and highest of the whole numbers."""
+
 
 def main(argv: list[str]) -> int:
     """Returns the exit status. Raises UserError."""
@@ -51,23 +51,29 @@ def main(argv: list[str]) -> int:
     for text in argv:
         key, eq, value = text.partition("=")
         if eq and key in own:
-            own[key] = yaml.safe_load(value)
+            own[key] = value if key == "out" else _value(key, value)
         else:
             rest.append(text)
-    if own["hold"] not in TASK:
+    if own["hold"] not in [*TASK]:  # a list, as what was typed may be one
         raise UserError(f"hold={own['hold']}: must be {' or '.join(TASK)}")
     task, usual = TASK[own["hold"]]
     sizes = usual if own["sizes"] is None else own["sizes"]
-    if not (isinstance(sizes, list) and len(sizes) == 2 and 0.01 <= sizes[0] <= sizes[1] <= 0.3):
+    if not (
+        isinstance(sizes, list)
+        and len(sizes) == 2
+        and all(type(x) in (int, float) for x in sizes)
+        and 0.01 <= sizes[0] <= sizes[1] <= 0.3
+    ):
         raise UserError(f"sizes={sizes}: must be [low, high] edges within [0.01, 0.3] m")
-    for key in ("count", "worlds"):
-        if not (isinstance(own[key], int) and own[key] >= 1):
-            raise UserError(f"{key}={own[key]}: must be a whole number from 1 up")
+    for key, (low, high) in WHOLE.items():
+        if type(own[key]) is not int or not low <= own[key] <= high:
+            raise UserError(f"{key}={own[key]}: must be a whole number from {low} to {high}")
     begun = start.for_train([f"task={task}", "device=cpu", f"worlds={own['worlds']}", *rest], CONFIGS)
     if begun is None:
         return 0
-    out = Path(str(own["out"])).expanduser()
-    folders.make(out.parent, "out=")
+    out = files.place(own["out"])
+    out = out if out.suffix == ".npz" else out.with_name(out.name + ".npz")
+    outputs.claim(out.parent, "out=", [out.name])
     import torch
 
     from dexsim.sim.quiet import quiet_warp
@@ -80,6 +86,12 @@ def main(argv: list[str]) -> int:
     if own["sizes"] is None:  # as large for this hand as the usual ones for a hand of UNIT_SPAN
         sizes = [hand_of(begun.cfg).span / UNIT_SPAN * x for x in sizes]
     grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))
-    grasps.save(out)
+    with outputs.staged(out.parent) as stage:
+        grasps.save(stage / out.name)
     print(f"{len(grasps)} held poses, cubes of {1000 * grasps.edge.min():.0f}-{1000 * grasps.edge.max():.0f} mm: {out}")
     return 0
+
+
+def _value(key: str, text: str) -> Any:
+    """A setting as it was typed: a number, a word, a list. Raises UserError."""
+    return yaml_text.parse(text, f"{key}={text[:40]}")

@@ -81,7 +81,7 @@ def for_play(argv: list[str], config_dir: Path) -> Start | None:
     argv, only_show = _flags(argv, config_dir, "play")
     if argv is None:
         return None
-    if any(a.startswith("replay=") and a != "replay=null" for a in argv):  # a recording's commands instead of a policy
+    if any(a.startswith("replay=") and a not in ("replay=null", "replay=") for a in argv):  # commands, not a policy
         from dexsim.cli import recorded
 
         play = recorded.settings(argv, config_dir)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dexsim import outputs
 from dexsim.console import folders
 from dexsim.errors import UserError
 from dexsim.import_hand import corrections
@@ -67,12 +68,12 @@ def _carry(old: Path, new: Path, sums: dict[str, str], kept: list[str]) -> None:
         name = str(path.relative_to(old))
         if name in (HAND, corrections.NOTE):
             continue
-        ours = name in sums and sha(path) == sums[name]
-        if ours and name not in SHOWN:
+        shown = name == outputs.WRITTEN or (name in SHOWN and outputs.ours(old, name))
+        if not shown and name in sums and sha(path) == sums[name]:
             continue
         (new / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, new / name)
-        if not ours:
+        if not shown:
             kept.append(name)
 
 

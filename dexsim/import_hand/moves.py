@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dexsim import files
+from dexsim import files, outputs
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.import_hand import folder, picture
@@ -112,9 +111,8 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"seconds={given['seconds']}: must be a number from 0.2 to 20, of each joint's move")
     hand = load_hand(where)
     out = Path(given["out"] or hand.folder).expanduser()
-    from dexsim.console import folders
-
-    folders.make(out, "out=")
+    film = given["film"] == "true"
+    outputs.claim(out, "out=", folder.SHOWN[: 1 + film])
     table = moves(hand)
     wrong = []
     print(
@@ -139,12 +137,15 @@ def main(argv: Sequence[str]) -> int:
             f"check: {joint} takes its fingertip away from those it presses against as it closes: turn its sign in"
             " closes, or take it out of flexion"
         )
-    _show(hand, out, seconds, given["film"] == "true")
+    with outputs.staged(out) as stage:
+        made = _show(hand, stage, seconds, film)
+    for name in made:
+        print(out / name)
     return 1 if wrong else 0
 
 
-def _show(hand: Hand, out: Path, seconds: float, film: bool) -> None:
-    """The film and the sheet of pictures."""
+def _show(hand: Hand, out: Path, seconds: float, film: bool) -> list[str]:
+    """The film and the sheet of pictures; which of them could be made."""
     from dexsim.view import video
 
     model = hand.spec().compile()
@@ -157,7 +158,6 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> None:
         "azimuth": 140.0,
         "elevation": -25.0,
     }
-    note = folder.corrections.written(hand.folder) if out.resolve() == hand.folder.resolve() else None
     made = []
     try:
         _sheet(hand, model, start, camera, out / "check.png")
@@ -186,12 +186,7 @@ def _show(hand: Hand, out: Path, seconds: float, film: bool) -> None:
             made.append("check.mp4")
     except video.NoRenderer as error:
         print(f"no pictures: {error}")
-    if note is not None:  # ours to overwrite the next time
-        for name in made:
-            note["files"][name] = folder.sha(out / name)
-        (out / folder.corrections.NOTE).write_text(json.dumps(note, indent=1), encoding="utf-8")
-    for name in made:
-        print(out / name)
+    return made
 
 
 def _sheet(hand: Hand, model: mujoco.MjModel, start: np.ndarray, camera: dict[str, Any], path: Path) -> None:

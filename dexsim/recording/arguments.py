@@ -15,6 +15,10 @@ def read_arguments(argv: Sequence[str]) -> tuple[list[str], dict[str, str], dict
         key, equals, value = argument.partition("=")
         group, dot, name = key.partition(".")
         if equals and dot and group in maps and name:
+            try:
+                value.encode()
+            except UnicodeEncodeError as error:
+                raise UserError(f"{key}={value}: character {error.start} is no text; write it in UTF-8") from None
             maps[group][name] = value
         elif equals and "/" not in key:
             raise UserError(f"'{argument}': expected FILE, remap.OURS=THEIRS or meta.KEY=VALUE")

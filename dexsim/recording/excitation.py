@@ -183,15 +183,14 @@ def groups(m: Mechanism, joints: Sequence[str]) -> list[tuple[str, ...]]:
     return [tuple(b[k] for b in branches.values() if k < len(b)) for k in range(longest)]
 
 
-def write_plan(p: Plan, folder: str | Path, name: str = "excite") -> list[Path]:
-    """`name`.mcap and `name`.csv (the commands), `name`_simulated.mcap (what the simulation made of them) and
-    `name`.yaml (what moves when, what was left out, the peaks). Returns the paths."""
-    folder = Path(folder).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"out={folder}: {error.strerror}") from None
-    paths = [folder / f"{name}{end}" for end in (".mcap", ".csv", "_simulated.mcap", ".yaml")]
+FILES = ("excite.mcap", "excite.csv", "excite_simulated.mcap", "excite.yaml")
+"""What `write_plan` writes."""
+
+
+def write_plan(p: Plan, folder: Path) -> list[Path]:
+    """Into a folder that is there: the commands, twice, what the simulation made of them, and what moves when, what was
+    left out, the peaks. Returns the paths."""
+    paths = [folder / name for name in FILES]
     write_commands(p, paths[0])
     with open(paths[1], "w", newline="") as file:
         rows = csv.writer(file)

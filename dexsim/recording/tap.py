@@ -13,7 +13,7 @@ import torch
 import warp as wp
 import yaml
 
-from dexsim import yaml_text
+from dexsim import outputs, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
@@ -197,6 +197,17 @@ class PlayRecorder:
             raise UserError(f"record={path}: cannot be written: {error.strerror}; choose another place") from None
         return path
 
+    def claim(self, path: str | Path) -> None:
+        """What `save` would write can be written, and is not there yet. Raises UserError."""
+        for to in self._paths(self.place(path)).values():
+            outputs.new(to, "record=")
+
+    def _paths(self, path: Path) -> dict[int, Path]:
+        """World -> its file."""
+        if len(self.tracks) == 1:
+            return {self.tracks[0].world: path}
+        return {t.world: path.with_name(f"{path.stem}_w{t.world}.mcap") for t in self.tracks}
+
     def save(self, path: str | Path, realistic: bool = False, seed: int = 0) -> list[Path]:
         """Write `path` (several worlds: NAME_w0.mcap, ...), like the hardware would have seen it if `realistic`."""
         path = self.place(path)
@@ -205,7 +216,7 @@ class PlayRecorder:
             if realistic:
                 recording = as_hardware(recording, seed + k, self.env.servo.current_per_torque.double().cpu().numpy())
             world = yaml_text.parse(recording.config, path)["recorded_world"]["index"]
-            to = path if len(self.tracks) == 1 else path.with_name(f"{path.stem}_w{world}.mcap")
+            to = self._paths(path)[world]
             write(to, recording)
             out.append(to)
         return out

@@ -178,9 +178,7 @@ def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report
     plain = cfg | {"hand_mirror": False, "hand_scale": 1.0, "reality": {"name": "none"}}
     one = hand.span / hand.scale / UNIT_SPAN
     poses = generate(plain, count, worlds, seed, (one * SIZES[0], one * SIZES[1]), report)
-    new = file.with_name(f".{file.stem}.new.npz")
-    poses.save(new)
-    new.replace(file)
+    poses.save(file)
 
 
 def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report=print) -> GraspSet:

@@ -118,7 +118,8 @@ class NanDump:
             k: v for k, v in self._env.cfg.items() if k in ("choices", "task", "sim", "servo", "tactile", "randomize")
         }
         try:
-            np.savez_compressed(path, world=int(self._world), config=json.dumps(cfg), **data)
+            with files.beside(path) as part, open(part, "wb") as file:
+                np.savez_compressed(file, world=int(self._world), config=json.dumps(cfg), **data)
         except OSError as error:  # a full disk must not end the training over this
             print(f"{path}: a world that was not finite could not be written ({error.strerror})", flush=True)
             path.unlink(missing_ok=True)

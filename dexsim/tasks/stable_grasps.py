@@ -46,9 +46,11 @@ class GraspSet:
                             "dexsim stable-grasps out=PATH") from None
 
     def save(self, path: Path) -> None:
-        """Write an npz file of float32 arrays."""
+        """Write an npz file of float32 arrays, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **{k: v.cpu().numpy().astype(np.float32) for k, v in vars(self).items()})
+        arrays = {k: v.cpu().numpy().astype(np.float32) for k, v in vars(self).items()}
+        with files.beside(path) as part, open(part, "wb") as file:
+            np.savez_compressed(file, **arrays)
 
     def within(self, low: float, high: float) -> GraspSet:
         """The poses of cubes with edges in [low, high] m. Raises UserError when there are none."""
