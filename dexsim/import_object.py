@@ -10,6 +10,7 @@ import numpy as np
 
 from dexsim import files, outputs
 from dexsim.assets.objects import own
+from dexsim.assets.objects.mesh import MOST_PARTS
 from dexsim.assets.objects.shape import Shape
 from dexsim.errors import UserError
 
@@ -52,9 +53,13 @@ def main(argv: Sequence[str]) -> int:
     if given["picture"] not in ("true", "false"):
         raise UserError(f"picture={given['picture']}: must be true or false")
     scale, hulls = _number("scale", given["scale"]), _number("hulls", given["hulls"])
-    path, out = Path(meshes[0]).expanduser(), Path(given["out"]).expanduser()
+    if hulls not in range(1, MOST_PARTS + 1):
+        raise UserError(f"hulls={given['hulls']}: must be a whole number from 1 to {MOST_PARTS}")
+    path, out = files.place(meshes[0]), files.place(given["out"])
     if path.is_dir():
         raise UserError(f"mesh {path} is a folder; import its meshes one by one, or give the folder to objects=")
+    written = [own.FILE, "part_0.obj"] + ["picture.png"] * (given["picture"] == "true")
+    outputs.claim(out, "out=", written, [path])
     shape = own.own_shape(str(path), scale, int(hulls))
     shape = Shape(**{**shape.__dict__, "name": path.stem})
     size = " x ".join(f"{1e3 * x:.0f}" for x in shape.extents)

@@ -12,7 +12,7 @@ import torch
 from bundles import make_checkpoint
 from recordings import signal
 
-from dexsim import excite, export
+from dexsim import excite, export, import_object
 from dexsim.assets import xhand
 from dexsim.cli import stable_grasps
 from dexsim.console.ending import guard
@@ -132,6 +132,17 @@ def test_held_poses(place, capfd, monkeypatch, name):
     refused(capfd, guard(stable_grasps.main, [f"out={name}"]), path)
 
 
+@pytest.mark.parametrize("name", ["object.npz", "picture.png", "a.obj"])
+def test_an_object(place, capfd, monkeypatch, name):
+    monkeypatch.setattr("dexsim.assets.objects.own.own_shape", never)
+    path = mine(place / name)
+    if name == "a.obj":  # the mesh itself
+        with pytest.raises(UserError, match="part_0.obj is read and would be written"):
+            import_object.main(["part_0.obj", "out=."])
+    else:
+        refused(capfd, guard(import_object.main, ["a.obj", "out=."]), path)
+
+
 def test_pictures_of_a_hands_check(place, capfd, monkeypatch):
     monkeypatch.setattr(moves, "moves", never)
     path = mine(place / "o" / "check.png")
@@ -183,6 +194,9 @@ def test_values_of_held_poses_that_are_none(place, setting, said):
         (["deploy", "record=\ud800"], "no path holds its character 0"),
         (["convert", "a.mcap", "out=b.mcap", "meta.robot=x\udcff"], "meta.robot=x\\udcff: character 1 is no text"),
         (["play", "replay="], "say what to play"),
+        (["import-object", "a.obj", "out=a\x00b"], "a path holds no zero character"),
+        (["import-object", "a.obj", "out=o", "hulls=nan"], "hulls=nan: must be a whole number from 1 to 32"),
+        (["import-object", "a.obj", "out=o", "hulls=1.5"], "hulls=1.5: must be a whole number from 1 to 32"),
     ],
 )
 def test_arguments_that_are_no_text(bundle_of_zeros, place, capfd, command, said):

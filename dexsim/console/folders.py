@@ -24,6 +24,7 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
             last = folder / "last.pt"  # a run that ended before it was saved has none
             go_on = f", or continue it with resume={last}" if last.is_file() else ""
             raise UserError(f"{folder} already holds a run: choose another {setting}{go_on}")
-    except OSError as error:
-        raise UserError(f"cannot write into {folder}: {error.strerror}; choose another place with {setting}") from None
+    except (OSError, ValueError) as error:  # the latter of a text that no path can be
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"cannot write into {folder}: {why}; choose another place with {setting}") from None
     return folder
