@@ -28,7 +28,8 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 LONGEST = {"train": 2.5, "record": 3.0, "write": 0.3, "diagnose": 2.5, "save": 0.5, "export": 4.0}
-"""s after which a process is killed at the latest, counted from when it is ready."""
+"""s after which a process is killed at the latest, counted from when it is ready; of a work that ends, 1.3 times what it
+takes on this machine (`longest`) where that is longer."""
 LATE = 0.5 + 0.1
 """s of a recording that may be lost: a chunk, and a sample that shows that it is over. (What waits for the recorder's
 thread is lost as well: how much depends on what else the machine does.)"""
@@ -75,6 +76,13 @@ def killed(work: Callable[[Shared], None], after: float, wait: bool) -> float:
     if os.WIFEXITED(status) and os.WEXITSTATUS(status):
         raise RuntimeError("the child failed (see above)")
     return shared.read()[1]
+
+
+def takes(work: Callable[[Shared], None]) -> float:
+    """s that a work takes in a child, until it first tells that it is ready."""
+    began = time.monotonic()
+    killed(work, 0.0, True)
+    return time.monotonic() - began
 
 
 class Train:
@@ -227,6 +235,7 @@ class Diagnose:
             True,
         )
         self.before: dict[str, bytes] = {}
+        self.longest = 0.0 if again else 1.3 * takes(self._diagnose)
 
     def trial(self, after: float, rng: np.random.Generator) -> str:
         from dexsim import outputs
@@ -277,9 +286,15 @@ class Export:
 
     def __init__(self, folder: Path):
         self.folder, self.k = folder, 0
+        self.longest = 1.3 * takes(lambda shared: (self._export(folder / "whole"), shared.tell(1.0), time.sleep(60)))
+
+    def _export(self, out: Path) -> None:
+        from dexsim import export
+
+        export.export(str(ROOT / "checkpoints" / "grasp.pt"), out, steps=2)
 
     def trial(self, after: float, rng: np.random.Generator) -> str:
-        from dexsim import export, outputs
+        from dexsim import outputs
         from dexsim.deploy import bundle
 
         self.k += 1
@@ -287,7 +302,7 @@ class Export:
 
         def made(shared: Shared) -> None:
             shared.tell(1.0)
-            export.export(str(ROOT / "checkpoints" / "grasp.pt"), out, steps=2)
+            self._export(out)
             time.sleep(60)
 
         killed(made, after, True)
@@ -326,7 +341,7 @@ def run(count: int, kinds: list[str], seed: int, folder: Path) -> tuple[Counter[
         if kind not in made:
             (folder / kind).mkdir(parents=True)
             made[kind] = KINDS[kind][0](folder / kind)
-        after = float(rng.uniform(0, LONGEST[kind]))
+        after = float(rng.uniform(0, max(LONGEST[kind], getattr(made[kind], "longest", 0.0))))
         try:
             outcomes[f"{kind}: {made[kind].trial(after, rng)}"] += 1
         except Exception as error:
