@@ -59,8 +59,14 @@ def main(argv: Sequence[str]) -> int:
     if path.is_dir():
         raise UserError(f"mesh {path} is a folder; import its meshes one by one, or give the folder to objects=")
     written = [own.FILE, "part_0.obj"] + ["picture.png"] * (given["picture"] == "true")
+    there = out.exists()
     outputs.claim(out, "out=", written, [path])
-    shape = own.own_shape(str(path), scale, int(hulls))
+    try:
+        shape = own.own_shape(str(path), scale, int(hulls))
+    except UserError:
+        if not there:
+            out.rmdir()
+        raise
     shape = Shape(**{**shape.__dict__, "name": path.stem})
     size = " x ".join(f"{1e3 * x:.0f}" for x in shape.extents)
     print(f"{path.name}: {size} mm, {1e6 * shape.volume:.1f} cm3, {len(shape.hulls)} convex part(s)")

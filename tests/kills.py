@@ -28,8 +28,8 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 LONGEST = {"train": 2.5, "record": 3.0, "write": 0.3, "diagnose": 2.5, "save": 0.5, "export": 4.0}
-"""s after which a process is killed at the latest, counted from when it is ready; of a work that ends, 1.3 times what it
-takes on this machine (`longest`) where that is longer."""
+"""s after which a process is killed at the latest, counted from when it is ready; of a work that ends, 1.3 times what
+it takes on this machine (`longest`) where that is longer."""
 LATE = 0.5 + 0.1
 """s of a recording that may be lost: a chunk, and a sample that shows that it is over. (What waits for the recorder's
 thread is lost as well: how much depends on what else the machine does.)"""
