@@ -554,7 +554,7 @@ def test_a_page_that_cannot_be_drawn_does_not_lose_the_answer(answer, tmp_path, 
     def broken(d):
         raise KeyError("<b>")
 
-    monkeypatch.setattr("dexsim.gap.report.page.page", broken)
+    monkeypatch.setattr("dexsim.gap.report.sections.page", broken)
     written = save(answer[0], tmp_path / "out")
     assert "report.html could not be drawn" in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["findings"]

@@ -143,8 +143,7 @@ def test_notes_that_recordings_share_are_said_once():
 
 
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
-    from dexsim.gap.report.page import render
-    from dexsim.gap.report.sections import Findings
+    from dexsim.gap.report.sections import Findings, render
     from dexsim.gap.report.sentence import sentence
     from dexsim.gap.result import Diagnosis, empty
 
@@ -179,7 +178,7 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
 
 
 def test_what_recordings_say_is_text_and_no_markup():
-    from dexsim.gap.report.page import page
+    from dexsim.gap.report.sections import page
     from dexsim.gap.result import Diagnosis, empty
 
     text = page(Diagnosis(empty(), "a <b>sentence</b> & more", ["<script>alert(1)</script>"]))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param, word
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dexsim.gap.plant.columns import Param
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Param, Scales
 from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.result import Fit, PadFacts, PadSettings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Scales
 
 
 class ExternalForce(Effect):

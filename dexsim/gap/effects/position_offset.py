@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case

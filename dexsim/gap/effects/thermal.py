@@ -9,8 +9,7 @@ import numpy as np
 
 from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
-from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import INDEX, Scales
 
 MIN_WARMTH = 2.0  # degC: a smaller change of temperature tells nothing
 ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param
 from dexsim.gap.effects.torque_limit import lost
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case

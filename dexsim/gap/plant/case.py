@@ -13,9 +13,8 @@ from dexsim.actuator.columns import NAMES as SERVO_NAMES
 from dexsim.actuator.reference import torque_along
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap.plant.batch import JointPlant, nominal_row
-from dexsim.gap.plant.columns import SERIES_INDEX
+from dexsim.gap.plant.columns import SERIES_INDEX, Scales
 from dexsim.gap.plant.mechanics import JointConstants, along
-from dexsim.gap.plant.scales import Scales
 from dexsim.gap.read.runs import Run
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque

@@ -60,7 +60,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
 
 def _page(d: Diagnosis) -> str:
     """The page. It is drawn from an answer that may have taken an hour: a fault in the drawing must not lose that."""
-    from dexsim.gap.report.page import page
+    from dexsim.gap.report.sections import page
 
     try:
         return page(d)

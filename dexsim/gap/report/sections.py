@@ -1,4 +1,9 @@
-"""What each section of the page shows: plain values and charts, which its template lays out."""
+"""report.html: one page that stands alone, read in a minute. Its figures are inline SVG: no script, no network, no
+font.
+
+A class and a template each section: the class says what is shown, as plain values and charts, the template
+(`templates/`) how it looks.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from dexsim.gap.effects.catalogue import entry
@@ -29,6 +35,13 @@ FLOORS = {
     "quantum": "the encoder's step",
 }
 MOST = 6  # joints beside the picture; the rest is in the details
+ENVIRONMENT = Environment(
+    loader=PackageLoader("dexsim.gap.report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
 
 
 class Section(ABC):
@@ -340,6 +353,18 @@ class Details(Section):
 
 
 SECTIONS: tuple[type[Section], ...] = (Hero, Where, Findings, Curves, Next, Details)
+
+
+def page(d: Diagnosis) -> str:
+    """The page as HTML text."""
+    shown = [text for section in SECTIONS if (text := render(section(d)))]
+    return ENVIRONMENT.get_template("page.html").render(word=VERDICTS[d.data["verdict"]][0], sections=shown)
+
+
+def render(section: Section) -> Markup:
+    """A section as HTML; empty where it has nothing to show."""
+    values = section.values()
+    return Markup("") if values is None else Markup(ENVIRONMENT.get_template(section.template).render(values).strip())
 
 
 def unit_of(metric: str) -> tuple[str, float]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.effects.presliding import give
 from dexsim.gap.plant.case import BELIEF, PHYSICAL, Case
-from dexsim.gap.plant.columns import Param
-from dexsim.gap.plant.scales import Scales
+from dexsim.gap.plant.columns import Param, Scales
 
 USUAL = (
     "kp",
