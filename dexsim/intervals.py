@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
+Seed = int | Sequence[int] | np.random.Generator
 LEVEL = 0.95
 AT_ONCE = 2_000_000
 """Numbers that the resamples of one batch hold, about."""
@@ -23,7 +24,7 @@ def share(hits: int, n: int, level: float = LEVEL) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
-def draws(samples: Sequence[np.ndarray], statistic: Callable, seed, count: int = 1000) -> np.ndarray:
+def draws(samples: Sequence[np.ndarray], statistic: Callable, seed: Seed, count: int = 1000) -> np.ndarray:
     """[..., count] values of a statistic of E units drawn anew, with replacement.
 
     samples: arrays [E], drawn together. statistic(*samples, axis=axis) reduces that axis of arrays [..., E]; it may
@@ -51,7 +52,7 @@ def draws(samples: Sequence[np.ndarray], statistic: Callable, seed, count: int =
 
 
 def bootstrap(
-    samples: Sequence[np.ndarray], statistic: Callable, seed, count: int = 1000, level: float = LEVEL
+    samples: Sequence[np.ndarray], statistic: Callable, seed: Seed, count: int = 1000, level: float = LEVEL
 ) -> np.ndarray:
     """[2, ...] ends of the percentile interval of a statistic; see `draws`. Resamples in which it is not a number count
     for nothing."""
@@ -59,7 +60,7 @@ def bootstrap(
     return np.nanpercentile(draws(samples, statistic, seed, count), ends, axis=-1)
 
 
-def weights(units: int, seed, count: int = 1000) -> np.ndarray:
+def weights(units: int, seed: Seed, count: int = 1000) -> np.ndarray:
     """[count, units] how often each unit is in each resample. Times sums by unit they give the sums of all resamples in
     one matrix product, for statistics of many sums over the same resamples."""
 
@@ -70,7 +71,7 @@ def weights(units: int, seed, count: int = 1000) -> np.ndarray:
     return np.ascontiguousarray(draws((np.arange(units),), times, seed, count).T)
 
 
-def stretches(units: int, length: int, seed, count: int = 1000) -> np.ndarray:
+def stretches(units: int, length: int, seed: Seed, count: int = 1000) -> np.ndarray:
     """[count, at least units] index of the units of each resample of a circular block bootstrap (Politis and Romano,
     1992): whole stretches of `length` neighbours (all units where they are fewer), as many as it takes, from the last
     unit on with the first. For units that are not independent of their neighbours.

@@ -8,6 +8,7 @@ to any floor. Imports inside functions count like those at the top; what stands 
 from __future__ import annotations
 
 import ast
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -134,6 +135,16 @@ def test_imports_run_down(graph):
 def test_no_circles_of_files(graph):
     found = [c for c in circles(graph) if frozenset(c) not in CIRCLES]
     assert not found, "\n".join(" -> ".join(c) for c in found)
+
+
+def test_mypy_passes_over_no_file_that_is_gone():
+    """Its list of files whose types are left to mend only shrinks."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]
+    passed_over = {m for part in settings["overrides"] if part.get("ignore_errors") for m in part["module"]}
+    known = modules(ROOT)
+    assert settings["files"] == ["dexsim"]
+    assert passed_over <= known.keys(), passed_over - known.keys()
+    assert len(passed_over) < 0.45 * len(known), f"{len(passed_over)} of {len(known)} files are not checked"
 
 
 def test_the_check_sees_what_it_must(tmp_path):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dexsim.errors import UserError
@@ -197,7 +198,7 @@ def simulated(features: frozenset[str]) -> list[int]:
     return [i for i, name in enumerate(NAMES) if name not in absent]
 
 
-def did_you_mean(name: str, valid) -> str:
+def did_you_mean(name: str, valid: Iterable[object]) -> str:
     """' Did you mean X?' for the valid name nearest to `name`, or nothing."""
     near = difflib.get_close_matches(str(name), [str(v) for v in valid], n=1)
     return f" Did you mean '{near[0]}'?" if near else ""

@@ -329,7 +329,9 @@ def _stated(table: ServoTable, joints: Sequence[str]) -> list[str]:
     ]
 
 
-def _addresses(mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int):
+def _addresses(
+    mjm: mujoco.MjModel, names: Sequence[str], known: Sequence[str], count: int
+) -> tuple[list[int], list[int]]:
     """qpos and dof addresses of the named joints; UserError for an unknown name or a joint not a hinge or slide."""
     if len(names) != count:
         raise UserError(f"servo: {len(names)} joints given where {count} are driven: {list(names)}.")

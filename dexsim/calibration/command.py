@@ -68,8 +68,8 @@ def run(s: dict[str, Any], meta: dict[str, str]) -> int:
     if s["simulate_touch"]:
         quiet_warp("cpu")
         with outputs.staged(out) as stage:
-            made = simulate.make_rolled(stage / "pads", hand, True, int(s["seed"]), s["faults"])
-        s["touch"] = s["touch"] or str(out / made.relative_to(stage))
+            rolled = simulate.make_rolled(stage / "pads", hand, True, int(s["seed"]), s["faults"])
+        s["touch"] = s["touch"] or str(out / rolled.relative_to(stage))
     with outputs.staged(out) as stage:
         assumed = _fits(s, meta, stage, report, hand)
     for text in assumed:

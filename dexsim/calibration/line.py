@@ -65,7 +65,7 @@ class LineFit:
     def table(self) -> dict[str, object]:
         """Plain numbers, rounded to 6 digits."""
 
-        def nice(x):
+        def nice(x: float) -> float:
             return float(f"{x:.6g}")
 
         return {
@@ -89,7 +89,7 @@ def fit(levels: Levels, unit: str = "", seed: int = 0) -> LineFit | None:
     names = np.unique(levels.level)
     rows = [np.flatnonzero(levels.level == k) for k in names]
     sums = np.array([(len(k), x[k].sum(), y[k].sum(), x[k] @ x[k], x[k] @ y[k]) for k in rows]).T
-    low, high = intervals.bootstrap(sums, _ratio_and_slope, seed, BOOTSTRAP)
+    low, high = intervals.bootstrap(tuple(sums), _ratio_and_slope, seed, BOOTSTRAP)
     total = ((y - y.mean()) ** 2).sum()
     r2 = 1 - ((y - slope * x - offset) ** 2).sum() / total
     r2_ratio = 1 - ((y - ratio * x) ** 2).sum() / total

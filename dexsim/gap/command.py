@@ -17,7 +17,7 @@ from dexsim.console import program
 from dexsim.errors import UserError
 
 if TYPE_CHECKING:
-    from dexsim.gap.result import Settings
+    from dexsim.gap.result import Diagnosis, Settings
     from dexsim.gap.search.time_limit import TimeLimit
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
@@ -317,7 +317,7 @@ class Progress:
         print(f"\r{text:<70}" if self.live else text, end="" if self.live and done < total else "\n", flush=True)
 
 
-def verdict(d) -> str:
+def verdict(d: Diagnosis) -> str:
     """The verdict in at most ten lines."""
     from dexsim.gap.report.charts import number
     from dexsim.gap.report.sentence import place

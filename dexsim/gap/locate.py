@@ -3,6 +3,7 @@ block-bootstrap intervals and one false-discovery control over all bins of all j
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def spots(
 ) -> list[Spot]:
     """Bins of one joint. residual [n] of the quantity `of` (in any unit), block [n] which stretch of time, regimes name
     -> [n]."""
-    out = []
+    out: list[Spot] = []
     _, block = np.unique(block, return_inverse=True)
     count = int(block.max()) + 1
     if count < 6:
@@ -80,7 +81,7 @@ def spots(
         if name.startswith("_") or np.ptp(x) < 1e-12:
             continue
         if name == "time since reversal":
-            edges = [0.0, 0.04, 0.12, 0.4, np.inf]
+            edges: Sequence[float] | np.ndarray = [0.0, 0.04, 0.12, 0.4, np.inf]
         elif name in ("direction", "driven against its load"):
             edges = [-1.5, -0.5, 0.5, 1.5]
         elif name == "saturation":

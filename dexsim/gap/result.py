@@ -87,7 +87,7 @@ class Diagnosis:
 
 def empty(verdict: str = "unusable") -> dict[str, Any]:
     """diagnosis.json with nothing in it."""
-    zero = {"recordings": [], "error": "position_rmse_rad"}
+    zero: dict[str, Any] = {"recordings": [], "error": "position_rmse_rad"}
     zero |= {k: None for k in ("before", "after", "before_low", "before_high", "after_low", "after_high")}
     return {
         "schema": 1,

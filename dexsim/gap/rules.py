@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import TypeVar
+
+T = TypeVar("T", int, float)
 
 
-def _rule(value: float, means: str, source: str, test: str) -> float:
+def _rule(value: T, means: str, source: str, test: str) -> T:
     """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py (touch:
     tests/test_gap_rules_touch.py, torque: tests/test_gap_rules_torque.py)."""
-    return field(default=value, metadata={"means": means, "source": source, "test": test})
+    made: T = field(default=value, metadata={"means": means, "source": source, "test": test})
+    return made
 
 
 @dataclass(frozen=True)

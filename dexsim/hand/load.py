@@ -147,9 +147,9 @@ def _names(file: HandFile, where: str) -> None:
             )
         if not np.linalg.norm(f.tip.normal) > 1e-6:
             raise UserError(f"{where}: fingers.{f.name}.tip.normal ({f.tip.normal}): must have a length")
-    for f in file.opposing:
-        if f not in fingers:
-            raise UserError(f"{where}: opposing: '{f}' is not a finger; {_near(f, fingers)}")
+    for name in file.opposing:
+        if name not in fingers:
+            raise UserError(f"{where}: opposing: '{name}' is not a finger; {_near(name, fingers)}")
     if len(file.opposing) == len(fingers):
         raise UserError(f"{where}: opposing names every finger; leave out those that they press against")
     _pads([f.pad for f in file.fingers], fingers, where)

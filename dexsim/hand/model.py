@@ -120,7 +120,7 @@ def _tips(spec: mujoco.MjSpec, file: HandFile, where: str) -> list[tuple[str, ..
         body = bodies.get(finger.tip.body)
         if body is None:
             raise UserError(f"{field}.tip.body ({finger.tip.body}): not in the model; it has {', '.join(bodies)}")
-        above = []
+        above: list[str] = []
         b = body
         while b is not None and b.name != "world":
             above = [j.name for j in b.joints] + above

@@ -90,8 +90,8 @@ def table(findings: Sequence[Finding]) -> str:
         return "no findings"
     rows = [("severity", "kind", "topic", "from s", "to s", "count", "what")]
     for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
-        times = ["" if not np.isfinite(x) else f"{x:.3f}" for x in (f.time, f.end)]
-        rows.append((f.severity, f.kind, f.topic, *times, str(f.count), f.text))
+        begin, end = ("" if not np.isfinite(x) else f"{x:.3f}" for x in (f.time, f.end))
+        rows.append((f.severity, f.kind, f.topic, begin, end, str(f.count), f.text))
     width = [max(len(r[i]) for r in rows) for i in range(6)]
     return "\n".join("  ".join([*(r[i].ljust(width[i]) for i in range(6)), r[6]]) for r in rows)
 

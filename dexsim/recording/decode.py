@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,9 @@ class JointSample:
 
     __slots__ = ("names", "position", "velocity", "effort", "stamp")
 
-    def __init__(self, names, position, velocity, effort, stamp):
+    def __init__(
+        self, names: Sequence[str], position: Any, velocity: Any, effort: Any, stamp: int | None
+    ):
         self.names, self.position, self.velocity, self.effort, self.stamp = names, position, velocity, effort, stamp
 
 

@@ -63,7 +63,10 @@ def _spans(series: Series, j: int, name: str) -> tuple[float, float]:
     """(lowest, highest) of a joint's values but for spikes and the outermost hundredth; NaN where there are too few."""
     x = series.value[:, j]
     x = x[np.isfinite(x) & ~spiked(x, name)]
-    return tuple(map(float, np.quantile(x, [0.01, 0.99]))) if len(x) >= FEWEST else (np.nan, np.nan)
+    if len(x) < FEWEST:
+        return np.nan, np.nan
+    low, high = np.quantile(x, [0.01, 0.99])
+    return float(low), float(high)
 
 
 def _jumped(t: np.ndarray, x: np.ndarray) -> bool:

@@ -181,7 +181,8 @@ def _index(where: str, k: object) -> int:
 
 
 def _swaps(where: str, value: Sequence) -> tuple[tuple[int, int], ...]:
-    out, used = [], set()
+    out: list[tuple[int, int]] = []
+    used: set[int] = set()
     for pair in value:
         a, b = (_index(where, k) for k in pair)
         if a == b or {a, b} & used:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +14,9 @@ from dexsim.sim.quiet import quiet_warp
 from dexsim.tasks import make_env
 from dexsim.tasks.nan_dump import load
 
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
+
 USAGE = """usage: dexsim nan-dump FILE.npz [engine=mujoco|warp] [device=cpu]
 
 Repeat the control step at which a world stopped being finite (nan_<k>.npz in the run folder), in one world of the same
@@ -21,7 +25,7 @@ come back.
 """
 
 
-def replay(path: Path, device: str = "cpu", engine: str = "auto"):
+def replay(path: Path, device: str = "cpu", engine: str = "auto") -> HandEnv:
     """The environment (one world) after the step that failed. Raises UserError."""
     data = load(path)
     env = make_env(json.loads(str(data["config"])), 1, device, 0, engine)

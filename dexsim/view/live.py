@@ -406,7 +406,8 @@ class LiveView:
 
 def _lighter(rgba: tuple[float, float, float, float]) -> tuple[float, float, float]:
     """A black hand shows no form in a browser's plain light: dark colours are lifted."""
-    return tuple(c + 0.16 * (1 - c) ** 2 for c in rgba[:3])
+    r, g, b = (c + 0.16 * (1 - c) ** 2 for c in rgba[:3])
+    return r, g, b
 
 
 def _viser() -> Any:

@@ -108,7 +108,8 @@ def main(folder: Path) -> int:
         data = mujoco.MjData(model)
         renderers: dict[tuple[int, int], Any] = {}
         for n, shot in own:
-            size = tuple(shot.size)
+            width, height = shot.size
+            size = width, height
             if size not in renderers:
                 renderers[size] = mujoco.Renderer(model, size[1], size[0])
             data.qpos[:] = shot.qpos

@@ -8,8 +8,12 @@ from __future__ import annotations
 import csv
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
 
 FOLDER = Path(__file__).parent
 FINGERS = ("thumb", "index", "mid", "ring", "pinky")
@@ -42,7 +46,7 @@ def xml_path() -> Path:
     return FOLDER / "xhand_right.xml"
 
 
-def hand_spec():
+def hand_spec() -> mujoco.MjSpec:
     """A fresh `mujoco.MjSpec` of the hand alone, to be extended with objects."""
     import mujoco
 

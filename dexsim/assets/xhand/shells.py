@@ -6,6 +6,7 @@ The link bounds in `bodies.csv` are measured; everything about the shapes inside
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def loft(outer: np.ndarray, normal: np.ndarray, thickness: float) -> Mesh:
     return vertices, np.concatenate([top, top[:, ::-1] + n, side])
 
 
-def write_obj(path, mesh: Mesh, note: str) -> None:
+def write_obj(path: Path, mesh: Mesh, note: str) -> None:
     """Wavefront OBJ, metres, 1 micrometre grid."""
     vertices, faces = mesh
     with open(path, "w", encoding="ascii") as f:

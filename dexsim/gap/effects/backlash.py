@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param
-from dexsim.gap.plant.columns import Scales
+from dexsim.gap.plant.columns import Param, Scales
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -34,7 +34,8 @@ class Backlash(Effect):
         gap = param("gap", "backlash", "set", low, top, low, "m" if s.slide else "rad")
         starts = sorted({min(f * s.sigma, 0.8 * top) for f in (4.0, 7.0, 12.0, 20.0, 40.0, 70.0, 120.0)})
         rebound = param("rebound", "rebound", "set", 0.02, 0.7, 0.1)
-        params, extra = (gap, rebound), ()
+        params: tuple[Param, ...] = (gap, rebound)
+        extra: tuple[float, ...] = ()
         if s.armature <= 0:  # how much of the inertia is the rotor's is not known
             params, extra = (
                 (*params, param("rotor", "rotor", "set", 0.05 * s.inertia, 0.95 * s.inertia, 0.3 * s.inertia)),

@@ -181,7 +181,7 @@ def modelled(finding: dict) -> bool:
     return e is not None and e.simulated
 
 
-def entry(finding: dict):
+def entry(finding: dict) -> Effect | TouchEffect | None:
     """The catalogue's entry of a finding, of a joint or of touch; None for a bad channel."""
     if finding["where"]["joints"]:
         return EFFECTS.get(finding["effect"])

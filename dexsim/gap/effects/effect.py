@@ -18,6 +18,8 @@ from dexsim.gap.touch.plant import contact, readings
 from dexsim.gap.touch.result import Fit, PadFacts, PadSettings
 
 if TYPE_CHECKING:
+    import mujoco
+
     from dexsim.actuator.table import ServoTable
     from dexsim.gap.plant.case import Case
     from dexsim.gap.touch.read import PadRun
@@ -68,7 +70,8 @@ class FittedEffect:
 
     def entry(self, key: str, unit: str, add: float = 0.0, times: float = 1.0) -> dict[str, Any]:
         """A parameter as `diagnosis.json` has it, (x + add) * times."""
-        return entry(*((x + add) * times for x in (self.value[key], *self.interval[key])), unit)
+        value, low, high = ((x + add) * times for x in (self.value[key], *self.interval[key]))
+        return entry(value, low, high, unit)
 
 
 def entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
@@ -158,7 +161,7 @@ class Effect:
         """Whether it and another effect replace one another: both at once mean nothing."""
         return False
 
-    def to_model(self, spec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         """Writes what is a field of the model into its spec; returns what was changed, in words."""
         return []
 

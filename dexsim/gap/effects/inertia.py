@@ -10,6 +10,8 @@ from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
+    import mujoco
+
     from dexsim.gap.plant.case import Case
 
 
@@ -40,7 +42,7 @@ class Inertia(Effect):
             "more (or less)", "more" if finding["parameters"]["armature"]["value"] > 0 else "less"
         )
 
-    def to_model(self, spec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         joint = spec.joint(case.joint)
         armature = float(np.ravel(joint.armature)[0]) + values["armature"]
         if armature >= 0:

@@ -10,6 +10,8 @@ from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, para
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
+    import mujoco
+
     from dexsim.gap.plant.case import Case
 
 STIFFEST = 12.0  # x the joint's large torque over its range of motion: stiffer, it would hardly have moved
@@ -60,7 +62,7 @@ class JointSpring(Effect):
     def of_pose(self, values: dict[str, float], case: Case) -> bool:
         return True
 
-    def to_model(self, spec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         joint, k = spec.joint(case.joint), values["stiffness"]
         if k <= 0:
             return []

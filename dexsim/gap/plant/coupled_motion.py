@@ -9,7 +9,7 @@ smaller, and so is its error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -33,7 +33,7 @@ def refine_motion(
     cases: list[Case],
     device: str,
     dt: float,
-    progress=None,
+    progress: Callable[[float, int, str], None] | None = None,
     only: set[str] | None = None,
 ) -> list[Case]:
     """The cases (at last those of `only`) built again along refined motions (`Run.fine`); as they are where there is
@@ -122,8 +122,8 @@ def _one(
     v = np.convolve(np.pad(v, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     a = np.gradient(v, step)
     miss, dv, da = (c[:, 0] for c in local_polynomial(t, (q - np.interp(t, times, x))[:, None], WIDTH))
-    at = lambda y: np.interp(times, t, y)  # noqa: E731
-    return times, x + at(miss), v + at(dv), a + at(da)
+    fine = lambda y: np.interp(times, t, y)  # noqa: E731
+    return times, x + fine(miss), v + fine(dv), a + fine(da)
 
 
 def fine_windows(plant: JointPlant, run: int, every: int) -> tuple[np.ndarray, Windows]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import mujoco.batch
@@ -11,6 +13,9 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.gap.plant.columns import SERIES, SERIES_INDEX
+
+if TYPE_CHECKING:
+    from dexsim.gap.read.runs import Run
 
 # Hz at which the model is evaluated (along a refined motion); the series are interpolated between
 RATE, FINE = 100.0, 250.0
@@ -68,7 +73,9 @@ def leaf_of(model: mujoco.MjModel, body: int) -> int:
     return best
 
 
-def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, list[JointConstants]]:
+def along(
+    model: mujoco.MjModel, run: Run, joints: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray, list[JointConstants]]:
     """Series of each joint along a run.
 
     Returns times [G0] s, values [J, G0, E] with the mechanical columns of `SERIES` filled, and the constants.
@@ -100,7 +107,7 @@ def along(model: mujoco.MjModel, run, joints: tuple[str, ...]) -> tuple[np.ndarr
     slide = np.array([int(model.jnt_type[i]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for i in ids])
     out = np.zeros((J, n, len(SERIES)))
 
-    def put(j, name, x):
+    def put(j: int, name: str, x: np.ndarray | float) -> None:
         out[j, :, SERIES_INDEX[name]] = x
 
     for j in range(J):
@@ -191,7 +198,7 @@ def _full(model: mujoco.MjModel, sparse: np.ndarray) -> np.ndarray:
     return full
 
 
-def _places(model: mujoco.MjModel, data: mujoco.MjData, ids, leaves) -> np.ndarray:
+def _places(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int], leaves: np.ndarray) -> np.ndarray:
     """[J, 2, 3] unit vectors in each last link's frame, by which a mass on it may be off that link's centre as a joint
     feels it: out from the hinge and across, both square to the hinge, at the model's own pose (along the hinge a joint
     feels nothing)."""
@@ -208,7 +215,9 @@ def _places(model: mujoco.MjModel, data: mujoco.MjData, ids, leaves) -> np.ndarr
     return out
 
 
-def _turned(axis, arm, mass, gravity, slide):
+def _turned(
+    axis: np.ndarray, arm: np.ndarray, mass: np.ndarray | float, gravity: np.ndarray, slide: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gravity's bias torque of a mass at `arm` from a hinge as the joint turns by d: cos * cos(d) + sin * sin(d).
 
     The torque is -m g . (axis x r), and r turns about the axis, which leaves the part along it. Also m |axis x r|^2.

@@ -66,7 +66,7 @@ def finding(
 
 def spoiled(recordings: list[Recording]) -> dict[tuple[str, str], str]:
     """(recording, joint) whose position or target the audit found wrong -> why."""
-    out = {}
+    out: dict[tuple[str, str], str] = {}
     for r in recordings:
         for f in r.findings:
             if (
@@ -114,7 +114,7 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
         spans: list[tuple[float, float]],
         confidence: float = 0.9,
         drop: bool = True,
-    ):
+    ) -> None:
         entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
         entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
         if drop:

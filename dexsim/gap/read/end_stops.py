@@ -66,7 +66,9 @@ def unforeseen(model: mujoco.MjModel, runs: list[Run]) -> dict[str, list[tuple[f
     return {name: spans for name, spans in out.items() if spans}
 
 
-def _end(model, data, runs: list[Run], j: int, side: int) -> tuple[float, str, float] | None:
+def _end(
+    model: mujoco.MjModel, data: mujoco.MjData, runs: list[Run], j: int, side: int
+) -> tuple[float, str, float] | None:
     """(position of the end, names of the recordings, what counts as near it) on one side of a joint; None where it
     meets none."""
     outer = max(float((side * r.q[:, j]).max()) for r in runs)
@@ -108,7 +110,7 @@ def _still(run: Run, j: int, near: float) -> np.ndarray:
     return np.ptp(windows, axis=1) < 0.25 * near
 
 
-def _hard(model, data, run: Run, j: int, i: int) -> bool:
+def _hard(model: mujoco.MjModel, data: mujoco.MjData, run: Run, j: int, i: int) -> bool:
     """Whether the believed drive asks at sample i for far more than gravity weighs there."""
     row = run.servo.nominal(run.joints)[j]
     from dexsim.actuator.columns import INDEX

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case
 from dexsim.gap.read.runs import Run
 
@@ -124,7 +125,14 @@ def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> i
     return best
 
 
-def _ends(runs, train, test, time, found, plant) -> dict[int, float]:
+def _ends(
+    runs: Sequence[Run],
+    train: Sequence[int],
+    test: list[int],
+    time: np.ndarray,
+    found: dict[str, np.ndarray],
+    plant: JointPlant,
+) -> dict[int, float]:
     """Where the end of a fitted recording begins that is kept out too [s], by run: those that visit regimes which
     `test` does not, before that moment and after."""
     out: dict[int, float] = {}

@@ -88,7 +88,8 @@ BEYOND = (("reason",), ("held_out", "how"), ("held_out", "confirmed"), ("unexpla
 def specified(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """(what diagnosis.json holds, and nothing else: programs rely on its keys; what is known beyond that, for
     details.json)."""
-    asked, more = copy.deepcopy(data), {}
+    asked = copy.deepcopy(data)
+    more: dict[str, Any] = {}
     for *parents, key in BEYOND:
         there = asked[parents[0]] if parents else asked
         if key in there:

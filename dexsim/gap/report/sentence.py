@@ -101,7 +101,7 @@ def spoken(f: dict, m: Mechanism | None) -> str:
     joint = f["where"]["joints"][0]
     hand = None if m is None else m.whose
     owner = hand.finger_of_joint[hand.joints.index(joint)] if hand is not None and joint in hand.joints else -1
-    if owner < 0:
+    if hand is None or owner < 0:
         return joint if "joint" in joint.lower() else f"joint {joint}"
     finger, number_ = hand.fingers[owner], hand.joints.index(joint)
     bends = number_ in finger.flexion
@@ -144,7 +144,7 @@ def place(f: dict, m: Mechanism | None) -> str:
 def _size(f: dict) -> str:
     """The first parameter of a finding in words: degrees and millimetres where a person thinks in them."""
     name, p = next(iter(f["parameters"].items()), (None, None))
-    if p is None or p["value"] is None or isinstance(p["value"], str):
+    if name is None or p is None or p["value"] is None or isinstance(p["value"], str):
         return ""
     number = np.atleast_1d(p["value"])  # com and tilt are vectors, gains one a taxel
     if len(number) > 4:

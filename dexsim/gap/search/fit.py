@@ -217,13 +217,13 @@ class Fitter:
                             root, right, ((low - f.x)[rest] / span[rest] - 1e-9, (high - f.x)[rest] / span[rest] + 1e-9)
                         ).x
                     guesses.append(np.clip(f.x + z * span, low, high))
-            guesses = np.array(guesses)
+            moved = np.array(guesses)
             s = self.init_directions(params, f.x)[1] if self.eliminate else None
-            tried = score(guesses, self.eliminated(self.residuals(params, guesses), s))
+            tried = score(guesses, self.eliminated(self.residuals(params, moved), s))
             here, best = float(score(f.x, f.residual)), int(np.argmin(tried))
             if not tried[best] < here * (1 - 5e-3):
                 return f
-            f = self.fit(params, x0=guesses[best], iterations=4, tolerance=5e-3, slopes=slopes_of(f))
+            f = self.fit(params, x0=moved[best], iterations=4, tolerance=5e-3, slopes=slopes_of(f))
         return f
 
     def pattern(self, params: list[Param], x: np.ndarray) -> np.ndarray:
@@ -367,7 +367,9 @@ class Fitter:
                 jac[:, i], known[i] = slopes[p.key], True
         return jac, known
 
-    def _slopes(self, params: list[Param], x: np.ndarray, delta: np.ndarray, which: np.ndarray):
+    def _slopes(
+        self, params: list[Param], x: np.ndarray, delta: np.ndarray, which: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """(residuals [m] at x, their changes [m, k] by delta of the parameters `which` [k], by initial states [2, m]),
         by one batch of simulations: here, each of them moved, the initial state moved."""
         k = len(which)

@@ -110,7 +110,7 @@ class JointHypotheses:
         others = self.all_nuisances if any(m.effect.parts_motor for m in members) else self.nuisances
         return mine + [p for p in others if not taken & set(p.columns)]
 
-    def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None):
+    def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None) -> Fixed:
         """Constants of the variants, written to the plant's nominal for the time of a fit."""
         return Fixed(plant or self.case.plant, [f for m in members for f in m.variant.fixed])
 
@@ -165,11 +165,13 @@ class JointHypotheses:
         """The fit, looked for nearby too, where it does not follow the data yet."""
         return self.fitter.perturbed_restarts(params, fit, self.rng) if fit.loss > SEARCH.enough**2 else fit
 
-    def _simulate(self, fitter: Fitter, plants: np.ndarray, s) -> np.ndarray:
+    def _simulate(self, fitter: Fitter, plants: np.ndarray, s: np.ndarray | None) -> np.ndarray:
         q, tau = self.case.plant.simulate(plants, fitter.w)
         return fitter.eliminated(fitter.compare(q, tau, plants), s)
 
-    def draft(self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None):
+    def draft(
+        self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None
+    ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
         """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
         params = self._params(members)
         x0 = np.array([p.start for p in params], float)
@@ -238,7 +240,8 @@ class JointHypotheses:
     ) -> Trial:
         """Fit of a hypothesis: short windows first from `starts` (values of the members' parameters), then long
         ones."""
-        return self.finish(*self.draft(members, starts, like), like, quick)
+        members, x0, short = self.draft(members, starts, like)
+        return self.finish(members, x0, short, like, quick)
 
     def _values(self, trial: Trial) -> np.ndarray:
         n = sum(len(m.variant.params) for m in trial.members)

@@ -19,6 +19,8 @@ BOOTSTRAPS, STRETCH = 300, 4  # and of how many neighbouring half-second blocks 
 class JointLosses(JointHypotheses):
     """Losses of one joint's hypotheses on conditions left out."""
 
+    none_loss: np.ndarray  # by block, without any effect
+
     def _score(self, trial: Trial) -> float:
         """Left-out loss with a price on parameters: 3 % each."""
         return (

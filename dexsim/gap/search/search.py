@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -112,7 +113,7 @@ class JointSearch(JointSelection):
         run, count = self.long.run[self.fitter.window], self.case.plant.runs
         return np.bincount(run, a, count) / np.maximum(np.bincount(run, minlength=count), 1)
 
-    def in_windows(self, trial: Trial, runs: list[int], span: dict[int, tuple[float, float]] | None) -> float:
+    def in_windows(self, trial: Trial, runs: Sequence[int], span: dict[int, tuple[float, float]] | None) -> float:
         """Mean Huber square, in sigmas, over windows of `runs` that begin anew at smoothed measured states."""
         windows = self.case.plant.windows(LONG, runs, span=span)
         if not len(windows.window):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dexsim.gap.effects.catalogue import compatible
 from dexsim.gap.effects.effect import Effect, Variant
+from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted
 
@@ -60,10 +62,10 @@ class Outcome:
 class Fixed:
     """Constants set on a plant's nominal inside a `with`."""
 
-    def __init__(self, plant, pairs):
+    def __init__(self, plant: JointPlant, pairs: Sequence[tuple[str, float]]):
         self.plant, self.pairs = plant, pairs
 
-    def __enter__(self):
+    def __enter__(self) -> None:
         self.saved = self.plant.nominal
         if self.pairs:
             self.plant.nominal = [row.copy() for row in self.saved]
@@ -71,7 +73,7 @@ class Fixed:
                 for row in self.plant.nominal:
                     row[INDEX[name]] = value
 
-    def __exit__(self, *exc):
+    def __exit__(self, *exc: object) -> None:
         self.plant.nominal = self.saved
 
 

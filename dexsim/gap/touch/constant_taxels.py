@@ -51,7 +51,7 @@ def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, flo
         values = [
             (float(np.median(np.nan_to_num(newtons(r)[0][:, pad, k, 2]))), 2 * (r.tactile_lsb or 0.0))
             for r in recordings
-            if r.tactile.value.ndim == 4
+            if r.tactile is not None and r.tactile.value.ndim == 4
         ]
         value, step = max(values)
         out[k] = value if value > max(step, 1e-6) else 0.0

@@ -107,7 +107,7 @@ class Touch(Steps):
         """Where the believed simulator is off: taxel by taxel."""
         error = np.zeros(self.sensors.shape)
         for pad in self.pads:
-            if pad.outcome is not None:
+            if pad.search is not None and pad.outcome is not None:
                 off = locate.by_taxel(pad.search, pad.outcome.none)
                 error[pad.number, : len(off)] = off
                 self.result.error = error
@@ -116,7 +116,7 @@ class Touch(Steps):
         """Findings, errors and facts of each pad on what was kept out of the fit, and of all of them."""
         out, judged = self.result, []
         for pad in self.pads:
-            if pad.outcome is not None:
+            if pad.search is not None and pad.outcome is not None:
                 pad.answer = PadAnswer(pad.search, pad.outcome, pad.kept)
                 if pad.answer.felt:
                     judged.append(pad.answer)

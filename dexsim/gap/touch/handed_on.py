@@ -49,7 +49,9 @@ def doubted(finding: dict[str, Any]) -> bool:
 
 def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
     """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
-    out, pads, drifts = Handed(), {}, {}
+    out = Handed()
+    pads: dict[str, dict[str, Any]] = {}
+    drifts: dict[str, Any] = {}
     for f in findings:
         if not f["where"]["taxels"]:
             continue

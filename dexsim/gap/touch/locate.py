@@ -40,8 +40,8 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
     if len(y) < 20 or y.std() == 0:
         return []
     said = []
-    for what, x in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
-        x = np.concatenate(x)
+    for what, parts in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
+        x = np.concatenate(parts)
         c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
         if abs(c) > 0.4:
             said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
@@ -56,5 +56,5 @@ def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: boo
         after[:, k] = value
     load = None if run.load is None else np.interp(run.t, run.grid, run.load)
     pick = run.t >= (run.t[0] if whole else run.t[0] + 0.75 * (run.t[-1] - run.t[0]))
-    sums = (x[pick].sum(1) for x in (run.z, before, after))
-    return PadCurve(name, run.recording, run.t[pick], *sums, None if load is None else load[pick])
+    measured, before, after = (x[pick].sum(1) for x in (run.z, before, after))
+    return PadCurve(name, run.recording, run.t[pick], measured, before, after, None if load is None else load[pick])

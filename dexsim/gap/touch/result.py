@@ -94,7 +94,8 @@ def instead(fit: Fit, believed: float) -> Fit:
 
 def fitted(p: dict[str, Any], believed: float | None, factor: float = 1.0) -> Fit:
     """(value, low, high) of a parameter, widened to what was believed (in the parameter's unit), times a factor."""
-    return times((factor,) * 3, wide(tuple(float(p[k]) for k in ("value", "low", "high")), believed))
+    value, low, high = (float(p[k]) for k in ("value", "low", "high"))
+    return times((factor, factor, factor), wide((value, low, high), believed))
 
 
 def times(a: Fit | None, b: Fit) -> Fit:
