@@ -101,7 +101,8 @@ def test_trainings_of_several_folders_are_one_set_without_pairs(tmp_path):
         judged(tmp_path / folder, "full", seed, "training", [n] * 4)
     for folder, seed, n in (("a", 11, 4), ("b", 12, 8)):
         judged(tmp_path / folder, "no_pose", seed, "training", [n] * 4)
-    found = unpaired.gathered([tmp_path / "a", tmp_path / "b"], "training")
+    found, steps = unpaired.gathered([tmp_path / "a", tmp_path / "b"], "training")
+    assert steps == 10
     assert sorted(found["full"]["successes"]) == [30, 32, 34] and sorted(found["no_pose"]["seconds"]) == [7.5, 15]
     text = unpaired.markdown(found, unpaired.claimed("no_pose:successes,no_pose:seconds"))
     line = next(x for x in text.splitlines() if x.startswith("| no pose"))
@@ -110,6 +111,24 @@ def test_trainings_of_several_folders_are_one_set_without_pairs(tmp_path):
     assert unpaired.welch(np.array([30.0, 34, 32]), np.array([4.0, 8]))["interval"] == pytest.approx(more, rel=0.01)
     # times: geometric means 10.61 s and (60^3 / (30 * 34 * 32))^(1/3) s
     assert "| 10.61 | 5.65 (" in line and "no_pose:successes` p =" in text and "no_pose:seconds` p =" in text
+
+
+def test_shares_are_of_what_everything_makes_and_the_figure_is_drawn(tmp_path):
+    for seed, n in ((1, 30), (2, 34), (3, 32)):
+        judged(tmp_path / "a", "full", seed, "training", [n] * 4)
+        judged(tmp_path / "a", "no_touch", seed, "training", [n - 8] * 4)
+    found, _ = unpaired.gathered([tmp_path / "a"], "training")
+    share, (low, high) = unpaired.shares(found)["no_touch"]
+    # Welch's by hand: errors 2/sqrt(3) each, 4 degrees of freedom, t = 2.776
+    assert share == pytest.approx(24 / 32)
+    assert [low, high] == pytest.approx([share - 2.776 * np.sqrt(8 / 3) / 32, share + 2.776 * np.sqrt(8 / 3) / 32],
+                                        rel=1e-3)  # fmt: skip
+    assert unpaired.PAPER["no_touch"] == pytest.approx(1.1 / 25.1) and unpaired.PAPER["no_pose"] < 0.5
+    unpaired.main([f"out={tmp_path / 'a'}:{tmp_path / 'a'}", f"figure={tmp_path / 'f.png'}"])
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    judged(tmp_path / "b", "no_touch", 1, "training", [20] * 4)
+    with pytest.raises(UserError, match="no training with everything at 0.0 M steps"):
+        unpaired.main([f"out={tmp_path / 'b'}", f"figure={tmp_path / 'f.png'}"])
 
 
 def test_trainings_of_other_steps_are_not_compared(tmp_path):

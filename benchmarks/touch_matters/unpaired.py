@@ -1,11 +1,12 @@
-"""Rows whose trainings are not paired: python -m benchmarks.touch_matters.unpaired out=FOLDER[,FOLDER,..]
-[world=training] [claims=no_pose:successes,no_pose:seconds].
+"""Rows whose trainings are not paired: python -m benchmarks.touch_matters.unpaired out=FOLDER[,FOLDER,..][:FOLDER,..]
+[world=training] [claims=no_pose:successes,no_pose:seconds] [figure=FILE.png].
 
 A seed does not repeat on a GPU, so trainings of the same seed share no more than others do. Of every row against the
 one with everything, over trainings and with Welch's 95 % interval: the difference in successes in a row, and the ratio
 of seconds a success (of logarithms: a row that takes six times as long varies six times as much); Holm's correction
 over `claims`, the ones fixed before. Rows that differ in the number of taxels alone also give a slope: successes over
-the binary logarithm of that number. Trainings of several folders count as one set.
+the binary logarithm of that number. Trainings of several folders count as one set, those after a `:` as another, of
+other steps; the figure shows every row's share of what everything makes, in each set and in the paper.
 """
 
 from __future__ import annotations
@@ -17,17 +18,25 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import tools
+from benchmarks.reproduce.rows import ROTATION
 from benchmarks.touch_matters import analysis, rows
 from dexsim.errors import UserError
 
-OWN = {"out": "out/touch_matters", "world": "training", "claims": "no_pose:successes,no_pose:seconds"}
+OWN = {"out": "out/touch_matters", "world": "training", "claims": "no_pose:successes,no_pose:seconds",
+       "figure": ""}  # fmt: skip
 GRADED = ("taxels_5", "taxels_25", "taxels_120", rows.FULL.key)
 """Rows that have nothing but the number of taxels between them."""
 
 
-def gathered(folders: list[Path], world: str) -> dict[str, dict[str, np.ndarray]]:
-    """Row -> successes and seconds: averages [S] of its S trainings. Raises UserError where nothing is judged, or not
-    all at the same steps."""
+PAPER = {{"no_orientation": "no_pose"}.get(r.key, r.key): r.paper["average"] / ROTATION[0].paper["average"]
+         for r in ROTATION}  # fmt: skip
+"""What each row of the paper's makes of what its first does; where the paper drops the orientation, ours drops the
+position with it."""
+
+
+def gathered(folders: list[Path], world: str) -> tuple[dict[str, dict[str, np.ndarray]], int]:
+    """Row -> successes and seconds: averages [S] of its S trainings; and their steps. Raises UserError where nothing is
+    judged, or not all at the same steps."""
     found: dict[str, dict[str, list[float]]] = {}
     steps: dict[int, str] = {}
     for folder in folders:
@@ -44,7 +53,7 @@ def gathered(folders: list[Path], world: str) -> dict[str, dict[str, np.ndarray]
     if len(steps) > 1:
         told = "; ".join(f"{n / 1e6:.1f} M in {where}" for n, where in sorted(steps.items()))
         raise UserError(f"out: trainings of different steps cannot be compared: {told}. Judge all at one iteration")
-    return {key: {k: np.array(v) for k, v in row.items()} for key, row in found.items()}
+    return {key: {k: np.array(v) for k, v in row.items()} for key, row in found.items()}, next(iter(steps))
 
 
 def welch(a: np.ndarray, b: np.ndarray) -> dict:
@@ -115,6 +124,50 @@ def markdown(found: dict[str, dict[str, np.ndarray]], claims: list[tuple[str, st
     return "\n".join(lines)
 
 
+def shares(found: dict[str, dict[str, np.ndarray]]) -> dict[str, tuple[float, list[float]]]:
+    """Row -> what it makes of what everything does, with Welch's interval of the difference over the latter's mean (so
+    that it holds 1 where the difference is undecided)."""
+    full = found[rows.FULL.key]["successes"]
+    out = {}
+    for row in rows.EVERY:
+        if row != rows.FULL and row.key in found and min(len(full), len(found[row.key]["successes"])) >= 2:
+            w = welch(full, found[row.key]["successes"])
+            ends = [float(1 - v / full.mean()) for v in w["interval"]]
+            out[row.key] = (float(1 - w["difference"] / full.mean()), ends[::-1])
+    return out
+
+
+def draw(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], path: Path) -> None:
+    """One line a row: its share of what everything makes, in each set and in the paper."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    by = [(shares(found), found[rows.FULL.key]["successes"], steps) for found, steps in sets]
+    shown = [r for r in rows.EVERY if any(r.key in one for one, _, _ in by)][::-1]
+    figure, ax = plt.subplots(figsize=(8.6, 1.6 + 0.5 * len(shown)), constrained_layout=True)
+    for i, row in enumerate(shown):
+        if row.key in PAPER:
+            ax.plot(100 * PAPER[row.key], i, "kx", markersize=8, label="the paper's hand" if row == shown[-1] else None)
+    for k, (one, full, steps) in enumerate(by):
+        name = f"here, {steps / 1e6:.0f} M steps; everything makes {full.mean():.1f} in a row"
+        for i, row in enumerate(shown):
+            if row.key in one:
+                middle, (low, high) = one[row.key]
+                ax.errorbar(100 * middle, i + 0.12 * (2 * k - len(by) + 1), xerr=[[100 * (middle - low)],
+                            [100 * (high - middle)]], fmt="o", capsize=3, color=f"C{k}", label=name)  # fmt: skip
+                name = None
+    ax.axvline(100, color="0.5", linewidth=0.8)
+    ax.set_yticks(range(len(shown)), [r.label for r in shown])
+    ax.set_ylim(-0.6, len(shown) - 0.4)
+    ax.set_xlim(left=0)
+    ax.set_xlabel("successes in a row, % of what the hand with everything makes (95 %)")
+    figure.legend(fontsize=8, loc="outside upper center", ncols=2, frameon=False)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def main(argv: list[str]) -> None:
     own, rest = tools.split(argv, OWN)
     if rest:
@@ -122,7 +175,14 @@ def main(argv: list[str]) -> None:
     if own["world"] not in rows.WORLDS:
         raise UserError(f"world={own['world']}: must be {', '.join(rows.WORLDS)}")
     claims = claimed(own["claims"])
-    print(markdown(gathered([Path(p).expanduser() for p in own["out"].split(",")], own["world"]), claims))
+    sets = [gathered([Path(p).expanduser() for p in one.split(",")], own["world"]) for one in own["out"].split(":")]
+    for found, steps in sets:
+        print(f"{steps / 1e6:.1f} M steps a training\n\n{markdown(found, claims)}\n")
+    if own["figure"]:
+        lacking = [steps for found, steps in sets if rows.FULL.key not in found]
+        if lacking:
+            raise UserError(f"figure={own['figure']}: no training with everything at {lacking[0] / 1e6:.1f} M steps")
+        draw(sets, Path(own["figure"]).expanduser())
 
 
 if __name__ == "__main__":
