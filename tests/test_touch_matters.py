@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import tools
 from benchmarks.touch_matters import analysis, rows, unpaired
-from benchmarks.touch_matters.__main__ import chosen, common
+from benchmarks.touch_matters.__main__ import chosen, common, following
 from benchmarks.touch_matters.judge import columns, metrics_of
 from dexsim.errors import UserError
 
@@ -184,6 +184,13 @@ def test_rows_are_judged_where_all_have_come(tmp_path):
             (tmp_path / name / "train_0" / f"model_{k}.pt").touch()
     assert common([Job(tmp_path / "a"), Job(tmp_path / "b")]) == 50
     assert common([Job(tmp_path / "a"), Job(tmp_path / "c")]) is None
+
+
+def test_going_on_takes_no_folder_that_is_there(tmp_path):
+    """A training that was packed and unpacked has its furthest folder only."""
+    assert following(tmp_path) == 0
+    (tmp_path / "train_1").mkdir()
+    assert following(tmp_path) == 2
 
 
 def test_a_row_that_is_not_is_named():

@@ -58,13 +58,18 @@ def chosen(text: str) -> list[list[rows.Row]]:
     return [[r for k in turn.split(",") for r in sets[k]] for turn in text.split("/")]
 
 
+def following(folder: Path) -> int:
+    """The number after the highest of train_0, train_1, .. in `folder`, of which some may not have been taken along."""
+    return max((int(p.name.removeprefix("train_")) for p in folder.glob("train_*")), default=-1) + 1
+
+
 def train(job: Job, gpu: str | None, iterations: int, until: float, save: int, extra: Sequence[str]) -> None:
     """Train to `iterations`, going on from what is there, or until time.monotonic() reaches `until`."""
     job.folder.mkdir(parents=True, exist_ok=True)
     before = done(job.folder)
     if before.iteration >= iterations or time.monotonic() >= until:
         return
-    out = job.folder / f"train_{len(list(job.folder.glob('train_*')))}"
+    out = job.folder / f"train_{following(job.folder)}"
     settings = ["task=rotate_fingertips", f"seed={job.seed}", *job.row.settings] if before.last is None else [
         f"resume={before.last}"]  # fmt: skip
     command = [sys.executable, "train.py", *settings, *extra, f"iterations={iterations}", "final_episodes=0",
