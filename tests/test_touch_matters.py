@@ -126,6 +126,9 @@ def test_shares_are_of_what_everything_makes_and_the_figure_is_drawn(tmp_path):
     assert unpaired.PAPER["no_touch"] == pytest.approx(1.1 / 25.1) and unpaired.PAPER["no_pose"] < 0.5
     unpaired.main([f"out={tmp_path / 'a'}:{tmp_path / 'a'}", f"figure={tmp_path / 'f.png'}"])
     assert (tmp_path / "f.png").stat().st_size > 10_000
+    judged(tmp_path / "c", "full", 1, "training", [20] * 4)  # nothing to compare with: only its dot
+    unpaired.main([f"out={tmp_path / 'c'}", f"figure={tmp_path / 'g.png'}"])
+    assert (tmp_path / "g.png").stat().st_size > 10_000
     judged(tmp_path / "b", "no_touch", 1, "training", [20] * 4)
     with pytest.raises(UserError, match="no training with everything at 0.0 M steps"):
         unpaired.main([f"out={tmp_path / 'b'}", f"figure={tmp_path / 'f.png'}"])

@@ -138,34 +138,57 @@ def shares(found: dict[str, dict[str, np.ndarray]]) -> dict[str, tuple[float, li
 
 
 def draw(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], path: Path) -> None:
-    """One line a row: its share of what everything makes, in each set and in the paper."""
+    """Left: every row's share of what everything makes, in each set and in the paper. Right, of the first set: the
+    trainings of the rows that differ in how much touch there is."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    lines = sum(any(r.key in found for found, _ in sets) for r in rows.EVERY) - 1
+    figure, axes = plt.subplots(1, 2, figsize=(13.4, 1.8 + 0.5 * lines), constrained_layout=True, width_ratios=(8, 5))
+    over_rows(sets, axes[0])
+    over_sensors(*sets[0], axes[1])
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def over_rows(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], ax) -> None:
+    """One line a row: its share of what everything makes, in each set and in the paper."""
     by = [(shares(found), found[rows.FULL.key]["successes"], steps) for found, steps in sets]
     shown = [r for r in rows.EVERY if any(r.key in one for one, _, _ in by)][::-1]
-    figure, ax = plt.subplots(figsize=(8.6, 1.6 + 0.5 * len(shown)), constrained_layout=True)
-    for i, row in enumerate(shown):
-        if row.key in PAPER:
-            ax.plot(100 * PAPER[row.key], i, "kx", markersize=8, label="the paper's hand" if row == shown[-1] else None)
+    there = [(100 * PAPER[r.key], i) for i, r in enumerate(shown) if r.key in PAPER]
+    ax.plot([x for x, _ in there], [i for _, i in there], "kx", markersize=8, label="the paper's hand")
     for k, (one, full, steps) in enumerate(by):
-        name = f"here, {steps / 1e6:.0f} M steps; everything makes {full.mean():.1f} in a row"
-        for i, row in enumerate(shown):
-            if row.key in one:
-                middle, (low, high) = one[row.key]
-                ax.errorbar(100 * middle, i + 0.12 * (2 * k - len(by) + 1), xerr=[[100 * (middle - low)],
-                            [100 * (high - middle)]], fmt="o", capsize=3, color=f"C{k}", label=name)  # fmt: skip
-                name = None
+        at = [(i, *one[r.key]) for i, r in enumerate(shown) if r.key in one]
+        middle = np.array([100 * m for _, m, _ in at])
+        ends = np.array([[100 * v for v in interval] for *_, interval in at]).reshape(-1, 2).T
+        ax.errorbar(middle, [i + 0.12 * (2 * k - len(by) + 1) for i, *_ in at], xerr=np.abs(ends - middle), fmt="o",
+                    capsize=3, color=f"C{k}",
+                    label=f"here, {steps / 1e6:.0f} M steps; everything makes {full.mean():.1f} in a row")  # fmt: skip
     ax.axvline(100, color="0.5", linewidth=0.8)
     ax.set_yticks(range(len(shown)), [r.label for r in shown])
-    ax.set_ylim(-0.6, len(shown) - 0.4)
+    ax.set_ylim(-0.6, len(shown) - 0.1 + 0.35 * (1 + len(by)))  # room for the legend above
     ax.set_xlim(left=0)
     ax.set_xlabel("successes in a row, % of what the hand with everything makes (95 %)")
-    figure.legend(fontsize=8, loc="outside upper center", ncols=2, frameon=False)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    ax.legend(fontsize=8, loc="upper left", frameon=False)
+
+
+def over_sensors(found: dict[str, dict[str, np.ndarray]], steps: int, ax) -> None:
+    """A dot a training, and mean with interval, of the rows in which the number of sensors changes."""
+    counted = sorted((r for r in rows.EVERY if r.sensors is not None and r.key in found),
+                     key=lambda r: (r.sensors, r.key))  # fmt: skip
+    for i, row in enumerate(counted):
+        each = found[row.key]["successes"]
+        ax.plot([i + 0.12] * len(each), each, ".", color="0.55", markersize=5)
+        if len(each) > 1:
+            analysis.bar(ax, i - 0.12, float(each.mean()), analysis.over_seeds(each), 0)
+    names = {"bits": "5 bits", "no_touch": "no touch"}
+    ax.set_xticks(range(len(counted)), [names.get(r.key, f"{r.sensors} taxels") for r in counted], fontsize=8)
+    ax.set_xlim(-0.5, len(counted) - 0.5)
+    ax.set_ylim(bottom=0)
+    ax.set_ylabel("successes in a row (95 %; dots: trainings)")
+    ax.set_title(f"{steps / 1e6:.0f} M steps", fontsize=9)
 
 
 def main(argv: list[str]) -> None:
