@@ -14,7 +14,9 @@ import yaml
 
 from dexsim.actuator.table import ServoTable
 from dexsim.calibration.file import Calibration
+from dexsim.calibration.rubber import read_curve
 from dexsim.errors import UserError
+from dexsim.learning import checkpoint
 from dexsim.recording import Recording, Series, States, Writer, container, read, write
 from dexsim.recording.schema import COMMANDS, STATES
 from dexsim.tactile import file as tactile_file
@@ -60,8 +62,15 @@ def test_yaml_beside_a_recording_and_in_its_metadata(tmp_path, bomb):
 
 @pytest.mark.parametrize(
     "reader",
-    [*LOADERS.values(), read, lambda p: read(p.with_suffix(".csv")), lambda p: read(p.with_suffix(".npz"))],
-    ids=[*LOADERS, "mcap", "csv", "npz"],
+    [
+        *LOADERS.values(),
+        read,
+        lambda p: read(p.with_suffix(".csv")),
+        lambda p: read(p.with_suffix(".npz")),
+        checkpoint.load,
+        read_curve,
+    ],
+    ids=[*LOADERS, "mcap", "csv", "npz", "checkpoint", "curve"],
 )
 @pytest.mark.parametrize("kind", ["fifo", "zero"])
 def test_devices_and_pipes_are_no_files(tmp_path, reader, kind):

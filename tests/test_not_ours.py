@@ -178,6 +178,8 @@ def test_held_poses_are_whole_or_not_there(tmp_path, monkeypatch):
         ("count=true", "must be a whole number from 1"),
         ("seed=-1", "must be a whole number from 0"),
         ("seed=x", "must be a whole number from 0"),
+        ("out=", "must be a file to write"),
+        ("out=..", "must be a file to write"),
         ("worlds=\x00", "cannot be read as YAML"),
     ],
 )

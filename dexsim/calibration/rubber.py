@@ -13,7 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import files
 from dexsim.errors import UserError
+
+MOST_BYTES = 64 << 20
+"""Of a curve's file."""
 
 TRELOAR_1944 = np.array([
     [1.000, 0.00], [1.020, 0.26], [1.125, 1.37], [1.240, 2.30], [1.390, 3.23], [1.585, 4.16], [1.900, 5.10],
@@ -150,6 +154,7 @@ def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
     if str(path) == "treloar":
         return "stress", *TRELOAR_1944.T
     path = Path(path).expanduser()
+    files.check(path, MOST_BYTES, "curve=")
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(line for line in file if not line.startswith("#")))

@@ -147,8 +147,12 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
             _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
         try:
             OmegaConf.update(cfg, key, value, merge=False, force_add=item.type != OverrideType.CHANGE)
-        except ValueError:  # a name where a list has numbers
-            owner = key.rpartition(".")[0]
+        except (ValueError, TypeError):  # a name where a list has numbers
+            parts = key.split(".")
+            owners = (".".join(parts[:n]) for n in range(1, len(parts)))
+            owner = next((o for o in owners if isinstance(OmegaConf.select(cfg, o), ListConfig)), None)
+            if owner is None:
+                raise
             raise UserError(f"{key}: {owner} is a list, whose values are numbered: {owner}.0=..., or [..]") from None
     return cfg
 

@@ -72,6 +72,8 @@ def main(argv: list[str]) -> int:
     if begun is None:
         return 0
     out = files.place(own["out"])
+    if out.name in ("", ".."):
+        raise UserError(f"out={own['out']}: must be a file to write, e.g. out=poses.npz")
     out = out if out.suffix == ".npz" else out.with_name(out.name + ".npz")
     outputs.claim(out.parent, "out=", [out.name])
     import torch

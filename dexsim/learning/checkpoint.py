@@ -40,6 +40,8 @@ FORMAT = "dexsim-checkpoint"
 VERSION = 1
 KEYS = ("kind", "config", "versions", "git", "layout", "iteration", "steps", "actor")
 TRAIN_KEYS = ("critic", "optimizer", "env", "rng")
+MOST_BYTES = 16 << 30
+"""Of a checkpoint: a million worlds' states."""
 
 
 def save(path: str | Path, payload: dict[str, Any]) -> Path:
@@ -142,6 +144,7 @@ def _check_whole(path: Path) -> None:
         raise UserError(f"{path}: no such checkpoint{_nearby(path)}")
     if path.is_dir():
         raise UserError(f"{path}: a folder, not a checkpoint{_nearby(path / 'last.pt')}")
+    files.check(path, MOST_BYTES, "checkpoint")
     try:
         with open(path, "rb") as file:
             head = file.read(2)

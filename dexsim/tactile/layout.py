@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 
@@ -203,7 +204,8 @@ def load_layout(path: str | Path, body: str, name: str | None = None, kind: str 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"taxel file {path}: not found")
-    lines = [s for s in path.read_text().splitlines() if s.strip() and not s.startswith("#")]
+    text = files.text(path, files.MAX_YAML, "taxel file")
+    lines = [s for s in text.splitlines() if s.strip() and not s.startswith("#")]
     rows = list(csv.DictReader(lines))
     if not rows:
         raise UserError(f"taxel file {path}: no taxels in it; expected a header line and one line a taxel")
