@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dexsim.errors import UserError
+from dexsim.typed import whole
 
 USAGE = """usage: dexsim export checkpoint=FILE out=DIR [key=value ...]
        dexsim export check=DIR
@@ -55,8 +56,8 @@ def main(argv: Sequence[str]) -> int:
         given["checkpoint"],
         given["out"],
         given.get("calibration"),
-        _whole(given, "steps", 64),
-        _whole(given, "seed", 0),
+        whole("steps", given.get("steps", "64"), 2, 100_000),
+        whole("seed", given.get("seed", "0")),
         frozenset((k, v) for k, v in given.items() if k.startswith("agent.")),
     )
     return 0 if check(out) else 1
@@ -417,13 +418,6 @@ def _settings(argv: Sequence[str]) -> dict[str, str]:
             raise UserError(f"'{argument}': expected key=value with one of the keys {', '.join(KEYS)}")
         out[key] = value
     return out
-
-
-def _whole(given: dict[str, str], key: str, default: int) -> int:
-    text = given.get(key, str(default))
-    if not text.isdigit() or (key == "steps" and int(text) < 2):
-        raise UserError(f"{key}={text}: must be a whole number{' of at least 2' if key == 'steps' else ''}")
-    return int(text)
 
 
 if __name__ == "__main__":

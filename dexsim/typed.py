@@ -17,6 +17,17 @@ Positive = Annotated[float, msgspec.Meta(gt=0, le=1e12)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
+def whole(key: str, text: str, low: int = 0, high: int = 2**63 - 1) -> int:
+    """A whole number as it was typed. Raises UserError for what is none, or lies outside [low, high]."""
+    try:
+        value = int(text) if text.isascii() and len(text) <= 20 and "_" not in text else None
+    except ValueError:
+        value = None
+    if value is None or not low <= value <= high:
+        raise UserError(f"{key}={text}: must be a whole number from {low} to {high}")
+    return value
+
+
 def convert(data: Any, kind: type[T], source: object, fix: str = "") -> T:
     """`data` (plain: dicts, lists, text, numbers) as `kind`. Raises UserError naming source, place, what is there and
     what must be.

@@ -198,6 +198,11 @@ def test_values_of_held_poses_that_are_none(place, setting, said):
         (["play", "replay="], "say what to play"),
         (["import-object", "a.obj", "out=a\x00b"], "a path holds no zero character"),
         (["import-object", "a.obj", "out=o", "hulls=nan"], "hulls=nan: must be a whole number from 1 to 32"),
+        (["export", "checkpoint=a.pt", "out=o", "seed=99999999999999999999"], "seed=99999999999999999999: must be a whole"),
+        (["export", "checkpoint=a.pt", "out=o", "steps=\u00b2"], "steps=\u00b2: must be a whole number from 2 to 100000"),
+        (["deploy", "record=none", "seed=-1"], "seed=-1: must be a whole number from 0"),
+        (["diagnose", "recordings=[a.mcap]", "seed=--5"], "seed=--5: must be a whole number from 0"),
+        (["diagnose", "recordings=[a.mcap]", "columns=["], "columns=: cannot be read as YAML"),
         (["import-object", "a.obj", "out=o", "hulls=1.5"], "hulls=1.5: must be a whole number from 1 to 32"),
     ],
 )

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dexsim.errors import UserError
+from dexsim.typed import whole
 
 USAGE = """usage: dexsim deploy bundle=DIR [key=value ...]
 
@@ -163,15 +164,14 @@ def _hand(given: dict[str, str], b: Any, calibration: Any) -> tuple[Any, Any]:
         vision = given.get("vision", "truth")
         if vision not in ("truth", "camera"):
             raise UserError(f"vision={vision}: must be truth or camera")
-        if not given.get("seed", "0").isdigit():
-            raise UserError(f"seed={given['seed']}: must be a whole number")
+        seed = whole("seed", given.get("seed", "0"))
         if "imu" in given:
             raise UserError("imu=: driver=sim has its own")
         config = b.config
         shapes = [*config["task"]["objects"]["train"], *config["task"]["objects"]["held_out"]]
         if given.get("shape", shapes[0]) not in shapes:
             raise UserError(f"shape={given['shape']}: must be one of {', '.join(shapes)}")
-        driver = SimulatedXHand(config, calibration, seed=int(given.get("seed", "0")), camera=vision == "camera",
+        driver = SimulatedXHand(config, calibration, seed=seed, camera=vision == "camera",
                                 shape=given.get("shape"),
                                 grip=b.manifest.get("grip"))  # fmt: skip
         return driver, place or driver
@@ -205,7 +205,7 @@ def _imu(given: dict[str, str], b: Any) -> Any:
         return None
     how, _, ports = given.get("imu", "").partition(":")
     port, colon, sender = ports.partition(":")
-    if how != "udp" or not port.isdigit() or (colon and not sender.isdigit()):
+    if how != "udp" or not port.isdecimal() or (colon and not sender.isdecimal()):
         raise UserError(
             f'imu={given.get("imu", "")}: nothing says how the object is turned; say imu=udp:PORT and send lines "w x y'
             ' z" there, or run'

@@ -22,7 +22,7 @@ def device(asked: str | None) -> str:
     name, _, index = str(asked).partition(":")
     if name == "cpu" and not index:
         return "cpu"
-    if name == "cuda" and (not index or index.isdigit()):
+    if name == "cuda" and (not index or index.isdecimal()):
         if not count:
             raise UserError(
                 f"device={asked}: torch {torch.__version__} sees no CUDA device here; use device=cpu"

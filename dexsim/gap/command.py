@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
+from dexsim import yaml_text
 from dexsim.console import program
 from dexsim.errors import UserError
+from dexsim.typed import whole
 
 if TYPE_CHECKING:
     from dexsim.gap.result import Diagnosis, Settings
@@ -117,7 +117,7 @@ def parse(argv: list[str]) -> dict:
         elif key == "demo":
             out[key] = _hidden(text)
         elif key in ("columns", "next", "hand_mirror"):
-            value = yaml.safe_load(text)
+            value = yaml_text.parse(text, f"{key}=")
             if not isinstance(value, bool):
                 raise UserError(f"{key}={text}: must be true or false")
             out[key] = value
@@ -129,9 +129,7 @@ def parse(argv: list[str]) -> dict:
             if not 1.0 <= out[key] < 1e7:
                 raise UserError(f"limit={text}: must be a number of seconds from 1 on")
         elif key == "seed":
-            if not text.lstrip("-").isdigit():
-                raise UserError(f"seed={text}: must be a whole number")
-            out[key] = int(text)
+            out[key] = whole(key, text)
         else:
             out[key] = text
     return out
@@ -279,7 +277,7 @@ def available(device: str) -> str:
 
     count = wp.get_cuda_device_count()
     number = device.partition(":")[2] or "0"
-    if not number.isdigit():
+    if not number.isdecimal():
         raise UserError(f"device={device}: must be cpu, cuda or cuda:0, cuda:1, ...")
     if int(number) < count:
         return f"cuda:{number}"  # torch wants the number

@@ -124,7 +124,7 @@ def settings(given: dict[str, str], said: dict[str, Any]) -> Any:
         out.pads = Path(pads).expanduser()
     else:
         rows, x, columns = pads.partition("x")
-        if not (x and rows.isdigit() and columns.isdigit() and 1 <= int(rows) <= 40 and 1 <= int(columns) <= 40):
+        if not (x and rows.isdecimal() and columns.isdecimal() and 1 <= int(rows) <= 40 and 1 <= int(columns) <= 40):
             raise UserError(f"pads={pads}: must be ROWSxCOLUMNS (1 to 40 each, e.g. 8x6), none, or a .csv file")
         out.pads = (int(rows), int(columns))
     return out

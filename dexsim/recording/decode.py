@@ -157,7 +157,7 @@ def first(m: Any, *names: str) -> Any:
 def walk(m: Any, path: str) -> Any:
     """Follow a dotted path of field names and list indices."""
     for step in filter(None, path.split(".")):
-        m = m[int(step)] if step.lstrip("-").isdigit() else get(m, step)
+        m = m[int(step)] if step.removeprefix("-").isdecimal() else get(m, step)
         if m is None:
             raise ValueError(f"no field '{step}' of '{path}'")
     return m
