@@ -32,7 +32,7 @@ def claim(folder: Path, setting: str, names: Iterable[str], inputs: Iterable[Pat
     of `names` (of a file, or of a folder of files) is there and not ours, or is one of `inputs`."""
     make(folder, setting)
     recover(folder)
-    read = {p.expanduser().resolve() for p in inputs}
+    read = {files.place(p).resolve() for p in inputs}
     for name in names:
         path = folder / name
         if path.resolve() in read:
