@@ -202,7 +202,7 @@ def test_values_of_held_poses_that_are_none(place, setting, said):
         (["export", "checkpoint=a.pt", "out=o", "steps=\u00b2"], ": must be a whole number from 2 to 100000"),
         (["deploy", "record=none", "seed=-1"], "seed=-1: must be a whole number from 0"),
         (["diagnose", "recordings=[a.mcap]", "seed=--5"], "seed=--5: must be a whole number from 0"),
-        (["diagnose", "recordings=[a.mcap]", "model=a\x00"], "a path holds no zero character"),
+        (["diagnose", "recordings=[there.mcap]", "model=a\x00"], "a path holds no zero character"),
         (["calibrate", "real=a\x00", "out=o"], "a path holds no zero character"),
         (["diagnose", "recordings=[a.mcap]", "columns=["], "columns=: cannot be read as YAML"),
         (["import-object", "a.obj", "out=o", "hulls=1.5"], "hulls=1.5: must be a whole number from 1 to 32"),
@@ -211,6 +211,7 @@ def test_values_of_held_poses_that_are_none(place, setting, said):
 def test_arguments_that_are_no_text(bundle_of_zeros, place, capfd, command, said):
     from dexsim.cli.main import main
 
+    (place / "there.mcap").write_bytes(b"")
     own = [f"bundle={bundle_of_zeros}"] if command[0] == "deploy" else []
     capfd.readouterr()
     assert main([*command, *own]) == 2
