@@ -301,6 +301,7 @@ def _rotate(env: Any) -> dict[str, Any]:
         "task_settings": settings,
         "grip": {"hand": _floats(g.hand[middle]), "target": _floats(g.target[middle]),
                  "object_pose": _floats(g.pose[middle]),
+                 "object": env.names[int(g.shape[middle])],
                  "object_edge_m": round(float(g.edge[middle]), 6), "pose_is": "x y z m, quaternion w x y z, palm frame",
                  "edges_trained_m": [round(float(x), 6) for x in (g.edge.min(), g.edge.max())]},
         "perception": {"object_orientation": "an IMU inside the object: to a frame whose z is the palm's normal, up;"

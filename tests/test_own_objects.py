@@ -140,8 +140,9 @@ def _plain(**given):
         ({"objects": ["cross"]}, "kept_out: 'cross' is trained on as well"),
         ({"objects": ["box"], "object_scale": 0}, "object_scale=0: must be a positive number"),
         ({"objects": ["box"], "object_hulls": 99}, "object_hulls=99: must be a whole number from 1 to 32"),
-        ({"objects": ["box"], "task": {"name": "rotate"}}, r"objects=.*rotate has its own object \(each trial begins"),
-        ({"kept_out": ["m.stl"], "task": {"name": "rotate"}}, r"kept_out=.*task=rotate.*kept_out= is for task=grasp"),
+        ({"objects": ["box"], "task": {"name": "press"}}, "objects=.*task=press has its own object"),
+        ({"kept_out": ["m.stl"], "task": {"name": "rotate", "mode": "fingertips"}},
+         "kept_out=.*task=rotate_fingertips.*kept_out= is for task=grasp and task=rotate"),
     ],
 )
 def test_wrong_settings(given, said):

@@ -16,13 +16,10 @@ def apply(plain: dict[str, Any]) -> None:
     if all(value is None for value in given.values()):
         return
     task = plain["task"]
-    if task.get("name") != "grasp":
+    if task.get("name") not in ("grasp", "rotate") or task.get("mode") == "fingertips":
         key = next(k for k, value in given.items() if value is not None)
-        why = " (each trial begins with a held cube, and such poses are only known of cubes)"
-        raise UserError(
-            f"{key}={given[key]}: task={task.get('name')} has its own object"
-            f"{why if task.get('name') == 'rotate' else ''}; {key}= is for task=grasp"
-        )
+        name = "rotate_fingertips" if task.get("mode") == "fingertips" else task.get("name")
+        raise UserError(f"{key}={given[key]}: task={name} has its own object; {key}= is for task=grasp and task=rotate")
     for key, into in (("objects", "train"), ("kept_out", "held_out")):
         names = given[key]
         if names is None:

@@ -13,6 +13,8 @@ USAGE = """usage: dexsim stable-grasps [key=value ...]
 
 Let cubes fall into half-open hands, close the fingers, and keep the poses that hold in worlds with other mass,
 friction and drives. Rotation episodes start from them: dexsim train task=rotate task.initial.poses=FILE
+With objects=[mug.obj,bolt.stl] (kept_out= too) they hold a user's own objects, about as many poses of each; train with
+the same objects=, kept_out=.
 With hold=fingertips, fingertips close on cubes above the palm instead: for task=rotate_fingertips.
 
 settings (key=default):
@@ -90,7 +92,9 @@ def main(argv: list[str]) -> int:
     grasps = generate(begun.cfg, own["count"], own["worlds"], own["seed"], tuple(sizes))
     with outputs.staged(out.parent) as stage:
         grasps.save(stage / out.name)
-    print(f"{len(grasps)} held poses, cubes of {1000 * grasps.edge.min():.0f}-{1000 * grasps.edge.max():.0f} mm: {out}")
+    what = "cubes" if grasps.names == ("box",) else ", ".join(grasps.names)
+    low, high = 1000 * grasps.edge.min(), 1000 * grasps.edge.max()
+    print(f"{len(grasps)} held poses, {what} of {low:.0f}-{high:.0f} mm: {out}")
     return 0
 
 

@@ -108,6 +108,7 @@ class Grip(msgspec.Struct):
     target: Joints
     object_pose: Annotated[list[Real], msgspec.Meta(min_length=7, max_length=7)]
     object_edge_m: Annotated[float, msgspec.Meta(gt=0, le=1.0)]
+    object: Annotated[str, msgspec.Meta(max_length=256)] = "box"
 
 
 class HandEntry(msgspec.Struct):

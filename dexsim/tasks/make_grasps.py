@@ -1,13 +1,15 @@
 """Finds held poses that rotation episodes start from: `dexsim stable-grasps out=poses.npz count=2000`.
 
-A cube falls into an open hand, whose fingers close until their tips lie against its sides. What has come to rest, lies
-about flat and is touched by fingertips is started again from exactly the saved state, in a world with other mass,
-friction and drives, and must lie still for `HOLD` seconds. The saved set is checked again by tests/test_rotate.py.
+A cube (or a user's own object, any of its axes up) falls into an open hand, whose fingers close until their tips lie
+against its sides. What has come to rest, lies about flat and is touched by fingertips is started again from exactly the
+saved state, in a world with other mass, friction and drives, and must lie still for `HOLD` seconds. The saved set is
+checked again by tests/test_rotate.py.
 """
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,8 +20,8 @@ from dexsim.hand import Hand
 from dexsim.hand.places import approach
 from dexsim.tasks.env import UNIT_SPAN, hand_of
 from dexsim.tasks.reach import Reach
-from dexsim.tasks.rotate import RotateEnv
-from dexsim.tasks.stable_grasps import GraspSet, held_file
+from dexsim.tasks.rotate import RotateEnv, check_objects
+from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_file
 
 SETTLE, HOLD = 2.0, 2.0  # s
 DRIFT, TURN = 0.004, 0.10  # m, rad: how far a held cube may creep in HOLD seconds
@@ -34,6 +36,8 @@ SPREAD = 0.15  # rad, by which those fingers differ from a common bend
 CENTRE_X, CENTRE_Y = 0.0125, 0.015  # m, either side of the hand's `catch`, where the cube is let go
 PLACES = 8  # of a cube that are tried: where most fingers reach its sides it is let fall
 CLEARANCE = 0.01  # m, of its lowest point over the palm
+ONTO = torch.tensor([[0.5**0.5, 0.0, -(0.5**0.5), 0.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
+"""Rotations that bring an object's x, y, z onto the palm's normal."""
 LAND, CLOSE, SPEED, LEAD = 0.4, 2.0, 1.5, 0.08  # s, s, rad/s, rad: the fingers close until their tips touch
 TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses on
 
@@ -41,8 +45,9 @@ TOUCH, PRESS = 0.03, 0.05  # N that stops a finger; rad by which it then presses
 def candidates(
     env: RotateEnv, n: int, sizes: tuple[float, float], rng: torch.Generator, reach: Reach
 ) -> GraspSet:
-    """n open hands, each with a cube (edges of sizes [m]) above its palm and the joint angles (`target`) that it will
-    close to: fingertips against the cube's sides where they can, about the cupped pose where they cannot."""
+    """n open hands, each with an object (cubes with edges of sizes [m]; others in turns) above its palm and the joint
+    angles (`target`) that it will close to: fingertips against a cube's sides where they can, or those of a square
+    block as wide as another object's narrower side, about the cupped pose where they cannot."""
     hand: Hand = env.hand
     J, sign = len(hand.joints), torch.as_tensor(hand.closing, dtype=torch.float32)
     u, common = 2 * torch.rand(n, J, generator=rng) - 1, 2 * torch.rand(n, 8, generator=rng) - 1
@@ -61,6 +66,15 @@ def candidates(
     aside = torch.tensor([CENTRE_X, CENTRE_Y]) * (2 * torch.rand(n, 2, generator=rng) - 1)
     catch = torch.as_tensor(env.places.catch, dtype=torch.float32)
     yaw = 2 * torch.pi * torch.rand(n, generator=rng)
+    shape = torch.arange(n) % len(env.names)
+    height, onto = edge.clone(), ONTO[2].repeat(n, 1)
+    for k, variant in enumerate(env.scene.variants):
+        mine = torch.nonzero(shape == k)[:, 0]
+        if env.names[k] != CUBE and len(mine):
+            up = torch.randint(3, (len(mine),), generator=rng)
+            size = torch.as_tensor(variant.shape.extents * variant.scale, dtype=torch.float32)
+            height[mine], onto[mine] = size[up], ONTO[up]
+            edge[mine] = torch.minimum(size[(up + 1) % 3], size[(up + 2) % 3])
     _against(reach, target, edge, aside, yaw, catch, env.unit, rng)
     limits = torch.as_tensor(hand.limits, dtype=torch.float32)
     target = torch.maximum(torch.minimum(target, limits[:, 1]), limits[:, 0])
@@ -69,9 +83,10 @@ def candidates(
     base = [hand.fingers[k].flexion[0] for k in hand.others]
     opened[:, base] = target[:, base]  # the fingers' first links stay: the cube may lie on them
     pose = torch.cat([
-        catch[:2] + env.unit * aside, (catch[2] + env.unit * CLEARANCE + edge / 2)[:, None], quat
+        catch[:2] + env.unit * aside, (catch[2] + env.unit * CLEARANCE + height / 2)[:, None],
+        rotation.multiply(quat, onto),
     ], 1)  # fmt: skip
-    return GraspSet(edge, opened, target, pose)
+    return GraspSet(edge, opened, target, pose, shape=shape, names=env.names)
 
 
 def _against(
@@ -101,18 +116,19 @@ def _against(
 def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit
     [N])."""
-    _begin(env, GraspSet(start.edge, start.hand, start.hand, start.pose))
+    _begin(env, replace(start, target=start.hand))
     _play(env, LAND)
     _play(env, CLOSE, start.target)
     _play(env, SETTLE)
-    end = GraspSet(start.edge, env.q.clone(), env.target.clone(), env.object_pose.clone())
+    end = replace(start, hand=env.q.clone(), target=env.target.clone(), pose=env.object_pose.clone())
     v, w = env.object_velocity.split(3, 1)
     still = (v.norm(dim=1) < 0.01) & (w.norm(dim=1) < 0.1) & (env.qd.abs().amax(1) < 0.2)
     flat = rotation.tilt(end.pose[:, 3:], env.axis) < TILT
     touched = (env.tip_force > 0.02).sum(1) >= TIPS
     catch = torch.as_tensor(env.places.catch, dtype=torch.float32)
     near = (end.pose[:, :2] - catch[:2]).norm(dim=1) < env.unit * AROUND
-    inside = near & (end.pose[:, 2] > catch[2] + 0.005 * env.unit)
+    low = torch.minimum(torch.tensor(0.005 * env.unit), 0.2 * _smallest(env)[start.shape])
+    inside = near & (end.pose[:, 2] > catch[2] + low)
     return end, still & flat & touched & inside & ~env.nan
 
 
@@ -125,6 +141,13 @@ def holds(env, start: GraspSet) -> torch.Tensor:
         ok &= (env.object_pose[:, :3] - start.pose[:, :3]).norm(dim=1) < env.unit * DRIFT
         ok &= rotation.error(env.object_pose[:, 3:], start.pose[:, 3:]) < TURN
     return ok & ((env.tip_force > 0.02).sum(1) >= 1) & ~env.nan
+
+
+def _smallest(env) -> torch.Tensor:
+    """Smallest extent of each object [m]; of a cube, whose edges differ, as large as may be."""
+    return torch.tensor([
+        torch.inf if v.shape.name == CUBE else float(min(v.shape.extents)) * v.scale for v in env.scene.variants
+    ])  # fmt: skip
 
 
 def _begin(env, start: GraspSet) -> None:
@@ -155,17 +178,26 @@ def _play(env, seconds: float, towards: torch.Tensor | None = None) -> None:
 
 
 def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:
-    """Something for the worlds to begin with: open hands, cubes well above them."""
+    """Something for the worlds to begin with: open hands, objects well above them."""
     hand = hand_of(cfg)
     opened = torch.as_tensor(hand.pose("open"), dtype=torch.float32).repeat(n, 1)
     pose = torch.tensor([0.0, 0.0, 3 * hand.span, 1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-    return GraspSet(torch.full((n,), float(sizes[1])), opened, opened.clone(), pose)
+    objects = cfg["task"]["objects"]
+    names = tuple(called(name) for name in (*objects["train"], *objects["held_out"]))
+    return GraspSet(torch.full((n,), float(sizes[1])), opened, opened.clone(), pose, names=names)
 
 
 def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report=print) -> None:
     """The held poses of a config's hand are there: else they are searched for and kept in the hand's folder. Raises
     UserError."""
-    hand = hand_of(cfg)
+    hand, objects = hand_of(cfg), cfg["task"]["objects"]
+    check_objects(cfg["task"])
+    own = [name for name in (*objects["train"], *objects["held_out"]) if name != CUBE]
+    if own:
+        raise UserError(
+            f"task.initial.poses: must name a file of held poses of {', '.join(map(called, own))}, with which trials"
+            f" begin: dexsim stable-grasps objects=[{','.join(own)}] hand={hand.folder} out=FILE"
+        )
     file = held_file(hand)
     if file.is_file() or hand.file.held_cubes is not None:
         return
@@ -182,23 +214,32 @@ def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report
 
 
 def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report=print) -> GraspSet:
-    """At least `count` held poses, made on the CPU by C MuJoCo. sizes: edges of the cubes [m]. Raises UserError."""
+    """`count` held poses (of several objects about as many each), made on the CPU by C MuJoCo. sizes: edges of the
+    cubes [m]. Raises UserError."""
     rng = torch.Generator().manual_seed(seed)
     env = RotateEnv(cfg, worlds, "cpu", seed, "mujoco", grasps=_waiting(cfg, worlds, sizes))
     reach = Reach(env.hand, np.random.default_rng(seed))
     found: list[GraspSet] = []
-    total = tried = 0
-    while total < count:
+    kinds = len(env.names)
+    share = [count // kinds + (k < count % kinds) for k in range(kinds)]
+    held, tried = [0] * kinds, 0
+    while any(h < s for h, s in zip(held, share, strict=True)):
         rest, fit = settle(env, candidates(env, worlds, sizes, rng, reach))
         tried += worlds
         for _ in range(2):  # two draws of mass, friction and drives
             fit &= holds(env, rest)
-        found.append(rest[fit])
-        total += int(fit.sum())
-        report(f"{total} held of {tried} tried")
-        if tried >= 4096 and total < tried / 2000:
-            raise UserError(
-                f"hand={env.hand.name}: only {total} of {tried} cubes of {list(sizes)} m were held: look at"
-                " poses.cupped, opposing and places.catch of its hand.yaml, or give sizes=[low,high] that fit the hand"
-            )
-    return GraspSet.join(found)[torch.arange(count)]
+        for k in range(kinds):  # no more of one than its share
+            mine = torch.nonzero(fit & (rest.shape == k))[:, 0][: share[k] - held[k]]
+            found.append(rest[mine])
+            held[k] += len(mine)
+        each = ", ".join(f"{h} {name}" for h, name in zip(held, env.names, strict=True))
+        report(f"{sum(held)} held of {tried} tried" + (f" ({each})" if kinds > 1 else ""))
+        for k, name in enumerate(env.names):
+            if held[k] < share[k] and tried // kinds >= 4096 and held[k] < tried / kinds / 2000:
+                what = f"cubes of {list(sizes)} m were" if name == CUBE else f"times '{name}' was"
+                fits = "give sizes=[low,high]" if name == CUBE else "an object"
+                raise UserError(
+                    f"hand={env.hand.name}: only {held[k]} of {tried // kinds} {what} held: look at poses.cupped,"
+                    f" opposing and places.catch of its hand.yaml, or {fits} that fit{'s' * (name != CUBE)} the hand"
+                )
+    return GraspSet.join(found)

@@ -1,4 +1,5 @@
-"""In-hand cube rotation: turn a cube on a palm-up hand about one axis of the palm, 90 degrees at a time.
+"""In-hand cube rotation: turn a cube, or a user's own objects, on a palm-up hand about one axis of the palm, 90 degrees
+at a time.
 
 Paper: "In-Hand Object Rotation" (setup), tables "Observation for in-hand object rotation" and "Reward for in-hand
 object rotation", and the ablation's settings. Constants the paper does not publish are marked `ours` in
@@ -15,6 +16,7 @@ import math
 import torch
 
 from dexsim import rotation
+from dexsim.assets.objects.own import is_own
 from dexsim.deploy import observations_rotate as observations
 from dexsim.deploy.observations_rotate import ORIENTATION
 from dexsim.errors import UserError
@@ -22,7 +24,9 @@ from dexsim.hand.skin import tip_skins
 from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tasks.env import HandEnv
 from dexsim.tasks.servos import ServoRandomizer
-from dexsim.tasks.stable_grasps import GraspSet, held_poses
+from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_poses
+
+LEAST = 0.4  # of an object's smallest extent: its centre is never lower over the palm while it lies there
 
 
 def critic(joints: int, fingers: int) -> tuple[tuple[str, int, str, str], ...]:
@@ -46,6 +50,25 @@ def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
     )  # fmt: skip
 
 
+def check_objects(task: dict) -> None:
+    """Raises UserError for objects that this task cannot turn."""
+    objects, tips = task["objects"], task.get("mode") == "fingertips"
+    if not objects["train"]:
+        raise UserError(f"task.objects.train=[]: must name '{CUBE}'{'' if tips else ' or mesh files'}")
+    for key in ("train", "held_out"):
+        for name in objects[key]:
+            if name != CUBE and (tips or not is_own(name)):
+                raise UserError(
+                    f"task.objects.{key}: '{name}': this task turns '{CUBE}'{'' if tips else ' or the path of a mesh'}"
+                )
+    names = [called(name) for name in dict.fromkeys((*objects["train"], *objects["held_out"]))]
+    if len(set(names)) < len(names):
+        raise UserError(
+            f"task.objects: {', '.join(names)}: two of one name, and held poses know a mesh by its file's name; rename"
+            " one"
+        )
+
+
 class RotateEnv(HandEnv):
     """The rotation task; see the module.
 
@@ -61,6 +84,7 @@ class RotateEnv(HandEnv):
         self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
     ):
         """grasps: start from these instead of the file `task.initial.poses`."""
+        check_objects(cfg["task"])
         self.grasps, self.in_order = grasps, False
         if not cfg["task"]["observe"]["force_weighted"]:  # the plain mean needs every taxel
             cfg = {**cfg, "tactile": {**cfg["tactile"], "raw": True}}
@@ -73,9 +97,21 @@ class RotateEnv(HandEnv):
         edges = [self.unit * x for x in self.sampler.range("object.size")[:2]]
         if self.grasps is None:
             self.grasps = held_poses(self.hand, t["initial"]["poses"]).within(*edges).to(dev)
-        self.box = [v.shape.name for v in self.scene.variants].index("box")
-        self.box_row = torch.full((n,), self.box, device=dev)
-        self.box_half = self.objects.primitive_size(self.box_row[:1], torch.ones(1, 3, device=dev))
+            source = t["initial"]["poses"] or f"of hand={self.hand.name}"
+            self.grasps = self.grasps.numbered(self.names, source)
+        self.box_half = torch.ones(1, 3, device=dev)
+        if CUBE in self.names:
+            box = torch.full((1,), self.names.index(CUBE), device=dev)
+            self.box_half = self.objects.primitive_size(box, torch.ones(1, 3, device=dev))
+        below = self.unit * t["termination"]["below"]
+        self.lowest = torch.tensor(
+            [below + self.rise if v.shape.name == CUBE else
+             min(below, LEAST * float(min(v.shape.extents)) * v.scale) + self.rise for v in self.scene.variants],
+            device=dev,
+        )  # fmt: skip
+        trained = self.grasps.shape < len(t["objects"]["train"])
+        self.poses_of = torch.nonzero(trained)[:, 0], torch.nonzero(~trained)[:, 0]
+        self.judge_kept_out(False)
         axis = torch.tensor([float(x) for x in t["goal"]["axis"]], device=dev)
         self.axis = axis / axis.norm()
         self.up = torch.tensor([0.0, 0.0, 1.0], device=dev)  # an IMU knows where down is, but not its heading
@@ -117,6 +153,15 @@ class RotateEnv(HandEnv):
         """Joints, fingers and touch pads."""
         return self.num_actions, self.fingers, self.pads
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What held poses call the objects, in the order of the scene's table; those trained on first."""
+        return tuple(called(name) for name in self.shape_names)
+
+    def judge_kept_out(self, kept_out: bool) -> None:
+        """Episodes begin with objects kept out of the training from now on, or with those of it."""
+        self.allowed = self.poses_of[kept_out]  # one and the same tensor each time: a recorded step holds on to it
+
     def _check(self) -> None:
         t = self.task
         for key, known in (("perception", self.PERCEPTION), ("critic", ("paper", "privileged"))):
@@ -144,11 +189,6 @@ class RotateEnv(HandEnv):
             raise UserError(
                 f"task.reward.delta_rot={r['delta_rot']}: must lie between 0 and the goal's angle, "
                 f"{math.radians(abs(goal['angle'])):.3g} rad, or goals are reached as they are set"
-            )
-        if "box" not in t["objects"]["train"]:
-            raise UserError(
-                f"task.objects.train={t['objects']['train']}: the rotation task needs 'box', "
-                "whose held poses it starts from"
             )
         for name, low, high in (
             ("object.mass", 1e-3, 5.0),
@@ -195,9 +235,9 @@ class RotateEnv(HandEnv):
     def begin_episodes(self, mask: torch.Tensor) -> None:
         s, m1 = self.sampler, mask[:, None]
         self.last_done.copy_(torch.where(mask, self.successes, self.last_done))
-        g = self.grasps
-        pick = self.worlds if self.in_order else (s.uniform() * len(g)).long().clamp(max=len(g) - 1)
-        self.give_object(mask, g.edge[pick])
+        g, of = self.grasps, self.allowed
+        pick = self.worlds if self.in_order else of[(s.uniform() * len(of)).long().clamp(max=len(of) - 1)]
+        self.give_object(mask, g.shape[pick], g.edge[pick])
         self.touch.randomize(mask, self.rng)
         self.servo_random.draw(mask)
         gravity = self.engine.field("opt.gravity")
@@ -218,12 +258,13 @@ class RotateEnv(HandEnv):
         delay = (s.draw("imu.delay") / self.dt).round().long()
         self.imu_delay.copy_(torch.where(mask, delay, self.imu_delay))
 
-    def give_object(self, mask: torch.Tensor, edge: torch.Tensor) -> None:
-        """Where mask holds: a cube of this edge [N] m, its mass, centre of mass, friction and rubber drawn anew."""
+    def give_object(self, mask: torch.Tensor, row: torch.Tensor, edge: torch.Tensor) -> None:
+        """Where mask holds: an object by its row [N] of the scene's table, a cube of this edge [N] m, its mass, centre
+        of mass, friction and rubber drawn anew."""
         s = self.sampler
         self.objects.write(
             mask,
-            self.box_row,
+            row,
             scale=edge[:, None] / 2 / self.box_half,
             mass=s.draw("object.mass"),
             com=s.draw("object.com", 3),
@@ -242,12 +283,12 @@ class RotateEnv(HandEnv):
     # -- terminations
     # --------------------------------------------------------------------------------------------------------
     def terminated(self) -> dict[str, torch.Tensor]:
-        """Dropped: the centre is too low or too far from where it began. Tipped: the goal's upper face looks more than
-        `tilt` away from the axis."""
+        """Dropped: the centre is too low (of a flat object, lower yet) or too far from where it began. Tipped: the
+        goal's upper face looks more than `tilt` away from the axis."""
         limit = self.task["termination"]
         p = self.object_pose[:, :3]
         away = (p - self.home).norm(dim=1) > self.unit * limit["distance"]
-        self.dropped.copy_(away | (p[:, 2] < self.unit * limit["below"] + self.rise))
+        self.dropped.copy_(away | (p[:, 2] < self.lowest[self.objects.variant]))
         self.tipped.copy_(self._tilt_from_goal() > limit["tilt"])
         self.nan_end.copy_(self.nan)
         return {"dropped": self.dropped, "tipped": self.tipped}
@@ -465,7 +506,7 @@ class RotateEnv(HandEnv):
             seen += [(name, width, "privileged") for name, width in privileged(*self.sizes[:2])]
         limit, r = t["termination"], t["reward"]
         actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in observations.rows(t, *self.sizes)]
-        edge = 1000 * self.grasps.edge
+        edge, what = 1000 * self.grasps.edge, "cubes" if self.names == (CUBE,) else ", ".join(self.names)
         return {
             "observations": {"actor": actor, "critic": seen},
             "action": [
@@ -485,7 +526,7 @@ class RotateEnv(HandEnv):
                 for name, (lo, hi, log) in self.sampler.ranges.items()
             ],
             "notes": [
-                f"{len(self.grasps)} held poses, cubes of {edge.min():.0f}-{edge.max():.0f} mm",
+                f"{len(self.grasps)} held poses, {what} of {edge.min():.0f}-{edge.max():.0f} mm",
                 f"reached: rotation error below {r['delta_rot']} rad and drift below"
                 f" {self.unit * r['delta_pos']:.3g} m",
                 *self.hand_notes(),

@@ -1,7 +1,7 @@
 """Evaluation of the rotation task in the paper's words: consecutive successes of each trial, time per success, time to
 fall.
 
-A trial begins in a held pose and ends when the cube is dropped or tips over, or at the cap (`task.evaluation.cap_s`);
+A trial begins in a held pose and ends when the object is dropped or tips over, or at the cap (`task.evaluation.cap_s`);
 nothing else ends it. The paper's table divides: its seconds per success are the mean time to fall over the mean
 successes (84.3 / 25.1 = 3.36 in its first row, and so in every row), and so are ours. A capped trial counts with the
 cap as its time, so the mean time to fall is a restricted mean. Intervals: bootstrap over trials, 95 %.
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from dexsim import intervals
+from dexsim.tasks.stable_grasps import CUBE
 
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
 HEADER = (
@@ -40,16 +41,16 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
     torch.manual_seed(seed)
     cap = float(env.task["evaluation"]["cap_s"])
     training_length, env.max_episode_length = env.max_episode_length, int(round(cap / env.dt)) + 2
-    parts, done = [], 0
     try:
-        while done < episodes:
-            parts.append(_play(env, policy, cap, not parts, progress, done, episodes))
-            done += env.num_envs
+        r, frames = _trials(env, policy, cap, episodes, True, progress)
+        kept = _kept_out(env, policy, cap, max(episodes // 2, 1), progress) if env.task["objects"]["held_out"] else None
     finally:
         env.max_episode_length = training_length
-    frames = parts[0].pop("frames")
-    r = {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}
-    metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, env.task["evaluation"]["resamples"], seed)
+    resamples = env.task["evaluation"]["resamples"]
+    metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, resamples, seed)
+    if kept is not None:
+        metrics["kept_out"] = summary(kept["successes"], kept["time"], kept["end"] == "capped", cap, resamples, seed)
+    metrics |= _by_object(env, [r] + [kept] * (kept is not None))
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
     metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.ENDS, "capped")}
@@ -62,6 +63,39 @@ def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
         _survival_plot(ax, r["time"], cap)
 
     return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": [successes, survival]}
+
+
+def _trials(env, policy, cap: float, episodes: int, keep_frames: bool, progress) -> tuple[dict, dict | None]:
+    """Arrays [E] of so many trials; the frames of the first."""
+    parts: list[dict] = []
+    while len(parts) * env.num_envs < episodes:
+        done = len(parts) * env.num_envs
+        parts.append(_play(env, policy, cap, keep_frames and not parts, progress, done, episodes))
+    frames = parts[0].pop("frames")
+    return {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}, frames
+
+
+def _kept_out(env, policy, cap: float, episodes: int, progress) -> dict:
+    """Trials that begin with the objects kept out of the training."""
+    was, env.graphs = env.graphs, False  # a recorded step begins with those of the training
+    env.judge_kept_out(True)
+    try:
+        return _trials(env, policy, cap, episodes, False, progress)[0]
+    finally:
+        env.judge_kept_out(False)
+        env.graphs = was
+
+
+def _by_object(env, parts: list[dict]) -> dict:
+    """Successes in a row by object, where there is more than one."""
+    if len(env.names) < 2:
+        return {}
+    which, count = (np.concatenate([p[k] for p in parts]) for k in ("object", "successes"))
+    return {
+        "successes_by_object": {
+            name: float(count[which == k].mean()) for k, name in enumerate(env.names) if (which == k).any()
+        }
+    }
 
 
 def summary(successes: np.ndarray, time: np.ndarray, capped: np.ndarray, cap: float, resamples: int, seed: int) -> dict:
@@ -110,7 +144,10 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     sums: dict[str, torch.Tensor] = {}
     shown = list(range(min(SHOWN, n))) if keep_frames else []
     models = [env.drawn_model(w) for w in shown]
-    edge, mass = (2000 * env.objects.size[:, 0]).cpu().numpy(), (1000 * env.objects.mass).cpu().numpy()
+    which = env.objects.variant.cpu().numpy().copy()
+    wide = [f"{2000 * float(x):.0f} mm" if env.names[v] == CUBE else env.names[v]
+            for x, v in zip(env.objects.size[:, 0], which, strict=True)]  # fmt: skip
+    mass = (1000 * env.objects.mass).cpu().numpy()
     qpos, force, score = [], [], []
     for k in range(steps):
         obs, _, dones, _ = env.step(policy(obs))
@@ -135,7 +172,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
                 break
     out = {
         "successes": count.cpu().numpy(), "time": end_step.cpu().numpy() * dt, "last": last_step.cpu().numpy() * dt,
-        "end": np.array([*env.ENDS, "capped"])[how.cpu().numpy()], "frames": None,
+        "end": np.array([*env.ENDS, "capped"])[how.cpu().numpy()], "object": which, "frames": None,
         **facts, **{name: total.cpu().numpy() for name, total in sums.items()},
     }  # fmt: skip
     if shown:
@@ -143,7 +180,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
         out["frames"] = {
             "model": models, "dt": dt, "names": env.hand.finger_names, "full": 5.0,
             "qpos": [np.stack([q[i] for q in qpos[:s]]) for i, s in enumerate(stop)],
-            "label": [f"{edge[w]:.0f} mm, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
+            "label": [f"{wide[w]}, {mass[w]:.0f} g: {score[s - 1][i]} in {s * dt:.0f} s"
                       for i, (w, s) in enumerate(zip(shown, stop, strict=True))],
             "overlay": [{"force": np.stack([f[i] for f in force[:s]])} for i, s in enumerate(stop)],
             "camera": {"lookat": [0.05, 0.0, 0.04], "distance": 0.36, "azimuth": 250.0, "elevation": -50.0},
@@ -177,9 +214,18 @@ def _tables(env, m: dict, r: dict) -> list:
         ("seconds to fall", f"{m['seconds_to_fall']:.1f}", _range(m["seconds_to_fall_interval"])),
     ]  # fmt: skip
     ends = [(name, count, f"{100 * count / m['episodes']:.1f}") for name, count in m["ends"].items()]
+    kept = m.get("kept_out")
+    if kept is not None:
+        intervals.append(
+            ("average, objects kept out", f"{kept['consecutive_successes']['average']:.2f}",
+             _range(kept["consecutive_successes"]["average_interval"]))
+        )  # fmt: skip
+    by = [(name, f"{value:.1f}") for name, value in m.get("successes_by_object", {}).items()]
+    own = [("Successes in a row by object", ("object", "average"), by)] if by else []
     return [
         ("In-hand rotation (the paper's columns)", HEADER, [line]),
         ("95 % intervals (bootstrap over trials)", ("quantity", "value", "interval"), intervals),
+        *own,
         (f"How {m['episodes']} trials ended (cap {m['cap_s']:g} s)", ("end", "trials", "%"), ends),
     ]
 

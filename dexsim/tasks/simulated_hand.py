@@ -73,10 +73,15 @@ class SimulatedHand:
             ]
         grasps = None
         if grip is not None:
-            from dexsim.tasks.stable_grasps import GraspSet
+            from dexsim.tasks.stable_grasps import CUBE, GraspSet, called
 
+            objects, held = cfg["task"]["objects"], grip.get("object", CUBE)
+            names = tuple(dict.fromkeys(called(name) for name in (*objects["train"], *objects["held_out"])))
+            if held not in names:
+                raise UserError(f"shape={shape}: the policy begins with '{held}' in the hand; leave shape= out")
             rows = (grip["object_edge_m"], grip["hand"], grip["target"], grip["object_pose"])
-            grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows))
+            which = torch.tensor([names.index(held)])
+            grasps = GraspSet(*(torch.tensor([x], dtype=torch.float32) for x in rows), shape=which, names=names)
         self.env = make_env(cfg, 1, "cpu", seed, "mujoco", grasps)
         self.taxels = touch_shape(self.env.hand)
         self.calibration, self.noise = calibration, float(config["task"]["sensors"].get("vision_z_noise", 0.0))

@@ -6,13 +6,15 @@ A file of them holds `GraspSet`; `dexsim.tasks.make_grasps` makes them.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from dexsim import files
+from dexsim.assets.objects.own import is_own
 from dexsim.errors import UserError
 from dexsim.hand import Hand
 
@@ -24,15 +26,37 @@ FINGERTIPS = Path(__file__).parents[1] / "assets" / "grasps" / "fingertips.npz"
 """Cubes that fingertips alone hold above the palm (`task=rotate_fingertips`)."""
 
 
+CUBE = "box"
+"""What cubes are called among the objects of a task."""
+ROWS = ("edge", "hand", "target", "pose")
+
+
+def called(name: str) -> str:
+    """What a file of held poses calls an object of a task: a user's own by its file's or folder's name, wherever that
+    lies."""
+    return Path(name).name if is_own(name) else name
+
+
 @dataclass
 class GraspSet:
-    """K held poses. edge [K] m; hand [K, J] rad, the joint angles; target [K, J] rad, what the servos are sent; pose
-    [K, 7], the cube (x y z m, quaternion w x y z), palm frame. Tensors, float32."""
+    """K held poses. edge [K] m, of a cube, or of another object its width between the fingers as it fell; hand [K, J]
+    rad, the joint angles; target [K, J] rad, what the servos are sent; pose [K, 7], the object (x y z m, quaternion w x
+    y z), palm frame: tensors, float32. shape [K] int64: which of `names` (`called`) it is; empty: all the first."""
 
     edge: torch.Tensor
     hand: torch.Tensor
     target: torch.Tensor
     pose: torch.Tensor
+    shape: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long), kw_only=True)
+    names: tuple[str, ...] = field(default=(CUBE,), kw_only=True)
+
+    def __post_init__(self) -> None:
+        if len(self.shape) == 0:
+            self.shape = torch.zeros(len(self.edge), dtype=torch.long, device=self.edge.device)
+
+    def of(self, edit: Callable[[torch.Tensor], torch.Tensor]) -> GraspSet:
+        """Every array as `edit` makes it, of the same objects."""
+        return GraspSet(*(edit(getattr(self, k)) for k in ROWS), shape=edit(self.shape), names=self.names)
 
     @classmethod
     def load(cls, path: str | Path) -> GraspSet:
@@ -40,21 +64,34 @@ class GraspSet:
         path = files.place(path)
         try:
             data = files.arrays(path, MOST_BYTES)
-            return cls(**{f.name: torch.as_tensor(data[f.name], dtype=torch.float32) for f in fields(cls)})
+            out = cls(*(torch.as_tensor(data[k], dtype=torch.float32) for k in ROWS))
+            if "names" in data:
+                out.names = tuple(str(x) for x in np.atleast_1d(data["names"]))
+                out.shape = torch.as_tensor(data["shape"]).long()
+                if out.shape.shape != out.edge.shape or not 0 <= int(out.shape.min()) <= int(out.shape.max()) < len(
+                    out.names
+                ):
+                    raise ValueError("shape: must number the objects in names")
+            return out
         except (KeyError, ValueError, TypeError) as error:
             raise UserError(f"held poses {path}: cannot read them ({error}); make them with "
                             "dexsim stable-grasps out=PATH") from None
 
     def save(self, path: Path) -> None:
-        """Write an npz file of float32 arrays, whole or not at all."""
+        """Write an npz file of float32 arrays, whole or not at all; with `shape` and `names` where there are
+        others than cubes."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {k: v.cpu().numpy().astype(np.float32) for k, v in vars(self).items()}
+        out = {k: getattr(self, k).cpu().numpy().astype(np.float32) for k in ROWS}
+        if self.names != (CUBE,):
+            out |= {"shape": self.shape.cpu().numpy(), "names": np.array(self.names)}
         with files.beside(path) as part, open(part, "wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **out)
 
     def within(self, low: float, high: float) -> GraspSet:
-        """The poses of cubes with edges in [low, high] m. Raises UserError when there are none."""
-        keep = (self.edge >= low - 1e-6) & (self.edge <= high + 1e-6)
+        """The poses of cubes with edges in [low, high] m, and all of other objects. Raises UserError when there are
+        none."""
+        cube = self.names.index(CUBE) if CUBE in self.names else -1
+        keep = (self.shape != cube) | ((self.edge >= low - 1e-6) & (self.edge <= high + 1e-6))
         if not bool(keep.any()):
             raise UserError(f"randomize.object.size=[{low}, {high}]: no held poses of that size; the set has "
                             f"{self.edge.min():.3f} to {self.edge.max():.3f} m")
@@ -68,20 +105,34 @@ class GraspSet:
         size = torch.tensor([scale] * 3 + [1.0] * 4)
         return GraspSet(self.edge * scale, self.hand.clone(), self.target.clone(), self.pose * flip * size)
 
+    def numbered(self, names: tuple[str, ...], source: str) -> GraspSet:
+        """The poses of these objects, `shape` by their places in `names`. Raises UserError for one without poses;
+        source: where they come from."""
+        place = torch.tensor([names.index(n) if n in names else -1 for n in self.names], device=self.edge.device)
+        out = replace(self, shape=place[self.shape], names=names)
+        for k, name in enumerate(names):
+            if not bool((out.shape == k).any()):
+                raise UserError(
+                    f"held poses {source}: none of object '{name}', of {', '.join(self.names)} only; make them with"
+                    " dexsim stable-grasps objects=... out=FILE and give task.initial.poses=FILE"
+                )
+        return out[out.shape >= 0]
+
     def to(self, device: str) -> GraspSet:
         """The same on a device."""
-        return GraspSet(*(v.to(device) for v in vars(self).values()))
+        return self.of(lambda v: v.to(device))
 
     def __getitem__(self, rows: torch.Tensor) -> GraspSet:
-        return GraspSet(*(v[rows] for v in vars(self).values()))
+        return self.of(lambda v: v[rows])
 
     def __len__(self) -> int:
         return len(self.edge)
 
     @staticmethod
     def join(parts: list[GraspSet]) -> GraspSet:
-        """All poses of several sets."""
-        return GraspSet(*(torch.cat([vars(p)[f.name] for p in parts]) for f in fields(GraspSet)))
+        """All poses of several sets of the same objects."""
+        rows = (torch.cat([getattr(p, k) for p in parts]) for k in ROWS)
+        return GraspSet(*rows, shape=torch.cat([p.shape for p in parts]), names=parts[0].names)
 
 
 def held_file(hand: Hand) -> Path:
