@@ -83,6 +83,14 @@ def stretches(units: int, length: int, seed: Seed, count: int = 1000) -> np.ndar
     return ((starts[..., None] + np.arange(length)) % units).reshape(count, -1)
 
 
+def wins(losses: np.ndarray, index: np.ndarray, within: float) -> np.ndarray:
+    """[H] share of the resamples `index` [count, m] in which the sum of each of H losses [H, E] is the least of all;
+    those that are near it share a resample, one that is worse by `within` (relative) by 1 to e."""
+    sums = losses[:, index].sum(-1)
+    weight = np.exp(-np.clip((sums / sums.min(0) - 1) / within, 0, 50))
+    return (weight / weight.sum(0)).mean(1)
+
+
 def of_rows(rows: np.ndarray, statistic: Callable) -> tuple[tuple[np.ndarray], Callable]:
     """(samples, statistic) as `draws` takes them, of any statistic(rows [E, ...]) that gives one number."""
     rows = np.asarray(rows)

@@ -251,12 +251,11 @@ MUTATIONS = (
         '0.0,\n        "share of the squared error on presses left out',
         "tests/test_gap_rules_touch.py::test_a_touch_effect_must_remove_a_least_share",
     ),
-    _constant(
+    Mutation(
         "inverse dynamics name what removes nothing",
-        "dexsim/gap/search/inverse_dynamics.py",
-        "LEAST",
-        "0.12",
-        "0.0",
+        "dexsim/gap/rules.py",
+        '0.12,\n        "of the squared residual on the quarters left out',
+        '0.0,\n        "of the squared residual on the quarters left out',
         "tests/test_gap_inverse.py::test_further_effects_are_named_one_after_another",
     ),
     Mutation(

@@ -12,15 +12,15 @@ import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
 
-from dexsim.gap import locate, rules
+from dexsim.gap import drives, locate, rules
 from dexsim.gap.drives import Drives
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
 from dexsim.gap.judge.joint import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
-from dexsim.gap.report import sections
-from dexsim.gap.search import selection
+from dexsim.gap.report import next_recording, sections
+from dexsim.gap.search import jitter, selection
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses, thin
 from dexsim.gap.search.search import JointSearch
@@ -74,7 +74,7 @@ def test_a_rule_that_is_moved_fails_its_test(name, factor):
         object.__setattr__(ROOMS[room], rule, value)
 
 
-RATIOS = ("enough", "worse", "noise", "carries")
+RATIOS = ("enough", "worse", "noise", "carries", "unsettled", "alike")
 
 
 def test_an_effect_must_remove_a_least_share():
@@ -545,6 +545,64 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
         assert (floor.at_most({"a": left}) is floor) is same, left
     assert floor.at_most({"a": 1.2}).lowered == ("a",) and floor.at_most({"a": 1.2}).how in sections.FLOORS
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
+
+
+def test_each_parameter_costs_a_part_of_the_loss():
+    search = Made()
+    search._dear = lambda trial: 1.0
+    member = lambda n: SimpleNamespace(variant=SimpleNamespace(params=range(n)))  # noqa: E731
+    for loss, better in ((0.96, True), (0.98, False)):  # with a parameter more
+        assert (search._score(trial(loss, (member(2),))) < search._score(trial(1.0, (member(1),)))) is better, loss
+
+
+def test_rivals_are_told_apart_by_what_they_lose():
+    search = Made()
+    fit = SimpleNamespace(loss=1.0, params=[], x=np.zeros(0))
+    mine, other = (SimpleNamespace(id=n, variant=SimpleNamespace(params=())) for n in ("lag", "backlash"))
+    current, rival = (SimpleNamespace(loss=np.full(40, x), fit=fit, members=(m,), ids=(m.id,), left_out=None)
+                      for x, m in ((1.0, mine), (1.03, other)))  # fmt: skip
+    search.none_loss, search.fitted = np.full(40, 50.0), {frozenset(("backlash",)): rival}
+    search._fix, search._on, search._dear = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
+    search.cross, search._by_condition = lambda _: None, lambda *_: []
+    search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.zeros(()))
+    rows, own, _ = search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"]
+    assert rows[0][0] == "backlash" and rows[0][1] / own == pytest.approx(np.exp(-1), rel=0.01)
+
+
+def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
+    """What a search of a joint ended with, at `loss`; and now, with what is known of the others."""
+    one = SimpleNamespace(members=members, fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)))
+    return SimpleNamespace(none=one, best=one)
+
+
+def test_joints_that_are_not_followed_are_looked_at_again():
+    assert not drives._unsettled(followed(1.5)) and drives._unsettled(followed(1.9))
+    assert drives._unsettled(followed(1.0, members=("lag",)))
+
+
+def test_a_joint_is_searched_again_where_the_others_move_it_otherwise():
+    for now, again in ((2.14, False), (2.3, True), (1.7, True)):
+        fitter = SimpleNamespace(loss=lambda _, now=now: np.array([now]), evaluate=lambda *_: np.zeros(1))
+        search = SimpleNamespace(_fix=lambda _: nullcontext(), fitter=fitter)
+        assert drives._other(search, followed(2.0)) is again, now
+
+
+def test_jitter_is_reported_where_the_likelihood_gains_much():
+    assert jitter.certain(9.0, 2e-3, 0.1, 1.0) and not jitter.certain(6.0, 2e-3, 0.1, 1.0)
+
+
+def test_jitter_is_more_than_that_of_the_clocks():
+    assert jitter.certain(50.0, 4e-4, 0.1, 1.0) and not jitter.certain(50.0, 2e-4, 0.1, 1.0)
+    assert not jitter.certain(50.0, 4e-4, 1.1, 1.0), "what is left beside it is not noise"
+
+
+def test_a_motion_that_settles_it_is_planned_alone():
+    for score, motions in ((4.0, ["steps"]), (2.0, ["steps", "chirp"])):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(next_recording.excitation, "plan", lambda *_, **__: None)
+            patch.setattr(next_recording, "disagreement", lambda *_, s=score: {"chirp": 1.0, "steps": s})
+            search = SimpleNamespace(case=SimpleNamespace(joint="j"))
+            assert next_recording.choose(None, search, None, None).chosen == motions, score
 
 
 TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | globals()

@@ -88,3 +88,11 @@ def test_stretches_see_that_neighbours_are_alike():
     by_stretch = x[intervals.stretches(n, 60, 0, 1000)].mean(1).std()
     by_unit = intervals.draws((x,), np.mean, 0, 1000).std()
     assert by_stretch == pytest.approx(1 / (1 - a) / math.sqrt(n), rel=0.15) and by_unit < 0.5 * by_stretch
+
+
+def test_who_loses_least_wins_and_who_is_near_shares():
+    losses = np.array([np.ones(12), np.full(12, 1.02), np.full(12, 9.0)])
+    won = intervals.wins(losses, intervals.stretches(12, 4, 0, 100), 0.02)
+    assert won == pytest.approx(np.array([1, np.exp(-1), 0]) / (1 + np.exp(-1)))
+    apart = np.where(np.arange(12) < 6, [[0.0], [2.0]], [[2.0], [0.0]]) + 1.0  # each better in its half
+    assert intervals.wins(apart, intervals.stretches(12, 4, 0, 4000), 1e-6) == pytest.approx([0.5, 0.5], abs=0.03)

@@ -24,15 +24,11 @@ from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain
 from dexsim.gap.report.next_recording import rival_of
 from dexsim.gap.result import Diagnosis
-from dexsim.gap.rules import JUDGE
+from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline, external_force, torque_told
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch.result import TouchResult
 
-# of what is left of a joint: by as much it must change with what is known of the others to be searched again
-OTHERWISE = 0.1
-# x the noise squared: what more than one joint of a mechanism leaves is looked at again with what was found in each
-UNSETTLED = 1.7
 Answers = list[tuple[JointSearch, Outcome | None]]
 
 
@@ -218,7 +214,7 @@ class Drives(Steps):
             for k, (search, found) in enumerate(answers)
             if found is not None
             and search.case.joint not in self.unknown_controllers
-            and (found.best.members or found.best.fit.loss > UNSETTLED)
+            and _unsettled(found)
         ]
         if len(unsettled) < 2 or any(found is None for _, found in answers):
             return
@@ -366,13 +362,18 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
     ]
 
 
+def _unsettled(found: Outcome) -> bool:
+    """Whether a joint's search is looked at again with what was found in the others."""
+    return bool(found.best.members) or found.best.fit.loss > SEARCH.unsettled
+
+
 def _other(search: JointSearch, found: Outcome) -> bool:
     """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was
     thought."""
     for trial in (found.none, found.best):
         with search._fix(trial.members):
             loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
-        if abs(loss - trial.fit.loss) > OTHERWISE * trial.fit.loss:
+        if abs(loss - trial.fit.loss) > SEARCH.otherwise * trial.fit.loss:
             return True
     return False
 

@@ -110,6 +110,30 @@ class SearchRules:
         "set above `least` on benchmarks.planted: there is less to tell effects by",
         "test_within_the_noise_an_effect_must_be_clear",
     )
+    per_parameter: float = _rule(
+        0.03,
+        "of the loss on what was left out: what each parameter of a hypothesis costs",
+        "by judgement",
+        "test_each_parameter_costs_a_part_of_the_loss",
+    )
+    apart: float = _rule(
+        0.03,
+        "of the loss: a rival as much worse than the best counts for a third of it in one draw",
+        "by judgement: finer than the plant is to be trusted",
+        "test_rivals_are_told_apart_by_what_they_lose",
+    )
+    unsettled: float = _rule(
+        1.7,
+        "x the noise squared: where several joints leave more, they are looked at again with what was found in each",
+        "by judgement",
+        "test_joints_that_are_not_followed_are_looked_at_again",
+    )
+    otherwise: float = _rule(
+        0.1,
+        "of the loss: by as much what is known of the others must change it for a joint to be searched again",
+        "by judgement",
+        "test_a_joint_is_searched_again_where_the_others_move_it_otherwise",
+    )
     most: int = _rule(
         4,
         "effects on one joint",
@@ -324,6 +348,24 @@ class JudgeRules:
         "share of the held-out error that a stand-in torque must take away to be offered",
         "by judgement",
         "test_a_stand_in_must_take_a_least_share_off",
+    )
+    jitter: float = _rule(
+        8.0,
+        "gain of the log likelihood from which jitter of a delay is reported",
+        "by judgement: a likelihood-ratio test passes it by chance three times in 100,000",
+        "test_jitter_is_reported_where_the_likelihood_gains_much",
+    )
+    clocks: float = _rule(
+        3e-4,
+        "s: less jitter than this is that of the clocks",
+        "by judgement",
+        "test_jitter_is_more_than_that_of_the_clocks",
+    )
+    settled: float = _rule(
+        3.0,
+        "x the noise: a motion on which two hypotheses differ by as much settles between them alone",
+        "by judgement",
+        "test_a_motion_that_settles_it_is_planned_alone",
     )
 
 
@@ -565,6 +607,48 @@ class TorqueRules:
         "share of the bootstraps in which an answer must be worse than the plain model not to be handed on",
         "the customary 95 %",
         "test_an_answer_must_surely_be_worse_than_the_plain_model",
+    )
+    shed: float = _rule(
+        0.8,
+        "of the misfit: what halving the cutoff leaves at most, where what it sheds is noise of derivatives",
+        "by judgement: of white noise in a second derivative a fifth is left",
+        "test_a_cutoff_is_halved_while_that_sheds_noise",
+    )
+    weighed: float = _rule(
+        0.03,
+        "relative, to which the recordings must tell what gravity pulls with for it to be fitted and not believed",
+        "by judgement",
+        "test_a_weight_is_believed_where_the_torque_cannot_tell",
+    )
+    further: float = _rule(
+        0.12,
+        "of the squared residual on the quarters left out: what a further effect must remove",
+        "as `search.least`",
+        "test_a_further_effect_of_the_torque_must_remove_a_least_share",
+    )
+    chance: float = _rule(
+        0.03,
+        "share of the bootstraps in which a further effect may be of no use to the quarters left out",
+        "as `search.chance`",
+        "test_a_further_effect_of_the_torque_must_help_in_nearly_all_bootstraps",
+    )
+    lag: float = _rule(
+        0.02,
+        "s: a torque that acts later than this is no lag of a drive",
+        "by judgement",
+        "test_a_torque_that_acts_far_later_is_no_lag",
+    )
+    trusted: float = _rule(
+        0.6,
+        "of the torque's rms: what may be left for its figures to be believed",
+        "by judgement: two thirds of the variance are then told",
+        "test_a_torque_that_fits_nothing_is_no_witness",
+    )
+    alike: float = _rule(
+        1.05,
+        "x the error of a free run in closed loop: within it the loop does not tell one from the other",
+        "by judgement",
+        "test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them",
     )
 
 

@@ -30,7 +30,6 @@ from dexsim.recording.mechanism import Mechanism
 
 KINDS = ("steps", "chirp", "triangles", "ladder", "holds")
 RATE = 100.0  # Hz
-ENOUGH = 3.0  # x the noise: a motion on which they differ by as much settles it
 
 
 def plan_next(
@@ -175,7 +174,7 @@ def choose(
     ranked = sorted(scores, key=lambda k: -scores[k])
     chosen = ranked[:1]
     # a second kind where the first alone may not settle it, or says nearly as much
-    chosen += [k for k in ranked[1:most] if scores[ranked[0]] < ENOUGH or scores[k] > 0.7 * scores[ranked[0]]]
+    chosen += [k for k in ranked[1:most] if scores[ranked[0]] < JUDGE.settled or scores[k] > 0.7 * scores[ranked[0]]]
     return Choice(scores, chosen)
 
 

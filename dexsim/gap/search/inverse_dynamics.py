@@ -20,17 +20,13 @@ import numpy as np
 from dexsim import intervals
 from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
+from dexsim.gap.rules import TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import WEIGHT, Columns, columns_of, least, misfit, solved, sums, unphysical
 
-SHED = 0.8  # of the misfit: what halving the cutoff leaves, where what it sheds is noise of derivatives
-# what gravity's factor must be known to by the recordings, to be fitted beside the friction and not believed
-WEIGHED = 0.03
 DRAWS = 300  # of a bootstrap
 QUARTERS = 4
-LEAST = 0.12  # of the squared residual on the quarters left out: what a further effect must remove
 MOST = 4
-LATE = 0.02  # s: a torque that acts later than this is no drive's lag
 BY_DIRECTION, SQUARE, LAG, STRIBECK = (
     "viscous friction that differs by direction",
     "friction with the square of the speed",
@@ -113,7 +109,7 @@ def solve(at: Callable[[float], tuple[Columns, Columns]], top: float, seed: int 
     cutoff, (own, other) = top, at(top)
     while 0.5 * cutoff >= body_torque.LEAST:
         lower = at(0.5 * cutoff)
-        if misfit(lower[0]) > SHED * misfit(own):
+        if misfit(lower[0]) > TORQUE.shed * misfit(own):
             break
         cutoff, (own, other) = 0.5 * cutoff, lower
     believed = _not_weighed(own)
@@ -142,7 +138,7 @@ def _not_weighed(d: Columns) -> list[str]:
     """Factors on gravity that these recordings tell worse than a model does (each half second one reading of it)."""
     at = {n: d.names.index(n) for n in WEIGHT if n in d.names}
     reach = {n: float(np.std(d.X[:, k])) * np.sqrt(d.blocks.max() + 1.0) for n, k in at.items()}
-    return [n for n in at if max(reach.values()) * WEIGHED < misfit(d.without(list(at)))]
+    return [n for n in at if max(reach.values()) * TORQUE.weighed < misfit(d.without(list(at)))]
 
 
 def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
@@ -177,7 +173,7 @@ def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
         kinds = {k: min((n for n in tried if _kind(n) == k), key=lambda n: tried[n].sum()) for k in map(_kind, tried)}
         each = (now - tried[best], *(tried[n] for n in kinds.values()))
         gained, *table = intervals.draws(each, lambda *x, axis: np.stack([one.sum(axis) for one in x]), rng, DRAWS)
-        if tried[best].sum() > (1 - LEAST) * now.sum() or np.quantile(gained, 0.03) <= 0:
+        if tried[best].sum() > (1 - TORQUE.further) * now.sum() or np.quantile(gained, TORQUE.chance) <= 0:
             break
         wins = dict(zip(kinds, (np.argmin(table, 0)[None] == np.arange(len(kinds))[:, None]).mean(1), strict=True))
         rival = max((k for k in wins if k != _kind(best)), key=wins.get, default="")
@@ -210,7 +206,7 @@ def _sensible(name: str, c: float, theta: dict[str, float]) -> bool:
     """Whether a coefficient can be what it is called: a lag is late, an excess is more, and what gives way is friction
     that is there."""
     if name == LAG:
-        return 0 < c < LATE * abs(theta["inertia"])
+        return 0 < c < TORQUE.lag * abs(theta["inertia"])
     if _kind(name) == GIVES:
         return 0 < c < 2 * theta.get("coulomb_friction", 0.0)
     if name == LOAD:

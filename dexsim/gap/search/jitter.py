@@ -21,6 +21,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq, minimize
 
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, expand
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import Fitter
 from dexsim.gap.search.search import JointSearch, Trial, subset
 
@@ -29,8 +30,6 @@ WINDOWS = 24  # at most, evenly over the recordings
 ALIKE = (0.05, 0.2)  # s
 SPAN = 1.25  # s of commands that may act within a window of a second
 FALL = 0.5 * 1.645**2  # of the log likelihood at the ends of a 90 % interval
-CERTAIN = 8.0  # gain of the log likelihood from which jitter is reported
-LEAST = 3e-4  # s: less is that of the clocks
 LEFT = 2.0  # x the noise squared that a hypothesis leaves, from which jitter is looked for
 
 
@@ -47,6 +46,13 @@ class Jitter:
     def entry(self) -> dict[str, float | str]:
         """As a parameter in diagnosis.json."""
         return {"value": self.value, "low": self.low, "high": self.high, "unit": "s"}
+
+
+def certain(gain: float, value: float, beside: float, noise: float) -> bool:
+    """Whether jitter of `value` [s] is reported. gain: of the log likelihood; beside: what stays with it that is
+    correlated, to compare with the noise: where that is more, something else is missing that looks alike (an unmodelled
+    resonance does)."""
+    return not (gain < JUDGE.jitter or value < JUDGE.clocks or beside > noise)
 
 
 def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
@@ -114,8 +120,7 @@ def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
     )
     best, value = float(both.fun), float(np.exp(both.x[-1]))
     gain = float(none.fun) - best
-    # where more than noise stays beside it, something else is missing that looks alike (an unmodelled resonance does)
-    if gain < CERTAIN or 1e-3 * value < LEAST or np.exp(both.x[1]) > noise:
+    if not certain(gain, 1e-3 * value, float(np.exp(both.x[1])), noise):
         return None
     over = lambda log: cost(both.x[:-1], np.exp(log)) - best - FALL  # noqa: E731
     middle = np.log(value)

@@ -22,10 +22,10 @@ class JointLosses(JointHypotheses):
     none_loss: np.ndarray  # by block, without any effect
 
     def _score(self, trial: Trial) -> float:
-        """Left-out loss with a price on parameters: 3 % each."""
+        """Left-out loss with a price on parameters."""
         return (
             float(self._left(trial).sum())
-            * (1 + 0.03 * sum(len(m.variant.params) for m in trial.members))
+            * (1 + SEARCH.per_parameter * sum(len(m.variant.params) for m in trial.members))
             * self._dear(trial)
         )
 

@@ -380,10 +380,8 @@ class JointSelection(JointScan):
                     self.cross(trial)
                     others.append(trial)
             table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
-            sums = table[:, intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)].sum(-1)
-            # a rival within 3 % of the best counts for half: finer than the plant is to be trusted
-            weight = np.exp(-np.clip((sums / sums.min(0) - 1) / 0.03, 0, 50))
-            shares = (weight / weight.sum(0)).mean(1)
+            drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
+            shares = intervals.wins(table, drawn, SEARCH.apart)
             rows = [
                 (next(x for x in t.ids if x not in {m.id for m in rest}), float(s))
                 for t, s in zip(others, shares[1:-1], strict=True)

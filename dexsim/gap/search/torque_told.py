@@ -13,11 +13,9 @@ from dexsim.gap.effects.command_delay import CommandDelay
 from dexsim.gap.rules import TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import HEAVY, NAMES, PER_CUTOFF, columns_of, moved, readable
-from dexsim.gap.search.inverse_dynamics import BY_DIRECTION, LAG, LEAST, LOAD, STRIBECK, solve
+from dexsim.gap.search.inverse_dynamics import BY_DIRECTION, LAG, LOAD, STRIBECK, solve
 
 SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
-TRUSTED = 0.6  # of the torque's rms: what may be left for figures to be believed
-ALIKE = 1.05  # x the error of a free run in closed loop: within it the loop does not tell one from the other
 
 
 def found(
@@ -104,7 +102,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
         open_ = [n for n in open_ if n not in x.refused or n == "viscous_friction"]
         if not open_ or x.value["coulomb_friction"] <= 0:
             continue
-        if x.residual > TRUSTED:
+        if x.residual > TORQUE.trusted:
             said.append(
                 f"{case.joint}: the recorded motor torque is no witness: {100 * x.residual:.0f} % of it fits no "
                 "inertia, gravity or friction"
@@ -146,9 +144,9 @@ def hand_on(
     loop does not say otherwise: what it was refitted to then is the fit's own wandering.
 
     d: the Diagnosis; outcomes: (case, search, outcome) of each joint. A closed loop says otherwise where a free run
-    over what was kept out is followed better than to `ALIKE` with its own figures, or where a finding of at least a
-    half is about them; not where `stages` say that the drive itself is not as believed, since what its loop does then
-    speaks of the drive.
+    over what was kept out is followed better than to `TORQUE.alike` with its own figures, or where a finding of at
+    least a half is about them; not where `stages` say that the drive itself is not as believed, since what its loop
+    does then speaks of the drive.
     """
     strange = {x.joint for x in stages if not x.sound}
     by = {case.joint: (search, outcome) for case, search, outcome in outcomes}
@@ -213,7 +211,7 @@ def _alike(case, search, trial, ours: dict[str, float], test: Sequence[int], spa
         float(np.sqrt(np.mean((measured - free_run(whole, params, x, windows, fixed, True)[0]) ** 2)))
         for x in (trial.fit.x, told)
     ]
-    return error[1] <= ALIKE * error[0] + 0.1 * case.sigma
+    return error[1] <= TORQUE.alike * error[0] + 0.1 * case.sigma
 
 
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[int]) -> list[dict]:
@@ -247,7 +245,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[i
             signal = EFFECTS[n.effect].signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
-            confidence = min(n.share, 0.95) * (1.0 if helped > LEAST else 0.5)
+            confidence = min(n.share, 0.95) * (1.0 if helped > TORQUE.further else 0.5)
             out.append(
                 {
                     "effect": n.effect,

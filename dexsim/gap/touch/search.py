@@ -258,9 +258,8 @@ class PadSearch(PadFit):
                 self.cross(t)
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[t.left_out for _, t in others], self.cross(base)])
-        sums = table[:, intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)].sum(-1)
-        weight = np.exp(-np.clip((sums / sums.min(0) - 1) / TOUCH.told_apart, 0, 50))
-        shares = (weight / weight.sum(0)).mean(1)
+        drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
+        shares = intervals.wins(table, drawn, TOUCH.told_apart)
         rows = sorted(
             ((name, float(s)) for (name, _), s in zip(others, shares[1:-1], strict=True)), key=lambda r: -r[1]
         )
