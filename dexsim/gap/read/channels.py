@@ -16,6 +16,7 @@ before.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -128,72 +129,9 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             if (run.name, joint) in out:
                 continue
             q, whole = run.q[:, j], [(run.t[0], run.t[-1])]
-            cmd = run.command_at(run.t)[:, j]
-            limits = _range(model, joint)
-            if limits is not None and _degrees(q, cmd, limits):
-                add(
-                    "unit",
-                    f"position and target of {joint} reach {np.abs(q).max():.3g}, where the model allows "
-                    f"{np.abs(limits).max():.3g}: degrees? "
-                    "(state meta.position_unit=deg)",
-                    run,
-                    joint,
-                    [STATES, COMMANDS],
-                    whole,
-                )
-                continue
-            far = [] if limits is None else [
-                (what, topic, _farthest(x, limits))
-                for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
-                if _outside(x, limits) > max(FAR * (limits[1] - limits[0]), 2 * np.pi)
-                and not (what == "target" and _within_drive(run, j))
-            ]
-            if far:
-                add(
-                    "unit",
-                    f"{' and '.join(what for what, _, _ in far)} of {joint} reach"
-                    f"{'es' if len(far) == 1 else ''} {' and '.join(f'{x:.4g}' for _, _, x in far)}, where the model"
-                    f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
-                    run,
-                    joint,
-                    [topic for _, topic, _ in far],
-                    whole,
-                )
-                continue
-            if np.ptp(cmd) > 1e-3 and np.ptp(q) > 0.2 * np.ptp(cmd) and _sign(run, q, j) < -0.7:
-                add(
-                    "sign",
-                    f"{joint} follows the negative of its target: another direction of its position or its commands",
-                    run,
-                    joint,
-                    [STATES, COMMANDS],
-                    whole,
-                )
-                continue
-            lead = _lead(run, j)
-            if lead > EARLY:
-                add(
-                    "clock_skew",
-                    f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
-                    "different clocks",
-                    run,
-                    joint,
-                    [COMMANDS, STATES],
-                    whole,
-                )
-                continue
-            stop = _stops(runs, run, joint, cmd)
-            if stop is not None:
-                add(
-                    "stuck",
-                    f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a "
-                    "drive that is off",
-                    run,
-                    joint,
-                    [STATES],
-                    [(stop, run.t[-1])],
-                    0.7,
-                )
+            wrong = _wrong(runs, run, j, model)
+            if wrong is not None:
+                add(wrong.kind, wrong.text, run, joint, wrong.topics, wrong.spans or whole, wrong.confidence)
                 continue
             if beat[joint] > 0:
                 between &= rhythm.between(run.t, q, beat[joint])  # joints of one bus are read one after the other
@@ -241,6 +179,71 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
     return list(found.values()), out, blind
+
+
+@dataclass
+class _Wrong:
+    """Why a joint's position or target is of no use in a recording. spans: when, in s; all the time where there are
+    none."""
+
+    kind: str
+    text: str
+    topics: list[str]
+    spans: list[tuple[float, float]] = field(default_factory=list)
+    confidence: float = 0.9
+
+
+def _wrong(runs: list[Run], run: Run, j: int, model: mujoco.MjModel) -> _Wrong | None:
+    """What is wrong with the position or the target of joint j in `run`, one of `runs`; None where nothing is."""
+    joint, q, cmd = run.joints[j], run.q[:, j], run.command_at(run.t)[:, j]
+    limits = _range(model, joint)
+    if limits is not None and _degrees(q, cmd, limits):
+        return _Wrong(
+            "unit",
+            f"position and target of {joint} reach {np.abs(q).max():.3g}, where the model allows "
+            f"{np.abs(limits).max():.3g}: degrees? "
+            "(state meta.position_unit=deg)",
+            [STATES, COMMANDS],
+        )
+    far = [] if limits is None else [
+        (what, topic, _farthest(x, limits))
+        for what, topic, x in (("position", STATES, q), ("target", COMMANDS, run.cmd[:, j]))
+        if _outside(x, limits) > max(FAR * (limits[1] - limits[0]), 2 * np.pi)
+        and not (what == "target" and _within_drive(run, j))
+    ]
+    if limits is not None and far:
+        return _Wrong(
+            "unit",
+            f"{' and '.join(what for what, _, _ in far)} of {joint} reach"
+            f"{'es' if len(far) == 1 else ''} {' and '.join(f'{x:.4g}' for _, _, x in far)}, where the model"
+            f" allows {limits[0]:.3g} to {limits[1]:.3g}: of another unit, or of another joint",
+            [topic for _, topic, _ in far],
+        )
+    if np.ptp(cmd) > 1e-3 and np.ptp(q) > 0.2 * np.ptp(cmd) and _sign(run, q, j) < -0.7:
+        return _Wrong(
+            "sign",
+            f"{joint} follows the negative of its target: another direction of its position or its commands",
+            [STATES, COMMANDS],
+        )
+    lead = _lead(run, j)
+    if lead > EARLY:
+        return _Wrong(
+            "clock_skew",
+            f"{joint} moves {1e3 * lead:.0f} ms before its target is sent: commands and states are on "
+            "different clocks",
+            [COMMANDS, STATES],
+        )
+    stop = _stops(runs, run, joint, cmd)
+    if stop is not None:
+        return _Wrong(
+            "stuck",
+            f"position of {joint} stops at {stop:.2f} s while its target moves on: a dead encoder, a jam or a "
+            "drive that is off",
+            [STATES],
+            [(stop, run.t[-1])],
+            0.7,
+        )
+    return None
 
 
 def drop(

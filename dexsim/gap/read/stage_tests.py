@@ -17,6 +17,7 @@ from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import TORQUE
 
 DRAWS = 300  # of the bootstrap
+SHIFTS = np.arange(-0.01, 0.0401, 0.002)  # s: by which a drive may act later than is believed
 
 
 @dataclass
@@ -59,41 +60,13 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
     out = []
     rng = np.random.default_rng(seed)
     for case in cases:
-        x, y, block, signal = [], [], [], ""
-        shifts = np.arange(-0.01, 0.0401, 0.002)
-        for r in train:
-            run = runs[r]
-            j = case.index
-            row = run.servo.nominal(run.joints)[j]
-            kp, kd, limit = (row[INDEX[n]] for n in ("kp", "kd", "torque_limit"))
-            logged = None
-            if run.duty is not None and run.servo.drive == "voltage":
-                logged, top, signal = run.duty[:, j], 1.0, "duty"
-            elif run.torque is not None and run.servo.drive == "torque":
-                logged, top, signal = run.torque[:, j], limit, "effort"
-            if logged is None:
-                continue
-            on = np.isfinite(logged)
-            if run.enabled is not None:
-                on &= run.enabled[:, j] > 0.5
-            law = []
-            for d in shifts + row[INDEX["delay"]]:
-                cmd = run.command_at(run.t - d)[:, j]
-                law.append(
-                    np.clip(
-                        kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j]))
-                        - kd * np.interp(run.t - d, run.t, run.vs[:, j]),
-                        -top,
-                        top,
-                    )
-                )
-            x.append(np.array(law)[:, on])
-            y.append(logged[on])
-            block.append(1000 * r + (run.t[on] / 0.5).astype(int))
-        if not x or sum(len(v) for v in y) < 50:
+        read = [(r, x) for r in train if (x := _logged(runs[r], case.index)) is not None]
+        if not read or sum(len(x.logged) for _, x in read) < 50:
             continue
-        law, logged = np.concatenate(x, 1), np.concatenate(y)
-        _, blocks = np.unique(np.concatenate(block), return_inverse=True)
+        law = np.concatenate([x.law for _, x in read], 1)
+        logged = np.concatenate([x.logged for _, x in read])
+        block = np.concatenate([1000 * r + (x.t / 0.5).astype(int) for r, x in read])
+        _, blocks = np.unique(block, return_inverse=True)
         if logged.std() < 1e-9 or law.std() < 1e-9:
             continue
         correlation = [np.corrcoef(row, logged)[0, 1] if row.std() > 0 else 0.0 for row in law]
@@ -107,16 +80,54 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
         out.append(
             Stage(
                 case.joint,
-                signal,
+                read[-1][1].signal,
                 float(slope),
                 float(np.quantile(slopes, 0.05)),
                 float(np.quantile(slopes, 0.95)),
                 float(offset),
-                float(shifts[best]),
+                float(SHIFTS[best]),
                 float(fit),
             )
         )
     return out
+
+
+@dataclass
+class _Logged:
+    """A drive's logged signal [n] at times t [n] s while it was on, and what the believed law gives for it [D, n] where
+    it acts later by each of `SHIFTS` than is believed."""
+
+    signal: str
+    t: np.ndarray
+    logged: np.ndarray
+    law: np.ndarray
+
+
+def _logged(run: Run, j: int) -> _Logged | None:
+    """What joint j's drive logged in a recording; None where it logged nothing that its law gives."""
+    row = run.servo.nominal(run.joints)[j]
+    kp, kd, limit = (row[INDEX[n]] for n in ("kp", "kd", "torque_limit"))
+    if run.duty is not None and run.servo.drive == "voltage":
+        logged, top, signal = run.duty[:, j], 1.0, "duty"
+    elif run.torque is not None and run.servo.drive == "torque":
+        logged, top, signal = run.torque[:, j], limit, "effort"
+    else:
+        return None
+    on = np.isfinite(logged)
+    if run.enabled is not None:
+        on &= run.enabled[:, j] > 0.5
+    law = []
+    for d in SHIFTS + row[INDEX["delay"]]:
+        cmd = run.command_at(run.t - d)[:, j]
+        law.append(
+            np.clip(
+                kp * (cmd - np.interp(run.t - d, run.t, run.qs[:, j]))
+                - kd * np.interp(run.t - d, run.t, run.vs[:, j]),
+                -top,
+                top,
+            )
+        )
+    return _Logged(signal, run.t[on], logged[on], np.array(law)[:, on])
 
 
 def _slope(n, sx, sy, sxx, sxy, axis=-1):

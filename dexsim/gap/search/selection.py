@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search import baseline
-from dexsim.gap.search.fit import slopes_of
+from dexsim.gap.search.fit import Fitted, slopes_of
 from dexsim.gap.search.left_out import BOOTSTRAPS, STRETCH
 from dexsim.gap.search.scan import JointScan, expand_one
 from dexsim.gap.search.trial import Member, Outcome, Trial, fits_beside
@@ -54,63 +55,12 @@ class JointSelection(JointScan):
                 listed = self._hinted([] if enough else listed, current.members, SEARCH.hint)
             if not listed:
                 break
-            drafts: list = []
-            followed: dict[str, float] = {}
-            for _, p, member, start in listed:
-                if drafts and self.deadline.over():
-                    break
-                if member.id not in pool or price.get(member.id, 1.0) > p:
-                    pool[member.id] = (member, start)
-                price[member.id] = p
-                begin = lambda x, current=current: np.concatenate([self._values(current), x])  # noqa: E731
-                tries = [self.draft((*current.members, member), begin(start), current)]
-                if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
-                    tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
-                drafts.append(min(tries, key=lambda d: d[2].loss))
-                if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
-                    if member.id in followed:
-                        pool[member.id] = (member, start)
-                    followed[member.id] = drafts[-1][2].loss
-                self._on(0.03)
-            drafts.sort(key=lambda d: d[2].loss)
-            good = [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
+            drafts = self._drafts(listed, current, pool, price)
             for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
                 if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
                     pool[member.id], price[member.id] = (member, start), p
-            trials = sorted(
-                (self.finish(*d, current) for k, d in enumerate(good) if k == 0 or not self.deadline.over()),
-                key=lambda t: t.fit.loss,
-            )
-            least = trials[0].fit.loss
-            # those that may still be the best are looked at closely
-            trials = [
-                self.thorough(t)
-                if not self.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1))
-                else t
-                for k, t in enumerate(trials)
-            ]
-            for trial in trials:
-                self._on(0.06)
-                known = self.fitted.get(frozenset(trial.ids))
-                if known is None or trial.fit.loss < known.fit.loss:
-                    self.fitted[frozenset(trial.ids)] = trial
-            for trial in trials:
-                self.cross(trial)
-            best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
-            if (
-                close.fit.loss < (1 - SEARCH.tie) * best.fit.loss
-            ):  # what follows best seems to last less: fits of their own decide
-                two = [self.refold(t) for t in (best, close)]
-                for t in two:
-                    self.fitted[frozenset(t.ids)] = t
-                best = min(two, key=self._score)
-            if not self._earns(
-                best, current
-            ):  # a good fit that seems not to last: is it the fit's, or the step's from it?
-                close = min(trials, key=lambda t: t.fit.loss)
-                if close.fit.loss < (1 - SEARCH.least) * current.fit.loss:
-                    best = self.refold(close)
-                    self.fitted[frozenset(best.ids)] = best
+            trials = self._finished(drafts, current)
+            best = self._best(trials, current)
             less = self._begun_again(current, trials)
             if less is not current:
                 if not current.members:
@@ -138,20 +88,97 @@ class JointSelection(JointScan):
         if not self.deadline.over():
             current = self._by_laws(self._refine(self._drop(current)))
         self._on(0.1)
-        final = self.rivals(current, pool)
-        for _ in range(len(current.members)):  # one that only seemed worse before it was fitted in full takes the place
-            better = self._overtaken(current, final)
-            if better is None:
-                break
-            self.fitted[frozenset(current.ids)] = current
-            current = (
-                self._drop(better) if len(better.members) > 1 else better
-            )  # what went with the other may not be needed with it
-            final = self.rivals(current, pool)
+        current, final = self._settled(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
             price.setdefault(m.id, 0.0)
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
+
+    def _drafts(
+        self,
+        listed: Sequence[tuple[float, float, Member, np.ndarray]],
+        current: Trial,
+        pool: dict[str, tuple[Member, np.ndarray]],
+        price: dict[str, float],
+    ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
+        """The hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted on
+        short windows: those that follow best, the best first. pool, price: by effect, are filled."""
+        drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
+        followed: dict[str, float] = {}
+        begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
+        for _, p, member, start in listed:
+            if drafts and self.deadline.over():
+                break
+            if member.id not in pool or price.get(member.id, 1.0) > p:
+                pool[member.id] = (member, start)
+            price[member.id] = p
+            tries = [self.draft((*current.members, member), begin(start), current)]
+            if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
+                tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
+            drafts.append(min(tries, key=lambda d: d[2].loss))
+            if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
+                if member.id in followed:
+                    pool[member.id] = (member, start)
+                followed[member.id] = drafts[-1][2].loss
+            self._on(0.03)
+        drafts.sort(key=lambda d: d[2].loss)
+        return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
+
+    def _finished(
+        self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
+    ) -> list[Trial]:
+        """The drafts fitted on long windows, and judged on what was left out."""
+        trials = sorted(
+            (self.finish(*d, current) for k, d in enumerate(drafts) if k == 0 or not self.deadline.over()),
+            key=lambda t: t.fit.loss,
+        )
+        least = trials[0].fit.loss
+        # those that may still be the best are looked at closely
+        trials = [
+            self.thorough(t)
+            if not self.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1))
+            else t
+            for k, t in enumerate(trials)
+        ]
+        for trial in trials:
+            self._on(0.06)
+            known = self.fitted.get(frozenset(trial.ids))
+            if known is None or trial.fit.loss < known.fit.loss:
+                self.fitted[frozenset(trial.ids)] = trial
+        for trial in trials:
+            self.cross(trial)
+        return trials
+
+    def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
+        """The one of the trials that loses least on what was left out; fits of their own decide where what follows best
+        seems to last less, or not to last."""
+        best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
+        if close.fit.loss < (1 - SEARCH.tie) * best.fit.loss:
+            two = [self.refold(t) for t in (best, close)]
+            for t in two:
+                self.fitted[frozenset(t.ids)] = t
+            best = min(two, key=self._score)
+        if not self._earns(best, current):  # a good fit that seems not to last: is it the fit's, or the step's from it?
+            close = min(trials, key=lambda t: t.fit.loss)
+            if close.fit.loss < (1 - SEARCH.least) * current.fit.loss:
+                best = self.refold(close)
+                self.fitted[frozenset(best.ids)] = best
+        return best
+
+    def _settled(
+        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
+    ) -> tuple[Trial, dict[str, tuple[list[tuple[str, float]], float, float]]]:
+        """(the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
+        final = self.rivals(current, pool)
+        for _ in range(len(current.members)):
+            better = self._overtaken(current, final)
+            if better is None:
+                break
+            self.fitted[frozenset(current.ids)] = current
+            # what went with the other may not be needed with it
+            current = self._drop(better) if len(better.members) > 1 else better
+            final = self.rivals(current, pool)
+        return current, final
 
     def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
         """The hypothesis fitted again from where those with one effect more ended that follow better: what they
