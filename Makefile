@@ -1,6 +1,6 @@
 # make train   sets up .venv once, then trains: make train ARGS="worlds=256 iterations=100"
 # make test    the tests, a process a core (up to 4): one alone, to debug it: make test ARGS="-n 0 -k name"
-# make lint    ruff over everything, mypy over the public functions
+# make lint    ruff over everything, mypy over the package
 # make wheel   what `pip install` takes, in dist/
 # make play    plays a policy: make play ARGS="checkpoint=checkpoints/grasp.pt"
 # make docs    this documentation as a site, in out/site/
