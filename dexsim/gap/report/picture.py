@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Set
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -97,35 +99,44 @@ def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
     return np.stack([np.cross(up, front), up, front])
 
 
-def mechanism(
-    model: mujoco.MjModel,
-    sensors: Sensors,
-    error: dict[str, float],
-    found: set[str],
-    taxels: np.ndarray | None = None,
-    marked: set[str] = frozenset(),
-    unit: str = "mrad",
-    width: int = 360,
-    height: int = 400,
-) -> str:
-    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
-    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model
-    carries the pads of `sensors`."""
-    from scipy.spatial import ConvexHull, QhullError
+@dataclass
+class _Drawing:
+    """A model at its own pose as seen from one side: where a point [.., 3] m lies on a picture of width x height, its
+    links' `shapes` (number of the geom, corners [n, 3]) and the `pads` (number of the finger, taxels [K, 3]) that it
+    carries."""
 
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    shapes: list[tuple[int, np.ndarray]]
+    pads: list[tuple[int, np.ndarray]]
+    axes: np.ndarray
+    scale: float  # of the picture per m
+    middle: np.ndarray
+    width: int
+    height: int
+
+    def at(self, p: np.ndarray) -> np.ndarray:
+        """[n, 2] of the picture."""
+        u = (np.atleast_2d(p) @ self.axes.T)[:, :2]
+        x, y = (u[:, k] - self.middle[k] for k in (0, 1))
+        return np.stack([self.width / 2 + x * self.scale, self.height / 2 - y * self.scale], 1)
+
+
+def _drawing(
+    model: mujoco.MjModel, sensors: Sensors, joints: list[int], touch_alone: bool, width: int, height: int
+) -> _Drawing | None:
+    """The model seen from where its motion shows best, filling the picture; None where there is nothing to see."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     groups = [g for g in range(model.ngeom) if int(model.geom_group[g]) <= 2] or list(range(model.ngeom))
     shapes = [(g, _corners(model, data, g)) for g in groups]
     shapes = [(g, p) for g, p in shapes if len(p) >= 4]
-    if not error and shapes:  # touch alone: what is small beside the rest is no part of the picture
+    if touch_alone and shapes:  # what is small beside the rest is no part of the picture
         most = max(float(np.ptp(p, axis=0).max()) for _, p in shapes)
         shapes = [(g, p) for g, p in shapes if float(np.ptp(p, axis=0).max()) > 0.15 * most]
-    names = [model.joint(i).name for i in range(model.njnt)]
-    joints = [i for i, n in enumerate(names) if n in error]
     cloud = np.concatenate([*[p for _, p in shapes], data.xanchor[joints].reshape(-1, 3)])
     if len(cloud) < 3:
-        return ""
+        return None
     pads = []
     facing = None
     bodies = [model.body(i).name for i in range(model.nbody)]
@@ -140,70 +151,114 @@ def mechanism(
     flat = cloud @ axes.T
     low, high = flat[:, :2].min(0), flat[:, :2].max(0)
     scale = min((width - 60) / max(high[0] - low[0], 1e-6), (height - 60) / max(high[1] - low[1], 1e-6))
-    middle = 0.5 * (low + high)
+    return _Drawing(model, data, shapes, pads, axes, scale, 0.5 * (low + high), width, height)
 
-    def at(p):
-        u = (np.atleast_2d(p) @ axes.T)[:, :2]
-        return np.stack([width / 2 + (u[:, 0] - middle[0]) * scale, height / 2 - (u[:, 1] - middle[1]) * scale], 1)
 
-    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="the mechanism, coloured by error">']
+def mechanism(
+    model: mujoco.MjModel,
+    sensors: Sensors,
+    error: dict[str, float],
+    found: set[str],
+    taxels: np.ndarray | None = None,
+    marked: Set[str] = frozenset(),
+    unit: str = "mrad",
+    width: int = 360,
+    height: int = 400,
+) -> str:
+    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
+    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model
+    carries the pads of `sensors`."""
+    names = [model.joint(i).name for i in range(model.njnt)]
+    joints = [i for i, n in enumerate(names) if n in error]
+    drawing = _drawing(model, sensors, joints, not error, width, height)
+    if drawing is None:
+        return ""
     hot = {int(model.jnt_bodyid[i]) for i in joints if names[i] in found}
-    for g, p in sorted(shapes, key=lambda s: float((s[1] @ axes[2]).mean())):
-        xy = at(p)
+    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="the mechanism, coloured by error">']
+    out += [*_outlines(drawing, hot), *_links(drawing, joints)]
+    if taxels is not None:
+        out += _taxels(drawing, taxels, marked)
+    most = max([*error.values(), 1e-12])
+    out += _discs(drawing, {i: (names[i], error[names[i]]) for i in joints}, most, found, unit)
+    return "".join(out) + "</svg>"
+
+
+def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
+    """The links from the farthest to the nearest, those of `hot` bodies in another colour."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    out = []
+    for g, p in sorted(d.shapes, key=lambda s: float((s[1] @ d.axes[2]).mean())):
+        xy = d.at(p)
         try:
             xy = xy[ConvexHull(xy).vertices]
         except QhullError:
             continue
-        fill = "#f4d9c0" if int(model.geom_bodyid[g]) in hot else "#e3e8ee"
+        fill = "#f4d9c0" if int(d.model.geom_bodyid[g]) in hot else "#e3e8ee"
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in xy)
         out.append(
             f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>'
         )
-    # links between joints, so that a mechanism without shapes still shows
+    return out
+
+
+def _links(d: _Drawing, joints: list[int]) -> list[str]:
+    """Lines from joint to joint, so that a mechanism without shapes still shows."""
+    out = []
     for i in joints:
-        parent = int(model.body_parentid[int(model.jnt_bodyid[i])])
+        parent = int(d.model.body_parentid[int(d.model.jnt_bodyid[i])])
         while parent:
-            inside = [k for k in joints if int(model.jnt_bodyid[k]) == parent]
+            inside = [k for k in joints if int(d.model.jnt_bodyid[k]) == parent]
             if inside:
-                a, b = at(data.xanchor[inside[-1]])[0], at(data.xanchor[i])[0]
+                a, b = d.at(d.data.xanchor[inside[-1]])[0], d.at(d.data.xanchor[i])[0]
                 out.append(
                     f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" '
                     'stroke-width="2"/>'
                 )
                 break
-            parent = int(model.body_parentid[parent])
-    if taxels is not None:
-        most = max(float(taxels.max()), 1e-9)
-        for f, p in pads:
-            for k, (x, y) in enumerate(at(p)):
-                mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
-                size = 2.2 if scale < 4000 else 5.0
-                out.append(
-                    f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
-                    f'fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} '
-                    'mN</title></circle>'
-                )
-    top = max([*error.values(), 1e-12])
-    labels = []
-    for i in joints:
-        (x, y) = at(data.xanchor[i])[0]
-        small = error[names[i]]
+            parent = int(d.model.body_parentid[parent])
+    return out
+
+
+def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
+    """The taxels of the pads, coloured by their error [F, K] N; ringed where `marked`."""
+    out = []
+    most = max(float(taxels.max()), 1e-9)
+    for f, p in d.pads:
+        for k, (x, y) in enumerate(d.at(p)):
+            mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
+            size = 2.2 if d.scale < 4000 else 5.0
+            out.append(
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
+                f'fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} '
+                'mN</title></circle>'
+            )
+    return out
+
+
+def _discs(
+    d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found: set[str], unit: str
+) -> list[str]:
+    """A disc at each joint (number -> name, error), coloured by its error of `most`, ringed and named where found."""
+    out, labels = [], []
+    for i, (name, small) in joints.items():
+        (x, y) = d.at(d.data.xanchor[i])[0]
         ring = (
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>'
-            if names[i] in found
+            if name in found
             else ""
         )
         out.append(
-            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / top)}" '
-            f'stroke="{SOFT}"><title>{html.escape(names[i])}: {1e3 * small:.3g} {unit}</title></circle>'
+            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / most)}" '
+            f'stroke="{SOFT}"><title>{html.escape(name)}: {1e3 * small:.3g} {unit}</title></circle>'
         )
-        if names[i] in found:
-            labels.append((x, y, names[i]))
+        if name in found:
+            labels.append((x, y, name))
     for x, y, name in labels:
-        side = "end" if x > 0.62 * width else "start"
+        side = "end" if x > 0.62 * d.width else "start"
         dx = -17 if side == "end" else 17
         out.append(
             '<g stroke="#fff" stroke-width="3" '
             f'paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
         )
-    return "".join(out) + "</svg>"
+    return out
