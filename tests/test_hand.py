@@ -189,12 +189,17 @@ def test_a_urdf_with_a_mimic_joint_is_refused(tmp_path):
         load_hand(folder)
 
 
-def test_names_of_hands(tmp_path):
+def test_names_of_hands(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="did you mean xhand"):
         load_hand("xhnd")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="has no hand.yaml"):
         load_hand(tmp_path / "empty")
+    monkeypatch.chdir(tmp_path)
+    made = made_hand(tmp_path / "hands" / "leapt")
+    assert load_hand("leapt").folder == made.resolve() == load_hand("hands/leapt").folder
+    with pytest.raises(UserError, match="hand=leap: must be one of xhand, leapt, .*did you mean leapt"):
+        load_hand("leap")
     with pytest.raises(UserError, match="hand_scale=9"):
         load_hand("xhand", scale=9.0)
 

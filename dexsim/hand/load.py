@@ -18,11 +18,13 @@ from dexsim.hand.schema import FILE, HandFile, Pad
 
 HANDS = Path(__file__).parents[1] / "assets"
 """Folders of the hands that come with dexsim."""
+IMPORTED = "hands"
+"""Folder of a user's own, in the working directory."""
 SCALES = (0.2, 5.0)
 
 
 def load_hand(which: str | Path = "xhand", mirror: bool = False, scale: float = 1.0) -> Hand:
-    """The hand of a folder (or of the hand.yaml in it), or one that comes with dexsim, by name.
+    """The hand of a folder (or of the hand.yaml in it), or by name one that comes with dexsim or lies in `hands/` here.
 
     mirror: its mirror image (a right hand becomes a left one); scale: all lengths times this, masses times its cube,
     motors unchanged. Raises UserError, one line: file, field, value, what must be there.
@@ -41,6 +43,11 @@ def known() -> list[str]:
     return sorted(p.parent.name for p in HANDS.glob(f"*/{FILE}"))
 
 
+def _imported() -> list[str]:
+    """Names of the hands in `hands/` of the working directory, where the tutorial has them imported."""
+    return sorted(p.parent.name for p in Path(IMPORTED).glob(f"*/{FILE}"))
+
+
 def _file(which: str | Path) -> Path:
     text = str(which)
     if text in known():
@@ -50,9 +57,12 @@ def _file(which: str | Path) -> Path:
         return (path / FILE).resolve()
     if path.name == FILE and os.path.isfile(path):
         return path.resolve()
-    near = difflib.get_close_matches(text, known(), 1)
+    if text in (mine := _imported()):
+        return (Path(IMPORTED) / text / FILE).resolve()
+    names = list(dict.fromkeys((*known(), *mine)))
+    near = difflib.get_close_matches(text, names, 1)
     raise UserError(
-        f"hand={text}: must be one of {', '.join(known())}, or a folder with a {FILE}"
+        f"hand={text}: must be one of {', '.join(names)}, or a folder with a {FILE}"
         + (f"; did you mean {near[0]}?" if near else "")
         + (f"; {path} has no {FILE}: write one, {schema.SEE}" if os.path.isdir(path) else "")
     )
