@@ -335,6 +335,7 @@ def test_a_hand_that_never_relaxes_is_said(b, capsys):
 def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_path, at):
     hand = Spoiled(VirtualClock(100.0))
     rec = recorder_at(tmp_path / "run.mcap")
+    rec.zero -= 30.0
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -348,6 +349,8 @@ def test_a_full_disk_costs_the_rest_of_the_recording_and_nothing_else(b, tmp_pat
     report = run(b, hand, recorder=rec)
     assert report.ended == "done" and report.acts == 48 and hand.relaxed_at
     assert ("nobody thought" if at == "thread" else "No space left") in rec.error and rec.writer._file.closed
+    if at == "write":  # of the first sample, however long the hand's start has taken
+        assert "nothing is recorded from 0.0 s on" in rec.error
     if at == "close":
         assert len(read(tmp_path / "run.mcap", audit=False).commands) > 10, "what was written before is there"
 

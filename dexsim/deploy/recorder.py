@@ -94,8 +94,10 @@ class Recorder:
             "temperature": w.add_temperature,
             "object": w.add_object_pose,
         }
+        first = None
         while (item := self._queue.get()) is not None:
             kind, t, values = item
+            first = t if first is None else first
             try:
                 if kind == "state":
                     position, velocity, effort, stamp = values
@@ -106,7 +108,7 @@ class Recorder:
                     self._array(kind, t, values[0])
                 self.written += 1
             except Exception as error:  # a full disk must not stop the hand, and neither must what cannot be written
-                self.error = f"{self.path}: {_reason(error)}; nothing is recorded from {t:.1f} s on"
+                self.error = f"{self.path}: {_reason(error)}; nothing is recorded from {t - first:.1f} s on"
                 return
             if self._queue.empty():
                 time.sleep(0.002)  # a few samples at a time: fewer turns taken from the loop

@@ -29,6 +29,10 @@ POSSIBLE = np.pi
 SETTLED = 0.05
 """s at the start, in which the sound recordings' positions are those of their end (they were rolled)."""
 START_NS = 1_700_000_000_000_000_000
+FEW = 20
+"""Samples of a topic from which on its clock is compared with another's (`recording.audit_time.between_topics`)."""
+SHIFTS = (-3.0, 3.0, 600.0)
+"""s by which `mutate.values` moves times."""
 ABOUT_NUMBERS = ("position_unit", "time_unit")
 """Metadata by which numbers are read otherwise; the sound recordings have none."""
 
@@ -55,11 +59,20 @@ def of_recording(path: Path, r: Recording, runs: list[Run], words: set[tuple[str
             values = np.unique(x[off])
             if len(values) == 1 and abs(values[0]) < POSSIBLE and off.any(1).mean() > 0.1:
                 continue
+            if min(len(r.commands), len(r.states.position)) < FEW and _shifted(t + shift, x, behind, columns):
+                continue  # all times of a topic later or earlier: so few samples of the other do not show it
             if off.any() and not any(about in (topic, "") or kind == "clock_skew" for about, kind in words):
                 i, j = (int(v) for v in np.argwhere(off)[0])
                 return (f"{what} of {run.joints[j]} is {x[i, j]:.4g} at {t[i]:.4g} s, and was {true[i, j]:.4g} when it"
                         f" was recorded ({int(off.sum())} such samples); nothing is said of it")  # fmt: skip
     return ""
+
+
+def _shifted(t: np.ndarray, x: np.ndarray, behind: float, columns: list[int]) -> bool:
+    """Whether values [T, J] are those of another time, all by as much."""
+    return any(
+        (np.abs(x - signal(t - s - behind)[:, columns])[t - s > SETTLED] < TOLERANCE).all() for s in SHIFTS
+    )
 
 
 def of_settings(said: Any, taken: Any, path: str = "") -> str:
@@ -72,6 +85,8 @@ def of_settings(said: Any, taken: Any, path: str = "") -> str:
         taken = taken[0]  # a range of one number
     if isinstance(taken, Mapping) and isinstance(said, (list, tuple)):
         taken = [taken.get("low"), taken.get("high")]
+    if isinstance(said, (int, float)) and isinstance(taken, Mapping) and set(taken.values()) == {said}:
+        return ""  # one number for all joints
     if isinstance(said, Mapping):
         if not isinstance(taken, Mapping):
             return "" if not said else f"{path}={said!r} was taken for {taken!r}"

@@ -98,6 +98,8 @@ FOUND = [
     ("overrides", 3017267),
     ("checkpoint", 4000029),
     ("overrides", 9004328),
+    ("recording", 10004427),
+    ("calibration", 10004780),
 ]
 """Cases of long runs that once broke something."""
 
