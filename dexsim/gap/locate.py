@@ -10,7 +10,7 @@ import numpy as np
 
 from dexsim import intervals
 
-BINS = 4
+BINS = 4  # of a regime variable, of equal numbers of samples
 DRAWS = 300  # of the bootstrap
 
 
@@ -80,14 +80,7 @@ def spots(
     for name, x in regimes.items():
         if name.startswith("_") or np.ptp(x) < 1e-12:
             continue
-        if name == "time since reversal":
-            edges: Sequence[float] | np.ndarray = [0.0, 0.04, 0.12, 0.4, np.inf]
-        elif name in ("direction", "driven against its load"):
-            edges = [-1.5, -0.5, 0.5, 1.5]
-        elif name == "saturation":
-            edges = [0.0, 0.5, 0.9, 1.0 - 1e-6, np.inf]
-        else:
-            edges = np.unique(np.quantile(x, np.linspace(0, 1, BINS + 1)))
+        edges = _edges(name, x)
         for low, high in zip(edges[:-1], edges[1:], strict=True):
             inside = (x >= low) & ((x < high) if high != edges[-1] else (x <= high))
             if not 0.02 < inside.mean() < 0.98:
@@ -122,6 +115,17 @@ def spots(
                 )
             )
     return out
+
+
+def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:
+    """Edges of the bins of a regime variable x [n]: where its meaning changes, or by equal numbers of samples."""
+    if name == "time since reversal":
+        return [0.0, 0.04, 0.12, 0.4, np.inf]
+    if name in ("direction", "driven against its load"):
+        return [-1.5, -0.5, 0.5, 1.5]
+    if name == "saturation":
+        return [0.0, 0.5, 0.9, 1.0 - 1e-6, np.inf]
+    return np.unique(np.quantile(x, np.linspace(0, 1, BINS + 1)))
 
 
 def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:

@@ -8,7 +8,7 @@ from dexsim import intervals
 from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param, expand
-from dexsim.gap.read.runs import Run, same_commands, spans
+from dexsim.gap.read.runs import BLOCK, Run, same_commands, spans
 
 UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
 FIRST = 0.1  # s tell where and how fast: within
@@ -119,7 +119,7 @@ def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray
 
 
 def rms_interval(
-    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = 0.5
+    squares: list[np.ndarray], times: list[np.ndarray], seed: int = 0, block: float = BLOCK
 ) -> tuple[float, float, float]:
     """(rms, low, high): 90 % by a bootstrap over half-second blocks of squared errors, drawn alike for all joints."""
     sums, counts = [], []

@@ -17,12 +17,12 @@ from dexsim.actuator.reference import torque_along
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read.runs import BLOCK, Run
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 
 COLUMNS = ("standin_constant", "standin_position", "standin_speed", "standin_drag")
-BLOCK, DRAWS = 0.5, 200  # s, bootstraps
+DRAWS = 200  # of the bootstrap
 
 
 @dataclass

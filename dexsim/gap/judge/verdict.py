@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim import intervals
+from dexsim.gap.read.runs import BLOCK
 from dexsim.gap.rules import JUDGE
 
 DRAWS, STRETCH = 400, 4  # bootstraps, of stretches of so many neighbouring blocks
@@ -67,7 +68,7 @@ def verdict(
 
 
 def gain_interval(
-    without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = 0.5
+    without: np.ndarray, with_it: np.ndarray, times: np.ndarray, seed: int = 0, block: float = BLOCK
 ) -> tuple[float, float]:
     """90 % interval of the share of the squared error `without` [n] that an effect removes (`with_it` [n]), both at
     times [n] s on what was kept out: a bootstrap over half-second blocks in stretches of two seconds, paired, of the

@@ -85,7 +85,7 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("late_group", 1.0, "1", "commands in a row that are one group"),
 )
 
-LATE_GROUPS = 128
+LATE_GROUPS = 128  # commands that are told apart where one of them acts late (`late_group`)
 
 NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}

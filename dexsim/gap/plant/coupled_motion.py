@@ -22,7 +22,7 @@ from dexsim.gap.read.runs import Run, local_polynomial
 
 WIDTH = 0.06  # s: of the smoothing of the difference
 EVERY = 2e-3  # s between the samples of the refined motion
-PASSES = 2
+PASSES = 2  # of building the cases along the motion that they show
 # of a joint's typical torque: what reaches it from the motion of others before it matters how well that is known
 COUPLED = 0.03
 

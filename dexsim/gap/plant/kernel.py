@@ -41,13 +41,13 @@ from dexsim.actuator.laws import (
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, SERIES_INDEX
 
 f64 = wp.float64
-ONE_BODY_STEPS = 1
+ONE_BODY_STEPS = 1  # sub-steps of the plant without a play or an elasticity in one step of the grid
 LEAST_SUPPLY = 0.2  # of a drive's supply that is left at least
 TWO_BODY_STEPS = 6  # sub-steps of the two-inertia plant in one step of the grid
 
 # constants of a joint: consts[...]
 C_VOLTAGE, C_LOOP_MOTOR, C_POS_MOTOR, C_DAMPING, C_FRICTION, C_LOW, C_HIGH, C_STIFF, C_SLIDE, C_OPEN = range(10)
-CONSTS = 10
+CONSTS = 10  # of them
 P_KP, P_KD, P_DEADBAND, P_LIMIT, P_NLS, P_EFF, P_DELAY, P_LAG, P_SUPPLY = (
     INDEX[n] for n in ("kp", "kd", "deadband", "torque_limit", "no_load_speed", "efficiency", "delay", "lag", "supply")
 )

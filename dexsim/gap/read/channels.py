@@ -35,7 +35,7 @@ BLIND = 0.5  # s: over a longer one the motion is not known, and a joint is judg
 EARLY = 0.015  # s: a joint that moves so long before its target is on another clock
 PAUSE = 1.0  # s without a sample, over which no lag is measured
 STILL = 0.1  # rad that the target of a joint that never moves must span
-REST = 0.05  # s
+REST = 0.05  # s: the shortest rest
 HOLDS = 1.5  # x the error at which dry friction has held the joint before
 TURN = 180 / np.pi
 LONG = 0.1  # s: what stays the same for as long is looked at
@@ -43,7 +43,7 @@ PULSE = 2.0  # x the largest pulse that does not end a rest
 PASSED = 2.0  # x the way that a target has gone during another rest
 WAY = 0.1  # of all the way that the target spans: less tells nothing
 OFTEN = 0.02  # of a recording's samples (and `FEW` at least): repeated ones of a moving joint are named from there on
-FEW = 8
+FEW = 8  # samples
 FAR = 3.0  # x a joint's range, beyond which a position or a target is not that joint's
 
 

@@ -10,7 +10,7 @@ from dexsim.gap.read.runs import Run
 NEAR = 0.012  # of the joint's whole motion: as near to its outermost position
 PRESSED = 5.0  # x the usual error at rest: what no friction would hold
 AGAINST = 5.0  # x gravity, at least, of the torque asked for: what no load would hold
-LAST = 0.1  # s
+LAST = 0.1  # s: the shortest meeting
 TIMES = 2  # separate times that it must meet the end
 
 

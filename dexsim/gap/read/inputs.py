@@ -22,7 +22,7 @@ from dexsim.recording.schema import Recording, Series
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
 BAD_CHANNEL = ("wrap", "lost_sign", "unit", "sign_mismatch", "stuck", "held", "clock_skew")
-SHORTEST = 0.5  # s
+SHORTEST = 0.5  # s: what a recording must last to be read
 
 
 class Unusable(Exception):

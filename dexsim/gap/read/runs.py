@@ -8,6 +8,9 @@ import numpy as np
 
 from dexsim.actuator.table import ServoTable
 
+BLOCK = 0.5
+"""s of a stretch whose samples are resampled together: errors that lie nearer to each other are not independent."""
+
 
 @dataclass
 class Run:

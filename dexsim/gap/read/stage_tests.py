@@ -13,7 +13,7 @@ import numpy as np
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.plant.case import Case
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read.runs import BLOCK, Run
 from dexsim.gap.rules import TORQUE
 
 DRAWS = 300  # of the bootstrap
@@ -65,7 +65,7 @@ def tests(cases: list[Case], runs: list[Run], train: list[int], seed: int = 0) -
             continue
         law = np.concatenate([x.law for _, x in read], 1)
         logged = np.concatenate([x.logged for _, x in read])
-        block = np.concatenate([1000 * r + (x.t / 0.5).astype(int) for r, x in read])
+        block = np.concatenate([1000 * r + (x.t / BLOCK).astype(int) for r, x in read])
         _, blocks = np.unique(block, return_inverse=True)
         if logged.std() < 1e-9 or law.std() < 1e-9:
             continue

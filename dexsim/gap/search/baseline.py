@@ -22,19 +22,20 @@ from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.plant.case import BELIEF, Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
+from dexsim.gap.read.runs import BLOCK
 from dexsim.gap.rules import TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
 WINDOW, WINDOWS = 2.0, 12  # s of a window, and how many: more would say little more
 GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside what is believed
-ITERATIONS = 8
+ITERATIONS = 8  # of the fit from each guess
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
 MOVING = 0.05  # of the joint's large speed
 TRAVEL, LASTS = 0.02, 0.1  # of the joint's span, and s: shorter stretches may be noise
 BELIEVED = 1.1  # x the driving torque: gravity and limits are off by a few percent
-BLOCK, DRAWS = 0.5, 400  # s, bootstraps
+DRAWS = 400  # of the bootstrap
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
 
 

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 from scipy.signal import butter, filtfilt
 
-from dexsim.gap.read.runs import Run
+from dexsim.gap.read.runs import BLOCK, Run
 
 CUTOFF = 0.2  # of half the sampling rate, and no more than
-TOP = 60.0  # Hz
+TOP = 60.0  # Hz: of the cutoff, too
 LEAST = 5.0  # Hz: of the cutoff
 EDGE, SWING = 50, 2.0  # samples, and periods of the cutoff, at each end in which the filter still swings in
 # Hz at which the model is evaluated; inertia and bias change slowly, accelerations keep their own rate
@@ -26,7 +26,6 @@ MODEL_RATE = 250.0
 RATE = 100.0  # Hz: readings slower than this are too few for a second derivative
 PER_CUTOFF = 10.0  # samples kept a period of the filter's cutoff
 HEAVY = 0.02  # of a joint's torque: gravity that matters
-BLOCK = 0.5  # s
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 WEIGHT = ("gravity", "gravity_across")  # factors on gravity's torque, beyond the model's, that are fitted beside them
 

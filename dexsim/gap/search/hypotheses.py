@@ -9,6 +9,7 @@ import numpy as np
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param
+from dexsim.gap.read.runs import BLOCK
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.beliefs import refitted, unknown
 from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
@@ -25,7 +26,7 @@ EXTREMES = (
     "load",
     "position error",
 )  # regime variables whose largest values are never thinned out
-EXTREME, OF_RUN = 12, 3  # windows
+EXTREME, OF_RUN = 12, 3  # windows that are kept for their extremes, and of one recording
 TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
 PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
 MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
@@ -95,9 +96,9 @@ class JointHypotheses:
     def _blocks(self, fitter: Fitter, w: Windows) -> np.ndarray:
         """Block of each residual [m]: half-second stretches of one window."""
         t = self.case.plant.t[w.sample_row]
-        start = np.zeros(len(w.window))
-        np.minimum.at(start := np.full(len(w.window), np.inf), w.sample_window, t)
-        b = w.sample_window * 1000 + ((t - start[w.sample_window]) / 0.5).astype(int)
+        start = np.full(len(w.window), np.inf)
+        np.minimum.at(start, w.sample_window, t)
+        b = w.sample_window * 1000 + ((t - start[w.sample_window]) / BLOCK).astype(int)
         _, b = np.unique(b, return_inverse=True)
         return np.concatenate([b, b]) if fitter.use_torque else b
 

@@ -20,13 +20,12 @@ import numpy as np
 from dexsim import intervals
 from dexsim.gap.effects.load_friction import LoadFriction
 from dexsim.gap.effects.stribeck_friction import StribeckFriction
-from dexsim.gap.rules import TORQUE
+from dexsim.gap.rules import SEARCH, TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import WEIGHT, Columns, columns_of, least, misfit, solved, sums, unphysical
 
 DRAWS = 300  # of a bootstrap
-QUARTERS = 4
-MOST = 4
+QUARTERS = 4  # of a recording, each left out in turn
 BY_DIRECTION, SQUARE, LAG, STRIBECK = (
     "viscous friction that differs by direction",
     "friction with the square of the speed",
@@ -158,7 +157,7 @@ def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
         return np.bincount(own.blocks, r * r, count)
 
     now = left_out(X)
-    for _ in range(MOST):
+    for _ in range(SEARCH.most):
         tried = {}
         for name, column in mine.items():
             if name in chosen or (_kind(name) in map(_kind, chosen)):

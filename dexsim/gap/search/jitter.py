@@ -27,7 +27,7 @@ from dexsim.gap.search.search import JointSearch, Trial, subset
 
 LATE = 2e-3  # s: by what a command is late to see what it does, at most a fifth of the time between commands
 WINDOWS = 24  # at most, evenly over the recordings
-ALIKE = (0.05, 0.2)  # s
+ALIKE = (0.05, 0.2)  # s: over which times that are off may be alike
 SPAN = 1.25  # s of commands that may act within a window of a second
 FALL = 0.5 * 1.645**2  # of the log likelihood at the ends of a 90 % interval
 LEFT = 2.0  # x the noise squared that a hypothesis leaves, from which jitter is looked for
@@ -55,8 +55,9 @@ def certain(gain: float, value: float, beside: float, noise: float) -> bool:
     return not (gain < JUDGE.jitter or value < JUDGE.clocks or beside > noise)
 
 
-def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
-    """The jitter that the residuals of a fitted hypothesis hold; None where they hold none for certain."""
+def _windows(search: JointSearch, trial: Trial) -> list[tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]]:
+    """Of each window of n samples: the residual [n] of a fitted hypothesis, H' H and H' K_k H [n, n] (H in ms), and the
+    time between its samples [n, n] s; none where the commands' times do nothing."""
     plant = search.case.plant
     keep = np.zeros(len(search.short.window), bool)
     keep[np.unique(np.linspace(0, len(keep) - 1, min(WINDOWS, len(keep))).astype(int))] = True
@@ -65,7 +66,7 @@ def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
     gaps = np.concatenate([np.diff(t) for t in plant.command_times])
     gaps = gaps[gaps > 1e-6]
     if not len(gaps):
-        return None
+        return []
     spacing = float(np.median(gaps))
     late, group = min(LATE, 0.2 * spacing), max(1, int(np.ceil(SPAN / spacing / LATE_GROUPS)))
     with search._fix(trial.members):
@@ -88,7 +89,13 @@ def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
             windows.append(
                 (residual[0, on], h.T @ h, [h.T @ k @ h for k in kernels], np.abs(t[on][:, None] - t[on][None]))
             )
-    if not windows or max(float(np.trace(h)) for _, h, _, _ in windows) < 1e-6:
+    return windows if windows and max(float(np.trace(h)) for _, h, _, _ in windows) >= 1e-6 else []
+
+
+def estimate(search: JointSearch, trial: Trial) -> Jitter | None:
+    """The jitter that the residuals of a fitted hypothesis hold; None where they hold none for certain."""
+    windows = _windows(search, trial)
+    if not windows:
         return None
 
     def cost(z: np.ndarray, jitter: float) -> float:

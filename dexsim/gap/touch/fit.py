@@ -10,11 +10,11 @@ from scipy.optimize import least_squares
 
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
 from dexsim.gap.plant.case import noise
+from dexsim.gap.read.runs import BLOCK
 from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
-BLOCK = 0.5  # s
 OF_LAW = ("stiffness", "neighbours", "fraction", "c10", "c01")  # sizes that hang on how a force spreads over taxels
 PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
 
