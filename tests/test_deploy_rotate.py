@@ -10,13 +10,15 @@ import pytest
 import torch
 import yaml
 from bundles import QUIET_TURN, make_checkpoint
+from test_deploy import FakeHand
 
 from dexsim import export, rotation
 from dexsim.calibration.file import Calibration
 from dexsim.cli.deploy import main as command
 from dexsim.deploy import bundle
+from dexsim.deploy import loop as deploy_loop
 from dexsim.deploy import observations_rotate as observations
-from dexsim.deploy.driver import HandState, VirtualClock
+from dexsim.deploy.driver import PASSIVE, HandState, VirtualClock
 from dexsim.deploy.imu import UdpImu
 from dexsim.deploy.loop import Loop, LoopSettings
 from dexsim.deploy.measure import TurnMeasure, for_bundle
@@ -218,6 +220,53 @@ def test_the_whole_loop_on_the_simulated_hand(made, tmp_path):
     seen = {ch.topic: sum(x.channel_id == i for x in container.messages) for i, ch in container.channels.items()}
     assert (seen.get(TURNED), seen.get(GOAL)) == ((47, 47) if made[2] != "proprioception" else (None, None))
     assert len(read(tmp_path / "run.mcap", audit=False).states.velocity) > 100
+
+
+NAN = float("nan")
+IMU = {
+    "an hour old": lambda now, since: (UPRIGHT, now - 3600),
+    "never": lambda now, since: None,
+    "a stamp of NaN": lambda now, since: (UPRIGHT, NAN),
+    "an hour ahead": lambda now, since: (UPRIGHT, now + 3600),
+    "NaN": lambda now, since: (UPRIGHT * NAN, now),
+    "of no length": lambda now, since: (UPRIGHT * 0.0, now),
+    "of 1e9": lambda now, since: (UPRIGHT * 1e9, now),
+    "three numbers": lambda now, since: (UPRIGHT[:3], now),
+    "frozen": lambda now, since: (UPRIGHT, since),
+}
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Imu:
+    """An IMU whose answers are `fault(now, since)` from `at` s after the policy's begin on."""
+
+    def __init__(self, hand, fault, at):
+        self.hand, self.fault, self.at, self.since = hand, fault, at, None
+
+    def orientation(self, now):
+        if self.hand.begun and now >= self.hand.begun + self.at:
+            self.since = now if self.since is None else self.since
+            return self.fault(now, self.since)
+        return UPRIGHT, now
+
+
+@pytest.mark.parametrize("at", [0.0, 0.3])
+@pytest.mark.parametrize("fault", IMU)
+def test_an_imu_that_is_not_read_relaxes_the_hand(made, fault, at, monkeypatch):
+    """Within 0.15 s, with the settings as they are; a policy without an IMU asks for none."""
+    monkeypatch.setattr(deploy_loop.gc, "collect", lambda: 0)  # of torch's whole heap, before each run
+    hand = FakeHand(VirtualClock(100.0), start=0.05)
+    imu = Imu(hand, IMU[fault], at)
+    loop = Loop(bundle.load(made[0]), hand, imu, Calibration.default(), LoopSettings(seconds=1.0, home_speed=3.0,
+                wait=0.1, grip=0.1), hand.clock)  # fmt: skip
+    report = loop.run()
+    if made[2] == "proprioception":
+        assert report.ended == "done" and imu.since is None
+    else:
+        assert "object" in report.ended, report.ended
+        assert hand.relaxed_at[0] - imu.since < 0.15, (hand.relaxed_at[0] - imu.since, report.ended)
+        driven = np.stack([q for _, q, _, mode in hand.sent if mode != PASSIVE])
+        assert np.isfinite(driven).all() and not [1 for t, *_ in hand.sent if t > hand.relaxed_at[0]]
 
 
 def test_the_loop_says_what_it_lacks(made):
