@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def of(model: str, **terms: float) -> dict:
 def budget(p: dict, motor: float, external: float, v: float) -> float:
     """What friction can hold, by the models' equations as published (arXiv 2410.08650, section III; m5's and m6's
     loads as the method's code has them: weighted, then subtracted). A term that p does not name is 0."""
-    peak = np.exp(-(abs(v / p["dtheta_stribeck"]) ** p["alpha"])) if p["model"] not in ("m1", "m3") else 0.0
+    peak = math.exp(-(abs(v / p["dtheta_stribeck"]) ** p["alpha"])) if p["model"] not in ("m1", "m3") else 0.0
     said = lambda name: p.get(f"load_friction_{name}", 0.0)  # noqa: E731
     most = p["friction_base"] + p["friction_viscous"] * abs(v) + peak * p["friction_stribeck"]
     if p["model"] in ("m3", "m4"):
@@ -42,7 +43,7 @@ def budget(p: dict, motor: float, external: float, v: float) -> float:
     elif p["model"] in ("m5", "m6"):
         most += abs(said("external") * external - said("motor") * motor)
         most += peak * abs(said("external_stribeck") * external - said("motor_stribeck") * motor)
-    if p["model"] == "m6" and np.sign(external) != np.sign(motor):
+    if p["model"] == "m6" and math.copysign(1, external) != math.copysign(1, motor):
         carried = (said("external_quad") * external**2, said("motor_quad") * motor**2)
         most += peak * (carried[0] if abs(external) < abs(motor) else carried[1] if abs(external) > abs(motor) else 0)
     return most
@@ -53,13 +54,13 @@ def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: fl
     budget. Semi-implicit Euler in steps of h [s]."""
     inertia, q, v = MASS * LENGTH**2 + p["armature"], 0.0, 0.0
     out = np.zeros(int(seconds / h))
-    for i in range(len(out)):
-        goal = goals[max(0, np.searchsorted(stamps, i * h, side="right") - 1)]
-        volts = VOLT * np.clip(KP * (goal - q), -1, 1)
-        motor, outside = p["kt"] * volts / p["R"] - p["kt"] ** 2 * v / p["R"], -MASS * 9.81 * LENGTH * np.sin(q)
+    at = np.maximum(np.searchsorted(stamps, h * np.arange(len(out)), side="right") - 1, 0)
+    for i, goal in enumerate(goals[at].tolist()):
+        volts = VOLT * min(max(KP * (goal - q), -1.0), 1.0)
+        motor, outside = p["kt"] * volts / p["R"] - p["kt"] ** 2 * v / p["R"], -MASS * 9.81 * LENGTH * math.sin(q)
         torque, most = motor + outside, budget(p, motor, outside, v)
         stop = -(inertia * v / h + torque)
-        v += h * (torque + np.clip(stop, -most, most)) / inertia
+        v += h * (torque + min(max(stop, -most), most)) / inertia
         q += h * v
         out[i] = q
     return out, h
