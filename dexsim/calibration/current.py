@@ -106,7 +106,8 @@ def combine(real: Half | None, sim: Half | None) -> dict[str, dict[str, Any]]:
     """By joint what `calibration.yaml` states: alpha (N per A), beta (N per N.m), current_per_torque (A per N.m) with
     intervals, normalizations and reasons."""
     out: dict[str, dict[str, Any]] = {}
-    for joint in (real or sim).joints if real or sim else ():
+    one = real or sim
+    for joint in one.joints if one else ():
         entry: dict[str, Any] = {}
         for name, symbol, side in (("real", "alpha", real), ("sim", "beta", sim)):
             if side is None:

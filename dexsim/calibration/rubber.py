@@ -163,7 +163,8 @@ def read_curve(path: str | Path) -> tuple[str, np.ndarray, np.ndarray]:
     for kind, names in (("press", ("depth_m", "force_N")), ("stress", ("stretch", "stress_Pa"))):
         if rows and set(names) <= set(rows[0]):
             try:
-                return kind, *(np.array([float(r[n]) for r in rows]) for n in names)
+                x, y = (np.array([float(r[n]) for r in rows]) for n in names)
+                return kind, x, y
             except (TypeError, ValueError):
                 raise UserError(f"curve={path}: {names[0]} and {names[1]} must be numbers in every row") from None
     has = ", ".join(rows[0]) if rows else "no rows"

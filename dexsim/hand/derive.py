@@ -8,6 +8,8 @@ inertias s^5; motors, their armature and damping are as they were.
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -67,7 +69,7 @@ def derived(spec: mujoco.MjSpec, mirror: bool, scale: float) -> mujoco.MjSpec:
     return out
 
 
-def _plain(item: object, kind: str) -> None:
+def _plain(item: Any, kind: str) -> None:
     """Its orientation as a quaternion: the other notations of MJCF are not rewritten."""
     if item.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         raise UserError(

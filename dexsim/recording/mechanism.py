@@ -78,7 +78,7 @@ class Mechanism:
 
 
 def of_hand(
-    hand: Hand, servo: str | Path | dict | None = None, gravity: Sequence[float] | None = None
+    hand: Hand, servo: str | Path | dict | None = None, gravity: Sequence[float] | np.ndarray | None = None
 ) -> Mechanism:
     """The mechanism of a hand alone, in its palm frame; servo, gravity as in `mechanism`. Raises UserError."""
     spec = hand.spec()
@@ -92,7 +92,7 @@ def mechanism(
     model: str | Path | None = None,
     servo: str | Path | dict | None = None,
     joints: Sequence[str] | None = None,
-    gravity: Sequence[float] | None = None,
+    gravity: Sequence[float] | np.ndarray | None = None,
     hand: Hand | None = None,
 ) -> Mechanism:
     """The mechanism in a MuJoCo or URDF file with the servo in a YAML file (or mapping), or in the folder of a hand

@@ -235,7 +235,7 @@ class JointPlant:
     def windows(
         self,
         length: float | None,
-        runs: list[int] | None = None,
+        runs: Sequence[int] | None = None,
         warm: float = 0.15,
         stride: float | None = None,
         span: dict[int, tuple[float, float]] | None = None,
