@@ -25,8 +25,9 @@ train: $(VENV)/.installed
 play: $(VENV)/.installed
 	$(PY) play.py $(or $(ARGS),checkpoint=checkpoints/grasp.pt)
 
+# The many programs that tests start read the package compiled, also where the shell asks for no such files
 test: $(VENV)/.installed-test
-	$(PY) -m pytest -q -m "not slow" -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+	PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -q -m "not slow" -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 lint: $(VENV)/.installed-test
 	$(PY) -m ruff check .
