@@ -49,7 +49,7 @@ def budget(p: dict, motor: float, external: float, v: float) -> float:
     return most
 
 
-def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: float = 2e-5) -> tuple:
+def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: float = 1e-4) -> tuple:
     """BAM's pendulum: torque kt U / R - kt^2 / R dq; friction is what would stop the joint within the step, at most the
     budget. Semi-implicit Euler in steps of h [s]."""
     inertia, q, v = MASS * LENGTH**2 + p["armature"], 0.0, 0.0

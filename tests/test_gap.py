@@ -363,7 +363,7 @@ MORE = [
 ]
 
 
-def check_planted(effect, changes, key, value, seconds=4.0):
+def check_planted(effect, changes, key, value, seconds=3.0):
     outcome = search(changes, seconds=seconds)
     assert outcome.best.members, f"{effect}: nothing found; scan {outcome.scanned[:4]}"
     first = outcome.best.members[0]
@@ -383,7 +383,7 @@ def check_planted(effect, changes, key, value, seconds=4.0):
     [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
 )
 def test_planted_effect_is_named_and_sized(effect, changes, key, value):
-    check_planted(effect, changes, key, value, 6.0 if effect == "deadband" else 4.0)
+    check_planted(effect, changes, key, value, 6.0 if effect == "deadband" else 3.0)
 
 
 @pytest.mark.slow
