@@ -70,6 +70,15 @@ class Page:
                 assert "error" not in message, message
                 return message["result"]
 
+    def show(self, url: str, width: int, height: int, scale: float = SCALE) -> None:
+        """Goes to an address in a window of other sides (pixels of the page), until all of it is there."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+        )
+        self.js("window.before = true")
+        self.call("Page.navigate", url=url)
+        self.wait("!window.before && document.readyState === 'complete'")
+
     def js(self, expression: str):
         """The value of a JavaScript expression."""
         found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)

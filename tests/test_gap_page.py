@@ -2,64 +2,37 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-from pathlib import Path
-
 import numpy as np
 import pytest
+from browser import CHROMIUM, Page
 
 from benchmarks import press_rig
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.report.files import grouped
 
-CHROMIUM = next(
-    (p for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (p := shutil.which(name))), None
-)
-PROBE = """<script>
-window.onload = function () {
-  var out = {width: document.documentElement.scrollWidth, height: document.documentElement.scrollHeight,
-             inner: window.innerWidth, figures: [],
-             first: document.querySelector('h1').getBoundingClientRect().bottom,
-             fetched: performance.getEntriesByType('resource').length, long: []};
-  document.querySelectorAll('svg').forEach(function (s) { var b = s.getBoundingClientRect();
-             out.figures.push([b.width, b.height, s.querySelectorAll('*').length]); });
-  document.querySelectorAll('svg text').forEach(function (t) {
-    var b = t.getBoundingClientRect(), s = t.ownerSVGElement.getBoundingClientRect();
+PROBE = """(() => {
+  const out = {width: document.documentElement.scrollWidth, inner: window.innerWidth, figures: [],
+               first: document.querySelector('h1').getBoundingClientRect().bottom,
+               fetched: performance.getEntriesByType('resource').length, long: []};
+  document.querySelectorAll('svg').forEach(s => { const b = s.getBoundingClientRect();
+               out.figures.push([b.width, b.height, s.querySelectorAll('*').length]); });
+  document.querySelectorAll('svg text').forEach(t => {
+    const b = t.getBoundingClientRect(), s = t.ownerSVGElement.getBoundingClientRect();
     if (b.right > s.right + 2 || b.left < s.left - 2) out.long.push(t.textContent);
   });
-  document.body.setAttribute('data-probe', JSON.stringify(out));
-};
-</script>"""
+  return out;
+})()"""
+"""What a browser makes of a page, measured in it."""
 
 
-def opened(page: Path, width: int = 1120) -> dict:
-    """What headless Chromium makes of the page, measured in it."""
-    text = page.read_text(encoding="utf-8")
-    probed = page.with_name("probed.html")
-    probed.write_text(text.replace("</body>", PROBE + "</body>"), encoding="utf-8")
-    done = subprocess.run(
-        [
-            CHROMIUM,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            f"--user-data-dir={page.parent / 'profile'}",
-            f"--window-size={width},1400",
-            "--virtual-time-budget=3000",
-            "--dump-dom",
-            probed.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    start = done.stdout.index('data-probe="') + len('data-probe="')
-    return json.loads(done.stdout[start : done.stdout.index('"', start)].replace("&quot;", '"'))
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium here (Debian, Ubuntu: apt-get install chromium)")
+    page = Page("about:blank")
+    yield page
+    page.close()
 
 
 @pytest.fixture(scope="module")
@@ -94,41 +67,25 @@ def pages(tmp_path_factory):
     return {name: s.out / "report.html" for name, s in out.items()}
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (Debian, Ubuntu: apt-get install chromium)")
 @pytest.mark.parametrize("name", ["joint", "touch", "unusable"])
 @pytest.mark.parametrize("width", [1120, 560])
-def test_page_renders_in_a_browser(pages, name, width):
-    seen = opened(pages[name], width)
-    assert seen["width"] <= seen["inner"]  # nothing sticks out sideways
+def test_page_renders_in_a_browser(pages, browser, name, width):
+    browser.show(pages[name].as_uri(), width, 1400)
+    seen = browser.js(PROBE)
+    assert seen["inner"] == width and seen["width"] <= width  # nothing sticks out sideways
     assert seen["first"] < 420  # the verdict is read without scrolling
-    assert seen["fetched"] == 0
+    assert seen["fetched"] == 0 and not browser.log
     if name != "unusable":
         assert len(seen["figures"]) >= 4 and all(w > 60 and h > 15 and parts > 2 for w, h, parts in seen["figures"])
         assert not seen["long"], seen["long"]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (Debian, Ubuntu: apt-get install chromium)")
-def test_page_is_not_blank(pages, tmp_path):
+def test_page_is_not_blank(pages, browser, tmp_path):
     from PIL import Image
 
-    shot = tmp_path / "page.png"
-    subprocess.run(
-        [
-            CHROMIUM,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--hide-scrollbars",
-            f"--user-data-dir={tmp_path / 'p'}",
-            "--window-size=1120,1600",
-            f"--screenshot={shot}",
-            pages["joint"].as_uri(),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=120,
-    )
-    image = np.asarray(Image.open(shot).convert("RGB")).astype(int)
+    browser.show(pages["joint"].as_uri(), 1120, 1600, scale=1.0)
+    image = np.asarray(Image.open(browser.screenshot(tmp_path / "page.png")).convert("RGB")).astype(int)
+    assert image.shape == (1600, 1120, 3)
     red, blue = np.array([209, 73, 91]), np.array([23, 104, 172])
     for colour in (red, blue):  # both curves and bars are there
         assert (np.abs(image - colour).max(-1) < 12).sum() > 500

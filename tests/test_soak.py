@@ -90,7 +90,7 @@ from dexsim.sim.memory import give_back
 from tests.soak import parts
 rng, kept = np.random.default_rng(0), []
 for k in range(250):
-    pieces = [bytearray(int(n)) for n in rng.integers(1000, 300_000, 20)]  # an environment, of some 3 MB
+    pieces = [bytearray(int(n)) for n in rng.integers(1000, 300_000, 60)]  # an environment, of some 9 MB
     time.sleep(0.01)
     kept.append(bytearray(int(float(sys.argv[2]) * 2**20)))
     del pieces
