@@ -11,6 +11,8 @@ from dexsim.gap.effects.position_offset import PositionOffset
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
+    import mujoco
+
     from dexsim.gap.plant.case import Case
 
 LIGHTEST = 0.95  # of a link's believed mass: what may be taken away at most
@@ -103,7 +105,7 @@ class Payload(Effect):
         # the same turn, once of the encoder and once of gravity
         return mine.label.startswith("tilt") and isinstance(other, PositionOffset)
 
-    def to_model(self, spec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
         if not values.get("mass"):
             return []
         place = None
@@ -127,7 +129,7 @@ def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[fl
     return lists | {"unit": "m"}
 
 
-def add_mass(spec, joint: str, mass: float, place: np.ndarray | None, own: bool = False) -> str:
+def add_mass(spec: mujoco.MjSpec, joint: str, mass: float, place: np.ndarray | None, own: bool = False) -> str:
     """Adds a point mass [kg] (or takes it away) at `place` [3] m in the frame of the last link after a joint (own: of
     the joint's own), by default at that link's centre of mass; returns what was done, in words."""
     import mujoco

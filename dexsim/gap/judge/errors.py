@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dexsim import intervals
@@ -45,7 +47,9 @@ def repeats(runs: list[Run]) -> list[tuple[Run, Run]]:
     return [(a, b) for i, a in enumerate(runs) for b in runs[i + 1 :] if a.name != b.name and same_commands(a, b)]
 
 
-def floor_beyond(case: Case, runs: list[Run], params: list[Param], x: np.ndarray, fixed=()) -> float:
+def floor_beyond(
+    case: Case, runs: list[Run], params: list[Param], x: np.ndarray, fixed: Sequence[tuple[str, float]] = ()
+) -> float:
     """Noise floor of a joint's position error [rad or m] from what repeats differ by beyond what a fit says that they
     do (a drive that was warmer in one of them moves otherwise, and that is no noise); never below the noise of its
     samples, inf without repeats."""
@@ -80,7 +84,12 @@ def _apart(pairs) -> float:
 
 
 def free_run(
-    case: Case, params: list[Param], x: np.ndarray, windows: Windows, fixed=(), underway: bool = False
+    case: Case,
+    params: list[Param],
+    x: np.ndarray,
+    windows: Windows,
+    fixed: Sequence[tuple[str, float]] = (),
+    underway: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulated position and motor torque [n] at the windows' samples, from their first sample on without correction.
 

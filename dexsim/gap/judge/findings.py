@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,11 @@ from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.plant.columns import SERIES_INDEX, Param, expand
 from dexsim.gap.rules import JUDGE
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from dexsim.gap.search.trial import Member, Trial
 
 
 def handed(p: Param, case: Case) -> bool:
@@ -28,7 +33,7 @@ def handed(p: Param, case: Case) -> bool:
     )
 
 
-def undamped(trial, kp: float) -> float:
+def undamped(trial: Trial, kp: float) -> float:
     """What the age of the position that the loop acts on takes of its damping, in units of kd: kp (q - age v) = kp q -
     kp age v. The loop that trains acts on the position of now, so it is given kd without it."""
     return next(
@@ -37,7 +42,7 @@ def undamped(trial, kp: float) -> float:
     )
 
 
-def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]:
+def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
     """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of
     the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it
     from."""
@@ -54,7 +59,7 @@ def columns_beside(case: Case, trial, joints: Sequence[str]) -> dict[str, float]
 LITTLE = 0.02  # of the model's friction: a smaller share of it stays where the model has it
 
 
-def on_motor(case: Case, trial) -> float:
+def on_motor(case: Case, trial: Trial) -> float:
     """Share of the model's friction and damping of the joint that a trial has on the motor's side of a play or an
     elasticity; 0 where nothing parts the two."""
     params, x = trial.fit.params, trial.fit.x
@@ -66,7 +71,7 @@ def on_motor(case: Case, trial) -> float:
     return share if parted else 0.0
 
 
-def moved_friction(case: Case, trial) -> dict[str, float]:
+def moved_friction(case: Case, trial: Trial) -> dict[str, float]:
     """What goes from the model's joint to the servo's columns, which act on the motor, with `on_motor`: friction N.m,
     damping N.m.s/rad."""
     share = on_motor(case, trial)
@@ -78,7 +83,7 @@ def moved_friction(case: Case, trial) -> dict[str, float]:
     }
 
 
-def servo_changes(table: ServoTable, case: Case, trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
+def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarray, joints: Sequence[str]) -> list[str]:
     """Writes what was fitted into the servo table, with intervals, for a mechanism with these joints; returns what the
     table has no column for. Where something changes with temperature, training is given the temperatures that were
     recorded."""
@@ -130,7 +135,7 @@ def earned(finding: dict[str, Any]) -> float:
     return less * max(1.0 - others, 0.0)
 
 
-def widen(table: ServoTable, case: Case, member, confidence: float, earned: float = 0.0) -> bool:
+def widen(table: ServoTable, case: Case, member: Member, confidence: float, earned: float = 0.0) -> bool:
     """Widens the ranges of an effect's columns towards what was believed before the fit: all the way at a confidence of
     a half and less, 2 (1 - confidence) of the way above, so that what training draws is on average as far from the
     belief as the effect is sure; and of that way only the share that is not `earned`: a policy meets the drive, not the
@@ -151,7 +156,7 @@ def widen(table: ServoTable, case: Case, member, confidence: float, earned: floa
     return changed
 
 
-def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]]) -> list[str]:
+def model_changes(spec: mujoco.MjSpec, case: Case, trial: Trial, by_member: dict[str, dict[str, float]]) -> list[str]:
     """Writes effects that live in the model into its spec (by_member: fitted values by effect; trial: None for values
     alone); returns what was changed, in words."""
     notes = {m.id: m.variant.note for m in trial.members} if trial is not None else {}
@@ -172,7 +177,7 @@ def model_changes(spec, case: Case, trial, by_member: dict[str, dict[str, float]
 MODEL_FILES = "model_files"  # folder beside model.xml
 
 
-def save_model(spec, path: Path) -> None:
+def save_model(spec: mujoco.MjSpec, path: Path) -> None:
     """The model as `path`, with the mesh, height field and texture files that it names by relative paths copied into
     `model_files` beside it, so that it loads from there; nothing is written anywhere else, whatever those paths say."""
     import shutil

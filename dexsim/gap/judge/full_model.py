@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -34,6 +34,9 @@ from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.search import Trial
 from dexsim.recording.mechanism import Mechanism
 from dexsim.sim import make_engine
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.batch import Windows
 
 STEP = 5e-4  # s: of the engine; its error is of first order in it
 REPLAY = ("mujoco", "warp", "none")
@@ -179,7 +182,7 @@ def missing_of(h: Hypothesis) -> list[str]:
     return sorted(out)
 
 
-def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows) -> list[World]:
+def worlds_of(m: Mechanism, runs: Sequence[Run], cases: Sequence[Case], h: Hypothesis, windows: Windows) -> list[World]:
     """One world a window (a whole run, or the part of it that was kept out)."""
     out = []
     at_rest = m.spec.compile()
@@ -414,7 +417,7 @@ def confirm(
     cases: Sequence[Case],
     hypotheses: Sequence[Hypothesis],
     test: list[int],
-    span_test,
+    span_test: dict[int, tuple[float, float]] | None,
     floor: float,
     device: str = "cpu",
     replay: str = "mujoco",

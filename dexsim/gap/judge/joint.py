@@ -19,7 +19,7 @@ from dexsim.gap.result import Curve
 from dexsim.gap.rules import JUDGE
 from dexsim.gap.search import jitter
 from dexsim.gap.search.fit import PRIOR, Fitted, intervals, prior_weight
-from dexsim.gap.search.search import JointSearch, Outcome, Trial
+from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
@@ -347,7 +347,7 @@ def nuisances(joint: str, trial: Trial) -> dict[str, float]:
             for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if p.nuisance}  # fmt: skip
 
 
-def without(search: JointSearch, best, member):
+def without(search: JointSearch, best: Trial, member: Member) -> Trial:
     """The best hypothesis without one member, refitted."""
     rest = tuple(x for x in best.members if x is not member)
     sizes = np.cumsum([len(x.variant.params) for x in best.members])[:-1]

@@ -9,11 +9,13 @@ are fitted to it, judged on recordings kept out, and written to `servo_standin.y
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from dexsim import intervals
 from dexsim.actuator.reference import torque_along
+from dexsim.actuator.table import ServoTable
 from dexsim.gap.judge import errors
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
@@ -117,8 +119,8 @@ def fit(
     trial: Trial,
     train: list[int],
     test: list[int],
-    span_train=None,
-    span_test=None,
+    span_train: dict[int, tuple[float, float]] | None = None,
+    span_test: dict[int, tuple[float, float]] | None = None,
     seed: int = 0,
 ) -> StandIn | None:
     """The stand-in of one joint; None where it would not take JUDGE.standin off the held-out error."""
@@ -178,7 +180,7 @@ def _held_out(
     return out[0], out[1]
 
 
-def write(table, found: list[StandIn], path) -> None:
+def write(table: ServoTable, found: list[StandIn], path: Path) -> None:
     """The fitted servo with the stand-ins' columns and their intervals, as a file that training loads."""
     import copy
 

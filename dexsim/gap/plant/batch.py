@@ -158,7 +158,8 @@ class JointPlant:
         self._ready = False
 
     def add(self, run_name: str, nominal: np.ndarray, times: np.ndarray, series: np.ndarray, cmd_t: np.ndarray,
-            cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None, exact: dict[str, np.ndarray]):
+            cmd: np.ndarray, t: np.ndarray, q: np.ndarray, torque: np.ndarray | None,
+            exact: dict[str, np.ndarray]) -> None:
         """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]."""
         t0 = float(t[0])
         steps = max(int(np.ceil((float(t[-1]) - t0) / self.dt)) + 2, 2)

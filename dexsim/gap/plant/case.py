@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -95,7 +95,7 @@ def build(
     runs: list[Run],
     device: str = "cpu",
     dt: float = 1e-3,
-    progress=None,
+    progress: Callable[[float, int, str], None] | None = None,
     only: set[str] | None = None,
 ) -> list[Case]:
     """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""

@@ -839,7 +839,7 @@ def held(c: Recorded, h: int, g: int, last: bool, x: State, p: Guess):
 
 
 @cache
-def plant_kernel():
+def plant_kernel() -> wp.Kernel:
     """The kernel: one thread a guess and window. first_window, first: numbers of the launch's first window and guess;
     dt: step of the grid [s]."""
 

@@ -34,7 +34,7 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
             touch_handed.handed(d.touch.findings, d.touch.facts, d.touch.names), stage / "tactile.yaml"
         ):
             names.append("tactile.yaml")
-        if d.standins:
+        if d.standins and d.servo is not None:
             residual_fit.write(d.servo, d.standins, stage / "servo_standin.yaml")
             names.append("servo_standin.yaml")
         if d.model_spec is not None:

@@ -156,7 +156,7 @@ class Choice:
         return max(self.scores.values()) >= 1.0
 
 
-def rival_of(search: JointSearch, outcome, effect: str, rival: str | None) -> Trial | None:
+def rival_of(search: JointSearch, outcome: Outcome, effect: str, rival: str | None) -> Trial | None:
     """The fitted hypothesis with `rival` in the place of `effect`; None for "without it" where no rival was fitted."""
     rest = {m.id for m in outcome.best.members} - {effect}
     if rival is not None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -21,6 +21,9 @@ from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import TORQUE
 from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import Columns, columns_of, moved, readable, solved, sums, unphysical
+
+if TYPE_CHECKING:
+    from dexsim.gap.result import Diagnosis
 
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
 MOVING = 0.1  # of the joint's large speed
@@ -233,7 +236,7 @@ def without(pushes: Sequence[Push], runs: list[Run], held: list[int], notes: lis
     return rest, kept
 
 
-def claim(d, pushes: Sequence[Push]) -> None:
+def claim(d: Diagnosis, pushes: Sequence[Push]) -> None:
     """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
     motion had another cause."""
     if not pushes:

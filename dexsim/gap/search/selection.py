@@ -367,7 +367,9 @@ class JointSelection(JointScan):
                 return better
         return None
 
-    def rivals(self, current: Trial, pool) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
+    def rivals(
+        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
+    ) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
         """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
         out = {}
         self.costs: dict[str, list[float]] = {}

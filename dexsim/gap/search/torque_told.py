@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,12 +16,17 @@ from dexsim.gap.search import body_torque
 from dexsim.gap.search.body_torque import HEAVY, NAMES, PER_CUTOFF, columns_of, moved, readable
 from dexsim.gap.search.inverse_dynamics import BY_DIRECTION, LAG, LOAD, STRIBECK, solve
 
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
+    from dexsim.gap.read.runs import Run
+    from dexsim.gap.result import Diagnosis
+
 SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
 
 
 def found(
-    cases,
-    runs,
+    cases: Sequence[Case],
+    runs: Sequence[Run],
     train: Sequence[int],
     test: Sequence[int],
     seed: int = 0,
@@ -134,7 +140,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
 
 def hand_on(
     given: Sequence[tuple],
-    d,
+    d: Diagnosis,
     outcomes: Sequence[tuple],
     test: Sequence[int],
     span_test: dict | None,
@@ -214,7 +220,7 @@ def _alike(case, search, trial, ours: dict[str, float], test: Sequence[int], spa
     return error[1] <= TORQUE.alike * error[0] + 0.1 * case.sigma
 
 
-def findings(given: Sequence[tuple], unknown: Sequence[str], runs, train: list[int]) -> list[dict]:
+def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
     """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed
     (`unknown`)."""
     from dexsim.gap.effects.catalogue import EFFECTS

@@ -152,7 +152,9 @@ class PadFit:
         spread = lambda x: np.broadcast_to(x.reshape(len(t), *[1] * (mask.ndim - 1)), mask.shape)[mask]  # noqa: E731
         return Sample(r, stage, mask, sigma, spread(block), spread(train))
 
-    def residual(self, v: dict[str, float], gains=None, order=None) -> np.ndarray:
+    def residual(
+        self, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None
+    ) -> np.ndarray:
         """Measured minus predicted, in sigmas, of everything that counts."""
         out = []
         for s in self.samples:
@@ -200,8 +202,8 @@ class PadFit:
         ids: tuple[str, ...],
         start: dict[str, float],
         where: np.ndarray | None = None,
-        gains=None,
-        order=None,
+        gains: np.ndarray | None = None,
+        order: np.ndarray | None = None,
         evaluations: int = 60,
         still: tuple[str, ...] = (),
     ) -> TouchTrial:
