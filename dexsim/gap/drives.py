@@ -17,8 +17,8 @@ from dexsim.gap.judge import errors, full_model, not_considered, residual_fit
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint import JointAnswer, Kept
 from dexsim.gap.parallel import map_joints, workers
-from dexsim.gap.plant.case import Case, build
-from dexsim.gap.plant.coupled_motion import coupled, refine_motion, refine_motion_by_fits
+from dexsim.gap.plant.case import Case
+from dexsim.gap.plant.coupled_motion import coupled, refine_motion_by_fits, refined_cases
 from dexsim.gap.read import end_stops, inputs, keep_out, stage_tests
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain
@@ -116,8 +116,7 @@ class Drives(Steps):
         w, s = self.w, self.w.settings
         count = len(w.runs[0].joints)
         w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
-        self.cases = build(self.mj_model, w.runs, device=s.device, dt=_step(w.runs))
-        self.cases = refine_motion(self.mj_model, w.runs, self.cases, s.device, _step(w.runs), only=s.joints)
+        self.cases = refined_cases(self.mj_model, w.runs, s.device, _step(w.runs), s.joints)
         self.left_out = not_considered.reasons(self.cases, self.felt, s.allowed)
         w.notes += cannot_be_seen(s.allowed, self.left_out) + not_considered.not_fitted(self.cases)
         if s.joints is not None:

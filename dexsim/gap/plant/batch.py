@@ -15,7 +15,7 @@ import warp as wp
 from dexsim.gap import parallel
 from dexsim.gap.plant import kernel as pk
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
-from dexsim.gap.plant.mechanics import JointConstants
+from dexsim.gap.plant.mechanics import JointConstants, on_lines
 
 # threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there
 # are
@@ -150,7 +150,7 @@ class JointPlant:
         self.joint, self.constants, self.dt = joint, constants, dt
         self.voltage, self.loop, self.position, self.device = voltage, loop, position, device
         self.nominal: list[np.ndarray] = []
-        self._series, self._cmd_t, self._cmd = [], [], []
+        self._added, self._cmd_t, self._cmd = [], [], []
         self._t, self._q, self._torque, self._start, self._grid, self._cmds = [], [], [], [], [0], [0]
         self._rows = [0]
         self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
@@ -163,14 +163,7 @@ class JointPlant:
         """Adds a run. times [G0], series [G0, E] coarse; exact: columns of the series at the samples t [S]."""
         t0 = float(t[0])
         steps = max(int(np.ceil((float(t[-1]) - t0) / self.dt)) + 2, 2)
-        grid = t0 + self.dt * np.arange(steps)
-        fine = np.stack([np.interp(grid, times, series[:, e]) for e in range(len(SERIES))], 1)
-        for name, values in exact.items():
-            fine[:, SERIES_INDEX[name]] = np.interp(grid, t, values)
-        if "enabled" in exact:
-            k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
-            fine[:, SERIES_INDEX["enabled"]] = exact["enabled"][k]
-        self._series.append(fine)
+        self._added.append((times, series, exact))
         self._grid.append(self._grid[-1] + steps)
         self._cmd_t.append(cmd_t)
         self._cmd.append(cmd)
@@ -187,8 +180,10 @@ class JointPlant:
         self.t, self.q = np.concatenate(self._t), np.concatenate(self._q)
         self.torque = np.concatenate(self._torque)
         self.run_of = np.repeat(np.arange(len(self._t)), [len(t) for t in self._t])
-        self.series = np.concatenate(self._series)
-        self._series = []  # long recordings of many joints are gigabytes: one copy is enough
+        self.series = np.empty((self._grid[-1], len(SERIES)))  # long recordings of many joints are gigabytes: one copy
+        for run in range(len(self._t)):
+            self._fill(run)
+        self._added = []
         self._consts = np.zeros(pk.CONSTS)
         c = self.constants
         kp = max(
@@ -201,6 +196,18 @@ class JointPlant:
         self.contact_stiffness = stiff
         self._d, self._version = {}, next(_VERSIONS)
         self._ready = True
+
+    def _fill(self, run: int) -> None:
+        """What was added of a run, on its stretch of the grid."""
+        (times, series, exact), t = self._added[run], self._t[run]
+        fine = self.series[self._grid[run] : self._grid[run + 1]]
+        grid = self._start[run] + self.dt * np.arange(len(fine))
+        on_lines(grid, times, series, fine)
+        for name, values in exact.items():
+            fine[:, SERIES_INDEX[name]] = np.interp(grid, t, values)
+        if "enabled" in exact:
+            k = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
+            fine[:, SERIES_INDEX["enabled"]] = exact["enabled"][k]
 
     @property
     def command_times(self) -> list[np.ndarray]:

@@ -12,6 +12,7 @@ from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.columns import NAMES as SERVO_NAMES
 from dexsim.actuator.reference import torque_along
 from dexsim.actuator.table import ALL, ServoTable
+from dexsim.gap import parallel
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.columns import SERIES_INDEX, Scales
 from dexsim.gap.plant.mechanics import JointConstants, along
@@ -90,44 +91,77 @@ def demand(
     return torque_along(pd, v, p("torque_limit"), p("no_load_speed"), voltage, limited=clip)
 
 
+@dataclass
+class Motion:
+    """What a mechanism's joints do along its runs. mech: by run the times [n] s and series [J, n, E] of `along`;
+    constants: of the joints; rows [J, C]: what is believed of the drives, by run; others: by joint those that may drag
+    it, the nearest first; plants: of the joints that were asked for, by joint."""
+
+    mech: list[tuple[np.ndarray, np.ndarray]]
+    constants: list[JointConstants]
+    rows: list[np.ndarray]
+    others: dict[int, list[int]]
+    plants: dict[int, JointPlant]
+
+
 def build(
     model: mujoco.MjModel,
     runs: list[Run],
     device: str = "cpu",
     dt: float = 1e-3,
-    progress: Callable[[float, int, str], None] | None = None,
     only: set[str] | None = None,
 ) -> list[Case]:
     """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     joints = runs[0].joints
-    J = len(joints)
     voltage = runs[0].servo.drive == "voltage"
-    mech, constants = [], None
-    for i, run in enumerate(runs):
-        times, values, c = along(model, run, joints)
-        mech.append((times, values))
-        constants = constants or c
-        if progress:
-            progress(i + 1, len(runs))
-    rows = [_believed(run, joints) for run in runs]
+    m = moved(model, runs, device, dt, only)
     torques = []
-    for run, row in zip(runs, rows, strict=True):
+    for run, row in zip(runs, m.rows, strict=True):
         cmd = run.command_at(run.t)
-        torques.append(np.stack([demand(row[j], voltage, cmd[:, j], run.q[:, j], run.vs[:, j]) for j in range(J)], 1))
-    given = [_given(run, row, *m[:2], voltage) for run, row, m in zip(runs, rows, mech, strict=True)] if J > 1 else []
-    cases = []
-    for j, joint in enumerate(joints):
-        if only is not None and joint not in only:
-            continue
-        c = constants[j]
-        inertia = float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
-        rotor = c.armature if c.armature > 0 else 0.3 * inertia
-        servo = runs[0].servo
-        plant = JointPlant(
+        each = zip(row, cmd.T, run.q.T, run.vs.T, strict=True)
+        torques.append(np.stack([demand(p, voltage, c, q, v) for p, c, q, v in each], 1))
+    wanted = list(m.plants)
+
+    def case(k: int) -> Case:
+        j = wanted[k]
+        inertia = _inertia(m.mech, j)
+        return _case(
+            joints[j], j, m.plants[j], m.constants[j], runs, m.rows, torques, m.mech, m.others[j], inertia, voltage
+        )
+
+    return parallel.each(len(wanted), case)
+
+
+def moved(
+    model: mujoco.MjModel,
+    runs: list[Run],
+    device: str = "cpu",
+    dt: float = 1e-3,
+    only: set[str] | None = None,
+    added: bool = True,
+) -> Motion:
+    """The joints (of `only`) along all runs. added: also what a mass that is added, or a tilt, would do to them."""
+    joints = runs[0].joints
+    J = len(joints)
+    servo = runs[0].servo
+    voltage = servo.drive == "voltage"
+    for run in runs:
+        run.smooth()
+    found = parallel.each(len(runs), lambda i: along(model, runs[i], joints, added))
+    mech, constants = [x[:2] for x in found], found[0][2]
+    rows = [_believed(run, joints) for run in runs]
+    given = [_given(run, row, *m, voltage) for run, row, m in zip(runs, rows, mech, strict=True)] if J > 1 else []
+    wanted = [j for j in range(J) if only is None or joints[j] in only]
+    others = {j: _draggers(model, joints, j, runs) for j in wanted}
+
+    def plant(k: int) -> JointPlant:
+        j = wanted[k]
+        joint, c, dragging = joints[j], constants[j], others[j]
+        rotor = c.armature if c.armature > 0 else 0.3 * _inertia(mech, j)
+        out = JointPlant(
             joint, c, dt, voltage, servo.encoder("loop", [joint])[0], servo.encoder("position", [joint])[0], device
         )
-        others = _draggers(model, joints, j, runs)
-        believed = [_drags(run, rows[i][j], others) for i, run in enumerate(runs)]
+        believed = [_drags(run, row[j], dragging) for run, row in zip(runs, rows, strict=True)]
         for i, run in enumerate(runs):
             exact = {}
             if run.supply is not None and servo.supply_voltage:
@@ -138,15 +172,15 @@ def build(
                 exact["warmth"] = run.temperature[:, j] - REFERENCE
             if J > 1:
                 mech[i][1][j][:, SERIES_INDEX["others_torque"]] = np.delete(given[i], j, 1).sum(1)
-            for k, o in enumerate(others[:4]):
-                exact[f"drag{k}"] = run.qs[:, o] - run.qs[0, o]
-                _linked(mech[i][0], mech[i][1][j], mech[i][1][o], k, constants[o].armature)
+            for n, o in enumerate(dragging[:4]):
+                exact[f"drag{n}"] = run.qs[:, o] - run.qs[0, o]
+                _linked(mech[i][0], mech[i][1][j], mech[i][1][o], n, constants[o].armature)
             if run.duty is not None:
                 exact["drive"] = run.duty[:, j]
             elif run.torque is not None:
                 exact["drive"] = np.nan_to_num(run.torque[:, j])
             effort = None if run.torque is None else run.torque[:, j]
-            plant.add(
+            out.add(
                 run.name,
                 nominal_row(believed[i], rotor),
                 mech[i][0],
@@ -158,10 +192,17 @@ def build(
                 effort,
                 exact,
             )
-        plant.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
-        plant.finish()
-        cases.append(_case(joint, j, plant, c, runs, rows, torques, mech, others, inertia, voltage))
-    return cases
+        out.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
+        out.finish()
+        return out
+
+    plants = dict(zip(wanted, parallel.each(len(wanted), plant), strict=True))
+    return Motion(mech, constants, rows, others, plants)
+
+
+def _inertia(mech: Sequence[tuple[np.ndarray, np.ndarray]], j: int) -> float:
+    """A joint's inertia about itself, typical of all runs [kg.m2]."""
+    return float(np.median([np.median(m[1][j][:, SERIES_INDEX["inertia"]]) for m in mech]))
 
 
 def _believed(run: Run, joints: Sequence[str]) -> np.ndarray:
@@ -309,18 +350,8 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
 
 def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[str, np.ndarray]:
     """Variables [n] of each measured sample, that a residual may depend on."""
-    since = np.full(len(t), 9.0)
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
-    for r in np.unique(run_of):
-        rows = np.flatnonzero(run_of == r)
-        sign, last = 0, -np.inf
-        for i in rows:
-            s = 0 if abs(v[i]) < small else (1 if v[i] > 0 else -1)
-            if s and s != sign:
-                if sign:
-                    last = t[i]
-                sign = s
-            since[i] = min(t[i] - last, 9.0)
+    since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _together(run_of)])
     out = {
         "time since reversal": since,
         "speed": np.abs(v),
@@ -341,6 +372,21 @@ def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[
         if o != j and J <= 16:
             out[f"motion of {runs[0].joints[o]}"] = np.abs(np.concatenate([r.vs[:, o] for r in runs]))
     return out
+
+
+def _together(run_of: np.ndarray) -> list[np.ndarray]:
+    """Rows [n] of each run, in their order."""
+    return [np.flatnonzero(run_of == r) for r in np.unique(run_of)]
+
+
+def _since_reversal(t: np.ndarray, v: np.ndarray, small: float) -> np.ndarray:
+    """[n] s at times t [n] since the speed v [n] changed its sign, at most 9; less than `small` is no speed."""
+    sign = np.where(np.abs(v) < small, 0, np.where(v > 0, 1, -1))
+    moves = np.flatnonzero(sign)
+    turns = moves[1:][sign[moves[1:]] != sign[moves[:-1]]]
+    at = np.searchsorted(turns, np.arange(len(t)), side="right") - 1
+    last = np.r_[t[turns], -np.inf][at]  # before any: infinitely long ago
+    return np.minimum(t - last, 9.0)
 
 
 def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, armature: float) -> None:

@@ -9,14 +9,15 @@ smaller, and so is its error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from dexsim.gap import parallel
 from dexsim.gap.plant.batch import JointPlant, Windows
-from dexsim.gap.plant.case import Case, build
+from dexsim.gap.plant.case import Case, build, moved
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run, local_polynomial
 
@@ -27,30 +28,36 @@ PASSES = 2  # of building the cases along the motion that they show
 COUPLED = 0.03
 
 
-def refine_motion(
-    model: mujoco.MjModel,
-    runs: list[Run],
-    cases: list[Case],
-    device: str,
-    dt: float,
-    progress: Callable[[float, int, str], None] | None = None,
-    only: set[str] | None = None,
+def refined_cases(
+    model: mujoco.MjModel, runs: list[Run], device: str, dt: float, only: set[str] | None = None
 ) -> list[Case]:
-    """The cases (at last those of `only`) built again along refined motions (`Run.fine`); as they are where there is
-    one joint only.
+    """A case a joint (of `only`), built along refined motions (`Run.fine`) where there are several joints."""
+    if len(runs[0].joints) < 2:
+        return build(model, runs, device, dt)
+    for _ in range(PASSES):
+        plants = moved(model, runs, device, dt, added=False).plants
+        _refine(runs, _motions(runs, [plants[j] for j in range(len(plants))]))
+    return build(model, runs, device, dt, only)
 
-    Else the list `cases` is emptied: together, long recordings of many joints before and after would not fit into
-    memory.
-    """
-    if len(cases) < 2:
-        return cases
-    for k in range(PASSES):
-        for i, run in enumerate(runs):
-            columns = [_one(case.plant, i, run.t, run.q[:, j]) for j, case in enumerate(cases)]
-            run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
-        cases.clear()
-        cases = build(model, runs, device=device, dt=dt, progress=progress, only=only if k == PASSES - 1 else None)
-    return cases
+
+def _motions(
+    runs: Sequence[Run], plants: Sequence[JointPlant], at: Sequence[np.ndarray | None] = ()
+) -> list[list[tuple[np.ndarray, ...]]]:
+    """By run and joint what `_one` makes of it; at: plant parameters of each joint (none: as believed)."""
+    pairs = [(i, j) for i in range(len(runs)) for j in range(len(plants))]
+
+    def one(k: int) -> tuple[np.ndarray, ...]:
+        i, j = pairs[k]
+        return _one(plants[j], i, runs[i].t, runs[i].q[:, j], at[j] if at else None)
+
+    found = parallel.each(len(pairs), one)
+    return [found[i * len(plants) : (i + 1) * len(plants)] for i in range(len(runs))]
+
+
+def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]) -> None:
+    """Writes `Run.fine`, of what each joint does in each run."""
+    for run, columns in zip(runs, motions, strict=True):
+        run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
 
 
 def coupled(cases: Sequence[Case]) -> bool:
@@ -69,18 +76,12 @@ def refine_motion_by_fits(
         for name, value in (f for m in trial.members for f in m.variant.fixed):
             with_fixed[:, :, INDEX[name]] = value
         at.append(with_fixed)
-    motion = [
-        [_one(case.plant, i, run.t, run.q[:, j], at[j]) for j, case in enumerate(cases)] for i, run in enumerate(runs)
-    ]
+    motion = _motions(runs, [c.plant for c in cases], at)
     misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
-        for i, run in enumerate(runs):
-            columns = [
-                _true(motion[i][j], at[j][0, i]) if j in misread and j != own else motion[i][j]
-                for j in range(len(cases))
-            ]
-            run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
+        shown = lambda i, j: _true(motion[i][j], at[j][0, i]) if j in misread and j != own else motion[i][j]  # noqa: E731
+        _refine(runs, [[shown(i, j) for j in range(len(cases))] for i in range(len(runs))])
         return build(model, runs, device=device, dt=dt)
 
     out = built(None)

@@ -48,7 +48,7 @@ class Run:
     qs: np.ndarray | None = None
     vs: np.ndarray | None = None
     as_: np.ndarray | None = None
-    # filled by `refine_motion`: times [n], position, speed, acceleration [n, J]
+    # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
 
     @property
