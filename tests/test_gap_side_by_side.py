@@ -9,7 +9,7 @@ from test_gap_linkage import MODEL
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import parallel
-from dexsim.gap.plant.case import _since_reversal, build, moved
+from dexsim.gap.plant.case import _since_reversal, moved
 from dexsim.gap.plant.coupled_motion import refined_cases
 from dexsim.gap.plant.mechanics import cross, on_lines
 from dexsim.gap.read.runs import Run
@@ -45,7 +45,8 @@ def test_cases_do_not_depend_on_the_number_of_cores(monkeypatch):
 def test_a_motion_without_what_may_be_added_is_the_same_motion():
     """Refining simulates with no mass added and no tilt: those columns alone are left out."""
     model, runs = mujoco.MjModel.from_xml_string(MODEL), two_runs()
-    whole, bare = moved(model, runs).plants, moved(model, runs, added=False).plants
+    kept = lambda j, plant: plant  # noqa: E731
+    whole, bare = moved(model, runs, kept).used, moved(model, runs, kept, added=False).used
     for j, plant in whole.items():
         windows = plant.windows(None)
         expected, got = (p.simulate(p.base()[None], p.windows(None)) for p in (plant, bare[j]))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dexsim.errors import UserError
+from dexsim.gap import parallel
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import Inquiry, NothingToJudge, Steps
 from dexsim.gap.judge import errors, full_model, not_considered, residual_fit
@@ -250,7 +251,7 @@ class Drives(Steps):
         """Where each joint's residual lives: speed, load, time since reversal, ..."""
         seed, kept = self.w.settings.seed, self.kept
         rng = np.random.default_rng(seed)
-        self.answers = [JointAnswer(case, search, outcome, kept) for case, search, outcome in self.outcomes]
+        self.answers = parallel.each(len(self.outcomes), lambda k: JointAnswer(*self.outcomes[k], kept))
         for a in self.answers:
             a.locate(rng, seed)
 
@@ -259,12 +260,13 @@ class Drives(Steps):
         p = self.parts
         for a in self.answers:
             a.judge(self.w.m)
-        fits = (
-            baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
-            for case, search, _ in self.outcomes
-            if case.moved
-        )
-        self.plains = [b for b in fits if b]
+        moved = [(case, search) for case, search, _ in self.outcomes if case.moved]
+
+        def judged(k: int) -> baseline.Baseline | None:
+            case, search = moved[k]
+            return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
+
+        self.plains = [b for b in parallel.each(len(moved), judged) if b]
         self.w.clock.lap("plain model")
 
     def report(self, d: Diagnosis) -> None:

@@ -109,9 +109,11 @@ class MujocoEngine(Engine):
             if before_each is None:
                 b.step(nstep=substeps)
             else:
+                # the sensors' contact forces are read after the last step only
+                self._disabled[:] = self._flags | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
                 for k in range(substeps):
-                    # the sensors' contact forces are read after the last step only
-                    self._disabled[:] = self._flags if k == substeps - 1 else self._flags | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+                    if k == substeps - 1:
+                        self._disabled[:] = self._flags
                     before_each()
                     b.step()
             self._check()

@@ -312,14 +312,16 @@ def _batch(
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
         turned = None if servo.at_rotor else torch.zeros(steps, *engine.t.qpos.shape, dtype=real)
+        at, kept = engine.t.qpos.numpy(), None if turned is None else turned.numpy()
 
         def before_each() -> None:
             k = next(step)
-            changes.before(k)
-            if turned is None:
+            if k in changes.when:
+                changes.before(k)
+            if kept is None:
                 seen[k].copy_(servo.position())
             else:
-                turned[k].copy_(engine.t.qpos)
+                kept[k] = at
             servo.before_each()
             if given is not None:
                 given[k].copy_(servo.torque)
@@ -342,7 +344,8 @@ def _batch(
 
 class Changes:
     """What the worlds are told in which step: targets, drives that are freed, temperatures. servo: theirs; now [N, J]:
-    targets in force; up: an array as a tensor beside the servo's; heated: whether temperatures matter to the drives."""
+    targets in force; up: an array as a tensor beside the servo's; heated: whether temperatures matter to the drives;
+    when: the steps in which anything is new."""
 
     def __init__(
         self,
@@ -368,6 +371,7 @@ class Changes:
                     self._freed.setdefault(int(k), []).append((i, on[k]))
         self._warm = [i for i, w in enumerate(worlds) if heated and w.warmth is not None]
         self._renewed = max(1, round(WARM_EVERY / timestep))
+        self.when = {*self._sent, *self._freed, *(range(0, steps, self._renewed) if self._warm else ())}
 
     def _sends(self, i: int, w: World, ends: np.ndarray) -> None:
         """World i's targets by the step within which they are stamped; several of one step follow each other."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -95,13 +96,13 @@ def demand(
 class Motion:
     """What a mechanism's joints do along its runs. mech: by run the times [n] s and series [J, n, E] of `along`;
     constants: of the joints; rows [J, C]: what is believed of the drives, by run; others: by joint those that may drag
-    it, the nearest first; plants: of the joints that were asked for, by joint."""
+    it, the nearest first; used: what was made of the plants of the joints that were asked for, by joint."""
 
     mech: list[tuple[np.ndarray, np.ndarray]]
     constants: list[JointConstants]
     rows: list[np.ndarray]
     others: dict[int, list[int]]
-    plants: dict[int, JointPlant]
+    used: dict[int, Any]
 
 
 def build(
@@ -114,19 +115,19 @@ def build(
     """One case a joint (of `only`), over all runs (training and held-out alike: indices are those of `runs`)."""
     joints = runs[0].joints
     voltage = runs[0].servo.drive == "voltage"
-    m = moved(model, runs, device, dt, only)
+    m = moved(model, runs, lambda j, plant: plant, device, dt, only)
     torques = []
     for run, row in zip(runs, m.rows, strict=True):
         cmd = run.command_at(run.t)
         each = zip(row, cmd.T, run.q.T, run.vs.T, strict=True)
         torques.append(np.stack([demand(p, voltage, c, q, v) for p, c, q, v in each], 1))
-    wanted = list(m.plants)
+    wanted = list(m.used)
 
     def case(k: int) -> Case:
         j = wanted[k]
         inertia = _inertia(m.mech, j)
         return _case(
-            joints[j], j, m.plants[j], m.constants[j], runs, m.rows, torques, m.mech, m.others[j], inertia, voltage
+            joints[j], j, m.used[j], m.constants[j], runs, m.rows, torques, m.mech, m.others[j], inertia, voltage
         )
 
     return parallel.each(len(wanted), case)
@@ -135,12 +136,14 @@ def build(
 def moved(
     model: mujoco.MjModel,
     runs: list[Run],
+    use: Callable[[int, JointPlant], Any],
     device: str = "cpu",
     dt: float = 1e-3,
     only: set[str] | None = None,
     added: bool = True,
 ) -> Motion:
-    """The joints (of `only`) along all runs. added: also what a mass that is added, or a tilt, would do to them."""
+    """The joints (of `only`) along all runs. use(j, plant): what is made of each one's plant, which is not kept here;
+    added: also what a mass that is added, or a tilt, would do to them."""
     joints = runs[0].joints
     J = len(joints)
     servo = runs[0].servo
@@ -154,7 +157,7 @@ def moved(
     wanted = [j for j in range(J) if only is None or joints[j] in only]
     others = {j: _draggers(model, joints, j, runs) for j in wanted}
 
-    def plant(k: int) -> JointPlant:
+    def one(k: int) -> Any:
         j = wanted[k]
         joint, c, dragging = joints[j], constants[j], others[j]
         rotor = c.armature if c.armature > 0 else 0.3 * _inertia(mech, j)
@@ -194,10 +197,10 @@ def moved(
             )
         out.left_out = {i for i, run in enumerate(runs) if joint in run.left_out}
         out.finish()
-        return out
+        return use(j, out)
 
-    plants = dict(zip(wanted, parallel.each(len(wanted), plant), strict=True))
-    return Motion(mech, constants, rows, others, plants)
+    used = dict(zip(wanted, parallel.each(len(wanted), one), strict=True))
+    return Motion(mech, constants, rows, others, used)
 
 
 def _inertia(mech: Sequence[tuple[np.ndarray, np.ndarray]], j: int) -> float:

@@ -35,28 +35,22 @@ def refined_cases(
     if len(runs[0].joints) < 2:
         return build(model, runs, device, dt)
     for _ in range(PASSES):
-        plants = moved(model, runs, device, dt, added=False).plants
-        _refine(runs, _motions(runs, [plants[j] for j in range(len(plants))]))
+        by_joint = moved(model, runs, lambda j, plant: _motions(runs, j, plant), device, dt, added=False).used
+        _refine(runs, [by_joint[j] for j in range(len(by_joint))])
     return build(model, runs, device, dt, only)
 
 
 def _motions(
-    runs: Sequence[Run], plants: Sequence[JointPlant], at: Sequence[np.ndarray | None] = ()
-) -> list[list[tuple[np.ndarray, ...]]]:
-    """By run and joint what `_one` makes of it; at: plant parameters of each joint (none: as believed)."""
-    pairs = [(i, j) for i in range(len(runs)) for j in range(len(plants))]
-
-    def one(k: int) -> tuple[np.ndarray, ...]:
-        i, j = pairs[k]
-        return _one(plants[j], i, runs[i].t, runs[i].q[:, j], at[j] if at else None)
-
-    found = parallel.each(len(pairs), one)
-    return [found[i * len(plants) : (i + 1) * len(plants)] for i in range(len(runs))]
+    runs: Sequence[Run], j: int, plant: JointPlant, at: np.ndarray | None = None
+) -> list[tuple[np.ndarray, ...]]:
+    """By run what `_one` makes of joint j."""
+    return [_one(plant, i, run.t, run.q[:, j], at) for i, run in enumerate(runs)]
 
 
 def _refine(runs: Sequence[Run], motions: Sequence[Sequence[tuple[np.ndarray, ...]]]) -> None:
     """Writes `Run.fine`, of what each joint does in each run."""
-    for run, columns in zip(runs, motions, strict=True):
+    for i, run in enumerate(runs):
+        columns = [by_run[i] for by_run in motions]
         run.fine = (columns[0][0], *(np.stack([c[k] for c in columns], 1) for k in (1, 2, 3)))
 
 
@@ -76,12 +70,12 @@ def refine_motion_by_fits(
         for name, value in (f for m in trial.members for f in m.variant.fixed):
             with_fixed[:, :, INDEX[name]] = value
         at.append(with_fixed)
-    motion = _motions(runs, [c.plant for c in cases], at)
+    motion = parallel.each(len(cases), lambda j: _motions(runs, j, cases[j].plant, at[j]))
     misread = [j for j, trial in enumerate(fitted) if any(m.effect.misreads for m in trial.members)]
 
     def built(own: int | None) -> list[Case]:
-        shown = lambda i, j: _true(motion[i][j], at[j][0, i]) if j in misread and j != own else motion[i][j]  # noqa: E731
-        _refine(runs, [[shown(i, j) for j in range(len(cases))] for i in range(len(runs))])
+        shown = lambda j, i: _true(motion[j][i], at[j][0, i]) if j in misread and j != own else motion[j][i]  # noqa: E731
+        _refine(runs, [[shown(j, i) for i in range(len(runs))] for j in range(len(cases))])
         return build(model, runs, device=device, dt=dt)
 
     out = built(None)
