@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import yaml
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from dexsim import export
+from dexsim.assets import xhand
+from dexsim.assets.objects import own
 from dexsim.learning import checkpoint
 from dexsim.recording import Recording, Series, States, schema, write
 
@@ -112,7 +116,11 @@ OVERRIDES = (
     "task.critic=paper",
     "save_worlds=true",
 )
-TREES = {"servo": SERVO, "calibration": CALIBRATION, "tactile": TACTILE, "metadata": METADATA, "config": CONFIG}
+HAND = yaml.safe_load((xhand.FOLDER / "hand.yaml").read_text(encoding="utf-8"))
+HAND |= {key: Path(HAND[key]).name for key in ("servo", "held_cubes")}  # all in one folder
+TREES = {
+    "servo": SERVO, "calibration": CALIBRATION, "tactile": TACTILE, "metadata": METADATA, "config": CONFIG, "hand": HAND
+}  # fmt: skip
 
 
 def recording(seconds: float = 1.5, tactile: bool = True, config: str | None = None) -> Recording:
@@ -166,18 +174,30 @@ def build(folder: Path) -> dict[str, list[Path]]:
     for kind, tree in TREES.items():
         (folder / f"{kind}.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     files = sorted(folder.iterdir())
-    out = {"recording": [p for p in files if p.suffix in (".mcap", ".csv", ".npz")]}
+    out = {"recording": [p for p in files if p.suffix in (".mcap", ".csv", ".npz") and p.name != "object.npz"]}
     checkpoint.save(folder / "checkpoint.pt", checkpoint_payload())
     if not (folder / "bundle").exists():
         with contextlib.redirect_stdout(io.StringIO()):
             export.export(str(ROOT / "checkpoints" / "grasp.pt"), folder / "bundle", steps=2)
     (folder / "overrides.txt").write_text("\n".join(OVERRIDES))
     out |= {
+        "object": objects(folder),
         "checkpoint": [folder / "checkpoint.pt"],
         "manifest": [folder / "bundle" / "manifest.yaml"],
         "overrides": [folder / "overrides.txt"],
     }
     return out | {kind: [folder / f"{kind}.yaml"] for kind in TREES}
+
+
+def objects(folder: Path) -> list[Path]:
+    """A box as meshes and as an imported object."""
+    box, made = trimesh.creation.box((0.04, 0.05, 0.06)), []
+    for end in ("obj", "stl", "ply"):
+        made.append(folder / f"mesh.{end}")
+        box.export(made[-1])
+    os.environ.setdefault("DEXSIM_CACHE", str(folder / "cache"))
+    own.save(own.own_shape(str(made[0]), parts=1), folder / "object.npz")
+    return [*made, folder / "object.npz"]
 
 
 def foreign(path: Path, compression: CompressionType, encoding: str) -> None:

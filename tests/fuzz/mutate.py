@@ -214,12 +214,12 @@ def case(kind: str, seed: int, files: dict[str, list[Path]], folder: Path) -> Pa
         return {"checkpoint": _checkpoint, "manifest": _manifest, "overrides": _overrides}[kind](
             rng, files[kind][0], folder
         )
-    if kind != "recording":
+    if kind not in ("recording", "object"):
         path = folder / "case.yaml"
         path.write_bytes(text_of(kind, rng))
         return path
     source = files[kind][int(rng.integers(0, len(files[kind])))]
-    if rng.random() < 0.5:
+    if kind == "recording" and rng.random() < 0.5:
         path = folder / "case.mcap"
         try:
             values(path, rng)

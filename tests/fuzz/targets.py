@@ -15,17 +15,21 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from dexsim import yaml_text
 from dexsim.actuator.table import ServoTable
+from dexsim.assets import xhand
+from dexsim.assets.objects import own
 from dexsim.calibration.file import Calibration
 from dexsim.cli import start
 from dexsim.deploy import bundle
 from dexsim.errors import UserError
 from dexsim.gap.read import channels, inputs
 from dexsim.gap.read.runs import Run
+from dexsim.hand import load_hand
 from dexsim.paths import CONFIGS
 from dexsim.recording import metadata, read, write
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import COMMANDS, STATES, Recording
 from dexsim.tactile import file as tactile_file
+from dexsim.tactile.layout import hand_layout
 
 from . import corpus, silence
 
@@ -132,6 +136,31 @@ def config(path: Path) -> str:
     return ""
 
 
+def hand(path: Path) -> str:
+    """As the hand.yaml of a folder with the xHand's other files, read as far as a training reads it."""
+    folder = path.parent / "case_hand"
+    folder.mkdir()
+    grasps = xhand.FOLDER.parent / "grasps"
+    for other in (*xhand.FOLDER.iterdir(), CONFIGS / "servo" / "xhand.yaml", *grasps.glob("*.npz")):
+        if other.name != "hand.yaml":
+            (folder / other.name).symlink_to(other)
+    path.rename(folder / "hand.yaml")
+    made = load_hand(folder)
+    made.spec().compile()
+    hand_layout(made)
+    return ""
+
+
+def object_(path: Path) -> str:
+    """A mesh to grasp, or a folder of import-object."""
+    if path.suffix == ".npz":
+        folder = path.parent / "case_object"
+        folder.mkdir()
+        path = path.rename(folder / own.FILE).parent
+    own.own_shape(str(path), parts=1)
+    return ""
+
+
 def checkpoint(path: Path) -> str:
     """Loaded, and its settings completed, as play does before it builds anything."""
     start.for_play([f"checkpoint={path}", "device=cpu"], CONFIGS)
@@ -185,6 +214,8 @@ TARGETS: dict[str, Callable[[Path], str]] = {
     "checkpoint": checkpoint,
     "manifest": manifest,
     "overrides": overrides,
+    "hand": hand,
+    "object": object_,
 }
 
 
