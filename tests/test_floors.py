@@ -137,6 +137,34 @@ def test_no_circles_of_files(graph):
     assert not found, "\n".join(" -> ".join(c) for c in found)
 
 
+def untyped(path: Path) -> list[str]:
+    """Public functions and methods of a file that leave out the type of an argument or of what they return. Warp's own
+    say what they return by themselves."""
+    found = []
+
+    def visit(node: ast.Module | ast.ClassDef) -> None:
+        for x in node.body:
+            if isinstance(x, ast.ClassDef) and not x.name.startswith("_"):
+                visit(x)
+            if not isinstance(x, ast.FunctionDef | ast.AsyncFunctionDef) or x.name.startswith("_"):
+                continue
+            if any(ast.unparse(d).startswith("wp.") for d in x.decorator_list):
+                continue
+            given = [*x.args.posonlyargs, *x.args.args, *x.args.kwonlyargs]
+            if x.returns is None or any(a.annotation is None and a.arg not in ("self", "cls") for a in given):
+                found.append(f"{path}:{x.lineno}: {x.name}")
+
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return found
+
+
+def test_public_functions_have_types(tmp_path):
+    (tmp_path / "a.py").write_text("def f(x: int): ...\ndef g(x) -> int: ...\ndef h(x: int) -> int: ...\n")
+    assert [line.split()[-1] for line in untyped(tmp_path / "a.py")] == ["f", "g"]
+    missing = [line for path in modules(ROOT).values() for line in untyped(path)]
+    assert not missing, "\n".join(missing)
+
+
 def test_mypy_passes_over_no_file_that_is_gone():
     """Its list of files whose types are left to mend only shrinks."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]

@@ -119,7 +119,7 @@ REST_SPEED, REST_DRAG = INDEX["standin_speed"], INDEX["standin_drag"]
 
 
 @cache
-def drives(real):
+def drives(real: type) -> Any:
     """The struct that the servo's kernel takes, in float32 or float64: N worlds, J joints; shapes and units as in
     `servo.Servo`."""
 
@@ -191,7 +191,7 @@ def target_rates(state: wp.array3d(dtype=Any), w: int, j: int, queue: int, begin
 
 
 @cache
-def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
+def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset()) -> wp.Kernel:
     """The kernel that runs before each physics step, for real in {wp.float32, wp.float64}, the kind of drive and
     `FEATURES`.
 
@@ -606,7 +606,7 @@ def servo_kernel(real, voltage: bool, features: frozenset[str] = frozenset()):
 
 
 @cache
-def send_kernel(real):
+def send_kernel(real: type) -> wp.Kernel:
     """Appends a target to the queues of the masked worlds; the oldest entry falls out."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -634,7 +634,7 @@ def send_kernel(real):
 
 
 @cache
-def reset_kernel(real, extended: bool = False):
+def reset_kernel(real: type, extended: bool = False) -> wp.Kernel:
     """Puts the masked worlds' drives at rest: no torque stored, enabled, the given target since ever."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -662,7 +662,7 @@ def reset_kernel(real, extended: bool = False):
 
 
 @cache
-def given_kernel(real):
+def given_kernel(real: type) -> wp.Kernel:
     """What all motors of a world give, from the last step: sum of |torque| [N.m], for a supply that sags."""
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.kernel import BORROWED, EDGE, LEAST_ROTOR, SEED, SNAP, STOP_GAIN, STOP_RATE
 
+Numbers = float | np.ndarray
 
-def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
+
+def target_in_force(time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float) -> np.ndarray:
     """Target [rad] after `delay`, averaged over the step [time, time + dt].
 
     stamps [..., queue] (s), targets [..., queue] (rad), oldest first; time, delay [...] (s).
@@ -22,7 +26,9 @@ def target_in_force(time, stamps, targets, delay, dt) -> np.ndarray:
     return target
 
 
-def target_rates(time, stamps, targets, delay, dt) -> tuple[np.ndarray, np.ndarray]:
+def target_rates(
+    time: Numbers, stamps: np.ndarray, targets: np.ndarray, delay: Numbers, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Speed [rad/s] and acceleration [rad/s2] of the target, means over the step: arguments as for `target_in_force`.
 
     Target k has speed (x_k - x_k-1) / span and acceleration (speed_k - speed_k-1) / span, span = t_k - t_k-1, from t_k
@@ -41,7 +47,13 @@ def target_rates(time, stamps, targets, delay, dt) -> tuple[np.ndarray, np.ndarr
 
 
 def torque_along(
-    asked: np.ndarray, v: np.ndarray, stall: float, no_load: float, voltage: bool, supply=1.0, limited: bool = True
+    asked: np.ndarray,
+    v: np.ndarray,
+    stall: float,
+    no_load: float,
+    voltage: bool,
+    supply: Numbers = 1.0,
+    limited: bool = True,
 ) -> np.ndarray:
     """Motor torque [S] N.m along a measured motion: `laws.torque_limit` with the same line for driving and braking, or
     `laws.voltage_torque`.
@@ -59,33 +71,33 @@ def torque_along(
 
 
 def servo(
-    params,
-    target,
-    q,
-    v,
+    params: np.ndarray,
+    target: Numbers,
+    q: Numbers,
+    v: Numbers,
     *,
-    dt,
-    voltage=False,
-    q_loop=None,
-    v_loop=None,
-    last=0.0,
-    enabled=1.0,
-    inertia=np.inf,
-    base_damping=0.0,
-    base_frictionloss=0.0,
-    base_armature=0.0,
-    features=(),
-    dragging=0.0,
-    others=0.0,
-    filtered=0.0,
-    rotor=0.0,
-    line_a=0.0,
-    line_b=0.0,
-    fresh=1.0,
-    loop_motor=False,
-    rates=(0.0, 0.0),
-    integral=0.0,
-    taken=0.0,
+    dt: float,
+    voltage: bool = False,
+    q_loop: Numbers | None = None,
+    v_loop: Numbers | None = None,
+    last: Numbers = 0.0,
+    enabled: Numbers = 1.0,
+    inertia: Numbers = np.inf,
+    base_damping: Numbers = 0.0,
+    base_frictionloss: Numbers = 0.0,
+    base_armature: Numbers = 0.0,
+    features: Collection[str] = (),
+    dragging: Numbers = 0.0,
+    others: Numbers = 0.0,
+    filtered: Numbers = 0.0,
+    rotor: Numbers = 0.0,
+    line_a: Numbers = 0.0,
+    line_b: Numbers = 0.0,
+    fresh: Numbers = 1.0,
+    loop_motor: Numbers = False,
+    rates: tuple[Numbers, Numbers] = (0.0, 0.0),
+    integral: Numbers = 0.0,
+    taken: Numbers = 0.0,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 

@@ -26,7 +26,7 @@ SCALE, OFFSET = INDEX["position_scale"], INDEX["position_offset"]
 
 
 @cache
-def copy_kernel(real):
+def copy_kernel(real: type) -> wp.Kernel:
     """One row of each chosen world: time, then reported position, speed and motor torque of every joint, then the
     object's pose. The slot written goes round, and is kept on the device so that the launch can be part of a graph."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from functools import cache
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -33,6 +34,9 @@ from dexsim.tactile.layout import TaxelLayout
 from dexsim.tactile.measure import NEVER, counts, relax, rubber_force
 from dexsim.tactile.pads import PAD_COLUMNS, THICKNESS
 from dexsim.tactile.sdf import Shapes, distance
+
+if TYPE_CHECKING:
+    from dexsim.tactile.tactile import Tactile
 
 COLUMNS = tuple(PAD_COLUMNS)
 OF_WORLD = ("hysteresis", "hysteresis_time", "delay")
@@ -145,7 +149,7 @@ class ByPad:
         args = [wp.from_torch(mask), self._row["gain"], self._m.gain, episode, self.seed, gain]
         wp.launch(lay_gains, dim=self.shape, inputs=args, device=self.device)
 
-    def launch_skin(self, touch, felt: wp.array) -> wp.array:
+    def launch_skin(self, touch: Tactile, felt: wp.array) -> wp.array:
         """[N, F, T] N: felt forces as they reach each taxel's wire; `felt` itself where nothing lies between. touch:
         `Tactile`."""
         m, n, f = self._m, self.shape[0], self.shape[1]
@@ -180,14 +184,14 @@ class ByPad:
             felt = m.mixed
         return felt
 
-    def launch_stuck(self, touch) -> None:
+    def launch_stuck(self, touch: Tactile) -> None:
         """Readings that never change, over those that were just written into the ring."""
         m = touch._m
         if self._m.stuck_at.shape[0]:
             args = [self._m.stuck, self._m.stuck_at, m.effects.lsb, m.tick, float(self.cfg.full_scale), m.ring]
             wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
 
-    def launch_choice(self, touch) -> tuple[wp.array, wp.array, wp.array]:
+    def launch_choice(self, touch: Tactile) -> tuple[wp.array, wp.array, wp.array]:
         """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have
         delays."""
         m, own = touch._m, self._m

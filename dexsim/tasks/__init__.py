@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import difflib
+from typing import TYPE_CHECKING
 
 from dexsim.errors import UserError
 
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
+    from dexsim.tasks.stable_grasps import GraspSet
 
-def make_env(cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps=None):
+
+def make_env(
+    cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto", grasps: GraspSet | None = None
+) -> HandEnv:
     """The environment of `cfg["task"]["name"]`: a `dexsim.tasks.env.HandEnv`, which is an rsl-rl VecEnv.
 
     cfg: the resolved configuration as a plain dict. engine: "auto", "warp" or "mujoco". grasps: held poses that

@@ -254,7 +254,7 @@ class HandEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         return TensorDict({k: v.clone() for k, v in self.obs.items()}, batch_size=[self.num_envs], device=self.device)
 
-    def step(self, actions: torch.Tensor):
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """One control period. Returns (observations, rewards [N], dones [N], extras); worlds that ended are reset, and
         their observation is the new episode's first. extras: "time_outs" [N], "log" (means over worlds), and with
         `keep_final_obs` also "final_obs", the observations before the reset."""

@@ -8,7 +8,7 @@ configs/task/grasp.yaml.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -436,13 +436,19 @@ class GraspEnv(HandEnv):
             "headline": ["task/held", "task/force_error"],
         }
 
-    def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
+    def evaluate(
+        self,
+        policy: Callable[..., torch.Tensor],
+        episodes: int = 256,
+        seed: int = 0,
+        progress: Callable[..., None] | None = None,
+    ) -> dict:
         """Play `episodes` episodes; see `tasks/grasp_eval.py`."""
         from dexsim.tasks.grasp_eval import evaluate
 
         return evaluate(self, policy, episodes, seed, progress)
 
-    def scripted_policy(self, rate: float = 0.5, wait: float = 0.35):
+    def scripted_policy(self, rate: float = 0.5, wait: float = 0.35) -> Callable[[Mapping], torch.Tensor]:
         """A policy without learning, from the actor's observation alone: open for `wait` seconds of an episode, then
         close thumb and fingers at `rate` (of the largest action), each joint until its torque reaches 0.1 + 0.6 F_cmd
         of its maximum. A floor for what is learned, and a check that the physics can hold anything at all."""

@@ -12,11 +12,17 @@ The command is constant in an episode, uniform in [0, 1] over episodes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 
 from dexsim import intervals
 from dexsim.tasks import base_path
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
 
 SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
@@ -28,7 +34,13 @@ RESAMPLES = 1000  # of the bootstrap
 
 
 @torch.inference_mode()
-def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
+def evaluate(
+    env: HandEnv,
+    policy: Callable[..., torch.Tensor],
+    episodes: int,
+    seed: int,
+    progress: Callable[..., None] | None = None,
+) -> dict:
     """Play `episodes` episodes, `env.num_envs` at a time, half as many again on shapes that were never trained on.
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.

@@ -60,7 +60,7 @@ def new_push(w: int, mass: float, d: Draws, o: Orders):
 
 
 @cache
-def orders_kernel(real):
+def orders_kernel(real: type) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def orders(
         period: float,  # s since the last step

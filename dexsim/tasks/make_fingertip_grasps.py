@@ -11,6 +11,8 @@ set is checked again by tests/test_rotate_fingertips.py.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -24,6 +26,9 @@ from dexsim.tactile.layout import hand_layout, tip_layout
 from dexsim.tasks.env import UNIT_SPAN, hand_of
 from dexsim.tasks.rotate import RotateEnv
 from dexsim.tasks.stable_grasps import GraspSet
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
 
 TABLE = 6000  # joint angles tried for each finger
 TRIES = 400  # places of a cube for each that is wanted, before it is said that there are none
@@ -131,7 +136,7 @@ def candidates(
     return GraspSet(edge, q, q.clone(), pose), torch.as_tensor(np.array(shares))
 
 
-def press(env, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
+def press(env: HandEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
     """Targets [N, J] that press with force [N] N from angles q [N, J]."""
     torque = np.array([pads.torque(a.double().numpy(), (f * s).numpy())
                        for a, s, f in zip(q, share, force.double(), strict=True)])  # fmt: skip
@@ -142,7 +147,9 @@ def press(env, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Te
     return torch.maximum(torch.minimum(target, env.q_high), env.q_low)
 
 
-def settle(env, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.Tensor) -> tuple[GraspSet, torch.Tensor]:
+def settle(
+    env: HandEnv, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.Tensor
+) -> tuple[GraspSet, torch.Tensor]:
     """Close every hand on its cube and let go of it without weight: (grasps, which are fit [N])."""
     _begin(env, start)
     env.engine.field("opt.gravity").zero_()
@@ -161,7 +168,7 @@ def settle(env, pads: Pads, start: GraspSet, share: torch.Tensor, force: torch.T
     return end, still & near & _by_fingertips(env)
 
 
-def holds(env, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
+def holds(env: HandEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
     """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under their targets, in worlds drawn anew, each
     weighed in a direction of its own."""
     _begin(env, start)
@@ -197,7 +204,14 @@ def _play(env, target: torch.Tensor) -> None:
     env.read_state()
 
 
-def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report=print) -> GraspSet:
+def generate(
+    cfg: dict,
+    count: int,
+    worlds: int,
+    seed: int,
+    sizes: tuple[float, float],
+    report: Callable[[str], None] = print,
+) -> GraspSet:
     """At least `count` poses held by fingertips alone, made on the CPU by C MuJoCo."""
     rng, draw = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     pads = Pads(hand_of(cfg), rng)

@@ -9,7 +9,9 @@ checked again by tests/test_rotate.py.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,6 +24,9 @@ from dexsim.tasks.env import UNIT_SPAN, hand_of
 from dexsim.tasks.reach import Reach
 from dexsim.tasks.rotate import RotateEnv, check_objects
 from dexsim.tasks.stable_grasps import CUBE, GraspSet, called, held_file
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
 
 SETTLE, HOLD = 2.0, 2.0  # s
 DRIFT, TURN = 0.004, 0.10  # m, rad: how far a held cube may creep in HOLD seconds
@@ -113,7 +118,7 @@ def _against(
             target[i, list(hand.fingers[f].joints)] = torch.as_tensor(reach.q[f][row], dtype=torch.float32)
 
 
-def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
+def settle(env: HandEnv, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     """Let the cubes land, close every hand, and let it come to rest. Returns (grasps at rest, which of them are fit
     [N])."""
     _begin(env, replace(start, target=start.hand))
@@ -132,7 +137,7 @@ def settle(env, start: GraspSet) -> tuple[GraspSet, torch.Tensor]:
     return end, still & flat & touched & inside & ~env.nan
 
 
-def holds(env, start: GraspSet) -> torch.Tensor:
+def holds(env: HandEnv, start: GraspSet) -> torch.Tensor:
     """Which grasps [N] stay within DRIFT and TURN for HOLD seconds under action zero, in worlds drawn anew."""
     _begin(env, start)
     ok = torch.ones(len(start), dtype=torch.bool)
@@ -187,7 +192,9 @@ def _waiting(cfg: dict, n: int, sizes: tuple[float, float]) -> GraspSet:
     return GraspSet(torch.full((n,), float(sizes[1])), opened, opened.clone(), pose, names=names)
 
 
-def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report=print) -> None:
+def ensure(
+    cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report: Callable[[str], None] = print
+) -> None:
     """The held poses of a config's hand are there: else they are searched for and kept in the hand's folder. Raises
     UserError."""
     hand, objects = hand_of(cfg), cfg["task"]["objects"]
@@ -213,7 +220,14 @@ def ensure(cfg: dict, count: int = 256, worlds: int = 128, seed: int = 0, report
     poses.save(file)
 
 
-def generate(cfg: dict, count: int, worlds: int, seed: int, sizes: tuple[float, float], report=print) -> GraspSet:
+def generate(
+    cfg: dict,
+    count: int,
+    worlds: int,
+    seed: int,
+    sizes: tuple[float, float],
+    report: Callable[[str], None] = print,
+) -> GraspSet:
     """`count` held poses (of several objects about as many each), made on the CPU by C MuJoCo. sizes: edges of the
     cubes [m]. Raises UserError."""
     rng = torch.Generator().manual_seed(seed)

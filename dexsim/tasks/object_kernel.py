@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -93,7 +94,7 @@ def half_extents(kind: int, size: wp.vec3):
 
 
 @cache
-def fields(real):
+def fields(real: type) -> Any:
     @wp.struct
     class Fields:
         """The engine's model fields by world: [N, geoms or bodies, numbers]."""
@@ -117,7 +118,7 @@ def fields(real):
 
 
 @cache
-def write_kernel(real):
+def write_kernel(real: type) -> wp.Kernel:
     Fields = fields(real)
 
     @wp.func

@@ -12,6 +12,7 @@ episode starts with, and exploration begins from a held cube; absolute actions w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 
@@ -545,7 +546,13 @@ class RotateEnv(HandEnv):
         """Further metrics of an evaluation, from the arrays [E] of its trials."""
         return {}
 
-    def evaluate(self, policy, episodes: int = 256, seed: int = 0, progress=None) -> dict:
+    def evaluate(
+        self,
+        policy: Callable[..., torch.Tensor],
+        episodes: int = 256,
+        seed: int = 0,
+        progress: Callable[..., None] | None = None,
+    ) -> dict:
         """Play `episodes` trials; see `tasks/rotate_eval.py`."""
         from dexsim.tasks.rotate_eval import evaluate
 

@@ -9,11 +9,17 @@ cap as its time, so the mean time to fall is a restricted mean. Intervals: boots
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 
 from dexsim import intervals
 from dexsim.tasks.stable_grasps import CUBE
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
 
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
 HEADER = (
@@ -31,7 +37,13 @@ HEADER = (
 
 
 @torch.inference_mode()
-def evaluate(env, policy, episodes: int, seed: int, progress=None) -> dict:
+def evaluate(
+    env: HandEnv,
+    policy: Callable[..., torch.Tensor],
+    episodes: int,
+    seed: int,
+    progress: Callable[..., None] | None = None,
+) -> dict:
     """Play `episodes` trials, `env.num_envs` at a time.
 
     policy: TensorDict of observations -> actions [N, J]. Returns {"metrics", "tables", "frames", "plots"}.
@@ -188,7 +200,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     return out
 
 
-def row_of(env) -> tuple[str, ...]:
+def row_of(env: HandEnv) -> tuple[str, ...]:
     """The four settings of a row of the paper's table."""
     o = env.task["observe"]
     none = env.task["perception"] == "proprioception"

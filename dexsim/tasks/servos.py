@@ -22,7 +22,7 @@ LANES = 64
 
 
 @cache
-def draw_kernel(real):
+def draw_kernel(real: type) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def draw(
         mask: wp.array(dtype=wp.bool),

@@ -42,7 +42,7 @@ class Seen:
 
 
 @cache
-def read_kernel(real):
+def read_kernel(real: type) -> wp.Kernel:
     """Joints, object, contact forces and fingertips of N worlds as float32; of a world that is not finite, zeros."""
 
     @wp.kernel(module="unique", enable_backward=False)
