@@ -112,6 +112,20 @@ def test_what_is_kept_out_takes_no_part():
     assert given[0][1].value["coulomb_friction"] == pytest.approx(COULOMB[0], rel=0.05)
 
 
+@pytest.mark.parametrize("fitted_weighs", (True, False))
+def test_gravity_may_matter_in_what_is_fitted_alone_or_in_what_is_kept_out_alone(fitted_weighs):
+    heavy, light = arm(), arm()
+    light.opt.gravity[2] = -0.01  # as good as lying
+    runs = [run(heavy, 0), run(light, 1)] if fitted_weighs else [run(light, 0), run(heavy, 1)]
+    for r, m in zip(runs, (heavy, light) if fitted_weighs else (light, heavy), strict=True):
+        r.gravity = m.opt.gravity.copy()
+    given = torque_told.found(cases(), runs, [0], [1], model=heavy)
+    assert [judged for _, _, judged in given] == [["run1.mcap"]] * 2
+    for k, (_, x, _) in enumerate(given):
+        assert x.low["coulomb_friction"] < COULOMB[k] < x.high["coulomb_friction"]
+        assert all(np.isfinite(n.after) for n in x.named)
+
+
 def test_a_negative_friction_is_a_refusal_with_a_reason():
     model = arm()
     r = run(model, 0, friction=(0.5, -0.2))

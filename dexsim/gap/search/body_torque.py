@@ -167,8 +167,9 @@ class Columns:
         return out | ({"inertia": out["inertia"] + self.inertia} if "inertia" in out else {"inertia": self.inertia})
 
 
-def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0) -> Columns:
-    """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed."""
+def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0, loaded: bool | None = None) -> Columns:
+    """Of joint j; given: (Motion, Body or None[, span s]) of each recording; efficiency: of the drive, believed;
+    loaded: whether gravity's factors are among the columns, by default where it matters in these recordings."""
     pieces, parts, at = [], [], 0
     inertia = (
         float(np.median(np.concatenate([b.inertia[:, j] for _, b, *_ in given]))) if given[0][1] is not None else 0.0
@@ -178,7 +179,8 @@ def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0) -> Colum
         for m, b, *_ in given
         if b is not None
     ]
-    loaded = bool(weights) and max(weights) > HEAVY
+    if loaded is None:
+        loaded = bool(weights) and max(weights) > HEAVY
     for m, b, *rest in given:
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
         load = np.zeros_like(q) if b is None else b.torque[:, j]

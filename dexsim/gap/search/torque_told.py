@@ -54,7 +54,10 @@ def found(
 
             efficiency = float(case.scales.nominal.get("efficiency", 1.0))
             own = columns_of([piece(r, span_train) for r in use], case.index, efficiency)
-            return own, own if not judge else columns_of([piece(r, span_test) for r in judge], case.index, efficiency)
+            if not judge:
+                return own, own
+            # the same columns: gravity may matter in the fitted recordings and hardly in those that judge, or not at all
+            return own, columns_of([piece(r, span_test) for r in judge], case.index, efficiency, own.loaded)
 
         top = min(body_torque.highest(runs[r].t) for r in use)
         first = at(top)[0]
