@@ -56,7 +56,7 @@ def found(
             own = columns_of([piece(r, span_train) for r in use], case.index, efficiency)
             if not judge:
                 return own, own
-            # the same columns: gravity may matter in the fitted recordings and hardly in those that judge, or not at all
+            # the same columns: gravity may matter in what is fitted and hardly in what judges, or the other way round
             return own, columns_of([piece(r, span_test) for r in judge], case.index, efficiency, own.loaded)
 
         top = min(body_torque.highest(runs[r].t) for r in use)
