@@ -124,12 +124,14 @@ def main(argv: list[str]) -> dict:
     out = folders.make(Path(own["out"]).resolve(), "out=")
     result: dict[str, Any] = {"benchmark": "replayed", "episodes": episodes, "seeds": seeds}
     for task in own["tasks"].split(","):
+        kept = json.loads((tools.ROOT / "checkpoints" / f"{task}.metrics.json").read_text())
+        cap = [f"task.evaluation.cap_s={kept['cap_s']:g}"] if "cap_s" in kept else []  # trials as long as before
+        given = any(r.startswith("task.evaluation.cap_s=") for r in rest)
         for setting in own["settings"].split(","):
-            play(task, setting, seeds, episodes, rest, out / f"{task}_{setting}.json")
+            play(task, setting, seeds, episodes, rest if given else [*rest, *cap], out / f"{task}_{setting}.json")
         files = [out / f"{task}_{setting}.json" for setting in ("hand", "mujoco")]
         if not all(f.exists() for f in files):
             continue
-        kept = json.loads((tools.ROOT / "checkpoints" / f"{task}.metrics.json").read_text())
         scale = episodes / kept["episodes"]
         rows = compare(*(json.loads(f.read_text()) for f in files), numbers(kept, kept["episodes"]), scale)
         result[task] = rows
