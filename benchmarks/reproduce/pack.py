@@ -104,8 +104,13 @@ def _unpacked(part: Path, out: Path) -> int:
             # a cut archive leaves no half of a file
             with tempfile.TemporaryDirectory(prefix=".unpack-", dir=out) as beside:
                 archive.extract(entry, beside, filter="data")
-                (out / entry.name).parent.mkdir(parents=True, exist_ok=True)
-                os.replace(Path(beside) / entry.name, out / entry.name)
+                to = out / entry.name
+                to.parent.mkdir(parents=True, exist_ok=True)
+                if to.name in JUDGED:  # a result of ours: judged again further on, it may be written over
+                    with outputs.staged(to.parent) as stage:
+                        os.replace(Path(beside) / entry.name, stage / to.name)
+                else:
+                    os.replace(Path(beside) / entry.name, to)
             count += 1
     return count
 
