@@ -113,6 +113,28 @@ def test_trainings_of_several_folders_are_one_set_without_pairs(tmp_path):
     assert "| 10.61 | 5.65 (" in line and "no_pose:successes` p =" in text and "no_pose:seconds` p =" in text
 
 
+def test_one_training_has_an_interval_where_all_rows_spread_alike(tmp_path):
+    for seed, n in ((11, 30), (12, 34), (13, 32)):
+        judged(tmp_path, "full", seed, "training", [n] * 4)
+    for seed, n in ((11, 20), (12, 26)):
+        judged(tmp_path, "bits", seed, "training", [n] * 4)
+    for seed, n in ((11, 1), (12, 9)):
+        judged(tmp_path, "no_pose", seed, "training", [n] * 4)  # would widen it, were it not left out
+    judged(tmp_path, "taxels_5", 11, "training", [25] * 4)
+    found, _ = unpaired.gathered([tmp_path], "training")
+    by = {k: v["successes"] for k, v in found.items()}
+    spread, free = unpaired.pooled_spread(by)
+    # squares about the rows' means: 8 of three trainings, 18 of two
+    assert (spread, free) == (pytest.approx(np.sqrt(26 / 3)), 3)
+    half = 3.1824 * np.sqrt(26 / 3) * np.sqrt(1 / 3 + 1)  # Student's, 3 degrees of freedom
+    ends = unpaired.alike(by["full"], by["taxels_5"], spread, free)
+    assert ends == pytest.approx([7 - half, 7 + half], rel=1e-4)
+    lines = unpaired.markdown(found, []).splitlines()
+    assert f"| +7.0 ({7 - half:+.1f} to {7 + half:+.1f}) |" in next(x for x in lines if x.startswith("| 5 taxels"))
+    assert unpaired.pooled_spread({"full": np.ones(1)})[1] == 0
+    assert len({x.count("|") for x in lines if x.startswith("|")}) == 1
+
+
 def test_shares_are_of_what_everything_makes_and_the_figure_is_drawn(tmp_path):
     for seed, n in ((1, 30), (2, 34), (3, 32)):
         judged(tmp_path / "a", "full", seed, "training", [n] * 4)

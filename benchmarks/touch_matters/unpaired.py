@@ -4,9 +4,10 @@
 A seed does not repeat on a GPU, so trainings of the same seed share no more than others do. Of every row against the
 one with everything, over trainings and with Welch's 95 % interval: the difference in successes in a row, and the ratio
 of seconds a success (of logarithms: a row that takes six times as long varies six times as much); Holm's correction
-over `claims`, the ones fixed before. Rows that differ in the number of taxels alone also give a slope: successes over
-the binary logarithm of that number. Trainings of several folders count as one set, those after a `:` as another, of
-other steps; the figure shows every row's share of what everything makes, in each set and in the paper.
+over `claims`, the ones fixed before. Beside it the interval of the difference that takes every row's trainings to
+spread alike, which one training has, too. Rows that differ in the number of taxels alone also give a slope: successes
+over the binary logarithm of that number. Trainings of several folders count as one set, those after a `:` as another,
+of other steps; the figure shows every row's share of what everything makes, in each set and in the paper.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ OWN = {"out": "out/touch_matters", "world": "training", "claims": "no_pose:succe
        "figure": ""}  # fmt: skip
 GRADED = ("taxels_5", "taxels_25", "taxels_120", rows.FULL.key)
 """Rows that have nothing but the number of taxels between them."""
+ALIKE = tuple(r.key for r in rows.EVERY if r.key != "no_pose")
+"""Rows that make about as many successes, so that their trainings may be taken to spread alike."""
 
 
 PAPER = {{"no_orientation": "no_pose"}.get(r.key, r.key): r.paper["average"] / ROTATION[0].paper["average"]
@@ -64,6 +67,22 @@ def welch(a: np.ndarray, b: np.ndarray) -> dict:
             "p": float(test.pvalue)}  # fmt: skip
 
 
+def pooled_spread(by: dict[str, np.ndarray]) -> tuple[float, int]:
+    """Standard deviation of a training about its row's mean, pooled over the rows that have two or more, and its
+    degrees of freedom. Rows that hardly succeed vary less and are left out (ALIKE)."""
+    each = [v for k, v in by.items() if k in ALIKE and len(v) > 1]
+    free = sum(len(v) - 1 for v in each)
+    return (float(np.sqrt(sum(((v - v.mean()) ** 2).sum() for v in each) / free)) if free else np.nan), free
+
+
+def alike(a: np.ndarray, b: np.ndarray, spread: float, free: int) -> list[float]:
+    """95 % interval of the difference of the means of a [S] and b [T] where a training of either varies by `spread`,
+    known to `free` degrees of freedom; one training is enough."""
+    half = stats.t.ppf(0.975, free) * spread * np.sqrt(1 / len(a) + 1 / len(b))
+    difference = a.mean() - b.mean()
+    return [float(difference - half), float(difference + half)]
+
+
 def slope(by: dict[str, np.ndarray]) -> dict | None:
     """Successes a doubling of the number of taxels, by least squares over all trainings of GRADED rows, with Student's
     95 % interval; None with fewer than three trainings or one number of taxels."""
@@ -96,14 +115,18 @@ def spoken(value: float, interval: Sequence[float] | None, form: str) -> str:
 
 def markdown(found: dict[str, dict[str, np.ndarray]], claims: list[tuple[str, str]]) -> str:
     """Table of the rows, Holm's correction and the slope."""
-    lines = ["| row | trainings | successes in a row (95 %) | by training | `full` makes more by (95 %) |"
-             " s a success | times that of `full` (95 %) |", "|---" * 7 + "|"]  # fmt: skip
+    lines = ["| row | trainings | successes in a row (95 %) | by training | `full` makes more by (95 %) | were all to"
+             " spread alike | s a success | times that of `full` (95 %) |", "|---" * 8 + "|"]  # fmt: skip
     p = {}
+    spread, free = pooled_spread({k: v["successes"] for k, v in found.items()})
     for row in rows.EVERY:
         if row.key not in found:
             continue
         each, full = found[row.key], found.get(rows.FULL.key)
-        more = times = ""
+        more = times = same = ""
+        if row != rows.FULL and full is not None and row.key in ALIKE and free:
+            ends = alike(full["successes"], each["successes"], spread, free)
+            same = spoken(full["successes"].mean() - each["successes"].mean(), ends, "+.1f")
         if row != rows.FULL and full is not None and min(len(v["successes"]) for v in (each, full)) >= 2:
             by = {"successes": welch(full["successes"], each["successes"]),
                   "seconds": welch(np.log(each["seconds"]), np.log(full["seconds"]))}  # fmt: skip
@@ -113,7 +136,10 @@ def markdown(found: dict[str, dict[str, np.ndarray]], claims: list[tuple[str, st
         own = each["successes"]
         average = spoken(own.mean(), analysis.over_seeds(own) if len(own) > 1 else None, ".1f")
         lines.append(f"| {row.label} | {len(own)} | {average} | {', '.join(f'{v:.1f}' for v in own)} | {more} |"
-                     f" {np.exp(np.log(each['seconds']).mean()):.2f} | {times} |")  # fmt: skip
+                     f" {same} | {np.exp(np.log(each['seconds']).mean()):.2f} | {times} |")  # fmt: skip
+    if free:
+        lines += ["", f"A training lies {spread:.1f} from its row's average (standard deviation, {free} degrees of"
+                  " freedom, without the pose's)."]  # fmt: skip
     if p:
         lines += ["", "Holm's correction over what was fixed before: "
                   + ", ".join(f"`{k}` p = {v:.2g}" for k, v in analysis.holm(p).items()) + "."]  # fmt: skip
