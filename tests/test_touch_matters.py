@@ -169,6 +169,15 @@ def test_trainings_of_other_steps_are_not_compared(tmp_path):
         unpaired.claimed("no_pose:time")
 
 
+def test_one_training_in_two_folders_is_not_two(tmp_path):
+    for folder in ("a", "b"):
+        judged(tmp_path / folder, "full", 1, "training", [30, 31])
+    with pytest.raises(UserError, match="b/full/seed1 is the training of .*a/full/seed1 again"):
+        unpaired.gathered([tmp_path / "a", tmp_path / "b"], "training")
+    judged(tmp_path / "b", "full", 1, "training", [31, 30])  # the same seed trained again: other trials
+    assert len(unpaired.gathered([tmp_path / "a", tmp_path / "b"], "training")[0]["full"]["successes"]) == 2
+
+
 def test_successes_a_doubling_of_the_taxels_are_a_line_through_all_trainings():
     """Exact line: 2 successes a doubling from 5 taxels on, the same to either side of it."""
     at = {k: 10 + 2 * np.log2(n / 5) for k, n in (("taxels_5", 5), ("taxels_25", 25), ("full", 600))}

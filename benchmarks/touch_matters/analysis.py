@@ -221,8 +221,7 @@ def over_sensors(data: dict, ax) -> None:
         of_row = [(k, w, by[row.key]) for k, (w, by) in enumerate(data["averages"].items()) if row.key in by]
         for k, _, r in of_row:
             bar(ax, i + 0.2 * (k - 1), r["average"], r["interval"], k)
-        unit = {"bits": "5 bits", "no_touch": "none"}.get(row.key, f"{row.sensors}")
-        names.append(unit if of_row else f"{unit}\n(not\ntrained)")
+        names.append(row.touch if of_row else f"{row.touch}\n(not\ntrained)")
     ax.axhline(AIM, color="0.6", linewidth=0.8, linestyle="--")
     ax.set_xticks(range(len(names)), names, fontsize=8)
     ax.set_ylim(bottom=0)

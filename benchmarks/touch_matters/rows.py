@@ -10,12 +10,17 @@ O = "task.observe"  # noqa: E741
 @dataclass(frozen=True)
 class Row:
     """key: folder name; label: what the actor has; settings: of train.py; sensors: taxels in all, None where the
-    comparison is not about their number."""
+    comparison is not about how much touch there is."""
 
     key: str
     label: str
     settings: tuple[str, ...] = ()
     sensors: int | None = None
+
+    @property
+    def touch(self) -> str:
+        """How much touch it has, in a word or two; of rows with `sensors`."""
+        return {"bits": "5 bits", "no_touch": "none", "springs": "600,\nsprings"}.get(self.key, f"{self.sensors}")
 
 
 FULL = Row("full", "everything", sensors=600)
@@ -31,7 +36,7 @@ TAXELS = (  # which taxels are enough
     Row("taxels_25", "25 taxels, 5 a finger", (f"{O}.taxels=5",), 25),
     Row("taxels_5", "5 taxels, one a finger", (f"{O}.taxels=1",), 5),
     Row("bits", "5 contact bits", (f"{O}.taxels=bits", f"{O}.contact_centre=false"), 5),
-    Row("springs", "taxels as linear springs (tactile.sum=spring)", ("tactile.sum=spring", "tactile.law=linear")),
+    Row("springs", "taxels as linear springs (tactile.sum=spring)", ("tactile.sum=spring", "tactile.law=linear"), 600),
 )
 EVERY = (*PAPER, *TAXELS)
 CLAIMS = tuple((FULL.key, row.key) for row in PAPER[1:])

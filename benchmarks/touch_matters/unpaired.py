@@ -7,11 +7,13 @@ of seconds a success (of logarithms: a row that takes six times as long varies s
 over `claims`, the ones fixed before. Beside it the interval of the difference that takes every row's trainings to
 spread alike, which one training has, too. Rows that differ in the number of taxels alone also give a slope: successes
 over the binary logarithm of that number. Trainings of several folders count as one set, those after a `:` as another,
-of other steps; the figure shows every row's share of what everything makes, in each set and in the paper.
+of other steps; the figure shows the paper's rows as a share of what everything makes, in each set and in the paper,
+and the rows that differ in how much touch there is.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,15 +41,20 @@ position with it."""
 
 def gathered(folders: list[Path], world: str) -> tuple[dict[str, dict[str, np.ndarray]], int]:
     """Row -> successes and seconds: averages [S] of its S trainings; and their steps. Raises UserError where nothing is
-    judged, or not all at the same steps."""
+    judged, not all at the same steps, or one training twice."""
     found: dict[str, dict[str, list[float]]] = {}
     steps: dict[int, str] = {}
+    once: dict[tuple, str] = {}
     for folder in folders:
         for (key, where), seeds in analysis.read(folder).items():
             if where != world:
                 continue
             for seed, data in seeds.items():
-                steps.setdefault(data["steps"], f"{folder}/{key}/seed{seed}")
+                place, same = f"{folder}/{key}/seed{seed}", (key, seed, json.dumps(data["metrics"]["trials"]))
+                if same in once:
+                    raise UserError(f"out: {place} is the training of {once[same]} again, trial by trial; give it once")
+                once[same] = place
+                steps.setdefault(data["steps"], place)
                 row = found.setdefault(key, {"successes": [], "seconds": []})
                 row["successes"].append(float(analysis.trials(data).mean()))
                 row["seconds"].append(float(data["metrics"]["seconds_per_success"] or np.inf))
@@ -151,12 +158,12 @@ def markdown(found: dict[str, dict[str, np.ndarray]], claims: list[tuple[str, st
 
 
 def shares(found: dict[str, dict[str, np.ndarray]]) -> dict[str, tuple[float, list[float]]]:
-    """Row -> what it makes of what everything does, with Welch's interval of the difference over the latter's mean (so
-    that it holds 1 where the difference is undecided)."""
+    """Row of the paper's -> what it makes of what everything does, with Welch's interval of the difference over the
+    latter's mean (so that it holds 1 where the difference is undecided)."""
     full = found[rows.FULL.key]["successes"]
     out = {}
-    for row in rows.EVERY:
-        if row != rows.FULL and row.key in found and min(len(full), len(found[row.key]["successes"])) >= 2:
+    for row in rows.PAPER[1:]:
+        if row.key in found and min(len(full), len(found[row.key]["successes"])) >= 2:
             w = welch(full, found[row.key]["successes"])
             ends = [float(1 - v / full.mean()) for v in w["interval"]]
             out[row.key] = (float(1 - w["difference"] / full.mean()), ends[::-1])
@@ -164,14 +171,14 @@ def shares(found: dict[str, dict[str, np.ndarray]]) -> dict[str, tuple[float, li
 
 
 def draw(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], path: Path) -> None:
-    """Left: every row's share of what everything makes, in each set and in the paper. Right, of the first set: the
-    trainings of the rows that differ in how much touch there is."""
+    """Left: share of what everything makes of each of the paper's rows, in each set and in the paper. Right, of the
+    first set: the trainings of the rows that differ in how much touch there is."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    lines = sum(any(r.key in found for found, _ in sets) for r in rows.EVERY) - 1
+    lines = sum(any(r.key in found for found, _ in sets) for r in rows.PAPER)
     figure, axes = plt.subplots(1, 2, figsize=(13.4, 1.8 + 0.5 * lines), constrained_layout=True, width_ratios=(8, 5))
     over_rows(sets, axes[0])
     over_sensors(*sets[0], axes[1])
@@ -180,9 +187,9 @@ def draw(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], path: Path) -
 
 
 def over_rows(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], ax) -> None:
-    """One line a row: its share of what everything makes, in each set and in the paper."""
+    """One line a row of the paper's: its share of what everything makes, in each set and in the paper."""
     by = [(shares(found), found[rows.FULL.key]["successes"], steps) for found, steps in sets]
-    shown = [r for r in rows.EVERY if any(r.key in one for one, _, _ in by)][::-1]
+    shown = [r for r in rows.PAPER if any(r.key in one for one, _, _ in by)][::-1]
     there = [(100 * PAPER[r.key], i) for i, r in enumerate(shown) if r.key in PAPER]
     ax.plot([x for x, _ in there], [i for _, i in there], "kx", markersize=8, label="the paper's hand")
     for k, (one, full, steps) in enumerate(by):
@@ -201,16 +208,19 @@ def over_rows(sets: list[tuple[dict[str, dict[str, np.ndarray]], int]], ax) -> N
 
 
 def over_sensors(found: dict[str, dict[str, np.ndarray]], steps: int, ax) -> None:
-    """A dot a training, and mean with interval, of the rows in which the number of sensors changes."""
+    """A dot a training, and the mean with its interval, of the rows in which the amount of touch changes. The interval
+    takes trainings to spread alike in all rows, so that those of two or three can be seen beside those of many."""
     counted = sorted((r for r in rows.EVERY if r.sensors is not None and r.key in found),
                      key=lambda r: (r.sensors, r.key))  # fmt: skip
+    spread, free = pooled_spread({k: v["successes"] for k, v in found.items()})
     for i, row in enumerate(counted):
         each = found[row.key]["successes"]
         ax.plot([i + 0.12] * len(each), each, ".", color="0.55", markersize=5)
-        if len(each) > 1:
-            analysis.bar(ax, i - 0.12, float(each.mean()), analysis.over_seeds(each), 0)
-    names = {"bits": "5 bits", "no_touch": "no touch"}
-    ax.set_xticks(range(len(counted)), [names.get(r.key, f"{r.sensors} taxels") for r in counted], fontsize=8)
+        if free:
+            half = stats.t.ppf(0.975, free) * spread / np.sqrt(len(each))
+            analysis.bar(ax, i - 0.12, float(each.mean()), [each.mean() - half, each.mean() + half], 0)
+    ax.set_xticks(range(len(counted)), [r.touch for r in counted], fontsize=8)
+    ax.set_xlabel("taxels in all, or bits")
     ax.set_xlim(-0.5, len(counted) - 0.5)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("successes in a row (95 %; dots: trainings)")
