@@ -329,6 +329,12 @@ def test_the_grasp_table(tmp_path):
     ]
     assert [o["here"] for o in data["orderings"]["reality"]] == ["not judged"] * 2
     assert "| R_force + R_torque | 0.90 (0.90) | 3.00 (3.00) | 40.00 (40.00) |" in text
+    near = jobs.Job(rows.TORQUE_NEAR, 1)  # a row of our own, compared once it is there
+    put(near, p, "simulation", [0])
+    near.metrics(p, "simulation").write_text(json.dumps({"force_command_correlation": 0.7}))
+    text, data, _ = report.grasp(p, [*every, near])
+    assert "- simulation, force > torque_near: so for one seed each (0.800, 0.700)." in text
+    assert [o["second"] for o in data["orderings"]["simulation"]] == ["force", "torque", "torque_near"]
 
 
 def test_a_correlation_is_stronger_beyond_what_seeds_do():

@@ -279,7 +279,8 @@ def grasp(plan: Plan, all_jobs: list[Job]) -> tuple[str, dict, Any]:
         said[world] = []
         each = {k: by[world]["force_correlation"] for k, by in table.items()}
         spread = _between_seeds([v for v in each.values() if v])
-        for first, second in (("both", "force"), ("force", "torque")):
+        ours = [("force", rows.TORQUE_NEAR.key)] if rows.TORQUE_NEAR.key in table else []
+        for first, second in (("both", "force"), ("force", "torque"), *ours):
             here = {"first": first, "second": second} | _stronger(each.get(first) or [], each.get(second) or [], spread)
             said[world].append(here)
             lines.append(f"- {WORLD_NAMES[world]}, {first} > {second}: {here['here']}.")
