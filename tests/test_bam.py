@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from dexsim.actuator import bam
+from dexsim.actuator.columns import INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
@@ -17,27 +18,46 @@ from dexsim.recording.mechanism import drive, mechanism
 from dexsim.recording.schema import COMMANDS, Series
 
 M2 = {"kt": 0.38, "R": 3.6, "armature": 0.0019, "q_offset": 0.0, "friction_base": 0.0186, "friction_stribeck": 0.011,
-      "dtheta_stribeck": 0.26, "alpha": 2.0, "friction_viscous": 0.004, "model": "m2", "actuator": "xl330"}  # fmt: skip
-LOADS = (
-    "load_friction_base", "load_friction_stribeck", "load_friction_motor", "load_friction_external",
-    "load_friction_motor_stribeck", "load_friction_external_stribeck", "load_friction_motor_quad",
-    "load_friction_external_quad",
-)  # fmt: skip
-OF = {"m3": LOADS[:1], "m4": LOADS[:2], "m5": LOADS[2:6], "m6": LOADS[2:]}
+      "dtheta_stribeck": 1.0, "alpha": 2.0, "friction_viscous": 0.004, "model": "m2", "actuator": "xl330"}  # fmt: skip
+OF = {
+    "m1": {},
+    "m2": {},
+    "m3": {"load_friction_base": 0.26},
+    "m4": {"load_friction_base": 0.2, "load_friction_stribeck": 0.12},
+    "m5": {
+        "load_friction_motor": 0.1,
+        "load_friction_external": 0.13,
+        "load_friction_motor_stribeck": 0.1,
+        "load_friction_external_stribeck": 0.15,
+    },
+}
+"""Load terms of each model, and Stribeck's speed above, so that each is felt on this pendulum: the squares are far
+beyond BAM's bound of 0.01."""
+OF["m6"] = OF["m5"] | {"load_friction_motor_quad": 8.0, "load_friction_external_quad": 3.0}
+FITTED = {
+    "kt": 0.286, "R": 2.0, "armature": 0.00257, "friction_base": 0.0023, "friction_stribeck": 0.0002,
+    "load_friction_motor": 0.23, "load_friction_external": 0.26, "load_friction_motor_stribeck": 0.0,
+    "load_friction_external_stribeck": 0.15, "load_friction_motor_quad": 0.0056, "load_friction_external_quad": 0.0038,
+    "dtheta_stribeck": 0.115, "alpha": 1.0, "friction_viscous": 0.0185, "model": "m6", "actuator": "xl330",
+}  # fmt: skip
+"""The figures of one of BAM's own fits to an XL330, rounded."""
+FALL = ("friction_stribeck", "dtheta_stribeck", "alpha")
 KP, VOLT, MASS, LENGTH = 1.15, 5.0, 0.3, 0.1
 
 
 def of(model: str, **terms: float) -> dict:
-    """A file of a model: M2's figures, each load term that the model has 0 but for those given."""
-    return M2 | dict.fromkeys(OF.get(model, ()), 0.0) | terms | {"model": model}
+    """A file of a model: M2's figures and the model's load terms, but for those given."""
+    own = {k: v for k, v in M2.items() if model not in ("m1", "m3") or k not in FALL}
+    return own | OF[model] | terms | {"model": model}
 
 
 def budget(p: dict, motor: float, external: float, v: float) -> float:
     """What friction can hold, by the models' equations as published (arXiv 2410.08650, section III; m5's and m6's
     loads as the method's code has them: weighted, then subtracted). A term that p does not name is 0."""
-    peak = math.exp(-(abs(v / p["dtheta_stribeck"]) ** p["alpha"])) if p["model"] not in ("m1", "m3") else 0.0
+    falls = p["model"] not in ("m1", "m3")
+    peak = math.exp(-(abs(v / p["dtheta_stribeck"]) ** p["alpha"])) if falls else 0.0
     said = lambda name: p.get(f"load_friction_{name}", 0.0)  # noqa: E731
-    most = p["friction_base"] + p["friction_viscous"] * abs(v) + peak * p["friction_stribeck"]
+    most = p["friction_base"] + p["friction_viscous"] * abs(v) + peak * p.get("friction_stribeck", 0.0)
     if p["model"] in ("m3", "m4"):
         most += (said("base") + peak * said("stribeck")) * abs(external - motor)
     elif p["model"] in ("m5", "m6"):
@@ -66,90 +86,127 @@ def theirs(p: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, h: fl
     return out, h
 
 
-@pytest.mark.parametrize(("model", "load"), [("m1", 0.0), ("m2", 0.0), ("m5", 0.27)])
-def test_the_motion_is_bams_within_a_hundredth(tmp_path, model, load):
-    """Of m5 with the motor's share of a published fit."""
-    file = of(model, load_friction_motor=load) if load else of(model)
+def ours(tmp_path, file: dict, stamps: np.ndarray, goals: np.ndarray, seconds: float, step: float = 5e-4):
+    """The same by the servo table of the file, on the pendulum as a MuJoCo model."""
     (tmp_path / "m.json").write_text(json.dumps(file))
     table = bam.to_servo(bam.read(tmp_path / "m.json"), KP, VOLT)
     (tmp_path / "rig.xml").write_text(
         f"""<mujoco><option timestep="0.0005"/><worldbody><body name="link">
         <inertial pos="0 0 {-LENGTH}" mass="{MASS}" diaginertia="1e-12 1e-12 1e-12"/>
-        <joint name="joint" axis="0 1 0" armature="{M2['armature']}"/></body></worldbody></mujoco>"""
+        <joint name="joint" axis="0 1 0" armature="{file['armature']}" solimpfriction="0.999 0.9999 0.001 0.5 2"
+        solreffriction="0.002 1"/></body></worldbody></mujoco>"""
     )
-    t = np.arange(0.0, 3.0, 0.01)
-    goals = 0.9 * np.sin(2 * np.pi * 0.6 * t) + 0.3 * np.sin(2 * np.pi * 1.7 * t)
     rig = mechanism(tmp_path / "rig.xml", table, gravity=(0, 0, -9.81))
-    run = drive(rig, Series(t, goals[:, None], COMMANDS), ("joint",), 3.0, timestep=5e-4)
-    want, h = theirs(file, t, goals, 3.0)
-    want = np.interp(run.t, h * np.arange(1, len(want) + 1), want)
-    apart = run.position[:, 0] - want
-    assert np.sqrt(np.mean(apart**2)) < 0.01 * np.ptp(want), "root mean square over the range"
-    less = of(model) if load else M2 | {"model": "m1", "friction_base": 0.0, "friction_viscous": 0.0}
-    without = theirs(less, t, goals, 3.0)[0]
-    without = np.interp(run.t, h * np.arange(1, len(without) + 1), without)
-    assert np.sqrt(np.mean((without - want) ** 2)) > 0.02 * np.ptp(want), "friction (by load) matters here"
+    return drive(rig, Series(stamps, goals[:, None], COMMANDS), ("joint",), seconds, timestep=step)
 
 
-@pytest.mark.parametrize("model", ["m1", "m2", "m5"])
+def both(tmp_path, file: dict, terms) -> tuple[float, dict[str, float]]:
+    """Root mean square, over the range, of how far our motion is from BAM's, and BAM's own without a term."""
+    t = np.arange(0.0, 3.0, 0.01)
+    goals = 1.2 * np.sin(2 * np.pi * 0.4 * t) + 0.15 * np.sin(2 * np.pi * 1.7 * t)
+    run = ours(tmp_path, file, t, goals, 3.0)
+
+    def at_the_same(file: dict) -> np.ndarray:
+        want, h = theirs(file, t, goals, 3.0)
+        return np.interp(run.t, h * np.arange(1, len(want) + 1), want)
+
+    want = at_the_same(file)
+    off = lambda q: float(np.sqrt(np.mean((q - want) ** 2)) / np.ptp(want))  # noqa: E731
+    return off(run.position[:, 0]), {term: off(at_the_same(file | {term: 0.0})) for term in terms}
+
+
+@pytest.mark.parametrize("model", list(OF))
+def test_the_motion_is_bams_within_a_hundredth(tmp_path, model):
+    """Also that each term of the model matters to it: BAM's own motion without it is another."""
+    apart, without = both(tmp_path, of(model), OF[model] or ("friction_base",))
+    assert apart < 0.002, "a fifth of what is asked, so that each term can be told"
+    assert min(without.values()) > 5 * apart, without
+
+
+def test_the_motion_of_a_published_fit_is_bams_within_a_hundredth(tmp_path):
+    apart, without = both(tmp_path, FITTED, ("load_friction_motor", "load_friction_external"))
+    assert apart < 0.01 < 0.02 < min(without.values())
+
+
+@pytest.mark.parametrize("model", list(OF))
 def test_there_and_back_again(tmp_path, model):
     source, servo, back = (tmp_path / n for n in ("a.json", "servo.yaml", "b.json"))
-    own = {"load_friction_motor": 0.27} if model == "m5" else {}
-    source.write_text(json.dumps(of(model, command_delay=0.004, q_offset=0.02, **own)))
+    source.write_text(json.dumps(of(model, command_delay=0.004, q_offset=0.02)))
     assert bam.main([f"in={source}", f"out={servo}", f"kp={KP}", f"supply_voltage={VOLT}"]) == 0
     assert bam.main([f"in={servo}", f"out={back}", "armature=0.0019"]) == 0
-    one, two = bam.read(source), bam.read(back)
-    for name in ("kt", "R", "armature", "friction_base", "friction_viscous", "q_offset", "command_delay"):
-        assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-9), name
-    if model != "m1":
-        assert (one.friction_stribeck, one.alpha) == pytest.approx((two.friction_stribeck, two.alpha))
-    assert two.model == model and all(getattr(one, name) == getattr(two, name) for name in LOADS)
-    if model == "m5":  # m6 without its squares; BAM has one figure for both
-        source.write_text(json.dumps(of("m6", command_delay=0.004, q_offset=0.02, **own)))
-        assert bam.to_servo(bam.read(source), KP, VOLT)["joints"] == yaml.safe_load(servo.read_text())["joints"]
-        said = yaml.safe_load(servo.read_text())
-        said["joints"]["*"]["load_friction_backdriven"] = 0.1
-        servo.write_text(yaml.safe_dump(said))
-        with pytest.raises(UserError, match=r"load_friction \(0.27\), load_friction_backdriven \(0.1\)"):
-            bam.main([f"in={servo}", f"out={back}", "armature=0.0019"])
+    one, two = json.loads(source.read_text()), json.loads(back.read_text())
+    assert one.keys() == two.keys() and one["model"] == two["model"] == model
+    for name in one.keys() - {"model", "actuator"}:
+        assert two[name] == pytest.approx(one[name], rel=1e-9), name
+    # and the table once more: nothing that it says is lost by BAM's file
+    assert bam.main([f"in={back}", f"out={tmp_path / 'c.yaml'}", f"kp={KP}", f"supply_voltage={VOLT}"]) == 0
+    first, again = (ServoTable.load(path).nominal(["a"]) for path in (servo, tmp_path / "c.yaml"))
+    np.testing.assert_allclose(again, first, rtol=1e-9)
+
+
+def test_the_first_model_that_says_it_is_written(tmp_path):
+    """m6 without squares is m5, m5 with the same shares on both sides m4, without Stribeck's part m3; no load: m2."""
+    squares = {"load_friction_motor_quad": 0.0, "load_friction_external_quad": 0.0}
+    same = {name: 0.2 for name in OF["m5"]}
+    steady = same | {"load_friction_motor_stribeck": 0.0, "load_friction_external_stribeck": 0.0}
+    none = dict.fromkeys(OF["m6"], 0.0)
+    for file, model in (
+        (of("m6", **squares), "m5"), (of("m6", **same, **squares), "m4"),
+        (of("m5", **steady, friction_stribeck=0.0), "m3"), (of("m5", **steady), "m4"), (of("m6", **none), "m2"),
+    ):  # fmt: skip
+        (tmp_path / "m.json").write_text(json.dumps(file))
+        table = ServoTable.from_dict(bam.to_servo(bam.read(tmp_path / "m.json"), KP, VOLT))
+        out = bam.to_bam(table, "*", 0.0019)
+        assert out["model"] == model
+        (tmp_path / "m.json").write_text(json.dumps(out))
+        again = ServoTable.from_dict(bam.to_servo(bam.read(tmp_path / "m.json"), KP, VOLT))
+        said = [INDEX[c] for c in (*bam.LOADED, "coulomb_friction", "stribeck_peak", "viscous_friction")]
+        np.testing.assert_allclose(again.nominal(["a"])[0, said], table.nominal(["a"])[0, said], rtol=1e-9)
+
+
+def test_one_figure_for_both_directions(tmp_path):
+    table = ServoTable.from_dict(bam.to_servo(bam.Bam(**of("m5")), KP, VOLT))
+    table.set("*", "load_friction_backdriven", 0.2)
+    with pytest.raises(UserError, match=r"load_friction \(0.1\), load_friction_backdriven \(0.2\)"):
+        bam.to_bam(table, "*", 0.002)
+
+
+def test_a_gain_that_was_fitted_is_the_loops(tmp_path):
+    gain = bam.to_servo(bam.Bam(**of("m2", error_gain_ratio=1.25)), KP, VOLT)["joints"]["*"]["kp"]
+    assert gain == pytest.approx(1.25 * KP)
 
 
 def test_what_cannot_be_said_is_one_line(tmp_path):
     path = tmp_path / "m.json"
     for change, said in (
         ({"model": "m7"}, "model ('m7')"), ({"kt": -1.0}, "kt (-1.0)"), ({"R": "a"}, "R ('a')"),
+        ({"current_limit": 1.5}, "current_limit: unknown; valid ones: model, actuator, kt"),
+        ({"actuator": "erob80_50"}, "actuator ('erob80_50'): BAM drives it by current or torque; must be"),
     ):  # fmt: skip
         path.write_text(json.dumps(M2 | change))
         with pytest.raises(UserError, match="m.json") as error:
             bam.read(path)
-        assert said in str(error.value)
+        assert said in str(error.value) and "\n" not in str(error.value)
     path.write_text("{")
     with pytest.raises(UserError, match="not JSON"):
         bam.read(path)
     table = ServoTable.from_dict(yaml.safe_load((CONFIGS / "servo" / "xc330_m288.yaml").read_text()))
     assert bam.to_bam(table, "*", 0.002)["kt"] == pytest.approx(5.0 / 8.48)
+    with pytest.raises(UserError, match="actuator=unitree_go1"):
+        bam.to_bam(table, "*", 0.002, "unitree_go1")
     table.set("*", "backlash", 0.01)
     with pytest.raises(UserError, match="backlash"):
         bam.to_bam(table, "*", 0.002)
 
 
-@pytest.mark.parametrize(("model", "term"), [(m, t) for m, ts in OF.items() for t in ts if t != LOADS[2]])
-def test_a_load_term_is_refused_by_its_name_and_read_where_it_is_0(tmp_path, model, term):
-    """m3 to m6 with no load are m1 and m2; nothing of a term that the servo table lacks is left out in silence."""
+@pytest.mark.parametrize(("model", "term"), [(m, t) for m, ts in OF.items() for t in ts] + [("m2", t) for t in FALL])
+def test_a_term_that_a_model_has_must_be_said(tmp_path, model, term):
+    """BAM takes a figure of its own for one that its file lacks."""
     path, servo = tmp_path / "m.json", tmp_path / "servo.yaml"
-    path.write_text(json.dumps(of(model, **{term: 0.12})))
-    with pytest.raises(UserError) as error:
-        bam.main([f"in={path}", f"out={servo}", f"kp={KP}", f"supply_voltage={VOLT}"])
-    assert f"m.json: {term} (0.12): model {model}" in str(error.value) and "\n" not in str(error.value)
     path.write_text(json.dumps({k: v for k, v in of(model).items() if k != term}))
-    with pytest.raises(UserError, match=f"m.json: {term}: missing in a file of model {model}"):
+    with pytest.raises(UserError, match=f"m.json: {term}: missing in a file of model {model}") as error:
         bam.main([f"in={path}", f"out={servo}", f"kp={KP}", f"supply_voltage={VOLT}"])
-    assert not servo.exists()
-    path.write_text(json.dumps(of(model)))
-    alike, ours = of("m1" if model == "m3" else "m2"), bam.to_servo(bam.read(path), KP, VOLT)
-    none = dict.fromkeys(bam.LOADED, 0.0)
-    ours["joints"]["*"] = {k: v for k, v in ours["joints"]["*"].items() if none.get(k) != v}
-    assert ours == bam.to_servo(bam.Bam(**alike), KP, VOLT)
+    assert "\n" not in str(error.value) and not servo.exists()
 
 
 @pytest.mark.parametrize("name", ["xl330_m288", "xc330_m288"])

@@ -42,6 +42,10 @@ class StubEngine:
         self._fields = {name: wp.zeros((n, nv), dtype=real, device="cpu") for name in FIELDS}
         self.t = SimpleNamespace(**{name: wp.to_torch(a) for name, a in vars(self.wp).items()})
 
+    def keep_outside(self):
+        self.wp.outside = wp.zeros(self.t.qvel.shape, dtype=self.real, device="cpu")
+        self.t.outside = wp.to_torch(self.wp.outside)
+
     def wp_field(self, name):
         return self._fields[name]
 
@@ -104,6 +108,11 @@ def random_params(rng, shape) -> np.ndarray:
         "viscous_friction": 0.01,
         "load_friction": 0.2,
         "load_friction_backdriven": 0.4,
+        "load_friction_external": 0.4,
+        "load_stribeck": 0.3,
+        "load_stribeck_external": 0.3,
+        "load_quadratic": 0.5,
+        "load_quadratic_external": 0.5,
         "torque_ripple": 0.02,
         "ripple_per_turn": 20.0,
         "ripple_phase": 3.0,
@@ -153,7 +162,16 @@ def test_every_column_is_randomized_here():
 @pytest.mark.parametrize("voltage", [False, True])
 @pytest.mark.parametrize(
     "features",
-    [(), ("braking",), ("controller",), ("presliding", "shape"), ("play",), ("play", "presliding"), tuple(FEATURES)],
+    [
+        (),
+        ("braking",),
+        ("controller",),
+        ("load",),
+        ("presliding", "shape"),
+        ("play",),
+        ("play", "presliding"),
+        tuple(FEATURES),
+    ],
 )
 @pytest.mark.parametrize("real, tolerance", [(wp.float32, 1e-5), (wp.float64, 1e-12)])
 def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
@@ -201,6 +219,10 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
     engine.t.qpos[:, qi] = torch.as_tensor(q).to(servo.params)
     engine.t.qvel[:, vi] = torch.as_tensor(v).to(servo.params)
     engine.t.time.fill_(1.0)
+    outside = np.zeros((n, j))
+    if "load" in features:
+        engine.t.outside[:, vi] = torch.as_tensor(rng.normal(0, 0.3, (n, j))).to(servo.params)
+        outside = engine.t.outside[:, vi].numpy().astype(float)
     # what the kernel sees is rounded to `real`: the reference starts from the same numbers
     params, state, v = (x.numpy().astype(float) for x in (servo.params, servo.state, engine.t.qvel[:, vi]))
     q = engine.t.qpos[:, qi].numpy().astype(float)
@@ -226,6 +248,7 @@ def test_kernel_agrees_with_reference(real, tolerance, features, voltage):
         others=np.abs(given).sum(1, keepdims=True) - np.abs(given),
         loop_motor=np.array([False, True, False]),
         rates=target_rates(1.0, stamps, targets, params[..., INDEX["delay"]], engine.dt),
+        outside=outside,
         last=state[..., slots["motor"]],
         enabled=state[..., slots["enabled"]],
         inertia=servo.inertia.numpy(),
@@ -441,6 +464,57 @@ def test_stribeck_and_load_friction_levels():
         servo.state[..., servo.slots["motor"]] = motor
         servo.before_each()
         assert level[0, 0].item() == pytest.approx(expected)
+
+
+def test_the_gears_load_from_both_sides():
+    """Levels by hand: shares weighted and then subtracted, squares only where the smaller torque is opposed, what fades
+    at 1/e of itself; warmer grease on all of it; without a share from outside the old law."""
+    columns = {"kp": 1.0, "coulomb_friction": 0.1, "stribeck_speed": 2.0, "load_friction": 0.2,
+               "load_friction_backdriven": 0.5, "load_friction_external": 0.3, "load_stribeck": 0.1,
+               "load_stribeck_external": 0.4, "load_quadratic": 2.0, "load_quadratic_external": 3.0}  # fmt: skip
+    engine, servo = drive(columns)
+    warm_engine, warm = drive(columns | {"thermal_friction": -0.01, "warmth": 40.0})
+    e = math.exp(-1)
+    for v, motor, outside, expected in (
+        (0.0, 0.3, 0.0, 0.1 + 0.06 + 0.03),
+        (0.0, 0.0, -0.3, 0.1 + 0.09 + 0.12),
+        (1e3, 0.3, -0.2, 0.1 + 0.12),  # opposed: both shares
+        (1e3, 0.3, 0.2, 0.1),  # the same way: they cancel
+        (1e3, -0.3, 0.2, 0.1 + 0.06 + 0.15),  # driven back
+        (0.0, 0.3, -0.2, 0.1 + 0.12 + 0.11 + 3 * 0.04),  # the motor drives the smaller torque
+        (2.0, 0.3, -0.2, 0.1 + 0.12 + e * (0.11 + 3 * 0.04)),
+        (0.0, 0.2, -0.3, 0.1 + 0.13 + 0.14 + 2 * 0.04),  # the larger one drives the motor
+        (0.0, 0.2, 0.3, 0.1 + 0.05 + 0.1),
+    ):
+        for system, drives, factor in ((engine, servo, 1.0), (warm_engine, warm, 0.6)):
+            system.t.qvel[:], system.t.outside[:] = v, outside
+            drives.state[..., drives.slots["motor"]] = motor
+            drives.before_each()
+            level = system.field("dof_frictionloss")[0, 0].item()
+            assert level == pytest.approx(factor * expected), (v, motor, outside)
+
+
+@pytest.mark.parametrize("kind", ["mujoco", "warp"])
+def test_the_gears_load_is_of_the_step_before_and_remembered(kind):
+    """A weight is carried: what is felt from outside is its torque; put back, the worlds go on bit for bit."""
+    spec = link_spec(1e-3, 0.002, G, STICKS)
+    engine = make_engine(spec, 2, "cpu", kind, fields=FIELDS, threads=1)
+    table = {"joints": {"joint": {"kp": 0.5, "kd": 0.01, "load_friction": 0.1, "load_friction_external": 0.2}}}
+    servo = Servo(engine, ["joint"], ServoTable.from_dict(table), control_period=0.005)
+    servo.send(torch.full((2, 1), 0.2))
+    engine.step(100, servo.before_each)
+    q = engine.t.qpos[0, 0].item()
+    assert engine.t.outside[0, 0].item() == pytest.approx(-0.1 * G * 0.008 * math.cos(q), rel=2e-3)
+    then = {k: v.clone() for part in (engine, servo) for k, v in part.memory().items() if torch.is_tensor(v)}
+    engine.step(5, servo.before_each)
+    after = engine.t.qpos.clone()
+    engine.t.outside.fill_(7.0)
+    for part in (engine, servo):
+        for name, value in part.memory().items():
+            if torch.is_tensor(value):
+                value.copy_(then[name])
+    engine.step(5, servo.before_each)
+    assert torch.equal(engine.t.qpos, after)
 
 
 def test_friction_never_adds_energy():

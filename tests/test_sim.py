@@ -520,6 +520,54 @@ def test_callbacks_run_before_each_physics_step_and_after(kind):
     assert after.numpy().tolist() == [4, 4] and count.numpy().tolist() == [8, 8]
 
 
+ARM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <geom type="plane" size="1 1 .1" pos="0 0 -.25"/>
+  <body><joint name="a" axis="0 1 0" frictionloss="0.02" damping="0.01" stiffness="0.1"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 .1 0 0" mass=".1"/>
+    <body pos=".1 0 0"><joint name="b" axis="0 1 0" frictionloss="0.03" damping="0.001" limited="true" range="-1 0.3"
+      solimpfriction="0.999 0.9999 0.001 0.5 2" solreffriction="0.01 1"/>
+      <geom type="capsule" size=".01" fromto="0 0 0 .1 0 0" mass=".05"/>
+      <body pos=".1 0 0"><joint name="c" axis="0 1 0" armature="1e-4" frictionloss="0.001" solreffriction="-100 -5"/>
+        <geom type="capsule" size=".01" fromto="0 0 0 .1 0 0" mass=".05"/></body></body></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("kind, tolerance", [("mujoco", 1e-12), ("warp", 1e-3)])
+def test_what_a_dof_feels_from_outside(kind, tolerance):
+    """Against MuJoCo's own forces, row by row: gravity, Coriolis, spring, push, limit and contact, without what is
+    applied, damping and dry friction (slipping, sticking, with each way to state solref)."""
+    e = make_engine(mujoco.MjSpec.from_string(ARM), 2, "cpu", kind, fields=("dof_frictionloss",))
+    assert e.wp.outside is None and "outside" not in e.memory()
+    e.keep_outside()
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    data = mujoco.MjData(model)
+    seen = set()
+    for k in range(300):
+        data.qfrc_applied[:] = 0.1 * math.sin(0.02 * k), 0.05 * math.cos(0.03 * k), 0.0
+        data.xfrc_applied[2, 2] = 0.3 if k > 200 else 0.0
+        for t, state in ((e.t.qpos, data.qpos), (e.t.qvel, data.qvel), (e.t.qfrc_applied, data.qfrc_applied)):
+            t[:] = torch.as_tensor(state)
+        e._warmstart[:] = torch.as_tensor(data.qacc_warmstart)
+        e.t.xfrc_applied[:, 2, 2] = float(data.xfrc_applied[2, 2])
+        e.step(1)
+        mujoco.mj_step(model, data)
+        rows = range(data.nefc)
+        seen |= {int(data.efc_type[r]) for r in rows}
+        friction = np.zeros(3)
+        for r in rows:
+            if data.efc_type[r] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF:
+                friction[data.efc_id[r]] = data.efc_force[r]
+        pushed = np.zeros(3)
+        mujoco.mj_applyFT(model, data, data.xfrc_applied[2, :3], np.zeros(3), data.xipos[2], 2, pushed)
+        felt = -data.qfrc_bias + data.qfrc_spring + pushed + data.qfrc_constraint - friction
+        assert np.abs(e.t.outside.double().numpy() - felt).max() < tolerance * max(1.0, np.abs(felt).max()), k
+    assert len(seen) == 3, "dry friction, limit and contact"
+    e.set_state(torch.tensor([True, False]), e.t.qpos.clone(), e.t.qvel.clone())
+    assert not e.t.outside[0].any() and e.t.outside[1].any() and e.memory()["outside"] is e.t.outside
+
+
 def _write_time(real):
     def write(time, count, log):
         w = wp.tid()

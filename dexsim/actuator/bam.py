@@ -2,12 +2,14 @@
 python -m dexsim.actuator.bam in=m2.json out=servo.yaml kp=1.15 supply_voltage=5
 
 BAM: torque = kt U / R - kt^2 / R dq, U = supply * duty, duty = kp (goal - q), friction at most friction_base +
-friction_stribeck exp(-|dq / dtheta_stribeck|^alpha) + friction_viscous |dq|, and in m5 and m6 |load_friction_external *
-external torque - load_friction_motor * motor torque| more. Here: drive: voltage with torque_limit = kt supply / R,
-no_load_speed = supply / kt, and columns of the same laws: m1, m2, and what m5 and m6 say of the motor's torque
-(load_friction_motor: `load_friction`, the same driving and driven back). What the torque from outside adds, known apart
-from friction, has no column, nor have friction by load that fades with speed and its square: m3's and m4's load terms
-and the others of m5 and m6 are refused by name unless they are 0.
+friction_viscous |dq| + the load's + S (friction_stribeck + the load's), S = exp(-|dq / dtheta_stribeck|^alpha). The
+load's is load_friction |external torque - motor torque| in m3 and m4, |load_friction_external * external torque -
+load_friction_motor * motor torque| in m5 and m6; in m6 there is also the smaller torque's square where the two oppose
+each other, under S. Here: drive: voltage with torque_limit = kt supply / R, no_load_speed = supply / kt, and columns of
+the same laws.
+
+The duty is cut at 1 on both sides; of a motor that BAM cuts lower (max_pwm of mx64 and mx106: 0.9625) give
+supply_voltage times that and kp over it. Motors that BAM drives by current or torque (erob, unitree) are refused.
 
 settings (key=default):
   in=               a BAM file (.json) or a servo table (.yaml)
@@ -23,6 +25,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,26 +49,32 @@ SAME = {
 }
 """Parameters that are a column as they stand."""
 FIX = "BAM writes such a file with its fit"
-LOADED = ("load_friction", "load_friction_backdriven")
-"""Columns of friction by the motor's torque, while it drives and while it is driven; BAM has one figure for both."""
 STRIBECK = ("m2", "m4", "m5", "m6")
-MOTOR_LOAD = ("m5", "m6")  # models with friction by the motor's torque alone
-UNKNOWN = {
-    "m3": ("load_friction_base",),
-    "m4": ("load_friction_base", "load_friction_stribeck"),
-    "m5": ("load_friction_external", "load_friction_motor_stribeck", "load_friction_external_stribeck"),
-    "m6": (
-        "load_friction_external", "load_friction_motor_stribeck", "load_friction_external_stribeck",
-        "load_friction_motor_quad", "load_friction_external_quad",
-    ),
-}  # fmt: skip
-"""Parameters of each model that have no column: friction by the torque from outside, friction by load that is there
-near standstill only, and the square of a load."""
+FALL = ("friction_stribeck", "dtheta_stribeck", "alpha")
+"""What a model without Stribeck's curve has not."""
+LOADS = {
+    "m3": {"load_friction_base": ("load_friction", "load_friction_backdriven", "load_friction_external")},
+    "m5": {
+        "load_friction_motor": ("load_friction", "load_friction_backdriven"),
+        "load_friction_external": ("load_friction_external",),
+        "load_friction_motor_stribeck": ("load_stribeck",),
+        "load_friction_external_stribeck": ("load_stribeck_external",),
+    },
+}
+"""The columns that each parameter of friction by load is, by model."""
+LOADS["m4"] = LOADS["m3"] | {"load_friction_stribeck": ("load_stribeck", "load_stribeck_external")}
+LOADS["m6"] = LOADS["m5"] | {
+    "load_friction_motor_quad": ("load_quadratic",),
+    "load_friction_external_quad": ("load_quadratic_external",),
+}
+LOADED = tuple(dict.fromkeys(column for columns in LOADS["m6"].values() for column in columns))
+NOT_BY_VOLTAGE = ("erob", "unitree")
+"""How the names of motors begin that BAM drives by current or torque."""
 
 
-class Bam(msgspec.Struct):
-    """A parameter file. kt N m/A, R ohm, armature kg m2, friction N m and N m s/rad, speeds rad/s, shares of a load 1
-    and 1/(N m); None where the file says nothing."""
+class Bam(msgspec.Struct, forbid_unknown_fields=True):
+    """A parameter file, of every model. kt N m/A, R ohm, armature kg m2, friction N m and N m s/rad, speeds rad/s,
+    shares of a load 1 and 1/(N m); None where the file says nothing."""
 
     model: Literal["m1", "m2", "m3", "m4", "m5", "m6"]
     actuator: str
@@ -74,11 +83,12 @@ class Bam(msgspec.Struct):
     armature: Zero
     friction_base: Zero
     friction_viscous: Zero
-    friction_stribeck: Zero = 0.0
-    dtheta_stribeck: typed.Positive = 1.0
-    alpha: typed.Positive = 2.0
+    friction_stribeck: Zero | None = None
+    dtheta_stribeck: typed.Positive | None = None
+    alpha: typed.Positive | None = None
     q_offset: typed.Real = 0.0
     command_delay: Zero = 0.0
+    error_gain_ratio: typed.Positive = 1.0  # of the gain that the firmware has over the one that was assumed
     load_friction_base: Zero | None = None
     load_friction_stribeck: Zero | None = None
     load_friction_motor: Zero | None = None
@@ -90,44 +100,44 @@ class Bam(msgspec.Struct):
 
 
 def read(path: str | Path) -> Bam:
-    """A BAM parameter file. Raises UserError: not JSON, a parameter missing or impossible, or a load term without a
-    column that is not 0."""
+    """A BAM parameter file. Raises UserError: not JSON, a parameter unknown, missing or impossible, a motor that is not
+    driven by voltage."""
     path = Path(path).expanduser()
     text = files.text(path, files.MAX_YAML, "BAM file")
     try:
         raw = json.loads(text)
     except ValueError as error:
         raise UserError(f"BAM file {path}: not JSON ({error})") from None
+    motor = raw.get("actuator") if isinstance(raw, dict) else None
+    if isinstance(motor, str) and motor.startswith(NOT_BY_VOLTAGE):
+        raise UserError(
+            f"BAM file {path}: actuator ('{motor}'): BAM drives it by current or torque; must be a motor driven by"
+            " voltage: a Dynamixel, Feetech or Waveshare one"
+        )
     bam = typed.convert(raw, Bam, f"BAM file {path}", FIX)
-    for name in ("load_friction_motor",) * (bam.model in MOTOR_LOAD) + UNKNOWN.get(bam.model, ()):
-        value = getattr(bam, name)
-        if value is None:
+    for name in (*(FALL if bam.model in STRIBECK else ()), *LOADS.get(bam.model, ())):
+        if getattr(bam, name) is None:
             raise UserError(
                 f"BAM file {path}: {name}: missing in a file of model {bam.model}; must be said (0: none of it), for"
                 f" BAM itself takes a figure of its own there: {FIX}"
-            )
-        if value and name in UNKNOWN[bam.model]:
-            raise UserError(
-                f"BAM file {path}: {name} ({value:g}): model {bam.model}'s term by this name is no law of"
-                " the servo table; must be 0: fit m1 or m2 with BAM (python -m bam.fit --model m2)"
             )
     return bam
 
 
 def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> dict[str, Any]:
     """The content of a servo table: kp duty per rad, supply_voltage V. The rotor's inertia is the model's or
-    hand.yaml's (`armature`). BAM's duty is cut at 1, as here."""
+    hand.yaml's (`armature`). BAM's duty is cut at 1, as here. Raises UserError for a figure that no column takes."""
     columns = {
-        "kp": float(kp),
+        "kp": float(kp) * bam.error_gain_ratio,
         "torque_limit": bam.kt * supply_voltage / bam.R,
         "no_load_speed": supply_voltage / bam.kt,
     }
     for theirs, ours in SAME.items():
-        value = getattr(bam, theirs)
-        if bam.model in STRIBECK or theirs not in ("friction_stribeck", "dtheta_stribeck", "alpha"):
-            columns[ours] = float(value)
-    if bam.model in MOTOR_LOAD:
-        columns |= dict.fromkeys(LOADED, float(bam.load_friction_motor or 0.0))
+        if bam.model in STRIBECK or theirs not in FALL:
+            columns[ours] = float(getattr(bam, theirs))
+    for theirs, loaded in LOADS.get(bam.model, {}).items():
+        if value := getattr(bam, theirs):
+            columns |= dict.fromkeys(loaded, float(value))
     table = {
         "drive": "voltage",
         "joints": {joint: columns},
@@ -139,11 +149,13 @@ def to_servo(bam: Bam, kp: float, supply_voltage: float, joint: str = "*") -> di
 
 
 def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl330") -> dict[str, Any]:
-    """The content of a BAM file of one joint. m5 where friction grows with the motor's torque, else m2 or m1. Raises
-    UserError where the table has what BAM has not, or lacks what it needs."""
+    """The content of a BAM file of one joint, of the first model of m1 to m6 that can say it. Raises UserError where
+    the table has what BAM has not, or lacks what it needs."""
     where = f"{table.source}: joints.{joint}"
     if table.drive != "voltage" or table.supply_voltage is None:
         raise UserError(f"{where}: BAM's motors are driven by voltage; state drive: voltage and supply_voltage")
+    if actuator.startswith(NOT_BY_VOLTAGE):
+        raise UserError(f"actuator={actuator}: BAM drives it by current or torque; must be a motor driven by voltage")
     said = {c.name: table.value(joint, c.name).value for c in COLUMNS}
     known = {"kp", "torque_limit", "no_load_speed", *SAME.values(), *LOADED}
     for c in COLUMNS:
@@ -152,7 +164,7 @@ def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl33
     stall, no_load, supply = said["torque_limit"], said["no_load_speed"], table.supply_voltage
     if not 0 < stall < float("inf") or not no_load < float("inf"):
         raise UserError(f"{where}: torque_limit ({stall:g}), no_load_speed ({no_load:g}): BAM needs both, finite")
-    load, back = (said[name] for name in LOADED)
+    load, back = said["load_friction"], said["load_friction_backdriven"]
     if load != back:
         raise UserError(
             f"{where}: load_friction ({load:g}), load_friction_backdriven ({back:g}): BAM has one figure for both; must"
@@ -160,16 +172,25 @@ def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl33
         )
     kt = supply / no_load
     out = {"kt": kt, "R": kt * supply / stall, "armature": float(armature)}
-    peaked = said["stribeck_peak"] > 0
+    model = _model(said)
     for theirs, ours in SAME.items():
-        if peaked or theirs not in ("friction_stribeck", "dtheta_stribeck", "alpha"):
+        if model in STRIBECK or theirs not in FALL:
             out[theirs] = said[ours]
-    if load > 0:
-        # every parameter of m5 is said: BAM starts one that is not from a figure of its own, which is not 0
-        none = {name: 0.0 for name in ("friction_stribeck", *UNKNOWN["m5"])}
-        shape = {name: said[SAME[name]] for name in ("dtheta_stribeck", "alpha")}
-        return none | shape | out | {"load_friction_motor": load, "model": "m5", "actuator": actuator}
-    return out | {"model": "m2" if peaked else "m1", "actuator": actuator}
+    # every load of the model is said: BAM starts one that is not from a figure of its own, which is not 0
+    out |= {theirs: said[columns[0]] for theirs, columns in LOADS.get(model, {}).items()}
+    return out | {"model": model, "actuator": actuator}
+
+
+def _model(said: Mapping[str, float]) -> str:
+    """The first model that has all of a table's columns."""
+    falls = said["stribeck_peak"] > 0
+    if not any(said[name] for name in LOADED):
+        return "m2" if falls else "m1"
+    if said["load_quadratic"] or said["load_quadratic_external"]:
+        return "m6"
+    if any(len({said[name] for name in columns}) > 1 for columns in LOADS["m4"].values()):
+        return "m5"
+    return "m4" if falls or said["load_stribeck"] else "m3"
 
 
 def main(argv: list[str]) -> int:

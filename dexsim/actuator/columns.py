@@ -163,6 +163,42 @@ COLUMNS: tuple[Column, ...] = (
     Column("standin_position", "N.m/rad", 0.0, -1e3, 1e3, "stand-in: torque per position"),
     Column("standin_speed", "N.m.s/rad", 0.0, -1e3, 1e3, "stand-in: torque per speed (negative brakes)"),
     Column("standin_drag", "N.m.s2/rad2", 0.0, -1e3, 1e3, "stand-in: torque per speed times |speed| (negative brakes)"),
+    # Friction of a gear by its load from both sides (BAM's m3 to m6). Last, so that the others keep their numbers.
+    Column(
+        "load_friction_external",
+        "1",
+        0.0,
+        0.0,
+        10.0,
+        "dry friction per torque from outside (gravity, contacts): with load_friction "
+        "|load_friction_external * outside - load_friction * motor|",
+    ),
+    Column(
+        "load_stribeck",
+        "1",
+        0.0,
+        0.0,
+        10.0,
+        "dry friction per motor torque that falls with speed as stribeck_peak does",
+    ),
+    Column("load_stribeck_external", "1", 0.0, 0.0, 10.0, "the same per torque from outside, subtracted likewise"),
+    Column(
+        "load_quadratic",
+        "1/(N.m)",
+        0.0,
+        0.0,
+        1e3,
+        "dry friction per motor torque squared while a larger torque from outside drives the motor; falls with speed "
+        "likewise",
+    ),
+    Column(
+        "load_quadratic_external",
+        "1/(N.m)",
+        0.0,
+        0.0,
+        1e3,
+        "the same per torque from outside squared while the motor drives a smaller one",
+    ),
 )
 
 NAMES: tuple[str, ...] = tuple(c.name for c in COLUMNS)
@@ -174,6 +210,13 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "braking": ("braking_slope",),
     "presliding": ("presliding",),
     "shape": ("stribeck_exponent", "ripple_shape"),
+    "load": (
+        "load_friction_external",
+        "load_stribeck",
+        "load_stribeck_external",
+        "load_quadratic",
+        "load_quadratic_external",
+    ),
     "controller": ("speed_feedforward", "acceleration_feedforward", "integral_gain"),
     "rare": (
         "eccentric_sin",

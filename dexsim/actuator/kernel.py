@@ -48,15 +48,17 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.actuator.columns import INDEX
+from dexsim.actuator.columns import FEATURES, INDEX
 from dexsim.actuator.laws import (
     arrived,
     difference,
     eccentricity,
     eccentricity_slope,
+    gear_friction,
     hold,
     lag_share,
     load_share,
+    opposed_square,
     other_terms,
     pd,
     preslide,
@@ -98,6 +100,7 @@ COULOMB, ASYMMETRY = INDEX["coulomb_friction"], INDEX["friction_asymmetry"]
 STRIBECK_PEAK, STRIBECK_SPEED = INDEX["stribeck_peak"], INDEX["stribeck_speed"]
 VISCOUS = INDEX["viscous_friction"]
 LOAD, LOAD_BACK = INDEX["load_friction"], INDEX["load_friction_backdriven"]
+LOAD_OUTSIDE, LOAD_PEAK, LOAD_PEAK_OUTSIDE, LOAD_SQUARE, LOAD_SQUARE_OUTSIDE = (INDEX[n] for n in FEATURES["load"])
 RIPPLE, RIPPLE_PER_TURN, RIPPLE_PHASE = INDEX["torque_ripple"], INDEX["ripple_per_turn"], INDEX["ripple_phase"]
 OFFSET, SCALE = INDEX["position_offset"], INDEX["position_scale"]
 ECC_SIN, ECC_COS = INDEX["eccentric_sin"], INDEX["eccentric_cos"]
@@ -143,6 +146,7 @@ def drives(real: type) -> Any:
         qpos: wp.array2d(dtype=real)
         qvel: wp.array2d(dtype=real)
         given: wp.array(dtype=real)  # sum of the motors' |torque| in the last step, [N]
+        outside: wp.array2d(dtype=real)  # what the dofs felt from outside in it, [N, nv], where friction grows with it
         # in and out
         state: wp.array3d(dtype=real)
         torque: wp.array2d(dtype=real)
@@ -198,8 +202,8 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
     Its steps, in the order of the signal: `locate` the rotor; `sense` what the encoder shows; `control` what the loop
     asks for; `limit` what the motor gives of it; `resist` the friction; `couple` rotor and link where they are two.
     Each has the law as `laws.py` states it and takes it to the end of the step ("Integration")."""
-    play, sag, rare, braking, controller, presliding, shape = (
-        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape")
+    play, sag, rare, braking, controller, presliding, shape, load = (
+        name in features for name in ("play", "sag", "rare", "braking", "controller", "presliding", "shape", "load")
     )
     extended = bool(features & EXTENDED)
     Drives, vec3 = drives(real), wp.types.vector(length=3, dtype=real)
@@ -455,7 +459,16 @@ def servo_kernel(real: type, voltage: bool, features: frozenset[str] = frozenset
         exponent = real(2.0)
         if wp.static(shape):
             exponent = d.params[w, j, STRIBECK_EXPONENT]
-        f.level += peak * wp.exp(-stribeck_power(r.v / d.params[w, j, STRIBECK_SPEED], exponent)) + share * wp.abs(last)
+        left = wp.exp(-stribeck_power(r.v / d.params[w, j, STRIBECK_SPEED], exponent))
+        if wp.static(load):
+            outside = d.outside[w, d.dof[j]]
+            of = d.params[w, j]
+            by_share = gear_friction(last, outside, share, factor * of[LOAD_OUTSIDE])
+            fading = gear_friction(last, outside, of[LOAD_PEAK], of[LOAD_PEAK_OUTSIDE])
+            fading += opposed_square(last, outside, of[LOAD_SQUARE], of[LOAD_SQUARE_OUTSIDE])
+            f.level += peak * left + by_share + factor * left * fading
+        else:
+            f.level += peak * left + share * wp.abs(last)
         f.own = f.level - d.base_frictionloss[w, j]
         if wp.static(presliding):  # a torque, taken up at the step's begin, and its line in the speed at the step's end
             give = d.params[w, j, PRESLIDING]

@@ -143,6 +143,32 @@ def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
 
 
 @wp.func
+def gear_friction(motor: Any, outside: Any, share: Any, share_outside: Any):
+    """Dry friction [N.m] of a gear that carries `motor` [N.m] on one side and `outside` [N.m] on the other, each
+    positive along the joint: |share_outside * outside - share * motor|.
+
+    The two oppose each other where one drives the other: their shares then add up, and where both push the same way
+    they relieve the gear. Equal shares are friction by |outside - motor| (M. Duclusaud, G. Passault, V. Padois, O. Ly,
+    Extended friction models for the physics simulation of servo actuators, arXiv 2410.08650, 2024, section III; the
+    shares weighted before they are subtracted, as in the authors' code)."""
+    return wp.abs(share_outside * outside - share * motor)
+
+
+@wp.func
+def opposed_square(motor: Any, outside: Any, per_motor: Any, per_outside: Any):
+    """Dry friction [N.m] by the square of the smaller of two torques [N.m] that oppose each other: per_outside
+    [1/(N.m)] * outside^2 while the motor drives (|outside| < |motor|), per_motor [1/(N.m)] * motor^2 while it is driven
+    (|outside| > |motor|), else 0 (source: `gear_friction`, model M6)."""
+    out = type(motor)(0.0)
+    if motor * outside < type(motor)(0.0):
+        if wp.abs(outside) < wp.abs(motor):
+            out = per_outside * outside * outside
+        elif wp.abs(outside) > wp.abs(motor):
+            out = per_motor * motor * motor
+    return out
+
+
+@wp.func
 def preslide(taken: Any, turned: Any):
     """Share of the dry friction that is taken up, -1 .. 1, after a turn: z' = (z + y) / (1 + |y|), y = turn /
     presliding.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -70,6 +70,20 @@ def torque_along(
     return np.clip(asked, -limit, limit)
 
 
+def load_level(
+    p: Mapping[str, Numbers], share: Numbers, motor: Numbers, outside: Numbers, fades: Numbers
+) -> np.ndarray:
+    """Dry friction [...] N.m of a gear by its load (`laws.gear_friction`, `laws.opposed_square`).
+
+    p: columns by name; share: `load_friction` in this direction; motor, outside: torques on the gear's two sides, N.m;
+    fades: exp(-|v / stribeck_speed|^stribeck_exponent)."""
+    lost = p["load_stribeck_external"] * outside - p["load_stribeck"] * motor
+    small = np.minimum(np.abs(motor), np.abs(outside)) ** 2
+    driven, drives = np.abs(outside) > np.abs(motor), np.abs(outside) < np.abs(motor)
+    square = small * (driven * p["load_quadratic"] + drives * p["load_quadratic_external"]) * (motor * outside < 0.0)
+    return np.abs(p["load_friction_external"] * outside - share * motor) + fades * (np.abs(lost) + square)
+
+
 def servo(
     params: np.ndarray,
     target: Numbers,
@@ -98,6 +112,7 @@ def servo(
     rates: tuple[Numbers, Numbers] = (0.0, 0.0),
     integral: Numbers = 0.0,
     taken: Numbers = 0.0,
+    outside: Numbers = 0.0,
 ) -> dict[str, np.ndarray]:
     """One evaluation of the servo, all arrays [...], params [..., C] in the units of `columns.py`.
 
@@ -106,7 +121,8 @@ def servo(
     base_*: the model's own friction and armature. features: those of `columns.FEATURES` that count. dragging [rad]: how
     far the joint that drags this one is from its home; others [N.m]: sum of the other motors' |torque|; filtered,
     rotor, line_a, line_b, fresh, integral, taken: the state's slots; loop_motor: the loop's encoder is on the rotor;
-    rates: the target's speed and acceleration (`target_rates`). Returns `torque` (motor torque the current shows),
+    rates: the target's speed and acceleration (`target_rates`); outside: what the joint felt from outside in the step
+    before [N.m]. Returns `torque` (motor torque the current shows),
     `qfrc_applied`, `dof_damping`, `dof_frictionloss`, `dof_armature` as `kernel.py` defines them, and the next
     `filtered`, `rotor`, `line_a`, `line_b`, `integral`, `taken`.
     """
@@ -242,8 +258,13 @@ def servo(
 
     fraction = np.where(last * v_drive < 0.0, p["load_friction_backdriven"], p["load_friction"])
     exponent = p["stribeck_exponent"] if "shape" in features else 2.0
-    own = p["coulomb_friction"] + p["stribeck_peak"] * np.exp(-(np.abs(v_drive / p["stribeck_speed"]) ** exponent))
-    own = friction_factor * (own + fraction * np.abs(last))
+    fades = np.exp(-(np.abs(v_drive / p["stribeck_speed"]) ** exponent))
+    own = p["coulomb_friction"] + p["stribeck_peak"] * fades
+    if "load" in features:
+        own = own + load_level(p, fraction, last, outside, fades)
+    else:
+        own = own + fraction * np.abs(last)
+    own = friction_factor * own
     level = base_frictionloss + own
     viscous = friction_factor * p["viscous_friction"]
 

@@ -145,6 +145,8 @@ class Servo:
         self.torque_max = as_tensor(nominal[:, INDEX["torque_limit"]])  # [J], what a normalised torque is over
         self.current_per_torque = as_tensor(table.current(self.joints))  # [J] A per N.m, nan where unknown
 
+        if "load" in self.features:
+            engine.keep_outside()
         self._servo = servo_kernel(real, table.drive == "voltage", self.features)
         self._send, self._reset, self._sum = send_kernel(real), reset_kernel(real, extended), given_kernel(real)
         self._period = 1.0 / table.control_rate if table.control_rate else 0.0
@@ -171,7 +173,7 @@ class Servo:
         )
         for name in own:
             setattr(self._drives, name, getattr(self, f"_{name}"))
-        for name in ("time", "qpos", "qvel", "qfrc_applied"):
+        for name in ("time", "qpos", "qvel", "qfrc_applied", *(("outside",) if "load" in self.features else ())):
             setattr(self._drives, name, getattr(self._wp, name))
         for name, field in self._fields.items():
             setattr(self._drives, name, field)

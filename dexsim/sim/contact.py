@@ -1,4 +1,5 @@
-"""Contact forces of named pairs, summed from MuJoCo-Warp's contact list."""
+"""What MuJoCo-Warp leaves of its forces: contact forces of named pairs, summed from its contact list, and what a dof
+felt from outside."""
 
 from __future__ import annotations
 
@@ -136,3 +137,22 @@ def check_worlds(
     if w == 0:
         wp.atomic_max(peak, 0, nacon[0])
     wp.atomic_max(peak, 1, nefc[w])
+
+
+@wp.kernel(enable_backward=False)
+def outside_torque(
+    smooth: wp.array2d(dtype=float),
+    applied: wp.array2d(dtype=float),
+    damper: wp.array2d(dtype=float),
+    constraint: wp.array2d(dtype=float),
+    row: wp.array2d(dtype=int),
+    force: wp.array2d(dtype=float),
+    # out
+    outside: wp.array2d(dtype=float),
+):
+    """`Engine.keep_outside`; row: the constraint that is a dof's dry friction, -1: none; force: of all constraints."""
+    w, i = wp.tid()
+    felt = smooth[w, i] - applied[w, i] - damper[w, i] + constraint[w, i]
+    if row[w, i] >= 0:
+        felt -= force[w, row[w, i]]
+    outside[w, i] = felt

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -67,12 +68,14 @@ class Engine:
         time [N], qpos [N, nq], qvel [N, nv], qfrc_applied [N, nv] (of `real`);
         xpos [N, nbody] vec3 and xmat [N, nbody] mat33 (float32): body frames in the world;
         pair_normal [N, P]: sum of normal contact forces [N]; pair_force [N, P] vec3: net force on the pair's first
-        member, world frame [N]; flags [N] int32.
+        member, world frame [N]; flags [N] int32;
+        outside [N, nv] (of `real`) after `keep_outside`, else None.
       t: the same memory as torch tensors, with xfrc_applied [N, nbody, 6] (world-frame force then torque).
     """
 
     kind = ""
     _derived: Sequence[str] = ()  # fields by world that MuJoCo derives from the others
+    real: Any  # Warp's scalar of states
     _warmstart: torch.Tensor  # [N, nv] accelerations that the solver begins with
 
     def __init__(self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]):
@@ -81,7 +84,7 @@ class Engine:
         self.mjm, self.n, self.device, self.dt = model, worlds, device, float(model.opt.timestep)
         self.pairs = tuple(pairs)
         self.field_names = tuple(fields)
-        self.wp = SimpleNamespace()
+        self.wp = SimpleNamespace(outside=None)
         self.t = SimpleNamespace()
 
     # -- names -------------------------------------------------------------------------------------------------------
@@ -154,10 +157,24 @@ class Engine:
         t = self.t
         out = {"time": t.time, "qpos": t.qpos, "qvel": t.qvel, "qacc_warmstart": self._warmstart, "qfrc_applied": t.qfrc_applied,
                "xfrc_applied": t.xfrc_applied}
+        if self.wp.outside is not None:
+            out["outside"] = t.outside
         for name in dict.fromkeys((*self.field_names, *self._derived)):
             field = self.field(name)
             out[name] = (field, -1, self.mjm.nmesh - 1) if name == "geom_dataid" else field
         return out
+
+    def keep_outside(self) -> None:
+        """From now on `wp.outside` and `t.outside` [N, nv] hold what a dof felt from outside in the last physics step,
+        N.m or N: gravity, Coriolis and springs, contacts, limits, pushes; all but `qfrc_applied`, damping and the dof's
+        own dry friction. 0 after `set_state`. Nobody who does not ask pays for it. Call it before the first `step`."""
+        if self.wp.outside is None:
+            self.wp.outside = wp.zeros((self.n, self.mjm.nv), dtype=self.real, device=self.device)
+            self.t.outside = wp.to_torch(self.wp.outside)
+
+    def _forget_outside(self, mask: torch.Tensor) -> None:
+        if self.wp.outside is not None:
+            self.t.outside.masked_fill_(mask[:, None], 0.0)
 
     def set_const(self) -> None:
         """Recompute what MuJoCo derives from masses, inertias and sizes (invweight0 and the like) in all worlds."""

@@ -106,7 +106,7 @@ class MujocoEngine(Engine):
     def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
         b = self.batch
         with wp.ScopedDevice("cpu"):
-            if before_each is None:
+            if before_each is None and self.wp.outside is None:
                 b.step(nstep=substeps)
             else:
                 # the sensors' contact forces are read after the last step only
@@ -114,8 +114,9 @@ class MujocoEngine(Engine):
                 for k in range(substeps):
                     if k == substeps - 1:
                         self._disabled[:] = self._flags
-                    before_each()
-                    b.step()
+                    if before_each is not None:
+                        before_each()
+                    self._one_step()
             self._check()
             self._contacts()
             self._kinematics()
@@ -127,6 +128,28 @@ class MujocoEngine(Engine):
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self._begin(mask, qpos, qvel)
+        self._forget_outside(mask)
+
+    def keep_outside(self) -> None:
+        if self.mjm.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
+            raise UserError("sim.engine=mujoco: friction under load from outside is read from a step of implicitfast, "
+                            "implicit or Euler; the model's integrator is discrete")  # fmt: skip
+        super().keep_outside()
+        view = lambda x: wp.array(x, dtype=wp.float64, device="cpu", copy=False)  # noqa: E731
+        read = ("qfrc_smooth", "qfrc_damper", "qfrc_constraint", "qacc")
+        level = self._fields.get("dof_frictionloss", self.mjm.dof_frictionloss[None].copy())
+        self._before = np.zeros(self.t.qvel.shape)
+        arrays = [kernels.friction_rows(self.mjm), level, self._fields["dof_invweight0"], self._before, *map(self.batch.bind, read)]
+        self._outside_args = [*map(view, arrays), self.wp.qfrc_applied, self.wp.outside]
+
+    def _one_step(self) -> None:
+        """One physics step of the batch, and what the dofs felt from outside in it, where that is asked for."""
+        if self.wp.outside is None:
+            self.batch.step()
+            return
+        self._before[:] = self.t.qvel.numpy()
+        self.batch.step()
+        self._launch("outside", kernels.outside_torque, (self.n, self.mjm.nv), self._outside_args)
 
     def set_const(self) -> None:
         self.batch.set_const()

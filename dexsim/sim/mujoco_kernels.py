@@ -187,3 +187,44 @@ def check_worlds(
         if not (wp.abs(qvel[w, i]) < wp.float64(1.0e4)):  # NaN compares false
             bad = nan_bit
     flags[w] = bad
+
+
+def friction_rows(model: mujoco.MjModel) -> np.ndarray:
+    """[nv, 2] of the constraint that MuJoCo makes of a dof's dry friction: its impedance d, and B [1/s] of its reference
+    acceleration -B v (MuJoCo's documentation, "Computation", "Parameters" of the constraint solver, at no distance)."""
+    out = np.zeros((model.nv, 2))
+    for i, (ref, imp) in enumerate(zip(model.dof_solref, model.dof_solimp, strict=True)):
+        low, high = np.clip(imp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        flat = low == high or imp[2] <= mujoco.mjMINVAL
+        time = ref[0]
+        if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
+            time = max(time, 2.0 * model.opt.timestep)
+        b = 2.0 / max(mujoco.mjMINVAL, high * time) if ref[0] > 0 else -ref[1] / max(mujoco.mjMINVAL, high)
+        out[i] = 0.5 * (low + high) if flat else low, b
+    return out
+
+
+@wp.kernel(enable_backward=False)
+def outside_torque(
+    rows: wp.array2d(dtype=wp.float64),
+    level: wp.array2d(dtype=wp.float64),
+    invweight: wp.array2d(dtype=wp.float64),
+    v: wp.array2d(dtype=wp.float64),
+    smooth: wp.array2d(dtype=wp.float64),
+    damper: wp.array2d(dtype=wp.float64),
+    constraint: wp.array2d(dtype=wp.float64),
+    acceleration: wp.array2d(dtype=wp.float64),
+    applied: wp.array2d(dtype=wp.float64),
+    # out
+    outside: wp.array2d(dtype=wp.float64),
+):
+    """`Engine.keep_outside`. The batch does not hand out the constraints' own forces, so that of dry friction is
+    computed as MuJoCo does: -(a - a_ref) / R within the level, R = (1 - d) / d * invweight, a_ref = -B v."""
+    w, i = wp.tid()
+    most = level[w % level.shape[0], i]
+    friction = wp.float64(0.0)
+    if most > wp.float64(0.0):
+        r = (wp.float64(1.0) - rows[i, 0]) / rows[i, 0] * invweight[w, i]
+        missed = acceleration[w, i] + rows[i, 1] * v[w, i]
+        friction = wp.clamp(-missed / wp.max(r, wp.float64(1.0e-15)), -most, most)
+    outside[w, i] = smooth[w, i] - applied[w, i] - damper[w, i] + constraint[w, i] - friction

@@ -142,6 +142,10 @@ class WarpEngine(Engine):
                 if ours is not None:
                     stack.enter_context(ours.in_place())
             mjw.step(self.m, self.d)
+        if self.wp.outside is not None:
+            d = self.d
+            own = [d.qfrc_smooth, d.qfrc_applied, d.qfrc_damper, d.qfrc_constraint, d.dof_frictionadr, d.efc.force]
+            wp.launch(contact.outside_torque, dim=(self.n, self.mjm.nv), inputs=own, outputs=[self.wp.outside])
 
     def _one_step(self) -> None:
         self.physics_step()
@@ -153,6 +157,7 @@ class WarpEngine(Engine):
 
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self._begin(mask, qpos, qvel)
+        self._forget_outside(mask)
         if self.narrow is not None:
             self._simplex.masked_fill_(mask[:, None, None], -1)
 
