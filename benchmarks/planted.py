@@ -378,7 +378,7 @@ def _off(rng: np.random.Generator, b: dict) -> dict:
     """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for
     each."""
     from dexsim.gap.plant.case import BELIEF
-    from dexsim.gap.search.beliefs import FILTER, LATE
+    from dexsim.gap.search.hypotheses import FILTER, LATE
 
     def draw(centre: float, sd: float, low: float, high: float) -> float:
         while not low <= (x := rng.normal(centre, sd)) <= high:

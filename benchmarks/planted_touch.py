@@ -50,8 +50,7 @@ def main(argv: list[str]) -> int:
             raise UserError(f"'{a}' is not a setting: {', '.join(s)}")
         s[key] = value
     from benchmarks import press_rig
-    from dexsim.gap.touch import handed_on as touch_handed
-    from dexsim.gap.touch.diagnosis import diagnose
+    from dexsim.gap.touch.diagnosis import diagnose, handed
     from dexsim.recording import read
     from dexsim.recording.mechanism import mechanism
     from dexsim.sim.quiet import quiet_warp
@@ -77,7 +76,7 @@ def main(argv: list[str]) -> int:
                     else _felt_again(
                         Path(folder),
                         paths,
-                        touch_handed.handed(out.findings, out.facts, out.names),
+                        handed(out.findings, out.facts, out.names),
                         planted,
                         10 + seed,
                         again,

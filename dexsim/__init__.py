@@ -48,7 +48,7 @@ if TYPE_CHECKING:
         write_recording,
     )
     from dexsim.errors import UserError
-    from dexsim.gap.result import Diagnosis
+    from dexsim.gap.inquiry import Diagnosis
     from dexsim.recording.schema import Recording
 
 __all__ = [
@@ -70,7 +70,7 @@ __all__ = [
 ]
 
 _ELSEWHERE = {
-    "Diagnosis": "dexsim.gap.result",
+    "Diagnosis": "dexsim.gap.inquiry",
     "Recording": "dexsim.recording.schema",
     "ServoTable": "dexsim.actuator.table",
     "UserError": "dexsim.errors",

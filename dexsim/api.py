@@ -18,7 +18,7 @@ from dexsim.paths import CONFIGS
 if TYPE_CHECKING:
     import torch
 
-    from dexsim.gap.result import Diagnosis
+    from dexsim.gap.inquiry import Diagnosis
     from dexsim.recording.schema import Recording
     from dexsim.tasks.env import HandEnv
 

@@ -266,8 +266,8 @@ class Diagnose:
 
     def _diagnose(self, shared: Shared) -> None:
         from dexsim.gap.diagnosis import diagnose
+        from dexsim.gap.inquiry import Settings
         from dexsim.gap.report.files import save
-        from dexsim.gap.result import Settings
 
         paths = sorted(self.folder.glob("motion_*.mcap"))
         model, servo = (str(self.folder / f"rig{end}") for end in (".xml", ".yaml"))

@@ -18,14 +18,14 @@ from dexsim.errors import UserError
 from dexsim.gap import command, demo, locate
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable
-from dexsim.gap.judge import errors
+from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.batch import JointPlant, nominal_row
 from dexsim.gap.plant.case import build, noise
 from dexsim.gap.plant.columns import INDEX, NEUTRAL
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.runs import Run, conditions, local_polynomial
 from dexsim.gap.search.search import JointSearch
-from dexsim.gap.touch import constant_taxels
+from dexsim.gap.touch import judge
 from dexsim.recording import read, write
 from dexsim.recording.mechanism import drive
 
@@ -223,10 +223,10 @@ def test_floor_from_repeats_of_the_same_commands():
         r.smooth()
         runs.append(r)
     assert conditions(runs) == [0, 0]
-    value, how = errors.floor(runs, build(model(), runs))
+    value, how = kept_out.floor(runs, build(model(), runs))
     assert how == "repeats" and value == pytest.approx(3e-3, rel=0.15)
     runs[1].name = "a"  # two pieces of one recording
-    assert errors.floor(runs, build(model(), runs))[1] != "repeats"
+    assert kept_out.floor(runs, build(model(), runs))[1] != "repeats"
 
 
 def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
@@ -237,12 +237,12 @@ def test_what_a_warmer_drive_does_otherwise_in_a_repeat_is_no_noise():
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
-    apart = errors.floors(runs, [case])[0]["joint"]
+    apart = kept_out.floors(runs, [case])[0]["joint"]
     thermal = EFFECTS["thermal"].variants(case.scales)[0].params
     assert thermal[0].columns == ("thermal_torque",) and apart > 4 * case.sigma
-    assert errors.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
-    assert errors.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
-    assert errors.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
+    assert kept_out.floor_beyond(case, runs, [], np.zeros(0)) == pytest.approx(apart, rel=0.1)
+    assert kept_out.floor_beyond(case, runs, list(thermal), np.array([-0.01])) < 1.5 * case.sigma
+    assert kept_out.floor_beyond(case, runs[:1], [], np.zeros(0)) == np.inf
 
 
 def test_map_finds_the_regime_and_controls_false_discoveries():
@@ -286,7 +286,7 @@ def test_dead_taxel_is_named_by_its_neighbours(tmp_path):
     z[:, 1, 5 * 12 + 7, 2] = 0.0
     empty = Series.empty("x", 1)
     made = Recording(Path("a"), {}, ("j",), empty, States(empty), tactile=Series(t, z))
-    found = constant_taxels.found([made], Sensors(load_hand()))
+    found = judge.constant_taxels([made], Sensors(load_hand()))
     assert [f["where"]["taxels"] for f in found] == [["1:67"]]
 
 
@@ -294,7 +294,7 @@ def test_rms_interval_covers():
     rng = np.random.default_rng(4)
     t = np.arange(0, 60, 0.01)
     e = np.convolve(rng.standard_normal(len(t)), np.ones(20) / np.sqrt(20), "same")
-    value, low, high = errors.rms_interval([e**2], [t])
+    value, low, high = kept_out.rms_interval([e**2], [t])
     assert low < 1.0 < high and low < value < high and high - low < 0.3
 
 
@@ -554,7 +554,7 @@ def test_a_page_that_cannot_be_drawn_does_not_lose_the_answer(answer, tmp_path, 
     def broken(d):
         raise KeyError("<b>")
 
-    monkeypatch.setattr("dexsim.gap.report.sections.page", broken)
+    monkeypatch.setattr("dexsim.gap.report.files.page", broken)
     written = save(answer[0], tmp_path / "out")
     assert "report.html could not be drawn" in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["findings"]

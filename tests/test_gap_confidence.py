@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.effects.thermal import temperature_follows
-from dexsim.gap.judge import confidence, verdict
+from dexsim.gap.effects.drive import temperature_follows
+from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.judge.confidence import Evidence
 from dexsim.gap.plant.columns import INDEX, Param, at_bound
 from dexsim.gap.rules import JUDGE
@@ -191,7 +191,7 @@ def test_temperature_that_follows_something_else(starts, gains, what):
 )
 def test_an_error_far_beyond_the_floor_is_not_nothing(before, low, structured, word):
     """In floors: the error before, the low end of its interval, whether the windows show structure."""
-    assert verdict.verdict([], 1.0, before, low, before, structured) == word
+    assert kept_out.verdict([], 1.0, before, low, before, structured) == word
 
 
 def test_of_two_effects_that_hold_back_what_is_fast_the_smaller_is_not_sure():

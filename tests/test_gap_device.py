@@ -9,8 +9,8 @@ import warp as wp
 from test_gap import demo, plant_run
 
 from dexsim.errors import UserError
-from dexsim.gap import command, parallel
-from dexsim.gap.parallel import map_joints, workers
+from dexsim.gap import command, compute
+from dexsim.gap.compute import map_joints, workers
 from dexsim.gap.plant import batch as plants
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
@@ -92,10 +92,10 @@ def test_joints_side_by_side_come_back_in_order(monkeypatch):
     assert done == sorted(done) and len(seen) == 7 and all(0 <= d <= 2.5 for d in done[:-1])
     with pytest.raises(ZeroDivisionError):
         map_joints(names, lambda k, tell: 1 // 0, "cuda")
-    for given, cores in (("1", 1), ("4", 4), ("64", parallel.MOST_CPU)):
+    for given, cores in (("1", 1), ("4", 4), ("64", compute.MOST_CPU)):
         monkeypatch.setenv("OMP_NUM_THREADS", given)
         assert workers("cpu", 20) == cores
-    assert workers("cpu", 1) == 1 and workers("cuda", 20) == parallel.MOST_GPU
+    assert workers("cpu", 1) == 1 and workers("cuda", 20) == compute.MOST_GPU
 
 
 def test_without_such_a_gpu_the_cpu_is_used_and_said(monkeypatch, capsys):
@@ -116,11 +116,11 @@ def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
     """Cut between windows or between guesses, whatever their number: each is simulated once, bit for bit as in one
     launch."""
     plant, params, inits = guesses
-    monkeypatch.setattr(parallel, "WORTH", 1)
-    monkeypatch.setattr(parallel, "cores", lambda: 1)
+    monkeypatch.setattr(compute, "WORTH", 1)
+    monkeypatch.setattr(compute, "cores", lambda: 1)
     expected = {length: plant.simulate(params, plant.windows(length), inits) for length in (1.0, None)}
     for cores in (2, 3, 5):
-        monkeypatch.setattr(parallel, "cores", lambda cores=cores: cores)
+        monkeypatch.setattr(compute, "cores", lambda cores=cores: cores)
         for length, (q, torque) in expected.items():
             windows = plant.windows(length)
             for count in (9, 2, 1):
@@ -129,16 +129,16 @@ def test_a_launch_in_parts_gives_the_same_numbers(guesses, monkeypatch):
                 assert np.array_equal(got[0], q[:count]) and np.array_equal(got[1], torque[:count])
     steps = np.array([100, 100, 400])
     for cores in (1, 2, 3, 8):
-        monkeypatch.setattr(parallel, "cores", lambda cores=cores: cores)
+        monkeypatch.setattr(compute, "cores", lambda cores=cores: cores)
         for guesses_ in (1, 2, 7):
             done = np.zeros((3, guesses_), int)
-            parts = parallel.parts(steps, guesses_)
+            parts = compute.parts(steps, guesses_)
             for w, g in parts:
                 done[w, g] += 1
             assert (done == 1).all() and len(parts) <= cores
     begun: list[int] = []  # in another's launch on six of the eight cores, two are free
-    parallel.run(lambda *part: begun.append(len(parallel.parts(steps, 8))), [(slice(0, 3), slice(0, 1))] * 6)
-    assert begun == [2] * 6 and len(parallel.parts(steps, 8)) == 8
+    compute.run(lambda *part: begun.append(len(compute.parts(steps, 8))), [(slice(0, 3), slice(0, 1))] * 6)
+    assert begun == [2] * 6 and len(compute.parts(steps, 8)) == 8
 
 
 def test_a_fault_in_a_part_is_not_lost(monkeypatch):
@@ -147,7 +147,7 @@ def test_a_fault_in_a_part_is_not_lost(monkeypatch):
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        parallel.run(work, [(slice(0, 1), slice(0, 1)), (slice(0, 1), slice(1, 2))])
+        compute.run(work, [(slice(0, 1), slice(0, 1)), (slice(0, 1), slice(1, 2))])
 
 
 def test_what_was_simulated_is_known_and_nothing_else_is(guesses):

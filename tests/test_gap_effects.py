@@ -63,10 +63,16 @@ def test_no_effect_is_asked_for_by_name_outside_its_class():
     } == {}
 
 
-def test_every_effect_has_a_file_of_its_own_and_says_what_it_is():
+def test_every_effect_is_one_class_of_one_file_and_says_what_it_is():
+    """Each class stands once in the files of `effects/`, and each class that stands there is an entry."""
+    classes = [
+        (path.stem, name)
+        for path in (ROOM / "effects").glob("*.py")
+        for name in re.findall(r"^class (\w+)\(.*Effect.*\)", path.read_text(encoding="utf-8"), re.M)
+    ]
+    entries = [(type(e).__module__.rpartition(".")[2], type(e).__name__) for e in (*CATALOGUE, *TOUCH_CATALOGUE)]
+    assert sorted(classes) == sorted(entries)
     for e in (*CATALOGUE, *TOUCH_CATALOGUE):
-        text = (ROOM / "effects" / f"{type(e).__module__.rpartition('.')[2]}.py").read_text(encoding="utf-8")
-        assert len(re.findall(r"^class \w+\((?:Touch)?Effect\)", text, re.M)) == 1, e.id
         assert e.words and e.shows and e.experiment and type(e).__doc__
     assert len(EFFECTS) == len(CATALOGUE) and len(TOUCH_EFFECTS) == len(TOUCH_CATALOGUE)
 
@@ -138,12 +144,7 @@ def test_an_interval_holds_the_size_by_another_law():
     assert best.members[0].variant.label == "exponential in speed"
 
 
-CABLE = '''"""A cable that pulls the joint home, the harder the farther it turned."""
-
-import numpy as np
-
-from dexsim.gap.effects.effect import Effect, Variant, param
-
+CABLE = '''
 
 class Cable(Effect):
     """A cable that pulls the joint home: -k q^3."""
@@ -192,8 +193,8 @@ ADDED = (
         'from dexsim.actuator.laws import cable_pull\n\nP_CABLE = INDEX["cable"]\n',
     ),
     ("gap/plant/kernel.py", "    applied += p.bias", "    applied += cable_pull(c.params[h, P_CABLE], x.q)\n"),
-    ("gap/effects/cable.py", "", CABLE),
-    ("gap/effects/catalogue.py", "CATALOGUE: tuple[Effect, ...] = (", "from dexsim.gap.effects.cable import Cable\n\n"),
+    ("gap/effects/body.py", "", CABLE),
+    ("gap/effects/catalogue.py", "CATALOGUE: tuple[Effect, ...] = (", "from dexsim.gap.effects.body import Cable\n\n"),
     ("gap/effects/catalogue.py", "    CoulombFriction(),", "    Cable(),\n"),
 )
 TRIED = """

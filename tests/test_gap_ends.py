@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.read import end_stops
+from dexsim.gap.read import inputs
 from dexsim.gap.read.runs import Run
 
 XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 {y} {z}"{more}/>
@@ -31,7 +31,7 @@ def model_of(y: int = 0, z: int = 1, more: str = "", mass: float = 0.1) -> mujoc
 
 def test_an_end_that_the_model_lacks_is_found_and_used():
     model = model_of(more=' range="-2.7 2.7" limited="true"')
-    said = end_stops.used(model, [run_of(None, reach=0.8), run_of(-1.03)])
+    said = inputs.used_end_stops(model, [run_of(None, reach=0.8), run_of(-1.03)])
     assert len(said) == 1 and "meets an end of its motion at -1.0" in said[0] and "-2.7" in said[0]
     low, high = model.jnt_range[0]
     assert low == pytest.approx(-1.03, abs=3e-3) and high == 2.7 and model.jnt_limited[0]
@@ -39,29 +39,29 @@ def test_an_end_that_the_model_lacks_is_found_and_used():
 
 def test_a_joint_that_follows_has_no_end():
     model = model_of()
-    assert end_stops.used(model, [run_of(None), run_of(None, reach=0.5)]) == [] and not model.jnt_limited[0]
+    assert inputs.used_end_stops(model, [run_of(None), run_of(None, reach=0.5)]) == [] and not model.jnt_limited[0]
 
 
 def test_what_gravity_may_hold_is_no_end():
     # 5 N.m/rad * 0.47 rad asked for at most, 1.5 N.m of gravity about a level axis
     model = model_of(y=1, z=0, mass=3.0)
-    assert end_stops.used(model, [run_of(-1.03)]) == []
+    assert inputs.used_end_stops(model, [run_of(-1.03)]) == []
 
 
 def test_one_meeting_may_be_a_hand_in_the_way():
     run = run_of(-1.03)
     run = Run(run.name, run.joints, run.cmd_t, run.cmd, run.t[:300], run.q[:300], run.servo, run.gravity)
-    assert end_stops.used(model_of(), [run]) == []
+    assert inputs.used_end_stops(model_of(), [run]) == []
 
 
 def test_an_end_met_only_in_what_is_kept_out_is_neither_used_nor_judged():
     model, held = model_of(more=' range="-2.7 2.7" limited="true"'), run_of(-1.03)
-    assert end_stops.used(model, [run_of(None, reach=0.8)]) == []
-    spans = end_stops.unforeseen(model, [held])["a.mcap"]
+    assert inputs.used_end_stops(model, [run_of(None, reach=0.8)]) == []
+    spans = inputs.unforeseen_end_stops(model, [held])["a.mcap"]
     assert len(spans) == 4 and all(b - a == pytest.approx(1.25, abs=0.4) for a, b in spans)
     inside = np.zeros(len(held.t), bool)
     for a, b in spans:
         inside |= (held.t >= a) & (held.t <= b)
     assert (held.q[~inside, 0] > -1.03 + 0.01).all() and inside.mean() < 0.35
-    end_stops.used(model, [held])  # the same end, shown to the fit: nothing is unforeseen about it
-    assert end_stops.unforeseen(model, [held]) == {}
+    inputs.used_end_stops(model, [held])  # the same end, shown to the fit: nothing is unforeseen about it
+    assert inputs.unforeseen_end_stops(model, [held]) == {}

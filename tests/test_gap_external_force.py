@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_gap_torque_route import ARM, arm, run
 
-from dexsim.gap.search import external_force
+from dexsim.gap.search import logged_torque
 
 SPANS = ((4.0, 6.5), (11.0, 12.5), (16.0, 18.0))
 
@@ -23,7 +23,7 @@ def shove(t: np.ndarray, size: float = 6.0) -> np.ndarray:
 def test_pushes_are_told_with_when_and_how_hard():
     model = arm()
     runs = [run(model, 0, pushed=shove), run(model, 1)]
-    pushes = external_force.find(model, runs, [0, 1])
+    pushes = logged_torque.find_pushes(model, runs, [0, 1])
     assert [p.joint for p in pushes] == ["elbow"]
     (push,) = pushes
     assert push.clear and push.torque == pytest.approx(6.0, rel=0.1) and set(push.spans) == {"run0.mcap"}
@@ -39,7 +39,7 @@ def test_pushes_are_told_with_when_and_how_hard():
 
 def test_nothing_is_told_where_nothing_pushes():
     model = arm()
-    assert external_force.find(model, [run(model, 0), run(model, 1, friction=(1.5, 0.6))], [0, 1]) == []
+    assert logged_torque.find_pushes(model, [run(model, 0), run(model, 1, friction=(1.5, 0.6))], [0, 1]) == []
 
 
 def test_what_friction_carries_at_rest_and_noise_are_no_push():
@@ -51,17 +51,17 @@ def test_what_friction_carries_at_rest_and_noise_are_no_push():
     data.qpos[:] = r.q[start]
     mujoco.mj_forward(model, data)
     r.torque[start:] = data.qfrc_bias + 0.9 * np.array([0.5, 0.2]) * np.sin(2 * np.pi * 0.5 * r.t[start:])[:, None]
-    assert external_force.find(model, [r], [0]) == []
+    assert logged_torque.find_pushes(model, [r], [0]) == []
     loud = run(model, 1)
     loud.torque += 8.0 * rng.standard_normal(loud.torque.shape)
-    assert external_force.find(model, [loud], [0]) == []
+    assert logged_torque.find_pushes(model, [loud], [0]) == []
 
 
 def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
     model = arm()
     r = run(model, 0)
     r.torque[:, 1] = np.random.default_rng(0).standard_normal(len(r.t) // 20 + 1).repeat(20)[: len(r.t)]
-    (push,) = external_force.find(model, [r], [0])
+    (push,) = logged_torque.find_pushes(model, [r], [0])
     assert not push.clear and push.finding()["confidence"] < 0.5
     size = {"torque": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}}
     held = {"before": 0.02, "after": 0.01}
@@ -81,7 +81,7 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
         "unexplained": {"depends_on": []},
     }
     d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={})
-    external_force.claim(d, [push])
+    logged_torque.claim_push(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
     assert d.sentence.startswith("Joint elbow is pushed by something outside")
     assert d.data["verdict"] == "explained" and len(d.notes) == 1

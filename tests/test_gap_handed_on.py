@@ -17,7 +17,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.assets import xhand
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
-from dexsim.gap.judge import residual_fit
+from dexsim.gap.judge import handed_on
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.search.search import JointSearch
@@ -101,7 +101,7 @@ def test_what_is_doubted_is_handed_on_with_a_range_towards_what_was_believed(fit
     stays, other columns do not move."""
     from types import SimpleNamespace
 
-    from dexsim.gap.judge.findings import widen
+    from dexsim.gap.judge.handed_on import widen
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 2.0, "torque_limit": 1.09}}})
     table.set(JOINT, "torque_limit", fitted, low, high)
@@ -118,7 +118,7 @@ def test_what_reproduces_what_was_kept_out_is_handed_on_as_fitted_whatever_its_n
     to the belief (1.09) is then 1 - 0.3 of 0.84."""
     from types import SimpleNamespace
 
-    from dexsim.gap.judge.findings import earned, widen
+    from dexsim.gap.judge.handed_on import earned, widen
 
     found = lambda after, *others: {  # noqa: E731
         "held_out": {"before": 1.0, "after": after},
@@ -212,7 +212,7 @@ def test_a_hand_with_play_in_every_joint_holds_what_it_catches(tmp_path):
 def test_model_file_is_the_hand_that_trains(tmp_path):
     from types import SimpleNamespace
 
-    from dexsim.gap.judge.findings import model_changes, save_model
+    from dexsim.gap.judge.handed_on import model_changes, save_model
 
     spec = xhand.hand_spec()
     case = SimpleNamespace(joint=JOINT)
@@ -243,7 +243,7 @@ def test_damping_that_a_loops_age_takes_is_not_handed_on(kd, after):
     there is none to take it from."""
     from types import SimpleNamespace
 
-    from dexsim.gap.judge.findings import servo_changes
+    from dexsim.gap.judge.handed_on import servo_changes
     from dexsim.gap.plant.columns import Param
 
     table = ServoTable.from_dict({"joints": {"*": {"kp": 4.0, "kd": kd}}})
@@ -299,12 +299,12 @@ def test_a_stand_in_takes_what_no_effect_explains(tmp_path):
         runs[-1].smooth()
     case = build(spec.compile(), runs)[0]
     none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
-    found = residual_fit.fit(case, runs, none, [0, 2], [1])
+    found = handed_on.fit_stand_in(case, runs, none, [0, 2], [1])
     assert found is not None and found.after < 0.5 * found.before
     assert found.value[3] == pytest.approx(drag, rel=0.35) and found.low[3] <= found.value[3] <= found.high[3]
     hand = ServoTable.from_dict(grasp_cfg()["servo"])
     found.joint = JOINT
-    residual_fit.write(hand, [found], tmp_path / "servo_standin.yaml")
+    handed_on.write_stand_in(hand, [found], tmp_path / "servo_standin.yaml")
     env = grasp_env(f"servo_file={tmp_path / 'servo_standin.yaml'}", worlds=32)
     drawn = env.servo.params[:, xhand.JOINTS.index(JOINT), INDEX["standin_drag"]]
     assert (
@@ -320,4 +320,4 @@ def test_no_stand_in_where_nothing_is_left():
         r.smooth()
     case = build(mujoco.MjModel.from_xml_string(demo.MODEL), runs)[0]
     none = JointSearch(case, [0, 2], None, conditions(runs)).without_search().none
-    assert residual_fit.fit(case, runs, none, [0, 2], [1]) is None
+    assert handed_on.fit_stand_in(case, runs, none, [0, 2], [1]) is None

@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.actuator.columns import INDEX
 from dexsim.gap.search.inverse_dynamics import identify
-from dexsim.gap.search.torque_told import believe
+from dexsim.gap.search.logged_torque import believe
 
 
 def carriage(backward: float = 0.0, seed: int = 0, late: float = 0.0):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import confidence, errors, joint
+from dexsim.gap.judge import confidence, joint, kept_out
 from dexsim.gap.judge.joint import JointAnswer
 from dexsim.gap.rules import JUDGE
 
@@ -48,8 +48,8 @@ class Judged(JointAnswer):
 def judged(answer: Judged) -> dict:
     """The finding of an answer."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(errors, "free_run", lambda *_: (answer.without, None))
-        patch.setattr(errors, "intervals_of", lambda *_: [])
+        patch.setattr(kept_out, "free_run", lambda *_: (answer.without, None))
+        patch.setattr(kept_out, "intervals_of", lambda *_: [])
         answer.judge(SimpleNamespace(table=None))
     return answer.found[0]
 

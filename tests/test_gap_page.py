@@ -100,9 +100,9 @@ def test_notes_that_recordings_share_are_said_once():
 
 
 def test_hints_stand_apart_and_are_not_in_the_first_sentence():
-    from dexsim.gap.report.sections import Findings, render
+    from dexsim.gap.inquiry import Diagnosis, empty
+    from dexsim.gap.report.files import Findings, render
     from dexsim.gap.report.sentence import sentence
-    from dexsim.gap.result import Diagnosis, empty
 
     def found(effect: str, confidence: float, key: str) -> dict:
         return {
@@ -135,8 +135,8 @@ def test_hints_stand_apart_and_are_not_in_the_first_sentence():
 
 
 def test_what_recordings_say_is_text_and_no_markup():
-    from dexsim.gap.report.sections import page
-    from dexsim.gap.result import Diagnosis, empty
+    from dexsim.gap.inquiry import Diagnosis, empty
+    from dexsim.gap.report.files import page
 
     text = page(Diagnosis(empty(), "a <b>sentence</b> & more", ["<script>alert(1)</script>"]))
     assert "<script" not in text and "&lt;script&gt;" in text and "a &lt;b&gt;sentence&lt;/b&gt; &amp; more" in text

@@ -10,8 +10,8 @@ from test_gap import mechanism_of, plant_run
 from dexsim.gap import demo
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.judge import full_model
-from dexsim.gap.judge.findings import model_changes, servo_changes
 from dexsim.gap.judge.full_model import Hypothesis
+from dexsim.gap.judge.handed_on import model_changes, servo_changes
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX
 from dexsim.gap.read.runs import conditions

@@ -8,7 +8,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
-from dexsim.gap.read import channels, rhythm
+from dexsim.gap.read import channels
 from dexsim.gap.read.runs import Run
 from tests.test_gap import SERVO, model
 
@@ -32,27 +32,27 @@ def held(t: np.ndarray, q: np.ndarray, period: float, begin: float = 0.013) -> n
 def test_the_rhythm_of_readings_is_found_and_one_of_each_is_kept(period):
     t, q = motion()
     shown = held(t, q, period)
-    assert rhythm.rhythm(t, shown) == pytest.approx(period, rel=0.01)
-    new = ~rhythm.between(t, shown, period)
+    assert channels.rhythm(t, shown) == pytest.approx(period, rel=0.01)
+    new = ~channels.between_readings(t, shown, period)
     assert new.sum() == pytest.approx(4.0 / period, abs=2)
     beat = np.floor((t - 0.013) / period)
     assert len(np.unique(beat[new])) == new.sum()
     # what stands still for a while is read as well
     still = np.where(t < 2.0, 0.3, shown)
-    assert (~rhythm.between(t, still, period))[t < 2.0].sum() == pytest.approx(2.0 / period, abs=2)
+    assert (~channels.between_readings(t, still, period))[t < 2.0].sum() == pytest.approx(2.0 / period, abs=2)
 
 
 def test_what_is_no_rhythm():
     t, q = motion()
-    assert rhythm.rhythm(t, q) == 0.0  # each sample is read
+    assert channels.rhythm(t, q) == 0.0  # each sample is read
     ramp = np.round(0.1 * t / 0.006) * 0.006  # past a coarse encoder's steps, one at a time
-    assert rhythm.rhythm(t, ramp) == 0.0
+    assert channels.rhythm(t, ramp) == 0.0
     rng = np.random.default_rng(1)
     slips = np.cumsum(rng.exponential(0.06, 200))
     size = np.cumsum(np.round(rng.uniform(1, 20, 200)) * STEP)
     slipping = size[np.clip(np.searchsorted(slips, t), 0, 199)]
-    assert rhythm.rhythm(t, slipping) == 0.0
-    assert np.isnan(rhythm.rhythm(t, np.full_like(t, 0.2)))  # it tells nothing
+    assert channels.rhythm(t, slipping) == 0.0
+    assert np.isnan(channels.rhythm(t, np.full_like(t, 0.2)))  # it tells nothing
 
 
 def test_a_joint_that_is_read_seldom_is_named_and_judged_by_its_readings():

@@ -12,21 +12,21 @@ import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
 
-from dexsim.gap import drives, locate, rules
-from dexsim.gap.drives import Drives
+from dexsim.gap import diagnosis as diagnosing
+from dexsim.gap import locate, rules
+from dexsim.gap.compute import Deadline
+from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
 from dexsim.gap.effects.effect import Variant, param
-from dexsim.gap.judge import conclude, confidence, findings, full_model, residual_fit, verdict
+from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint, kept_out
 from dexsim.gap.judge.joint import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
-from dexsim.gap.report import next_recording, sections
-from dexsim.gap.search import jitter, selection
+from dexsim.gap.report import files, next_recording
+from dexsim.gap.search import search as selecting
 from dexsim.gap.search.fit import Fitted
-from dexsim.gap.search.hypotheses import JointHypotheses, thin
+from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, thin
 from dexsim.gap.search.search import JointSearch
-from dexsim.gap.search.time_limit import Deadline
-from dexsim.gap.search.trial import Member, Trial
-from dexsim.gap.touch.handed_on import doubted
+from dexsim.gap.touch.diagnosis import doubted
 
 
 class Made(JointSearch):
@@ -235,10 +235,10 @@ def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, m
         variant = SimpleNamespace(refines=False, params=[SimpleNamespace(columns=(column,))])
         return SimpleNamespace(id=name, plain=(column,), variants=lambda scales: [variant])
 
-    fitted = [effect(e.id, e.plain[0]) for e in selection.CATALOGUE if e.plain]
+    fitted = [effect(e.id, e.plain[0]) for e in selecting.CATALOGUE if e.plain]
     assert {e.id for e in fitted} >= {"coulomb_friction", "viscous_friction", "command_delay", "torque_limit"}
-    monkeypatch.setattr(selection, "CATALOGUE", fitted)
-    monkeypatch.setattr(selection, "fits_beside", lambda a, b: True)
+    monkeypatch.setattr(selecting, "CATALOGUE", fitted)
+    monkeypatch.setattr(selecting, "fits_beside", lambda a, b: True)
     search = Plainly(lambda ids: (10 * left,) * 2 if len(ids) > 1 else (10.0,) * 2, (0.3, 0.2, 0.01))
     best = search.run().best
     assert search.fits == [(("coulomb_friction", "viscous_friction"), (0.3, 0.2))]  # the delay is as believed
@@ -306,30 +306,30 @@ def named(**changes):
 
 
 def test_an_error_within_the_noise_asks_for_nothing():
-    word = lambda before: verdict.verdict([], 1.0, before, before, before, True)  # noqa: E731
+    word = lambda before: kept_out.verdict([], 1.0, before, before, before, True)  # noqa: E731
     assert word(1.25) == "none" and word(1.35) == "unknown"
     assert confidence.too_small(1.25, 1.25, 1.0, 1.0, True) and not confidence.too_small(1.35, 1.35, 1.0, 1.0, True)
 
 
 def test_a_large_error_is_never_nothing():
-    word = lambda before: verdict.verdict([], 1.0, before, 1.0, before, True)  # noqa: E731
+    word = lambda before: kept_out.verdict([], 1.0, before, 1.0, before, True)  # noqa: E731
     assert word(4.9) == "none" and word(5.1) == "unknown"
 
 
 def test_what_counts_as_a_part_of_the_answer():
-    word = lambda after: verdict.verdict([named()], 1.0, 11.0, 10.0, after, True)  # noqa: E731
+    word = lambda after: kept_out.verdict([named()], 1.0, 11.0, 10.0, after, True)  # noqa: E731
     assert word(8.1) == "unknown" and word(7.9) == "partly_explained"
 
 
 def test_names_below_firm_are_hints():
     found = [named(confidence=0.51), named(confidence=0.49)]
-    verdict.settle(found, set())
+    kept_out.settle(found, set())
     assert [f.get("hint", False) for f in found] == [False, True]
 
 
 def test_what_is_not_borne_out_keeps_little():
     found = [named()]
-    verdict.settle(found, {"j"})
+    kept_out.settle(found, {"j"})
     assert 0.4 < found[0]["confidence"] < 0.5 and found[0]["hint"]
 
 
@@ -352,7 +352,7 @@ def test_one_reason_against_a_name_makes_it_doubted():
 
 
 def test_nothing_is_explained_by_doubtful_names_alone():
-    word = lambda sure: verdict.verdict([named(confidence=sure)], 1.0, 5.0, 4.0, 1.0, True)  # noqa: E731
+    word = lambda sure: kept_out.verdict([named(confidence=sure)], 1.0, 5.0, 4.0, 1.0, True)  # noqa: E731
     assert word(0.74) == "partly_explained" and word(0.76) == "explained"
 
 
@@ -367,7 +367,7 @@ def test_what_removes_nothing_keeps_a_share():
 
 
 def test_a_name_earns_its_confidence_by_what_it_removes():
-    less = lambda after: findings.earned({"held_out": {"before": 1.0, "after": after}})  # noqa: E731
+    less = lambda after: handed_on.earned({"held_out": {"before": 1.0, "after": after}})  # noqa: E731
     assert less(0.89) == 1.0 and 0.85 < less(0.91) < 0.95
 
 
@@ -450,7 +450,7 @@ def test_an_effect_may_lose_little_where_it_does_not_act():
     decides."""
     for lost, hint in ((0.03, False), (0.08, True)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(verdict, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
+            patch.setattr(kept_out, "gain_interval", lambda *_, lost=lost: (-lost, 0.9))
             assert (judged(Judged(1.0, 0.1))["confidence"] < 0.5) is hint, lost
 
 
@@ -493,10 +493,10 @@ def test_a_stand_in_must_take_a_least_share_off():
     run = SimpleNamespace(t=t, qs=np.sin(9 * t)[:, None], vs=np.cos(7 * t)[:, None])
     for after, offered in ((0.91, False), (0.89, True)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(residual_fit, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
-            patch.setattr(residual_fit, "_held_out", lambda *_, after=after: (1.0, after))
+            patch.setattr(handed_on, "residual_torque", lambda *_: (noise, np.ones(n, bool)))
+            patch.setattr(handed_on, "_held_out", lambda *_, after=after: (1.0, after))
             assert (
-                residual_fit.fit(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None
+                handed_on.fit_stand_in(SimpleNamespace(joint="j", index=0), [run], None, [0], []) is not None
             ) is offered, after
 
 
@@ -524,7 +524,7 @@ def test_a_stand_in_is_offered_where_much_is_left():
                                  noise=SimpleNamespace(floor=1.0), parts=parts,
                                  w=SimpleNamespace(runs=[], settings=SimpleNamespace(seed=0)))  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(residual_fit, "fit", lambda *_: SimpleNamespace(text="a torque stands in"))
+            patch.setattr(handed_on, "fit_stand_in", lambda *_: SimpleNamespace(text="a torque stands in"))
             Drives.stand_in(drives, d)
         assert (len(d.standins) == 1) is offered, left
 
@@ -543,7 +543,7 @@ def test_repeats_that_differ_by_what_was_found_are_no_floor():
     floor = conclude.Noise(3.0, "repeats", {"a": 3.0, "b": 3.0})
     for left, same in ((2.2, False), (2.5, True)):
         assert (floor.at_most({"a": left}) is floor) is same, left
-    assert floor.at_most({"a": 1.2}).lowered == ("a",) and floor.at_most({"a": 1.2}).how in sections.FLOORS
+    assert floor.at_most({"a": 1.2}).lowered == ("a",) and floor.at_most({"a": 1.2}).how in files.FLOORS
     assert floor.at_most({"a": 1.2}).joints == {"a": 1.2, "b": 3.0} and floor.at_most({"a": 1.2}).floor < 3.0
 
 
@@ -576,24 +576,24 @@ def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
 
 
 def test_joints_that_are_not_followed_are_looked_at_again():
-    assert not drives._unsettled(followed(1.5)) and drives._unsettled(followed(1.9))
-    assert drives._unsettled(followed(1.0, members=("lag",)))
+    assert not diagnosing._unsettled(followed(1.5)) and diagnosing._unsettled(followed(1.9))
+    assert diagnosing._unsettled(followed(1.0, members=("lag",)))
 
 
 def test_a_joint_is_searched_again_where_the_others_move_it_otherwise():
     for now, again in ((2.14, False), (2.3, True), (1.7, True)):
         fitter = SimpleNamespace(loss=lambda _, now=now: np.array([now]), evaluate=lambda *_: np.zeros(1))
         search = SimpleNamespace(_fix=lambda _: nullcontext(), fitter=fitter)
-        assert drives._other(search, followed(2.0)) is again, now
+        assert diagnosing._other(search, followed(2.0)) is again, now
 
 
 def test_jitter_is_reported_where_the_likelihood_gains_much():
-    assert jitter.certain(9.0, 2e-3, 0.1, 1.0) and not jitter.certain(6.0, 2e-3, 0.1, 1.0)
+    assert joint.certain(9.0, 2e-3, 0.1, 1.0) and not joint.certain(6.0, 2e-3, 0.1, 1.0)
 
 
 def test_jitter_is_more_than_that_of_the_clocks():
-    assert jitter.certain(50.0, 4e-4, 0.1, 1.0) and not jitter.certain(50.0, 2e-4, 0.1, 1.0)
-    assert not jitter.certain(50.0, 4e-4, 1.1, 1.0), "what is left beside it is not noise"
+    assert joint.certain(50.0, 4e-4, 0.1, 1.0) and not joint.certain(50.0, 2e-4, 0.1, 1.0)
+    assert not joint.certain(50.0, 4e-4, 1.1, 1.0), "what is left beside it is not noise"
 
 
 def test_a_motion_that_settles_it_is_planned_alone():

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.judge import errors
+from dexsim.gap.judge import kept_out
 from dexsim.gap.read import inputs
 from dexsim.gap.read.stage_tests import Stage
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search import baseline, external_force, inverse_dynamics, torque_told
-from dexsim.gap.search.body_torque import WEIGHT, Columns, least
+from dexsim.gap.search import baseline, inverse_dynamics, logged_torque
+from dexsim.gap.search.inverse_dynamics import WEIGHT, Columns, least
 
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 STEP, BLOCKS, A_BLOCK = 0.01, 80, 50
@@ -39,7 +39,7 @@ def recorded(push: np.ndarray, noise: float, own: float = 1.0, standing: int = 0
 
 def pushed(of: Columns):
     """(samples that are pushed, the answer) of one recording; None where nothing is told."""
-    said = external_force._of_joint([of], [True], np.random.default_rng(0))
+    said = logged_torque._of_joint([of], [True], np.random.default_rng(0))
     return said and (said[0][0][1], said)
 
 
@@ -88,7 +88,7 @@ def test_a_push_is_no_small_part_of_the_torque():
 def test_a_joint_at_rest_carries_some_more_than_its_friction():
     A, x = np.array([[0.0, 0.0, 1.0, 0.0]] * 2), np.array([0.0, 0.0, 2.0, 0.0])
     for torque, beyond in ((2.0 * 1.2, False), (2.0 * 1.6, True)):
-        found = external_force._beyond(np.array([torque, -torque]), A, x, 2, np.zeros(2, bool))
+        found = logged_torque._beyond(np.array([torque, -torque]), A, x, 2, np.zeros(2, bool))
         assert (np.abs(found) > 0).all() == beyond == (np.abs(found) > 0).any(), torque
 
 
@@ -97,7 +97,7 @@ def test_a_force_lasts_and_noise_does_not():
     noise = np.tile([1.0, -1.0], 1000)
     for share, slow in ((0.35, True), (0.17, False)):  # of the variance that lies between the blocks
         force = np.sqrt(share / (1 - share)) * np.where(block % 2, 1.0, -1.0)
-        assert external_force._slow(noise + force, block) is slow, share
+        assert logged_torque._slow(noise + force, block) is slow, share
 
 
 def test_what_pushes_most_of_the_time_is_no_stretch():
@@ -117,12 +117,12 @@ def test_what_pushes_most_of_the_time_is_no_stretch():
 
 def test_a_joint_is_judged_without_pushes_where_enough_is_left():
     run = SimpleNamespace(name="a", duration=10.0)
-    push = external_force.Push("j", 1.0, 0.1, 0.5, True, False, {"a": [(0.0, 1.0)]})
+    push = logged_torque.Push("j", 1.0, 0.1, 0.5, True, False, {"a": [(0.0, 1.0)]})
     for seconds, cut in ((5.0, True), (3.0, False)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(inputs, "merged_spans", lambda *_: {})
             patch.setattr(inputs, "free_air", lambda *_, s=seconds: ([SimpleNamespace(name="a", duration=s)], []))
-            rest, _ = external_force.without([push], [run], [], [])
+            rest, _ = logged_torque.without_pushes([push], [run], [], [])
         assert (rest[0].duration == seconds) is cut, seconds
 
 
@@ -132,14 +132,14 @@ def test_short_gaps_of_a_push_are_joined_and_short_pushes_left_out():
 
     def found(*spans):
         on = np.any([(t > a - 1e-6) & (t < b + 1e-6) for a, b in spans], 0)
-        return external_force._spans([(t, on)], [run]).get("a", [])
+        return logged_torque._spans([(t, on)], [run]).get("a", [])
 
     assert len(found((1.0, 2.0), (2.1, 3.0))) == 1 and len(found((1.0, 2.0), (2.25, 3.0))) == 2
     assert len(found((1.0, 1.07))) == 1 and found((1.0, 1.03)) == []
 
 
 def push(clear: bool) -> float:
-    return external_force.Push("j", 1.0, 0.1, 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
+    return logged_torque.Push("j", 1.0, 0.1, 0.5, clear, False, {"a": [(0.0, 1.0)]}).finding()["confidence"]
 
 
 def test_a_push_is_named_surely_where_the_rest_fits():
@@ -153,7 +153,7 @@ def test_a_push_is_a_hint_where_the_rest_does_not_fit():
 def test_a_loop_tells_of_the_joint_where_its_law_is_half_right():
     given = [(SimpleNamespace(joint="j", told={"inertia": 1.0}), None, None)]
     for fit, tells in ((0.65, True), (0.4, False)):
-        unknown = torque_told.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
+        unknown = logged_torque.unknown_controllers(given, [SimpleNamespace(joint="j", fit=fit)], [])
         assert (unknown == set()) is tells, fit
 
 
@@ -249,7 +249,7 @@ def test_a_torque_that_fits_nothing_is_no_witness():
         scales = SimpleNamespace(nominal={"friction_asymmetry": 0.0}, inertia=1.0)
         case = SimpleNamespace(joint="j", unknown=("coulomb_friction",), scales=scales, ranges={}, factors={},
                                told=False, plant=SimpleNamespace(nominal=np.zeros((1, len(INDEX)))))  # fmt: skip
-        torque_told.believe([(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
+        logged_torque.believe([(case, inverse_dynamics.Inverse(value, value, value, left, []), [])])
         assert case.told is told, left
 
 
@@ -264,6 +264,6 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
     trial = SimpleNamespace(fit=SimpleNamespace(params=[SimpleNamespace(key="kd")], x=np.array([1.0])), members=())
     for error, stand in ((1.03, True), (1.08, False)):  # with the torque's figure; 1 with the loop's own
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(errors, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
+            patch.setattr(kept_out, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
             search = SimpleNamespace(whole=whole)
-            assert torque_told._alike(Followed(None), search, trial, {"kd": error}, [0], None) is stand, error
+            assert logged_torque._alike(Followed(None), search, trial, {"kd": error}, [0], None) is stand, error

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS
-from dexsim.gap.touch import fit as pad_fit
-from dexsim.gap.touch import judge, locate
+from dexsim.gap.touch import judge
 from dexsim.gap.touch import search as pad_search
 from dexsim.gap.touch.diagnosis import Pad, Touch
-from dexsim.gap.touch.fit import PadFit, TouchTrial
 from dexsim.gap.touch.judge import PadAnswer
 from dexsim.gap.touch.plant import PARAMS
-from dexsim.gap.touch.search import PadSearch
+from dexsim.gap.touch.search import PadFit, PadSearch, TouchTrial
 
 
 class Felt(PadSearch):
@@ -177,7 +175,7 @@ def claimed(after=0.5, share=0.0):
                              _parameters=lambda e: ([], {}))  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(judge, "held_out", lambda s, trial, stage: left(s, "best" if trial is best else trial, stage))
-        patch.setattr(locate, "when", lambda *_: [])
+        patch.setattr(judge, "when", lambda *_: [])
         return PadAnswer._finding(answer, "tactile_gain")
 
 
@@ -209,7 +207,7 @@ def sigma_of(z, t):
     pad = SimpleNamespace(runs=[run], base={}, silent={}, noise=1e-9, load=False, shear=False)
     pad._sample = lambda *given: PadFit._sample(pad, *given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pad_fit, "readings", lambda r, *_: r.z)
+        patch.setattr(pad_search, "readings", lambda r, *_: r.z)
         return PadFit._samples(pad, set())[0].sigma[:, 0]
 
 
@@ -239,7 +237,7 @@ def test_the_gain_of_a_taxel_is_believed_to_be_one():
                              run=SimpleNamespace(z=np.zeros((count, 1))))  # fmt: skip
     pad = SimpleNamespace(runs=[sample.run], samples=[sample])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pad_fit, "readings", lambda r, *_: np.ones_like(r.z))
+        patch.setattr(pad_search, "readings", lambda r, *_: np.ones_like(r.z))
         assert PadFit.gain_map(pad, TouchTrial((), {}), np.ones(count, bool)) == pytest.approx(0.5)
 
 

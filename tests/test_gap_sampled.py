@@ -9,9 +9,8 @@ import pytest
 from test_gap import SERVO, model, motion
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.plant.case import build
+from dexsim.gap.plant.case import _true, build
 from dexsim.gap.plant.columns import INDEX
-from dexsim.gap.plant.coupled_motion import _true
 from dexsim.gap.read.runs import Run
 from dexsim.gap.search.search import JointSearch
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from dexsim.gap import parallel
+from dexsim.gap import compute
 from dexsim.gap.command import Progress
-from dexsim.gap.judge import conclude, errors, verdict
+from dexsim.gap.judge import conclude, kept_out
 from dexsim.gap.judge.joint import stretched
 from dexsim.gap.plant.case import REFERENCE, build
 from dexsim.gap.plant.columns import Param
@@ -111,7 +111,7 @@ def test_what_only_the_recording_kept_out_shows_is_said():
 )
 def test_an_error_that_is_gone_under_doubtful_names_is_not_explained(confidence, group, word):
     finding = {"held_out": {"before": 0.01}, "confidence": confidence, "indistinguishable": group}
-    assert verdict.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
+    assert kept_out.verdict([finding], 1e-3, 1e-2, 9e-3, 1.1e-3, False) == word
 
 
 def test_temperature_counts_from_that_of_a_data_sheet():
@@ -179,7 +179,7 @@ def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeyp
             tell(part)
         return k
 
-    assert parallel.map_joints(["knuckle"], work, "cpu", Progress()) == [0]
+    assert compute.map_joints(["knuckle"], work, "cpu", Progress()) == [0]
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == [
         "searching knuckle (1/1)",
@@ -210,7 +210,7 @@ def test_a_recording_that_begins_in_motion_is_followed_from_where_it_did():
     windows = case.plant.windows(None)
     error = lambda underway: np.sqrt(  # noqa: E731
         np.mean(
-            (case.plant.q[windows.sample_row] - errors.free_run(case, [], np.zeros(0), windows, underway=underway)[0])
+            (case.plant.q[windows.sample_row] - kept_out.free_run(case, [], np.zeros(0), windows, underway=underway)[0])
             ** 2
         )
     )

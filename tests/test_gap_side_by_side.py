@@ -8,9 +8,8 @@ import pytest
 from test_gap_linkage import MODEL
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap import parallel
-from dexsim.gap.plant.case import _since_reversal, moved
-from dexsim.gap.plant.coupled_motion import refined_cases
+from dexsim.gap import compute
+from dexsim.gap.plant.case import _since_reversal, moved, refined_cases
 from dexsim.gap.plant.mechanics import cross, on_lines
 from dexsim.gap.read.runs import Run
 
@@ -56,8 +55,8 @@ def test_a_motion_without_what_may_be_added_is_the_same_motion():
 
 def test_each_keeps_the_order_and_hands_errors_on(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert parallel.each(20, lambda k: k * k) == [k * k for k in range(20)]
-    assert parallel.each(0, lambda k: k) == []
+    assert compute.each(20, lambda k: k * k) == [k * k for k in range(20)]
+    assert compute.each(0, lambda k: k) == []
 
     def bad(k: int) -> int:
         if k == 7:
@@ -65,7 +64,7 @@ def test_each_keeps_the_order_and_hands_errors_on(monkeypatch):
         return k
 
     with pytest.raises(ValueError, match="seven"):
-        parallel.each(9, bad)
+        compute.each(9, bad)
 
 
 def test_lines_between_rows_are_those_of_interp():

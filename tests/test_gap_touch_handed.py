@@ -17,10 +17,11 @@ from dexsim.cli import start
 from dexsim.errors import UserError
 from dexsim.gap.diagnosis import Settings, diagnose, save
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE
-from dexsim.gap.touch import handed_on
-from dexsim.gap.touch.handed_on import HEAD, chord
-from dexsim.gap.touch.handed_on import save as write
-from dexsim.gap.touch.result import PadFacts
+from dexsim.gap.effects.effect import PadFacts
+from dexsim.gap.touch import diagnosis
+from dexsim.gap.touch.diagnosis import HEAD
+from dexsim.gap.touch.diagnosis import save_tactile as write
+from dexsim.gap.touch.judge import chord
 from dexsim.paths import CONFIGS
 from dexsim.recording import read
 from dexsim.tactile.file import load
@@ -29,7 +30,7 @@ INDEX, MID = 1, 2
 
 
 def handed(findings, facts):
-    return handed_on.handed(findings, facts, xhand.FINGERS)
+    return diagnosis.handed(findings, facts, xhand.FINGERS)
 
 
 def diagnosed(folder, allowed=None, **planted):

@@ -11,8 +11,8 @@ from test_gap import SERVO, motion, plant_run
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.judge import not_considered
-from dexsim.gap.judge.findings import servo_changes
+from dexsim.gap.judge import conclude
+from dexsim.gap.judge.handed_on import servo_changes
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read.runs import Run, conditions
@@ -66,13 +66,13 @@ def test_an_unknown_column_is_fitted_with_every_hypothesis_and_handed_on(name, t
     table = ServoTable.from_dict({"joints": {"*": SERVO}})
     servo_changes(table, search.case, none, intervals(none.fit, search.blocks), ["joint"])
     assert table.value("joint", name).value == pytest.approx(value, rel=1e-6)
-    assert not_considered.not_fitted([search.case]) == []
+    assert conclude.not_fitted([search.case]) == []
 
 
 def test_a_column_that_says_nothing_alone_is_taken_as_absent_and_said():
     search = searched(("torque_ripple", "sag"), {})
     assert not {"torque_ripple", "sag"} & {c for p in search.all_nuisances for c in p.columns}
-    said = not_considered.not_fitted([search.case])
+    said = conclude.not_fitted([search.case])
     assert len(said) == 2 and all("taken as absent" in x for x in said)
     assert any(search._narrow(v) is not None for v in EFFECTS["torque_ripple"].variants(search.case.scales)), (
         "it is still looked for"

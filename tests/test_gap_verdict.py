@@ -4,12 +4,11 @@ time."""
 import numpy as np
 import pytest
 
-from dexsim.gap.judge import verdict
-from dexsim.gap.read import keep_out
+from dexsim.gap.compute import TimeLimit
+from dexsim.gap.inquiry import TouchResult
+from dexsim.gap.judge import kept_out
 from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.time_limit import TimeLimit
-from dexsim.gap.touch import report as touch_report
-from dexsim.gap.touch.result import TouchResult
+from dexsim.gap.touch import diagnosis as touch_report
 
 
 def finding(confidence: float, joint: str = "a") -> dict:
@@ -23,10 +22,10 @@ def finding(confidence: float, joint: str = "a") -> dict:
 
 def test_names_on_joints_that_need_no_effect_are_hints():
     found = [finding(0.99, "a"), finding(0.9, "b"), finding(0.4, "b")]
-    verdict.settle(found, quiet={"a"})
+    kept_out.settle(found, quiet={"a"})
     assert [f.get("hint", False) for f in found] == [True, False, True]
     assert found[0]["confidence"] < JUDGE.firm and found[1]["confidence"] == 0.9
-    assert verdict.firm(found) == [found[1]]
+    assert kept_out.firm(found) == [found[1]]
 
 
 @pytest.mark.parametrize(
@@ -43,8 +42,8 @@ def test_names_on_joints_that_need_no_effect_are_hints():
 )
 def test_no_verdict_by_a_whisper(before, after, confidence, word):
     found = [finding(confidence)]
-    verdict.settle(found, set())
-    assert verdict.verdict(found, 1.0, before, 0.9 * before, after, True) == word
+    kept_out.settle(found, set())
+    assert kept_out.verdict(found, 1.0, before, 0.9 * before, after, True) == word
 
 
 @pytest.mark.parametrize(
@@ -53,24 +52,24 @@ def test_no_verdict_by_a_whisper(before, after, confidence, word):
 def test_a_wrong_signal_is_an_answer_where_the_rest_is_followed(before, confidence, word):
     """`none` would say that nothing was amiss; where the rest is not followed either the signal does not explain it."""
     bad = finding(confidence) | {"effect": "bad_channel", "held_out": None}
-    assert verdict.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
+    assert kept_out.verdict([bad], 1.0, before, 0.9 * before, before, True) == word
 
 
 def test_the_interval_of_a_gain_holds_it_and_knows_chance():
     rng = np.random.default_rng(1)
     t = np.arange(0, 20, 0.01)
     noise = rng.standard_normal(len(t)) ** 2
-    low, high = verdict.gain_interval(4 * noise, noise, t)
+    low, high = kept_out.gain_interval(4 * noise, noise, t)
     assert low < 0.75 < high and high - low < 0.15
     few = np.where(t > 18, 400.0, 1.0)  # what acts in a tenth of the time: draws without it show no loss
-    low, high = verdict.gain_interval(few * noise, 1.02 * noise, t)
+    low, high = kept_out.gain_interval(few * noise, 1.02 * noise, t)
     assert -0.01 < low < 0.5 < high
-    low, high = verdict.gain_interval(noise, rng.permutation(noise), t)
+    low, high = kept_out.gain_interval(noise, rng.permutation(noise), t)
     assert low < 0 < high
 
 
 class Held:
-    """Regimes of runs, as `keep_out` asks a case for them: T s of each at 100 Hz."""
+    """Regimes of runs, as `kept_out.split` asks a case for them: T s of each at 100 Hz."""
 
     def __init__(self, saturated: list[tuple[float, float]], T: float = 10.0):
         n = int(100 * T)
@@ -97,7 +96,7 @@ class Held:
 def test_what_alone_visits_a_regime_is_not_kept_out_whole():
     # the last, which used to be kept out, is the only one at its limit
     case = Held([(0, 0), (0, 0), (0, 0), (1.0, 9.0)])
-    parts = keep_out.split(case.runs, [], [0, 1, 2, 3], [case])
+    parts = kept_out.split(case.runs, [], [0, 1, 2, 3], [case])
     assert parts.test == [2, 3] and parts.train == [0, 1, 3] and not parts.not_judged
     assert parts.span_train[3][1] == parts.span_test[3][0] == 7.5 and parts.span_test[2][0] == 0.0
 
@@ -108,21 +107,21 @@ def test_a_recording_whose_end_does_not_visit_a_regime_takes_no_others_place():
     case = Held([(0, 0), (0, 0), (1.0, 9.0), (0, 0), (1.0, 9.0)])
     warm = Held([(0, 0), (1.0, 4.0), (0, 0), (0, 9.9), (0, 0)]).regimes["saturation"] > 0
     case.regimes["temperature"] = 20.0 + 20.0 * warm
-    parts = keep_out.split(case.runs, [], [0, 1, 2, 3, 4], [case])
+    parts = kept_out.split(case.runs, [], [0, 1, 2, 3, 4], [case])
     assert parts.test == [3, 4] and parts.span_test[3][0] == 7.5
 
 
 def test_a_regime_that_was_only_held_out_is_said_to_be_unjudged():
     case = Held([(0, 0), (0, 0), (1.0, 9.0)])
-    parts = keep_out.split(case.runs, [2], [0, 1, 2], [case])
+    parts = kept_out.split(case.runs, [2], [0, 1, 2], [case])
     assert parts.test == [2] and "saturation of a" in parts.not_judged
     both = Held([(0, 0), (2.0, 4.0), (1.0, 9.0)])
-    assert not keep_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
+    assert not kept_out.split(both.runs, [2], [0, 1, 2], [both]).not_judged
 
 
 def test_ends_of_all_recordings_where_there_are_few():
     case = Held([(0, 0), (0, 0)])
-    parts = keep_out.split(case.runs, [], [0, 1], [case])
+    parts = kept_out.split(case.runs, [], [0, 1], [case])
     assert parts.train == parts.test == [0, 1] and parts.span_train[0] == (0.0, 7.5)
 
 

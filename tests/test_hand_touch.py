@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import press_rig
 from dexsim.errors import UserError
-from dexsim.gap.touch import diagnosis, handed_on
+from dexsim.gap.touch import diagnosis
 from dexsim.gap.touch import plant as touch_plant
 from dexsim.gap.touch import read as touch_read
 from dexsim.hand import Hand, load_hand
@@ -60,7 +60,7 @@ def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     assert f["parameters"]["gain"]["value"] == pytest.approx(0.4, abs=0.08) and result.names[2] == "middle"
     assert result.error.shape == (4, 48)
     path = tmp_path / "tactile.yaml"
-    assert handed_on.save(handed_on.handed(result.findings, result.facts, result.names), path)
+    assert diagnosis.save_tactile(diagnosis.handed(result.findings, result.facts, result.names), path)
     assert list(load(path, claw)["tactile"]["pads"]) == ["middle"]
     with pytest.raises(UserError, match=r"pads\.middle: no such fingertip; fingertips: thumb, index, mid"):
         load(path)  # of the xHand

@@ -8,9 +8,9 @@ import pytest
 
 from dexsim import outputs
 from dexsim.errors import UserError
-from dexsim.gap.judge.findings import save_model
+from dexsim.gap.inquiry import Diagnosis, empty
+from dexsim.gap.judge.handed_on import save_model
 from dexsim.gap.report.files import save
-from dexsim.gap.result import Diagnosis, empty
 
 CUBE = "v -.1 -.1 -.1\nv .1 -.1 -.1\nv 0 .1 -.1\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 

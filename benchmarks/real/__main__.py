@@ -196,7 +196,7 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
     kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
     from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.gap.read.keep_out import KEEP_OUT
+    from dexsim.gap.judge.kept_out import KEEP_OUT
 
     made = convert(data, out / "recordings")
     wall, cpu = time.perf_counter(), time.process_time()

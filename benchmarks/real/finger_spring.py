@@ -21,7 +21,7 @@ from benchmarks.real.common import fitted
 from benchmarks.real.convert_ergocub import FINGERS, KEPT, cycles
 from dexsim.console.ending import guard
 from dexsim.errors import UserError
-from dexsim.gap.read import rhythm
+from dexsim.gap.read import channels
 
 STEP = 2e-3  # s
 PERIOD = 0.05  # s from one reading of the position to the next
@@ -59,7 +59,7 @@ def load(folder: Path, name: str, kept: bool) -> Clips:
     t, duty, q, clips = cycles(path)
     rows = []
     for a, b in [c for k, c in enumerate(clips) if (k % KEPT == KEPT - 1) == kept]:
-        new = a + np.flatnonzero(~rhythm.between(t[a:b], q[a:b], PERIOD))
+        new = a + np.flatnonzero(~channels.between_readings(t[a:b], q[a:b], PERIOD))
         grid = np.arange(t[new[0]] - OLDEST, t[b - 1], STEP)
         held = duty[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)]
         steps = np.round((t[new] - t[new[0]]) / STEP).astype(int)

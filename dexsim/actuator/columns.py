@@ -158,7 +158,7 @@ COLUMNS: tuple[Column, ...] = (
     Column(
         "coupling_from", "1", 0.0, 0.0, 1e3, "which joint: its number in the mechanism's order, from 0 (if coupling)"
     ),
-    # Torque of nothing that is known: a regression of what a diagnosis could not name, marked as such (gap/standin.py).
+    # Torque of nothing that is known: a regression of what a diagnosis could not name, marked as such (`gap`).
     Column("standin_constant", "N.m", 0.0, -1e3, 1e3, "stand-in: constant torque on the joint"),
     Column("standin_position", "N.m/rad", 0.0, -1e3, 1e3, "stand-in: torque per position"),
     Column("standin_speed", "N.m.s/rad", 0.0, -1e3, 1e3, "stand-in: torque per speed (negative brakes)"),

@@ -17,8 +17,8 @@ from dexsim.errors import UserError
 from dexsim.typed import whole
 
 if TYPE_CHECKING:
-    from dexsim.gap.result import Diagnosis, Settings
-    from dexsim.gap.search.time_limit import TimeLimit
+    from dexsim.gap.compute import TimeLimit
+    from dexsim.gap.inquiry import Diagnosis, Settings
 
 HELP = """usage: python diagnose.py recordings='[a.mcap,b.mcap]' out=DIR [key=value ...]
        python diagnose.py demo=true [out=DIR]
@@ -138,7 +138,7 @@ def parse(argv: list[str]) -> dict:
 def _hidden(text: str) -> str | None:
     """The effect that a demo hides; None for no demo."""
     from dexsim.gap.demo import HIDDEN
-    from dexsim.gap.effects.command_delay import CommandDelay
+    from dexsim.gap.effects.signals import CommandDelay
 
     value = {"true": CommandDelay.id, "false": None}.get(text.lower(), text)
     if value is not None and value not in HIDDEN:
@@ -158,9 +158,9 @@ def main(argv: list[str]) -> int:
         print(describe())
         return 0
     from dexsim import outputs
+    from dexsim.gap.compute import TimeLimit
     from dexsim.gap.diagnosis import diagnose, save
     from dexsim.gap.report.files import RESULTS
-    from dexsim.gap.search.time_limit import TimeLimit
 
     start = time.perf_counter()
     device = started(given.get("device", "cpu"))
@@ -224,9 +224,9 @@ def settings_of(given: dict, out: Path, device: str) -> Settings:
     """What `parse` took apart, as :func:`dexsim.gap.diagnosis.diagnose` takes it. Raises UserError."""
     from dexsim.actuator.columns import did_you_mean
     from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
+    from dexsim.gap.inquiry import Settings
     from dexsim.gap.judge.full_model import REPLAY
     from dexsim.gap.read import inputs
-    from dexsim.gap.result import Settings
 
     if given.get("replay", "mujoco") not in REPLAY:
         raise UserError(f"replay={given['replay']}: must be one of {', '.join(REPLAY)}")

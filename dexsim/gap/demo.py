@@ -9,7 +9,7 @@ import yaml
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS
-from dexsim.gap.effects.stribeck_friction import StribeckFriction
+from dexsim.gap.effects.friction import StribeckFriction
 from dexsim.recording import write
 from dexsim.recording.mechanism import drive, mechanism, recorded
 from dexsim.recording.realistic import Hardware, realistic

@@ -1,16 +1,41 @@
-"""The whole diagnosis: recordings in, verdict, findings, fitted servo and model, report out."""
+"""The whole diagnosis: recordings in, verdict, findings, fitted servo and model, report out. Its drives are taken
+through their steps here, joint by joint, judged on recordings kept out; its touch in `gap.touch.diagnosis`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
-from dexsim.gap.drives import Drives, cannot_be_seen
-from dexsim.gap.inquiry import Inquiry, NothingToJudge, read_files, to_runs
-from dexsim.gap.judge import not_considered
-from dexsim.gap.report.files import save
-from dexsim.gap.report.next_recording import plan_next
-from dexsim.gap.result import Diagnosis, Settings, empty
-from dexsim.gap.search.time_limit import TimeLimit
+import numpy as np
+
+from dexsim.errors import UserError
+from dexsim.gap import compute
+from dexsim.gap.compute import TimeLimit, map_joints, workers
+from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
+from dexsim.gap.inquiry import (
+    Diagnosis,
+    Inquiry,
+    NothingToJudge,
+    Settings,
+    Steps,
+    TouchResult,
+    empty,
+    read_files,
+    to_runs,
+)
+from dexsim.gap.judge import conclude, full_model, handed_on, kept_out
+from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
+from dexsim.gap.judge.joint import JointAnswer, Kept
+from dexsim.gap.plant.case import Case, coupled, refine_motion_by_fits, refined_cases
+from dexsim.gap.read import inputs, stage_tests
+from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.report.files import plain, save
+from dexsim.gap.report.next_recording import plan_next, rival_of
+from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.search import baseline, logged_torque
+from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch.diagnosis import Touch
 
 
@@ -57,7 +82,7 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
         d.data["reason"] = reason
         return d
     w.notes.append(f"no joint is judged: {reason}")
-    left_out = not_considered.reasons((), felt, w.settings.allowed)
+    left_out = conclude.not_considered((), felt, w.settings.allowed)
     w.notes += cannot_be_seen(w.settings.allowed, left_out)
     touch.report(d)
     d.data["unexplained"]["not_considered"] = left_out
@@ -69,3 +94,381 @@ def _without_drives(w: Inquiry, touch: Touch, reason: str) -> Diagnosis:
 
 
 __all__ = ["Diagnosis", "Settings", "diagnose", "save"]
+
+
+# -- the drives -------------------------------------------------------------------------------------------------------
+
+Answers = list[tuple[JointSearch, Outcome | None]]
+
+
+class Drives(Steps):
+    """The drives of a mechanism. w: what is asked and has been read; felt: touch, which is judged before: a joint is
+    judged where nothing is touched."""
+
+    def __init__(self, w: Inquiry, felt: TouchResult):
+        self.w, self.felt = w, felt
+        self.pushes: Sequence[logged_torque.Push] = ()  # from outside
+        # model: a case a joint, what is kept out of the fit, the noise
+        self.cases: list[Case] = []
+        self.left_out: dict[str, str] = {}  # effects that are not considered, with reasons
+        # search: what recorded torque, duty and current say; joints whose closed loop says nothing of them; an answer a
+        # joint
+        self.stages: Sequence[stage_tests.Stage] = ()
+        self.by_torque: Sequence[tuple] = ()
+        self.unknown_controllers: set[str] = set()
+        self.outcomes: list[tuple[Case, JointSearch, Outcome]] = []
+        # locate and judge
+        self.answers: list[JointAnswer] = []
+        self.plains: list[baseline.Baseline] = []
+
+    @property
+    def kept(self) -> Kept:
+        """What every joint is judged by."""
+        p = self.parts
+        return Kept(self.w.runs, p.train, p.test, p.span_train, p.span_test)
+
+    # -- read
+    # ------------------------------------------------------------------------------------------------------------------
+    def read(self) -> None:
+        """The stretches in which every joint moves by its own drive alone."""
+        w = self.w
+        if w.nothing_left():
+            raise NothingToJudge("No recording can be used: " + "; ".join(w.failures))
+        touched = inputs.merged_spans(self.felt.contact, inputs.self_touch(w.runs, w.m.spec.compile()))
+        w.clock.lap("contacts along the motion")
+        if touched:
+            w.runs, w.held = inputs.free_air(w.runs, w.held, touched, w.notes)
+            if w.nothing_left():
+                raise NothingToJudge("every joint moves only while something is touched")
+        try:
+            w.runs = inputs.common_joints(w.runs, w.notes)
+        except inputs.Unusable as error:
+            raise NothingToJudge(str(error)) from error
+        if w.settings.held_out and not w.held:
+            w.notes.append("none of the held_out recordings can be used; part of the others is kept out instead")
+        self.mj_model = w.m.spec.compile()
+        self._within_the_stops()
+        self._without_pushes()
+        for run in w.runs:
+            run.smooth()
+        joints = range(len(w.runs[0].joints))
+        moving = any(max(float(np.ptp(r.q[:, j])) for r in w.runs) > 2e-3 for j in joints)
+        commanded = any(max(float(np.ptp(r.cmd[:, j])) for r in w.runs) > 1e-4 for j in joints)
+        if not moving and not commanded:
+            raise NothingToJudge(
+                "Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged"
+            )
+
+    def _within_the_stops(self) -> None:
+        """The runs without what only those kept out press: ends of a motion that no recording for the fit has shown."""
+        w, model = self.w, self.mj_model
+        fitted = [r for i, r in enumerate(w.runs) if i not in w.held]
+        w.notes += _limits(model, w.runs) + inputs.used_end_stops(model, fitted)
+        pressed = inputs.unforeseen_end_stops(model, [w.runs[i] for i in w.held])
+        if pressed:
+            why = "presses against an end of its motion that no recording for the fit has shown"
+            w.runs, w.held = inputs.free_air(w.runs, w.held, inputs.merged_spans(pressed), w.notes, why)
+            if w.settings.held_out and not w.held:
+                raise NothingToJudge("the recordings kept out do nothing but press against an end of a joint's motion")
+
+    def _without_pushes(self) -> None:
+        """The runs without the stretches in which something outside pushes."""
+        w = self.w
+        fitted = [i for i in range(len(w.runs)) if i not in w.held]
+        self.pushes = logged_torque.find_pushes(self.mj_model, w.runs, fitted, w.settings.seed)
+        w.runs, w.held = logged_torque.without_pushes(self.pushes, w.runs, w.held, w.notes)
+        w.clock.lap("forces from outside")
+
+    # -- model
+    # -----------------------------------------------------------------------------------------------------------------
+    def model(self) -> None:
+        """A case a joint: its plant along the motion, what is kept out of the fit, the noise floor."""
+        w, s = self.w, self.w.settings
+        count = len(w.runs[0].joints)
+        w.say(f"{len(w.runs)} recordings, {sum(r.duration for r in w.runs):.0f} s, {count} joint{'s' * (count > 1)}")
+        self.cases = refined_cases(self.mj_model, w.runs, s.device, _step(w.runs), s.joints)
+        self.left_out = conclude.not_considered(self.cases, self.felt, s.allowed)
+        w.notes += cannot_be_seen(s.allowed, self.left_out) + conclude.not_fitted(self.cases)
+        if s.joints is not None:
+            self.cases = [c for c in self.cases if c.joint in s.joints]
+            if not self.cases:
+                raise UserError(
+                    f"joints: none of {', '.join(sorted(s.joints))} is in the recordings "
+                    f"({', '.join(w.runs[0].joints)})"
+                )
+        w.clock.lap("model along the motion")
+        group = conditions(w.runs)
+        drives = [json.dumps(plain(r.servo.to_dict()), sort_keys=True) for r in w.runs]
+        self.fold_groups = [sorted(set(drives)).index(x) for x in drives] if len(set(drives)) > 2 else group
+        self.parts = kept_out.split(w.runs, w.held, group, self.cases)
+        w.say(f"kept out of the fit: {self.parts.how}")
+        self.noise = Noise(*kept_out.floor(w.runs, self.cases), kept_out.floors(w.runs, self.cases)[0])
+        w.say(f"noise floor {1e3 * self.noise.floor:.2f} mrad ({self.noise.how})")
+
+    # -- search
+    # ----------------------------------------------------------------------------------------------------------------
+    def search(self) -> None:
+        """Which effects each joint has; again where what was found in one moves the others otherwise than was
+        thought."""
+        w = self.w
+        self._left = len(self.cases)  # joints that are still to be searched: they share the time
+        linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
+        if linked:
+            first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
+            if all(t is not None for t in first):
+                self._coupled_by(first)
+            w.clock.lap("model along the motion")
+        self._test_stages()
+        answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
+        if linked:
+            self._search_again(answers)
+        for search, found in answers:
+            case = search.case
+            if not case.moved:
+                w.notes.append(f"{case.joint} does not move: nothing can be said of it")
+            if found is None:
+                w.notes.append(f"{case.joint}: no stretch long enough to simulate")
+            else:
+                self.outcomes.append((case, search, found))
+        if w.limit.cut:
+            why = "it was interrupted" if w.limit.stopped else f"the limit of {w.limit.seconds:g} s"
+            joints = ", ".join(sorted(w.limit.cut))
+            w.notes.insert(
+                0,
+                f"the search of {joints} ended early ({why}): this is the best answer by then, further effects were "
+                "not looked for",
+            )
+        w.clock.lap("search")
+
+    def _begun(self, k: int, tell: Callable[[float], None]) -> JointSearch:
+        """The search of one joint, not yet run."""
+        w, case = self.w, self.cases[k]
+        deadline = w.limit.share(case.joint, min(1.0, workers(w.settings.device, len(self.cases)) / max(self._left, 1)))
+        return JointSearch(
+            case,
+            self.parts.train,
+            self.parts.span_train,
+            self.fold_groups,
+            seed=w.settings.seed + k,
+            allowed=w.settings.allowed,
+            tell=tell,
+            deadline=deadline,
+        )
+
+    def _start(self, k: int, tell: Callable[[float], None]) -> Trial | None:
+        """The joint as believed, its uncertain figures refitted; None where nothing is long enough to be simulated."""
+        search = self._begun(k, tell)
+        return search.start() if len(search.long.window) else None
+
+    def _search_of(self, k: int, tell: Callable[[float], None]) -> tuple[JointSearch, Outcome | None]:
+        """The search of one joint and its answer; None where nothing is long enough to be simulated."""
+        search, case = self._begun(k, tell), self.cases[k]
+        if len(search.long.window) == 0:
+            return search, None
+        found = search.run() if case.moved and case.joint not in self.unknown_controllers else search.without_search()
+        search.settle(found)
+        self._left -= 1
+        return search, found
+
+    def _coupled_by(self, trials: Sequence[Trial]) -> None:
+        """The cases once more, with the others' motion as these trials have it."""
+        w = self.w
+        self.cases = refine_motion_by_fits(self.mj_model, w.runs, self.cases, trials, w.settings.device, _step(w.runs))
+
+    def _search_again(self, answers: Answers) -> None:
+        """Joints that what was found in the others moves otherwise, searched once more; `answers` is changed."""
+        w = self.w
+        unsettled = [
+            k
+            for k, (search, found) in enumerate(answers)
+            if found is not None
+            and search.case.joint not in self.unknown_controllers
+            and _unsettled(found)
+        ]
+        if len(unsettled) < 2 or any(found is None for _, found in answers):
+            return
+        self._coupled_by([found.best for _, found in answers])
+        unsettled = [
+            k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), answers[k][1])
+        ]
+        self._left = len(unsettled)
+        joints = [self.cases[k].joint for k in unsettled]
+        renewed = map_joints(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
+        for k, answer in zip(unsettled, renewed, strict=True):
+            answers[k] = answer
+
+    def _test_stages(self) -> None:
+        """What recorded torque, duty and current say before any search; what they tell of friction is believed."""
+        w, p, cases = self.w, self.parts, self.cases
+        self.stages = stage_tests.tests(cases, w.runs, p.train, w.settings.seed)
+        for x in self.stages[:4]:
+            w.say(f"  {x.text}")
+        self.by_torque = logged_torque.identify_joints(
+            cases, w.runs, p.train, p.test, w.settings.seed, self.mj_model, p.span_train, p.span_test
+        )
+        self.behind = logged_torque.torque_texts(self.by_torque)
+        self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
+        w.notes += logged_torque.believe(self.by_torque)
+        self.unknown_controllers = logged_torque.unknown_controllers(self.by_torque, self.stages, w.notes)
+        for x in self.behind[:4]:
+            w.say(f"  {x}")
+        w.clock.lap("stage tests")
+
+    # -- locate, judge, report
+    # -------------------------------------------------------------------------------------------------
+    def locate(self) -> None:
+        """Where each joint's residual lives: speed, load, time since reversal, ..."""
+        seed, kept = self.w.settings.seed, self.kept
+        rng = np.random.default_rng(seed)
+        self.answers = compute.each(len(self.outcomes), lambda k: JointAnswer(*self.outcomes[k], kept))
+        for a in self.answers:
+            a.locate(rng, seed)
+
+    def judge(self) -> None:
+        """The answers on what was kept out, and what a plain model of each joint leaves of it."""
+        p = self.parts
+        for a in self.answers:
+            a.judge(self.w.m)
+        moved = [(case, search) for case, search, _ in self.outcomes if case.moved]
+
+        def judged(k: int) -> baseline.Baseline | None:
+            case, search = moved[k]
+            return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
+
+        self.plains = [b for b in compute.each(len(moved), judged) if b]
+        self.w.clock.lap("plain model")
+
+    def report(self, d: Diagnosis) -> None:
+        """The joints into a diagnosis: findings, verdict, what is handed on."""
+        w, p = self.w, self.parts
+        into_diagnosis(d, w.settings, self.answers, self.kept, self.noise, p.how, w.channel, self.plains)
+        d.data["held_out"]["not_judged"] = p.not_judged
+        if p.not_judged:
+            w.notes.append(
+                f"not judged: {', '.join(p.not_judged)}; what was kept out visits it and no recording that is fitted "
+                "does"
+            )
+        d.stages = [x.text for x in self.stages] + self.behind
+        add_behind(d, logged_torque.findings(self.by_torque, self.nothing_believed, w.runs, p.train), self.by_torque)
+        logged_torque.hand_on(self.by_torque, d, self.outcomes, p.test, p.span_test, self.stages)
+        logged_torque.claim_push(d, self.pushes)
+        d.data["unexplained"]["not_considered"] = self.left_out
+
+    def stand_in(self, d: Diagnosis) -> None:
+        """Stand-ins for joints of which something is left that no effect explains."""
+        p = self.parts
+        for case, search, outcome in self.outcomes:
+            if d.joints[case.joint]["after"] < JUDGE.unexplained * self.noise.floor:
+                continue
+            claimed = any(case.joint in f["where"]["joints"] and modelled(f) for f in d.data["findings"])
+            trial = search.polish(outcome.best if claimed else outcome.none)
+            found = handed_on.fit_stand_in(
+                case, self.w.runs, trial, p.train, p.test, p.span_train, p.span_test, self.w.settings.seed
+            )
+            if found is not None:
+                d.standins.append(found)
+                d.notes.append(found.text)
+
+    def confirm(self, d: Diagnosis) -> None:
+        """The believed, the final and the second-best hypothesis in the engine that trains; where it leaves more, the
+        sentence says so."""
+        w, s, p = self.w, self.w.settings, self.parts
+        if s.replay == "none":
+            return
+        cases, finer = (
+            [case for case, _, _ in self.outcomes],
+            [replace(case, plant=search.whole) for case, search, _ in self.outcomes],
+        )
+        try:
+            found = full_model.confirm(
+                w.m,
+                w.runs,
+                cases,
+                self._hypotheses(d),
+                p.test,
+                p.span_test,
+                self.noise.floor,
+                s.device,
+                s.replay,
+                finer=finer,
+            )
+        except UserError as error:
+            d.notes.append(f"not replayed in the engine that trains: {error}")
+            return
+        if found is None:
+            return
+        d.confirmation = found
+        d.data["held_out"]["confirmed"] = found.entry()
+        if d.data["held_out"]["error"].startswith("position"):
+            d.sentence += " " + found.text("mm" if d.data["held_out"]["error"].endswith("_m") else "mrad")
+
+    def _hypotheses(self, d: Diagnosis) -> list[full_model.Hypothesis]:
+        """What is replayed: as believed, as found, and with the first rival in the place of what it rivals."""
+        named = [f for f in d.data["findings"] if f["where"]["joints"] and modelled(f)]
+        claimed = {j for f in named for j in f["where"]["joints"]}
+        searches = {case.joint: (search, outcome) for case, search, outcome in self.outcomes}
+        none = {case.joint: search.polish(outcome.none) for case, search, outcome in self.outcomes}
+        final = none | {j: searches[j][0].polish(searches[j][1].best) for j in claimed}
+        out = [full_model.Hypothesis("believed", none)] + ([full_model.Hypothesis("found", final)] if claimed else [])
+        for f in named:
+            rivals = [a["effect"] for a in f["alternatives"]]
+            joint = f["where"]["joints"][0]
+            other = rival_of(*searches[joint], f["effect"], rivals[0]) if rivals else None
+            if other is not None:
+                return [
+                    *out,
+                    full_model.Hypothesis(f"{rivals[0]} instead", final | {joint: searches[joint][0].polish(other)}),
+                ]
+        return out
+
+
+def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str]:
+    """Of the effects that were asked for: those that this mechanism, or these recordings, cannot show."""
+    every: dict[str, Any] = TOUCH_EFFECTS | EFFECTS
+    return [
+        f"{e} cannot be seen here: {left_out[e]}; to see it: {every[e].experiment}"
+        for e in sorted(asked or ())
+        if e in left_out
+    ]
+
+
+def _unsettled(found: Outcome) -> bool:
+    """Whether a joint's search is looked at again with what was found in the others."""
+    return bool(found.best.members) or found.best.fit.loss > SEARCH.unsettled
+
+
+def _other(search: JointSearch, found: Outcome) -> bool:
+    """Whether what was fitted to a joint follows it otherwise, now that the others are known to move otherwise than was
+    thought."""
+    for trial in (found.none, found.best):
+        with search._fix(trial.members):
+            loss = float(search.fitter.loss(search.fitter.evaluate(trial.fit.params, trial.fit.x)[None])[0])
+        if abs(loss - trial.fit.loss) > SEARCH.otherwise * trial.fit.loss:
+            return True
+    return False
+
+
+def _step(runs: list[Run]) -> float:
+    """Integration step [s]: 1 ms, and no coarser than half a sampling period."""
+    period = min(float(np.median(np.diff(r.t))) for r in runs)
+    return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
+
+
+def _limits(model, runs: list[Run]) -> list[str]:
+    """Measured positions outside the model's range: the limit is taken away, and said."""
+    notes = []
+    for j, name in enumerate(runs[0].joints):
+        joint = model.joint(name).id
+        if not model.jnt_limited[joint]:
+            continue
+        low, high = model.jnt_range[joint]
+        mn, mx = min(r.q[:, j].min() for r in runs), max(r.q[:, j].max() for r in runs)
+        margin = 0.02 * (high - low) + 0.01
+        if mn < low - margin or mx > high + margin:
+            notes.append(
+                f"{name} moved {mn:.3g} to {mx:.3g}, beyond the model's range {low:.3g} to {high:.3g} (degrees for "
+                "radians in the"
+                " model, another zero, or another joint?); the range is not used"
+            )
+            model.jnt_limited[joint] = 0
+    return notes

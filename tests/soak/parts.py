@@ -125,8 +125,8 @@ def diagnoses(count: float, folder: Path) -> str:
     searches among all effects, the others among three."""
     from dexsim.gap import demo
     from dexsim.gap.diagnosis import diagnose
+    from dexsim.gap.inquiry import Settings
     from dexsim.gap.report.files import save
-    from dexsim.gap.result import Settings
     from dexsim.sim.quiet import quiet_warp
 
     warnings.simplefilter("ignore")

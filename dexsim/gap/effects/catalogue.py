@@ -11,41 +11,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dexsim.gap.effects.backlash import Backlash
-from dexsim.gap.effects.braking_limit import BrakingLimit
-from dexsim.gap.effects.command_delay import CommandDelay
-from dexsim.gap.effects.compliance import Compliance
-from dexsim.gap.effects.contact_friction import ContactFriction
-from dexsim.gap.effects.contact_stiffness import ContactStiffness
-from dexsim.gap.effects.controller_term import ControllerTerm
-from dexsim.gap.effects.coulomb_friction import CoulombFriction
-from dexsim.gap.effects.current_sensor import CurrentSensor
-from dexsim.gap.effects.deadband import Deadband
+from dexsim.gap.effects.body import ExternalForce, Inertia, JointSpring, Payload
+from dexsim.gap.effects.drive import (
+    BrakingLimit,
+    ControllerTerm,
+    Deadband,
+    GainMismatch,
+    SupplySag,
+    Thermal,
+    TorqueLimit,
+    TorqueSpeedLimit,
+)
 from dexsim.gap.effects.effect import SLOW, Effect, TouchEffect, Variant
-from dexsim.gap.effects.external_force import ExternalForce
-from dexsim.gap.effects.gain_mismatch import GainMismatch
-from dexsim.gap.effects.inertia import Inertia
-from dexsim.gap.effects.joint_coupling import JointCoupling
-from dexsim.gap.effects.joint_spring import JointSpring
-from dexsim.gap.effects.lag import Lag
-from dexsim.gap.effects.load_friction import LoadFriction
-from dexsim.gap.effects.payload import Payload
-from dexsim.gap.effects.position_offset import PositionOffset
-from dexsim.gap.effects.position_scale import PositionScale
-from dexsim.gap.effects.presliding import Presliding
-from dexsim.gap.effects.stribeck_friction import StribeckFriction
-from dexsim.gap.effects.supply_sag import SupplySag
-from dexsim.gap.effects.tactile_crosstalk import TactileCrosstalk
-from dexsim.gap.effects.tactile_delay import TactileDelay
-from dexsim.gap.effects.tactile_drift import TactileDrift
-from dexsim.gap.effects.tactile_gain import TactileGain
-from dexsim.gap.effects.tactile_hysteresis import TactileHysteresis
-from dexsim.gap.effects.tactile_stiffening import TactileStiffening
-from dexsim.gap.effects.thermal import Thermal
-from dexsim.gap.effects.torque_limit import TorqueLimit
-from dexsim.gap.effects.torque_ripple import TorqueRipple
-from dexsim.gap.effects.torque_speed_limit import TorqueSpeedLimit
-from dexsim.gap.effects.viscous_friction import ViscousFriction
+from dexsim.gap.effects.friction import CoulombFriction, LoadFriction, Presliding, StribeckFriction, ViscousFriction
+from dexsim.gap.effects.signals import CommandDelay, CurrentSensor, Lag, PositionOffset, PositionScale
+from dexsim.gap.effects.touch import (
+    ContactFriction,
+    ContactStiffness,
+    TactileCrosstalk,
+    TactileDelay,
+    TactileDrift,
+    TactileGain,
+    TactileHysteresis,
+    TactileStiffening,
+)
+from dexsim.gap.effects.transmission import Backlash, Compliance, JointCoupling, TorqueRipple
 from dexsim.gap.rules import JUDGE
 
 if TYPE_CHECKING:

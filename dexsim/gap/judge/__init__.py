@@ -1,1 +1,1 @@
-"""Step 5: held-out errors, confidence, findings and the verdict."""
+"""Step 5: what is kept out, errors on it, confidence, findings, the verdict, and what is handed on to training."""

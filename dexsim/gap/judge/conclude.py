@@ -1,24 +1,26 @@
-"""From the search's answers to the diagnosis: findings with their doubts, the verdict, the fitted servo and model."""
+"""From the search's answers to the diagnosis: findings with their doubts, the verdict, the fitted servo and model, what
+was not considered."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from dexsim.gap import locate
-from dexsim.gap.effects.catalogue import EFFECTS, entry
-from dexsim.gap.judge import confidence, errors, verdict
-from dexsim.gap.judge.findings import earned, model_changes, servo_changes, widen
+from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry
+from dexsim.gap.inquiry import Diagnosis, Settings, TouchResult
+from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
-from dexsim.gap.result import Diagnosis, Settings
 from dexsim.gap.rules import JUDGE, SEARCH
 from dexsim.gap.search import baseline
+from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
 
@@ -108,7 +110,7 @@ def into_diagnosis(
         data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}
-    verdict.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
+    kept_out.settle([f for f in findings if not EFFECTS[f["effect"]].effort_only], quiet)
     findings.sort(key=lambda f: f.get("hint", False))
     data["findings"] = sorted(channel, key=lambda f: -f["confidence"]) + findings
     _verdict(d, answers, kept, findings, refuted, noise.floor, how, s.seed, len(quiet) == len(answers))
@@ -191,8 +193,8 @@ def _verdict(
 ) -> None:
     """Errors over all joints on what was kept out, and the word for it."""
     data, times = d.data, [a.t for a in answers]
-    b, bl, bh = errors.rms_interval([a.before for a in answers], times, seed)
-    a, al, ah = errors.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
+    b, bl, bh = kept_out.rms_interval([a.before for a in answers], times, seed)
+    a, al, ah = kept_out.rms_interval([x.before if x.case.joint in refuted else x.after for x in answers], times, seed)
     slide = all(x.case.constants.slide for x in answers)
     data["held_out"] = {
         "recordings": [kept.runs[i].name for i in kept.test],
@@ -208,7 +210,7 @@ def _verdict(
     structured = any(
         x.outcome.none.fit.loss > JUDGE.within**2 and (len(x.outcome.scanned) > 0 or x.case.moved) for x in answers
     )
-    data["verdict"] = verdict.verdict(data["findings"], floor, b, bl, a, structured, quiet)
+    data["verdict"] = kept_out.verdict(data["findings"], floor, b, bl, a, structured, quiet)
     findings = [f for f in findings if f["confidence"] >= JUDGE.firm]
     if findings and all(EFFECTS[f["effect"]].effort_only for f in findings):
         data["verdict"] = "explained"
@@ -356,3 +358,63 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
         data["verdict"] = "partly_explained" if a < 0.7 * b else "unknown"
         data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
+
+
+# -- what is not considered -------------------------------------------------------------------------------------------
+# Effects that are not considered, each with the reason: what the mechanism has not, or the recordings do not carry.
+
+
+def not_considered(cases: Sequence, felt: TouchResult, allowed: Collection[str] | None) -> dict[str, str]:
+    """Effect id -> why it was not considered on any joint or pad (or on which), in the catalogue's order.
+
+    cases: `plant.case.Case`."""
+    out: dict[str, str] = {}
+    moved = [c for c in cases if c.moved]
+    for e, x in EFFECTS.items():
+        if allowed is not None and e not in allowed:
+            out[e] = "not asked for (effects=)"
+            continue
+        if not moved:
+            out[e] = "no joint is judged" if not cases else "no joint moves"
+            continue
+        given = {c.joint: x.unseen(c.scales) for c in moved}
+        lacking = {j: r for j, r in given.items() if r}
+        if not lacking:
+            continue
+        first = next(iter(lacking.values()))
+        if len(lacking) == len(given):
+            same = all(r == first for r in lacking.values())
+            out[e] = first if same else "; ".join(f"{j}: {r}" for j, r in lacking.items())
+        else:
+            out[e] = "; ".join(f"on {j}: {r}" for j, r in lacking.items())
+    touch = (
+        "no /tactile is recorded"
+        if not felt.tactile
+        else "nothing is touched"
+        if not felt.contact
+        else "no force could be predicted"
+        if felt.before is None
+        else ""
+    )
+    for e in TOUCH_EFFECTS:
+        if e in EFFECTS:
+            continue
+        if allowed is not None and e not in allowed:
+            out[e] = "not asked for (effects=)"
+        elif touch and not any(f["effect"] == e for f in felt.findings):
+            out[e] = touch
+    return out
+
+
+def not_fitted(cases: Sequence) -> list[str]:
+    """Columns that the servo's file says are unknown and that are not refitted, by joints: what is done instead."""
+    by: dict[str, list[str]] = {}
+    for c in cases:
+        for name in c.unknown:
+            if unknown(name, c.scales) is None:
+                by.setdefault(name, []).append(c.joint)
+    return [
+        f"{name} is unknown on {', '.join(joints)} and cannot be fitted to these recordings by itself: it is taken as "
+        "absent"
+        for name, joints in by.items()
+    ]

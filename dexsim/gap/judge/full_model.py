@@ -25,8 +25,8 @@ from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import model_columns
-from dexsim.gap.judge.errors import free_run
-from dexsim.gap.judge.findings import columns_beside, handed, model_changes, moved_friction, undamped
+from dexsim.gap.judge.handed_on import columns_beside, handed, model_changes, moved_friction, undamped
+from dexsim.gap.judge.kept_out import free_run
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run

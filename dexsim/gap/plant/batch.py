@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from dexsim.gap import parallel
+from dexsim.gap import compute
 from dexsim.gap.plant import kernel as pk
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants, on_lines
@@ -415,7 +415,7 @@ class JointPlant:
                 device="cpu",
             )
 
-        parallel.run(launch, parallel.parts(steps, H))
+        compute.run(launch, compute.parts(steps, H))
 
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""

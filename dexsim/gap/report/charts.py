@@ -1,11 +1,15 @@
-"""Small charts as inline SVG text: curves, bars, intervals, time strips. The mechanism's picture is in `picture.py`."""
+"""Small charts as inline SVG text (curves, bars, intervals, time strips), and a picture of the mechanism."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
 
+import mujoco
 import numpy as np
+
+from dexsim.tactile.sensors import Sensors
 
 GRID, INK, SOFT = "#e6e9ee", "#333", "#8a94a3"
 BEFORE, AFTER, COMMAND, FLOOR = "#d1495b", "#1768ac", "#b8c0ca", "#9aa5b1"
@@ -206,3 +210,258 @@ def ratios(rows: Sequence[tuple[str, float, float, float]], width: int = 980, le
     )
     out.append(text(x(1), height - 4, "as elsewhere (1)", "middle"))
     return "".join(out) + "</svg>"
+
+
+# -- a picture of the mechanism ---------------------------------------------------------------------------------------
+# A picture of the mechanism as inline SVG: outlines of its links, joints coloured by error, taxels where they sit.
+
+PALE, HOT = (247, 243, 236), (196, 38, 46)
+UNKNOWN = 12  # taxels drawn in a column where no lattice is known
+
+
+def pad(error: np.ndarray, marked: set[int], lattice: tuple[int, int] | None, size: float = 15.0) -> str:
+    """One pad's taxels [K] N as its lattice of (columns, rows), rows from the joint (below) to the tip, coloured by
+    error; the marked ringed. Without a lattice in rows of twelve, by number."""
+    columns, rows = lattice or (-(-len(error) // UNKNOWN), UNKNOWN)
+    error = error[: columns * rows]  # a smaller pad's end before the largest's
+    most = max(float(error.max()), 1e-9)
+    width, height = columns * size + 2, rows * size + 2
+    out = [
+        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="error '
+        'of each taxel">'
+    ]
+    for k, e in enumerate(error):
+        c, r = divmod(k, rows)
+        x, y = 1 + c * size, 1 + (rows - 1 - r) * size
+        ring = f' stroke="{INK}" stroke-width="2"' if k in marked else ' stroke="#fff" stroke-width="1"'
+        out.append(
+            f'<rect x="{x + 1:g}" y="{y + 1:g}" width="{size - 2:g}" height="{size - 2:g}" rx="2" '
+            f'fill="{heat(e / most)}"{ring}><title>taxel {k}: {1e3 * e:.0f} mN</title></rect>'
+        )
+    return "".join(out) + "</svg>"
+
+
+def heat(share: float) -> str:
+    """Colour of an error, as a share of the largest."""
+    share = float(np.clip(share, 0.0, 1.0)) ** 0.7
+    return "#" + "".join(f"{int(a + share * (b - a)):02x}" for a, b in zip(PALE, HOT, strict=True))
+
+
+def scale(most: float, unit: str, width: int = 360) -> str:
+    """The colours' scale: from none to the largest error `most`, in thousandths of the position's unit."""
+    left, right, steps = 60, width - 96, 24
+    part = (right - left) / steps
+    out = [
+        f'<svg viewBox="0 0 {width} 20" role="img" aria-label="colours of the error">',
+        text(left - 8, 14, "0", "end"),
+    ]
+    out += [
+        f'<rect x="{left + k * part:.1f}" y="4" width="{part + 0.5:.1f}" height="11" fill="{heat((k + 0.5) / steps)}"/>'
+        for k in range(steps)
+    ]
+    return "".join(out) + text(right + 8, 14, f"{number(1e3 * most)} {unit}") + "</svg>"
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarray:
+    """Points [n, 3] whose hull is the geom, world frame."""
+    kind, size = int(model.geom_type[g]), model.geom_size[g]
+    if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
+        m = model.geom_dataid[g]
+        p = model.mesh_vert[model.mesh_vertadr[m] : model.mesh_vertadr[m] + model.mesh_vertnum[m]].astype(float)
+    elif kind == int(mujoco.mjtGeom.mjGEOM_PLANE):
+        return np.zeros((0, 3))
+    else:
+        u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13)[:-1], np.linspace(0, np.pi, 7))
+        ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], -1).reshape(-1, 3)
+        if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
+            p = ball * size[0]
+        elif kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+            p = np.concatenate([ball * size[0] + [0, 0, size[1]], ball * size[0] - [0, 0, size[1]]])
+        elif kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER):
+            ring = np.stack([np.cos(u[0]), np.sin(u[0]), 0 * u[0]], -1) * size[0]
+            p = np.concatenate([ring + [0, 0, size[1]], ring - [0, 0, size[1]]])
+        elif kind == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+            p = ball * size
+        else:
+            p = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * size
+    return p @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+
+
+def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
+    """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side
+    stands."""
+    centred = cloud - cloud.mean(0)
+    _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=True)
+    front = axes[2]
+    if facing is not None and abs(front @ facing) > 0.2:
+        front = front * np.sign(front @ facing)
+    up = np.array([0.0, 0.0, 1.0]) - front * front[2]
+    if np.linalg.norm(up) < 0.6:  # seen from above or below
+        up = axes[0] * (1 if axes[0][int(np.argmax(np.abs(axes[0])))] > 0 else -1)
+    up = up / np.linalg.norm(up)
+    return np.stack([np.cross(up, front), up, front])
+
+
+@dataclass
+class _Drawing:
+    """A model at its own pose as seen from one side: where a point [.., 3] m lies on a picture of width x height, its
+    links' `shapes` (number of the geom, corners [n, 3]) and the `pads` (number of the finger, taxels [K, 3]) that it
+    carries."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    shapes: list[tuple[int, np.ndarray]]
+    pads: list[tuple[int, np.ndarray]]
+    axes: np.ndarray
+    scale: float  # of the picture per m
+    middle: np.ndarray
+    width: int
+    height: int
+
+    def at(self, p: np.ndarray) -> np.ndarray:
+        """[n, 2] of the picture."""
+        u = (np.atleast_2d(p) @ self.axes.T)[:, :2]
+        x, y = (u[:, k] - self.middle[k] for k in (0, 1))
+        return np.stack([self.width / 2 + x * self.scale, self.height / 2 - y * self.scale], 1)
+
+
+def _drawing(
+    model: mujoco.MjModel, sensors: Sensors, joints: list[int], touch_alone: bool, width: int, height: int
+) -> _Drawing | None:
+    """The model seen from where its motion shows best, filling the picture; None where there is nothing to see."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    groups = [g for g in range(model.ngeom) if int(model.geom_group[g]) <= 2] or list(range(model.ngeom))
+    shapes = [(g, _corners(model, data, g)) for g in groups]
+    shapes = [(g, p) for g, p in shapes if len(p) >= 4]
+    if touch_alone and shapes:  # what is small beside the rest is no part of the picture
+        most = max(float(np.ptp(p, axis=0).max()) for _, p in shapes)
+        shapes = [(g, p) for g, p in shapes if float(np.ptp(p, axis=0).max()) > 0.15 * most]
+    cloud = np.concatenate([*[p for _, p in shapes], data.xanchor[joints].reshape(-1, 3)])
+    if len(cloud) < 3:
+        return None
+    pads = []
+    facing = None
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    layout = sensors.layout
+    for f, body in enumerate(() if layout is None else layout.bodies):
+        if body in bodies:
+            b, n = data.body(body), layout.count[f]
+            R = b.xmat.reshape(3, 3)
+            pads.append((f, layout.point[f, :n] @ R.T + b.xpos))
+            facing = (0 if facing is None else facing) + (layout.normal[f, :n] @ R.T).mean(0)
+    axes = _view(cloud, facing)
+    flat = cloud @ axes.T
+    low, high = flat[:, :2].min(0), flat[:, :2].max(0)
+    scale = min((width - 60) / max(high[0] - low[0], 1e-6), (height - 60) / max(high[1] - low[1], 1e-6))
+    return _Drawing(model, data, shapes, pads, axes, scale, 0.5 * (low + high), width, height)
+
+
+def mechanism(
+    model: mujoco.MjModel,
+    sensors: Sensors,
+    error: dict[str, float],
+    found: set[str],
+    taxels: np.ndarray | None = None,
+    marked: Set[str] = frozenset(),
+    unit: str = "mrad",
+    width: int = 360,
+    height: int = 400,
+) -> str:
+    """The links' outlines; a disc at each joint that has an error [by name], coloured by it, ringed and named where
+    found. taxels [F, K]: error of each taxel (`marked`: "f:k" ringed), drawn where the model
+    carries the pads of `sensors`."""
+    names = [model.joint(i).name for i in range(model.njnt)]
+    joints = [i for i, n in enumerate(names) if n in error]
+    drawing = _drawing(model, sensors, joints, not error, width, height)
+    if drawing is None:
+        return ""
+    hot = {int(model.jnt_bodyid[i]) for i in joints if names[i] in found}
+    out = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="the mechanism, coloured by error">']
+    out += [*_outlines(drawing, hot), *_links(drawing, joints)]
+    if taxels is not None:
+        out += _taxels(drawing, taxels, marked)
+    most = max([*error.values(), 1e-12])
+    out += _discs(drawing, {i: (names[i], error[names[i]]) for i in joints}, most, found, unit)
+    return "".join(out) + "</svg>"
+
+
+def _outlines(d: _Drawing, hot: set[int]) -> list[str]:
+    """The links from the farthest to the nearest, those of `hot` bodies in another colour."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    out = []
+    for g, p in sorted(d.shapes, key=lambda s: float((s[1] @ d.axes[2]).mean())):
+        xy = d.at(p)
+        try:
+            xy = xy[ConvexHull(xy).vertices]
+        except QhullError:
+            continue
+        fill = "#f4d9c0" if int(d.model.geom_bodyid[g]) in hot else "#e3e8ee"
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in xy)
+        out.append(
+            f'<polygon points="{points}" fill="{fill}" stroke="#aeb8c4" stroke-width="0.8" stroke-linejoin="round"/>'
+        )
+    return out
+
+
+def _links(d: _Drawing, joints: list[int]) -> list[str]:
+    """Lines from joint to joint, so that a mechanism without shapes still shows."""
+    out = []
+    for i in joints:
+        parent = int(d.model.body_parentid[int(d.model.jnt_bodyid[i])])
+        while parent:
+            inside = [k for k in joints if int(d.model.jnt_bodyid[k]) == parent]
+            if inside:
+                a, b = d.at(d.data.xanchor[inside[-1]])[0], d.at(d.data.xanchor[i])[0]
+                out.append(
+                    f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#8f9baa" '
+                    'stroke-width="2"/>'
+                )
+                break
+            parent = int(d.model.body_parentid[parent])
+    return out
+
+
+def _taxels(d: _Drawing, taxels: np.ndarray, marked: Set[str]) -> list[str]:
+    """The taxels of the pads, coloured by their error [F, K] N; ringed where `marked`."""
+    out = []
+    most = max(float(taxels.max()), 1e-9)
+    for f, p in d.pads:
+        for k, (x, y) in enumerate(d.at(p)):
+            mark = f' stroke="{INK}" stroke-width="1"' if f"{f}:{k}" in marked else ""
+            size = 2.2 if d.scale < 4000 else 5.0
+            out.append(
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
+                f'fill="{heat(taxels[f, k] / most)}"{mark}><title>taxel {f}:{k}: {1e3 * taxels[f, k]:.0f} '
+                'mN</title></circle>'
+            )
+    return out
+
+
+def _discs(
+    d: _Drawing, joints: dict[int, tuple[str, float]], most: float, found: set[str], unit: str
+) -> list[str]:
+    """A disc at each joint (number -> name, error), coloured by its error of `most`, ringed and named where found."""
+    out, labels = [], []
+    for i, (name, small) in joints.items():
+        (x, y) = d.at(d.data.xanchor[i])[0]
+        ring = (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{INK}" stroke-width="2"/>'
+            if name in found
+            else ""
+        )
+        out.append(
+            f'{ring}<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="{heat(small / most)}" '
+            f'stroke="{SOFT}"><title>{html.escape(name)}: {1e3 * small:.3g} {unit}</title></circle>'
+        )
+        if name in found:
+            labels.append((x, y, name))
+    for x, y, name in labels:
+        side = "end" if x > 0.62 * d.width else "start"
+        dx = -17 if side == "end" else 17
+        out.append(
+            '<g stroke="#fff" stroke-width="3" '
+            f'paint-order="stroke">{text(x + dx, y + 4, name, side, 12, INK, 600)}</g>'
+        )
+    return out

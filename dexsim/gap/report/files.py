@@ -1,4 +1,4 @@
-"""A diagnosis as files: diagnosis.json, details.json, report.html, servo.yaml and the rest."""
+"""A diagnosis as files: diagnosis.json, details.json, servo.yaml and the rest, and report.html by its sections."""
 
 from __future__ import annotations
 
@@ -6,18 +6,27 @@ import copy
 import html
 import json
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from dexsim import outputs
-from dexsim.gap.judge import residual_fit
-from dexsim.gap.judge.findings import MODEL_FILES, save_model
-from dexsim.gap.result import Diagnosis
-from dexsim.gap.touch import handed_on as touch_handed
+from dexsim.gap.effects.catalogue import entry
+from dexsim.gap.inquiry import Diagnosis
+from dexsim.gap.judge import handed_on
+from dexsim.gap.judge.full_model import TASKS
+from dexsim.gap.judge.handed_on import MODEL_FILES, save_model
+from dexsim.gap.report import charts
+from dexsim.gap.report.charts import mechanism, number, pad, scale
+from dexsim.gap.report.sentence import place, spoken, words_of
+from dexsim.gap.search import baseline
+from dexsim.gap.touch.diagnosis import handed, save_tactile
 
 
 def save(d: Diagnosis, out: Path) -> list[Path]:
@@ -30,12 +39,12 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
         if d.servo is not None:
             d.servo.save(stage / "servo.yaml")
             names.append("servo.yaml")
-        if d.touch is not None and touch_handed.save(
-            touch_handed.handed(d.touch.findings, d.touch.facts, d.touch.names), stage / "tactile.yaml"
+        if d.touch is not None and save_tactile(
+            handed(d.touch.findings, d.touch.facts, d.touch.names), stage / "tactile.yaml"
         ):
             names.append("tactile.yaml")
         if d.standins and d.servo is not None:
-            residual_fit.write(d.servo, d.standins, stage / "servo_standin.yaml")
+            handed_on.write_stand_in(d.servo, d.standins, stage / "servo_standin.yaml")
             names.append("servo_standin.yaml")
         if d.model_spec is not None:
             try:
@@ -60,8 +69,6 @@ def save(d: Diagnosis, out: Path) -> list[Path]:
 
 def _page(d: Diagnosis) -> str:
     """The page. It is drawn from an answer that may have taken an hour: a fault in the drawing must not lose that."""
-    from dexsim.gap.report.sections import page
-
     try:
         return page(d)
     except Exception:
@@ -120,3 +127,421 @@ def plain(x: Any) -> Any:
     if isinstance(x, np.integer):
         return int(x)
     return x
+
+
+# -- report.html ------------------------------------------------------------------------------------------------------
+# report.html: one page that stands alone, read in a minute. Its figures are inline SVG: no script, no network, no font.
+#
+# A class and a template each section: the class says what is shown, as plain values and charts, the template
+# (`templates/`) how it looks.
+
+VERDICTS = {
+    "explained": ("Explained", "good"), "partly_explained": ("Partly explained", "warn"), "unknown": ("Unknown", "bad"),
+    "none": ("Nothing missing", "good"), "unusable": ("Cannot be judged", "bad"),
+}  # fmt: skip
+FLOORS = {
+    "repeats": "repeats of the same commands",
+    "split": "the scatter of single samples",
+    "quantum": "the encoder's step",
+}
+MOST = 6  # joints beside the picture; the rest is in the details
+ENVIRONMENT = Environment(
+    loader=PackageLoader("dexsim.gap.report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+class Section(ABC):
+    """A section of the page."""
+
+    template: ClassVar[str]
+
+    def __init__(self, d: Diagnosis):
+        self.d = d
+        self.held_out = d.data["held_out"]
+        self.unit = "mm" if self.held_out["error"].endswith("_m") else "mrad"  # of positions
+
+    @abstractmethod
+    def values(self) -> dict[str, Any] | None:
+        """What its template is given; None where it is not shown."""
+
+
+class Hero(Section):
+    """The verdict and its sentence."""
+
+    template = "hero.html"
+
+    def values(self) -> dict[str, Any]:
+        d, h = self.d, self.held_out
+        word, tone = VERDICTS[d.data["verdict"]]
+        said, replayed = d.sentence, ""
+        if d.confirmation is not None:
+            text = d.confirmation.text(unit_of(h["error"])[0])
+            if said.endswith(text):
+                said, replayed = said[: -len(text)].rstrip(), text
+        kept = h.get("how") or ", ".join(h["recordings"])
+        return {
+            "word": word,
+            "tone": tone,
+            "said": said,
+            "replayed": replayed,
+            "judged": h["before"] is not None,
+            "kept": kept,
+        }
+
+
+class Where(Section):
+    """The mechanism coloured by its error, the error before and after, the joints and pads with the largest."""
+
+    template = "where.html"
+
+    def values(self) -> dict[str, Any] | None:
+        d = self.d
+        if d.mechanism is None or not (d.joints or d.touch is not None):
+            return None
+        named = {j for f in d.data["findings"] for j in f["where"]["joints"]}
+        marked = {
+            t
+            for f in d.data["findings"]
+            if "taxels" in f["parameters"]
+            for t in f["where"]["taxels"]
+            if len(f["where"]["taxels"]) <= 40
+        }
+        taxels = d.touch.error if d.touch is not None else None
+        before = {j: v["before"] for j, v in d.joints.items()}
+        height = 400 if d.joints else 240
+        m, words = d.mechanism, []
+        picture = mechanism(m.spec.compile(), m.sensors, before, named, taxels, marked, self.unit, height=height)
+        if d.joints:
+            words.append("Joints by their error before; ringed where something was found.")
+            picture += scale(max(before.values()), self.unit)
+        if taxels is not None:
+            words.append(
+                "The lattices are the pads' taxels, tip above, coloured by their error before; ringed where they are "
+                "named."
+            )
+        several = len(d.joints) + (len(d.touch.pads) if d.touch else 0) > 1
+        spots = (
+            _ratios(d, ((4, "position"), (2, "effort")), len(d.joints) > 1, 560, 250)
+            if len(d.joints) <= 2 and d.spots
+            else None
+        )
+        return {
+            "picture": Markup(picture),
+            "pads": None if taxels is None else self._pads(taxels, marked),
+            "words": " ".join(words),
+            "joints": len(d.joints) if self.unit_shown in ("mrad", "mm") else 0,
+            "bars": self._bars(),
+            "rows": _rows(d, self.unit, MOST) if several else [],
+            "more": max(len(d.joints) - MOST, 0),
+            "spots": spots,
+        }
+
+    @property
+    def unit_shown(self) -> str:
+        """Unit of the error on what was kept out."""
+        return unit_of(self.held_out["error"])[0]
+
+    def _pads(self, taxels: np.ndarray, marked: set[str]) -> list[dict[str, Any]]:
+        out = []
+        for name in list(self.d.touch.pads)[:3]:
+            number_ = self.d.touch.names.index(name)
+            ringed = {int(t.split(":")[1]) for t in marked if int(t.split(":")[0]) == number_}
+            lattice = self.d.mechanism.sensors.lattice(number_)
+            out.append({"name": name, "map": Markup(pad(taxels[number_], ringed, lattice))})
+        return out
+
+    def _bars(self) -> dict[str, Any] | None:
+        """The error before and after beside the noise floor."""
+        d, h = self.d, self.held_out
+        if h["before"] is None:
+            return None
+        unit, k = unit_of(h["error"])
+        scaled = lambda *x: tuple(None if v is None else k * v for v in x)  # noqa: E731
+        rows = [("before", *scaled(h["before"], h["before_low"], h["before_high"]), charts.BEFORE)]
+        if any(f["effect"] != "bad_channel" for f in d.data["findings"]):
+            rows.append(("after", *scaled(h["after"], h["after_low"], h["after_high"]), charts.AFTER))
+        plain = d.data["baseline"] if h["error"].startswith("position") else {}
+        if plain:
+            rows.append(("plain model", k * plain["error"], None, None, charts.FLOOR))
+        floor, touched = d.data["noise_floor"], h["error"].startswith("tactile")
+        value = floor.get("tactile_N") if touched else floor["position_rad"] if unit in ("mrad", "mm") else None
+        if value is not None:
+            rows.append(("noise floor", k * value, None, None, charts.FLOOR))
+        how = "the counts of the taxels" if touched else FLOORS[floor["how"]]
+        return {"chart": Markup(charts.bars(rows, unit)), "plain": baseline.text(plain, unit), "floor": how}
+
+
+class Findings(Section):
+    """What is missing, a card each, and the hints; or what came nearest."""
+
+    template = "findings.html"
+
+    def values(self) -> dict[str, Any] | None:
+        cards = [(f.get("hint", False), self._card(f)) for f in self.d.data["findings"]]
+        sure, hints = ([card for hint, card in cards if hint is kind] for kind in (False, True))
+        nearest = [] if sure else self._nearest()
+        return {"sure": sure, "hints": hints, "nearest": nearest} if sure or hints or nearest else None
+
+    def _card(self, f: dict[str, Any]) -> dict[str, Any]:
+        """One finding."""
+        e, h = entry(f), f["held_out"]
+        where = place(f, self.d.mechanism)
+        unit, k = unit_of(self._metric(f)) if h else ("", 1.0)
+        doubtful = f["indistinguishable"] or f.get("hint")
+        return {
+            "kind": "bad" if f["effect"] == "bad_channel" else "set" if doubtful else "",
+            "name": _name(f["effect"]),
+            "where": where,
+            "confidence": f"{100 * f['confidence']:.0f}",
+            "words": f"{_capital(spoken(f, self.d.mechanism))} {words_of(f, self.d.mechanism)}; it shows {f['regime']}."
+            if e is not None
+            else f"{where}: {f['regime']}.",
+            "parameters": [_parameter(key, p) for key, p in f["parameters"].items() if p["value"] is not None],
+            "strip": self._strip(f),
+            "before": number(k * h["before"]) if h else "",
+            "after": number(k * h["after"]) if h else "",
+            "unit": unit,
+        } | self._lost(f)
+
+    def _metric(self, f: dict[str, Any]) -> str:
+        """The metric of a finding's held-out error."""
+        if not f["where"]["joints"]:
+            return "tactile_rmse_N"
+        if (e := entry(f)) is not None and e.effort_only:
+            return "effort_rmse_Nm"
+        h = self.held_out["error"]
+        return h if not h.startswith("tactile") else "position_rmse_rad"
+
+    def _strip(self, f: dict[str, Any]) -> Markup | None:
+        """When it acts, a line for each of the first recordings."""
+        rows = []
+        for name in list(dict.fromkeys(w["recording"] for w in f["when"]))[:4]:
+            spans = [(w["start"], w["end"]) for w in f["when"] if w["recording"] == name]
+            every = [w["end"] for g in self.d.data["findings"] for w in g["when"] if w["recording"] == name]
+            rows.append((name, max(self.d.lengths.get(name, 0.0), *every), spans))
+        return Markup(charts.strips(rows)) if rows else None
+
+    def _lost(self, f: dict[str, Any]) -> dict[str, Any]:
+        """The runner-up and why it lost, or the set that cannot be told apart."""
+        rivals = [a for a in f["alternatives"] if a["confidence"] >= 0.005]
+        out: dict[str, Any] = dict.fromkeys(
+            ("set", "separating", "lone", "open", "rival", "then", "wins", "replayed"), ""
+        )
+        if f["indistinguishable"]:
+            return out | {
+                "set": " and ".join(_name(x) for x in f["indistinguishable"]),
+                "separating": f["separating_experiment"],
+            }
+        if not f["held_out"]:  # found before any fit: a signal, or a push from outside
+            return out
+        if not rivals:
+            return out | {"lone": True}
+        first, *rest = rivals
+        return out | {
+            "rival": _name(first["effect"]),
+            "wins": f"{100 * first['confidence']:.0f}",
+            "open": first["confidence"] > f["confidence"],
+            "then": ", ".join(_name(a["effect"]) for a in rest),
+            "replayed": self._replayed(first["effect"]),
+        }
+
+    def _replayed(self, effect: str) -> str:
+        """What the runner-up leaves in the engine that trains, where it was replayed there."""
+        errors = self.d.confirmation.errors if self.d.confirmation is not None else {}
+        if f"{effect} instead" not in errors or "found" not in errors:
+            return ""
+        rival, found = (number(1e3 * errors[name][0]) for name in (f"{effect} instead", "found"))
+        return f"Over all joints, in the engine that trains, it leaves {rival} {self.unit}, the finding {found}."
+
+    def _nearest(self) -> list[dict[str, str]]:
+        """The effects that a search priced highest and did not find."""
+        scanned = sorted(((o.joint, *x) for o in self.d.outcomes for x in o.scanned), key=lambda r: -r[2])[:5]
+        return [
+            {"joint": j, "effect": _name(e), "gain": f"{100 * gain:.1f}", "chance": f"{p:.2f}"}
+            for j, e, gain, p in scanned
+        ]
+
+
+class Curves(Section):
+    """Measured beside simulated, where the error before is largest."""
+
+    template = "curves.html"
+
+    def values(self) -> dict[str, Any] | None:
+        d = self.d
+        found = {j for f in d.data["findings"] for j in f["where"]["joints"]}
+        order = sorted(d.curves, key=lambda c: (c.joint not in found, -d.joints[c.joint]["before"]))
+        felt = d.touch.curves[:3] if d.touch is not None else []
+        joints, pads = (
+            [self._joint(c, c.joint in found) for c in order[: max(1, min(3, len(found)))]],
+            [self._pad(c) for c in felt],
+        )
+        if not joints and not pads:
+            return None
+        grey = "command" if joints else "load cell" if any(c.load is not None for c in felt) else ""
+        return {"joints": joints, "pads": pads, "grey": grey, "unit": self.unit}
+
+    def _joint(self, c: Any, found: bool) -> dict[str, Any]:
+        d = self.d
+        mine = [f for f in d.data["findings"] if c.joint in f["where"]["joints"]]
+        spans = [(w["start"], w["end"]) for f in mine for w in f["when"] if w["recording"] == c.recording]
+        svg = charts.curves(c.t, c.measured, c.before, c.after if found else None, c.command, self.unit[1:], spans)
+        before, after = (f"{1e3 * d.joints[c.joint][k]:.3g}" for k in ("before", "after"))
+        return {"chart": Markup(svg), "name": c.joint, "recording": c.recording, "before": before, "after": after}
+
+    def _pad(self, c: Any) -> dict[str, Any]:
+        after = c.after if np.abs(c.after - c.before).max() > 1e-9 else None
+        svg = charts.curves(c.t, c.measured, c.before, after, c.load, "N")
+        return {"chart": Markup(svg), "name": c.pad, "recording": c.recording, "load": c.load is not None}
+
+
+class Next(Section):
+    """What to record next."""
+
+    template = "next.html"
+
+    def values(self) -> dict[str, Any] | None:
+        data, n = self.d.data, self.d.data["next_recording"]
+        if n:
+            return {"why": n["why"][:1].upper() + n["why"][1:], "commands": n["commands"]}
+        sure = data["verdict"] in ("explained", "none") and not any(f["indistinguishable"] for f in data["findings"])
+        return {"why": "", "commands": ""} if sure else None
+
+
+class Details(Section):
+    """Notes, and what a second minute is for, folded away."""
+
+    template = "details.html"
+
+    def values(self) -> dict[str, Any] | None:
+        d = self.d
+        total = sum(d.shares.values())
+        out = {
+            "notes": list(dict.fromkeys(self._notes())),
+            "rows": _rows(d, self.unit) if len(d.joints) > 6 else [],
+            "spots": _ratios(d, ((10, "position"), (10, "effort"))) if d.spots else None,
+            "stages": d.stages,
+            "absent": [(_name(e), why) for e, why in d.data["unexplained"].get("not_considered", {}).items()],
+            "confirmed": self._confirmed() if d.confirmation is not None else None,
+            "nuisance": ", ".join(f"{k} {v:.4g}" for k, v in d.data["nuisance"].items()),
+            "took": f"Took {total:.0f} s: {', '.join(f'{k} {v:.1f} s' for k, v in d.shares.items())}." if total else "",
+        }
+        return out | {"unit": self.unit} if any(out.values()) else None
+
+    def _notes(self) -> list[str]:
+        d, left, notes = self.d, self.d.data["unexplained"], list(self.d.notes)
+        if d.untrained:
+            notes.append(
+                "fitted, but not a column of the servo table, so training does not carry it: " + ", ".join(d.untrained)
+            )
+        if left["depends_on"]:
+            notes.insert(
+                0,
+                f"{100 * (left['fraction_of_gap'] or 0):.0f} % of the gap is left; it depends on "
+                + "; ".join(left["depends_on"]),
+            )
+        return notes
+
+    def _confirmed(self) -> dict[str, Any]:
+        """The hypotheses in the engine that trains beside the search's own plant."""
+        c = self.d.confirmation
+        return {
+            "engine": c.engine,
+            "step": f"{1e3 * c.step_s:g}",
+            "recordings": ", ".join(c.recordings),
+            "tasks_step": f"{1e3 * TASKS:g}",
+            "at_tasks_step": number(1e3 * c.at_tasks_step),
+            "rows": [
+                {"name": name.replace("_", " "), "engine": number(1e3 * a), "plant": number(1e3 * b)}
+                for name, (a, b) in c.errors.items()
+            ],
+        }
+
+
+SECTIONS: tuple[type[Section], ...] = (Hero, Where, Findings, Curves, Next, Details)
+
+
+def page(d: Diagnosis) -> str:
+    """The page as HTML text."""
+    shown = [text for section in SECTIONS if (text := render(section(d)))]
+    return ENVIRONMENT.get_template("page.html").render(word=VERDICTS[d.data["verdict"]][0], sections=shown)
+
+
+def render(section: Section) -> Markup:
+    """A section as HTML; empty where it has nothing to show."""
+    values = section.values()
+    return Markup("") if values is None else Markup(ENVIRONMENT.get_template(section.template).render(values).strip())
+
+
+def unit_of(metric: str) -> tuple[str, float]:
+    """(unit in which a metric of `diagnosis.json` is shown, factor)."""
+    if metric.startswith("effort"):
+        return ("mA" if metric.endswith("_A") else "mN" if metric.endswith("_N") else "mN.m"), 1e3
+    if metric.endswith("_N"):
+        return "mN", 1e3
+    return ("mm" if metric.endswith("_m") else "mrad"), 1e3
+
+
+def _name(effect: str) -> str:
+    return effect.replace("_", " ")
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:] if text.startswith(("the ", "joint ")) else text
+
+
+def _ratios(d: Diagnosis, most: tuple[tuple[int, str], ...], named: bool = True, *size: int) -> Markup:
+    """The regimes in which the error before is largest, the strongest bin of each; so many of each signal. named: with
+    their joint."""
+    best: dict[tuple[str, str, str], Any] = {}
+    for s in d.spots:
+        best.setdefault((s.joint, s.of, s.regime), s)
+    chosen = [s for count, of in most for s in [x for x in best.values() if x.of == of][:count]]
+    return Markup(
+        charts.ratios(
+            [(f"{s.joint}: {s.text}" if named else s.text, s.ratio, s.ratio_low, s.ratio_high) for s in chosen], *size
+        )
+    )
+
+
+def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, str]]:
+    """The joints with the largest errors, and the pads."""
+    plain, found, rows = d.data["baseline"].get("joints", {}), d.data["findings"], []
+    for j, v in sorted(d.joints.items(), key=lambda x: -x[1]["before"])[:most]:
+        names = [_name(f["effect"]) + " (hint)" * f.get("hint", False) for f in found if j in f["where"]["joints"]]
+        rows.append(
+            _row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}")
+        )
+    for finger, v in (d.touch.pads if d.touch else {}).items():
+        mine = f"{d.touch.names.index(finger)}:"
+        names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
+        rows.append(_row(f"pad of the {finger}", names, v, "", f"{1e3 * v['noise']:.2g} mN"))
+    return rows
+
+
+def _row(where: str, names: list[str], v: dict[str, float], plain: str, noise: str) -> dict[str, str]:
+    before, after = (number(1e3 * v[k]) for k in ("before", "after"))
+    return {"where": where, "found": ", ".join(names), "before": before, "after": after, "plain": plain, "noise": noise}
+
+
+def _parameter(key: str, p: dict[str, Any]) -> dict[str, Any]:
+    """A row of a finding's parameters: a number with its interval, a list, or words."""
+    value, out = (
+        p["value"],
+        {"label": key.replace("_", " "), "unit": "" if p["unit"] == "1" else p["unit"], "chart": None},
+    )
+    if isinstance(value, list):
+        return out | {"text": ", ".join(f"{v:.3g}" for v in value[:8]) + (" ..." if len(value) > 8 else "")}
+    if isinstance(value, str):
+        return out | {"text": value if len(value) < 60 else value[:57] + "...", "unit": ""}
+    low, high = number(p["low"]), number(p["high"])
+    return out | {
+        "text": number(value, 4),
+        "low": low,
+        "high": high,
+        "chart": Markup(charts.interval(value, p["low"], p["high"])),
+    }

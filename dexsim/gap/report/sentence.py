@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dexsim.gap.effects.catalogue import entry, modelled
+from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.report.charts import number
-from dexsim.gap.result import Diagnosis
 from dexsim.recording.mechanism import Mechanism
 
 

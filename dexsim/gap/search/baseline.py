@@ -152,7 +152,7 @@ def judged(
 ) -> Baseline | None:
     """The plain model of a joint (`fitted`) on runs `test` (span: part of each run, s). whole: the plant on which free
     runs are judged (None: the case's own). None where nothing was fitted or there is nothing to judge."""
-    from dexsim.gap.judge.errors import free_run
+    from dexsim.gap.judge.kept_out import free_run
 
     here = replace(case, plant=whole or case.plant)
     kept = here.plant.windows(None, list(test), span=span)

@@ -1,17 +1,446 @@
-"""The search on one joint: its selection, then what was found on whole recordings, and intervals."""
+"""The search on one joint: effects are added, swapped and dropped while they earn it on conditions left out; then what
+was found on whole recordings, and intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
+from dexsim import intervals
+from dexsim.gap.effects.catalogue import CATALOGUE, confusable
+from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.fit import AWAY, Fitter, Residuals, slopes_of
-from dexsim.gap.search.hypotheses import LONG, MAYBE, subset
-from dexsim.gap.search.selection import JointSelection
-from dexsim.gap.search.trial import Member, Outcome, Trial
+from dexsim.gap.search import baseline
+from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
+from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, subset
+from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, expand_one
+
+CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
+AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
+
+
+class JointSelection(JointScan):
+    """The selection of one joint's effects."""
+
+    def run(self, shortlist: int = 6) -> Outcome:
+        """Adds effects while they earn it on left-out conditions, swaps and drops, and prices what is claimed."""
+        self.fitted: dict[frozenset, Trial] = {}
+        none = self.start()
+        self.none_loss = self._left(none)
+        self._on(0.1)
+        current = none
+        gains, price, scanned = {}, {}, []
+        rivals: dict[str, list[tuple[str, float]]] = {}
+        confidence: dict[str, float] = {}
+        per = len(self.blocks)
+        pool: dict[str, tuple[Member, np.ndarray]] = {}
+        level: list[Trial] = []
+        for _ in range(SEARCH.most):
+            loss = self._left(current).sum() / per
+            enough = loss < SEARCH.enough**2
+            if (enough and current.members) or self.deadline.over():
+                break
+            scan = self.scan(current)
+            self._on(0.06)
+            if not scanned:
+                scanned = [(m.id + (f" ({m.variant.label})" if m.variant.label else ""), g, p) for g, p, m, _ in scan]
+            if not scan:
+                break
+            listed = self._shortlist(scan, shortlist, loss, current.members)
+            if loss < SEARCH.rough:
+                listed = self._hinted([] if enough else listed, current.members, SEARCH.hint)
+            if not listed:
+                break
+            drafts = self._drafts(listed, current, pool, price)
+            for _, p, member, start in scan:  # what a candidate is confused with is asked in its place, seen or not
+                if member.id not in pool and any(confusable(member.id, row[2].id) for row in listed[:3]):
+                    pool[member.id], price[member.id] = (member, start), p
+            trials = self._finished(drafts, current)
+            best = self._best(trials, current)
+            less = self._begun_again(current, trials)
+            if less is not current:
+                if not current.members:
+                    none, self.none_loss = less, self._left(less)
+                    self.fitted.clear()
+                else:
+                    self.fitted[frozenset(less.ids)] = less
+                current = less
+                if not self._earns(
+                    best, current
+                ):  # the fit without it had stopped short: what is missing is looked for anew
+                    continue
+                self.fitted.update({frozenset(t.ids): t for t in (*trials, best)})
+            if enough and self.gain(best, current) < SEARCH.clear:
+                break
+            if not self._earns(best, current):
+                # a pair may be there where neither of its halves is seen alone
+                best = current if enough or self.deadline.over() else self._pair(current, listed[:3]) or current
+                if best is current:
+                    break
+            current, level = best, trials
+            if len(current.members) > 1 and not self.deadline.over():
+                current, level = self._swap(current, pool, level)
+        current = self._from_plain(current)
+        if not self.deadline.over():
+            current = self._by_laws(self._refine(self._drop(current)))
+        self._on(0.1)
+        current, final = self._settled(current, pool)
+        for m in current.members:
+            rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
+            price.setdefault(m.id, 0.0)
+        return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
+
+    def _drafts(
+        self,
+        listed: Sequence[tuple[float, float, Member, np.ndarray]],
+        current: Trial,
+        pool: dict[str, tuple[Member, np.ndarray]],
+        price: dict[str, float],
+    ) -> list[tuple[tuple[Member, ...], np.ndarray, Fitted]]:
+        """The hypotheses with one of the `listed` (gain, price, effect, start) beside those of `current`, fitted on
+        short windows: those that follow best, the best first. pool, price: by effect, are filled."""
+        drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
+        followed: dict[str, float] = {}
+        begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
+        for _, p, member, start in listed:
+            if drafts and self.deadline.over():
+                break
+            if member.id not in pool or price.get(member.id, 1.0) > p:
+                pool[member.id] = (member, start)
+            price[member.id] = p
+            tries = [self.draft((*current.members, member), begin(start), current)]
+            if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
+                tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
+            drafts.append(min(tries, key=lambda d: d[2].loss))
+            if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
+                if member.id in followed:
+                    pool[member.id] = (member, start)
+                followed[member.id] = drafts[-1][2].loss
+            self._on(0.03)
+        drafts.sort(key=lambda d: d[2].loss)
+        return [d for k, d in enumerate(drafts) if k < 2 or (k < 6 and d[2].loss < 1.3 * drafts[0][2].loss + 0.15)]
+
+    def _finished(
+        self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
+    ) -> list[Trial]:
+        """The drafts fitted on long windows, and judged on what was left out."""
+        trials = sorted(
+            (self.finish(*d, current) for k, d in enumerate(drafts) if k == 0 or not self.deadline.over()),
+            key=lambda t: t.fit.loss,
+        )
+        least = trials[0].fit.loss
+        # those that may still be the best are looked at closely
+        trials = [
+            self.thorough(t)
+            if not self.deadline.over() and (k == 0 or (k < CLOSELY and t.fit.loss < 1.3 * least + 0.1))
+            else t
+            for k, t in enumerate(trials)
+        ]
+        for trial in trials:
+            self._on(0.06)
+            known = self.fitted.get(frozenset(trial.ids))
+            if known is None or trial.fit.loss < known.fit.loss:
+                self.fitted[frozenset(trial.ids)] = trial
+        for trial in trials:
+            self.cross(trial)
+        return trials
+
+    def _best(self, trials: Sequence[Trial], current: Trial) -> Trial:
+        """The one of the trials that loses least on what was left out; fits of their own decide where what follows best
+        seems to last less, or not to last."""
+        best, close = min(trials, key=self._score), min(trials, key=lambda t: t.fit.loss)
+        if close.fit.loss < (1 - SEARCH.tie) * best.fit.loss:
+            two = [self.refold(t) for t in (best, close)]
+            for t in two:
+                self.fitted[frozenset(t.ids)] = t
+            best = min(two, key=self._score)
+        if not self._earns(best, current):  # a good fit that seems not to last: is it the fit's, or the step's from it?
+            close = min(trials, key=lambda t: t.fit.loss)
+            if close.fit.loss < (1 - SEARCH.least) * current.fit.loss:
+                best = self.refold(close)
+                self.fitted[frozenset(best.ids)] = best
+        return best
+
+    def _settled(
+        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
+    ) -> tuple[Trial, dict[str, tuple[list[tuple[str, float]], float, float]]]:
+        """(the answer, its rivals): one that only seemed worse before it was fitted in full takes the place."""
+        final = self.rivals(current, pool)
+        for _ in range(len(current.members)):
+            better = self._overtaken(current, final)
+            if better is None:
+                break
+            self.fitted[frozenset(current.ids)] = current
+            # what went with the other may not be needed with it
+            current = self._drop(better) if len(better.members) > 1 else better
+            final = self.rivals(current, pool)
+        return current, final
+
+    def _begun_again(self, current: Trial, trials: list[Trial]) -> Trial:
+        """The hypothesis fitted again from where those with one effect more ended that follow better: what they
+        refitted, and of that effect what is inside the bounds of a belief. The fit without it may have stopped in a
+        hollow beside; `current` where it had not."""
+        best, params = current, current.fit.params
+        columns = [INDEX[p.columns[0]] for p in params]
+        believed = self.case.plant.base()[0][columns]
+        ahead = [t for t in trials if t.fit.loss < (1 - SEARCH.tie) * current.fit.loss]
+        for trial in sorted(ahead, key=lambda t: t.fit.loss)[:AGAIN]:
+            own = {p.key: x for p, x in zip(trial.fit.params, trial.fit.x, strict=True) if not p.nuisance}
+            at = expand_one(self.case, trial.fit.params, trial.fit.x)[0][columns]
+            x0 = [
+                own.get(p.key, p.start)
+                if not p.nuisance
+                else a / b
+                if p.mode == "factor"
+                else a - b
+                if p.mode == "add"
+                else a
+                for p, a, b in zip(params, at, believed, strict=True)
+            ]
+            with self._fix(current.members):
+                new = Trial(
+                    current.members,
+                    self.fitter.fit(params, x0=np.array(x0), iterations=8, slopes=slopes_of(current.fit)),
+                )
+            if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best):
+                with self._fix(current.members):
+                    new = Trial(current.members, self.fitter.toward_prior(params, new.fit))
+            if self._here(new) < (1 - 0.5 * SEARCH.tie) * self._here(best) and not self._shrunk(new):
+                best = new
+        return best
+
+    def plain(self) -> tuple[list[Param], np.ndarray] | None:
+        """The plain model of this joint (`baseline.fitted`), fitted once."""
+        if not hasattr(self, "_plain"):
+            self._plain = baseline.fitted(self.case, self.train, self.span, self.seed)
+        return self._plain
+
+    def _from_plain(self, current: Trial) -> Trial:
+        """The effects by which a plain least squares differs from what is believed, all at once and from its figures,
+        where they follow better: of several that are missing together each alone may look like another. Those that do
+        not earn their place are let go. `current` where they do not."""
+        enough = self._left(current).sum() / len(self.blocks) < SEARCH.enough**2
+        if enough or self.deadline.over() or (plain := self.plain()) is None:
+            return current
+        at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
+        members, starts = [], []
+        for effect in CATALOGUE:
+            moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
+            if not moved or (self.allowed is not None and effect.id not in self.allowed):
+                continue
+            variants = [v for v in effect.variants(self.case.scales) if not v.refines]
+            variant = self._narrow(variants[0]) if variants else None
+            if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
+                continue
+            values = [
+                _value(p, *at[p.columns[0]], self.case) if p.columns[0] in at else v
+                for p, v in zip(variant.params, variant.starts[0], strict=True)
+            ]
+            members.append(Member(effect, variant))
+            starts.append(np.array(values))
+        if len(members) < 2:
+            return current
+        with self._fix(current.members):
+            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
+        like = SimpleNamespace(fit=SimpleNamespace(params=plain[0], x=plain[1]))
+        draft = self.draft(tuple(members), np.concatenate(starts), like)
+        if draft[2].loss > (1 - SEARCH.least) * short:
+            return current
+        trial = self.thorough(self.finish(*draft, current))
+        if not self._earns(trial, current, further=False):
+            return current
+        return self._drop(trial)
+
+    def _pair(self, current: Trial, listed) -> Trial | None:
+        best = None
+        for i, (_, _, m1, s1) in enumerate(listed):
+            for _, _, m2, s2 in listed[i + 1 :]:
+                if m1.id == m2.id or not fits_beside(m1, m2):
+                    continue
+                trial = self.fit(
+                    (*current.members, m1, m2), np.concatenate([self._values(current), s1, s2]), current, quick=True
+                )
+                if best is None or trial.fit.loss < best.fit.loss:
+                    best = trial
+        if best is not None and self._earns(best, current):
+            return best
+        return None
+
+    def _swap(self, current: Trial, pool, level):
+        """Each earlier member replaced by others of the pool, while the rest stays."""
+        best = current
+        for i, member in enumerate(current.members[:-1]):
+            rest = [m for k, m in enumerate(current.members) if k != i]
+            values = np.split(self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1])
+            kept = [v for k, v in enumerate(values) if k != i]
+            for key, (other, start) in list(pool.items()):
+                if key in current.ids or not confusable(key, member.id) or any(not fits_beside(other, m) for m in rest):
+                    continue
+                trial = self.fit((*rest, other), np.concatenate([*kept, start]), current, quick=True)
+                if (
+                    trial.fit.loss < best.fit.loss
+                    and self._left(trial).sum() < self._left(best).sum()
+                    and not self._shrunk(trial)
+                ):
+                    best = trial
+        return best, level
+
+    def _drop(self, current: Trial) -> Trial:
+        """Members that no longer earn their place are let go."""
+        changed = True
+        while changed and len(current.members) > 1:
+            changed = False
+            for i in range(len(current.members)):
+                rest = tuple(m for k, m in enumerate(current.members) if k != i)
+                values = np.split(
+                    self._values(current), np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+                )
+                kept = np.concatenate([v for k, v in enumerate(values) if k != i])
+                less = self.fit(rest, kept, current, quick=True)
+                if not self._earns(current, less):
+                    current, changed = less, True
+                    break
+        return current
+
+    def _refine(self, current: Trial) -> Trial:
+        """Members with more parameters (an elasticity that hardens), where those earn their place."""
+        for i, member in enumerate(current.members):
+            for variant in member.effect.variants(self.case.scales):
+                variant = self._narrow(variant) if variant.refines else None
+                if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
+                    continue
+                sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+                values = np.split(self._values(current), sizes)
+                known = dict(zip([p.key for p in member.variant.params], values[i], strict=True))
+                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+                extra = {
+                    tuple(v for p, v in zip(variant.params, start, strict=True) if p.key not in known): start
+                    for start in variant.starts
+                }
+                tries = []
+                for start in extra.values():
+                    values[i] = np.array([known.get(p.key, v) for p, v in zip(variant.params, start, strict=True)])
+                    tries.append(self.draft(members, np.concatenate(values), current))
+                more = self.finish(*min(tries, key=lambda d: d[2].loss), current, quick=True)
+                if self._earns(more, current, further=False) and self._score(more) < self._score(current):
+                    current = more
+                    break
+        return current
+
+    def _by_laws(self, current: Trial) -> Trial:
+        """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the
+        others kept beside it, so that intervals hold what the law is not known to be."""
+        for i, member in enumerate(current.members):
+            tries = [current]
+            for variant in member.variant.by_law():
+                members = tuple(replace(m, variant=variant) if k == i else m for k, m in enumerate(current.members))
+                tries.append(self.fit(members, self._values(current), current, quick=True))
+            current = min(tries, key=self._score)
+            self.by_law[member.id] = tries
+        return current
+
+    def _overtaken(
+        self, current: Trial, final: dict[str, tuple[list[tuple[str, float]], float, float]]
+    ) -> Trial | None:
+        """The hypothesis in which a rival stands in the place of the member that it beats in most bootstraps; None
+        where each holds its own."""
+        ahead = []
+        for k, m in enumerate(current.members):
+            others, share, _ = final[m.id]
+            if others:
+                rival = others[0][
+                    0
+                ]  # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
+                like = (
+                    sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival))
+                    if not confusable(rival, m.id)
+                    else 0.0
+                )
+                ahead.append((others[0][1] - share - like, k, rival))
+        for lead, k, rival in sorted(ahead, reverse=True):
+            better = self.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
+            if lead > 0.1 and better is not None and not self._shrunk(better):
+                return better
+        return None
+
+    def rivals(
+        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]]
+    ) -> dict[str, tuple[list[tuple[str, float]], float, float]]:
+        """For each member: what else in its place would do (its share of bootstraps), its confidence, its gain."""
+        out = {}
+        self.costs: dict[str, list[float]] = {}
+        mine = self._left(current)
+        sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+        values = np.split(self._values(current), sizes)
+        with self._fix(current.members):
+            short = float(self.scan_fitter.loss(self.scan_fitter.evaluate(current.fit.params, current.fit.x)[None])[0])
+        for i, member in enumerate(current.members):
+            rest = tuple(m for k, m in enumerate(current.members) if k != i)
+            kept = [v for k, v in enumerate(values) if k != i]
+            without = (
+                self.fit(rest, np.concatenate(kept) if kept else np.zeros(0), current, quick=True) if rest else None
+            )
+            lost = self._left(without) if without else self.none_loss
+            self.costs[member.id] = self._by_condition(lost, mine)
+            others: list[Trial] = []
+            for key, (other, start) in pool.items():
+                if key == member.id or key in current.ids or any(not fits_beside(other, m) for m in rest):
+                    continue
+                known = self.fitted.get(frozenset((key, *(m.id for m in rest))))
+                if known is None and len(others) >= 3 and not confusable(key, member.id):
+                    continue
+                if known is None and self.deadline.over():
+                    self.unasked |= {member.id} if confusable(key, member.id) else set()
+                    continue
+                trial = known
+                if trial is None:
+                    draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
+                    if draft[2].loss > 2.5 * short + 0.4:  # one that cannot follow even short stretches is no rival
+                        continue
+                    trial = self.finish(*draft, current, quick=True)
+                self._on(0.05)
+                self.fitted[frozenset(trial.ids)] = trial
+                # one that cannot follow even what it was fitted to is no rival
+                if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
+                    self.cross(trial)
+                    others.append(trial)
+            table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
+            drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
+            shares = intervals.wins(table, drawn, SEARCH.apart)
+            rows = [
+                (next(x for x in t.ids if x not in {m.id for m in rest}), float(s))
+                for t, s in zip(others, shares[1:-1], strict=True)
+            ]
+            rows.sort(key=lambda r: -r[1])
+            out[member.id] = (rows, float(shares[0]), float(1 - mine.sum() / lost.sum()))
+        return out
+
+    def without_search(self) -> Outcome:
+        """No search: the nuisances alone."""
+        self.fitted = {}
+        none = self.start()
+        self.none_loss = self._left(none)
+        return Outcome(self.case.joint, none, none, {}, {}, {}, {}, [])
+
+
+def _value(p: Param, plain: Param, x: float, case: Case) -> float:
+    """The value of an effect's parameter `p` that writes to its column what the plain model's `plain` does at `x`."""
+    nominal = case.scales.nominal[p.columns[0]]
+    absolute = x * nominal if plain.mode == "factor" else x
+    value = absolute / nominal if p.mode == "factor" else absolute - nominal if p.mode == "add" else absolute
+    return float(np.clip(value, p.low, p.high))
+
+
+def _differs(plain: Param, x: float, case: Case) -> bool:
+    """Whether the plain model's figure is another than what is believed, as far as that is believed."""
+    nominal = case.scales.nominal[plain.columns[0]]
+    unit = nominal if plain.mode == "factor" else 1.0
+    return abs(x * unit - nominal) > max(BELIEF * abs(nominal), 0.01 * plain.span * unit)
+
 
 FINER = 2  # steps of whole recordings, where an effect was found, in one of the windows'
 PIN = 1e-6  # of room for what is held at a value

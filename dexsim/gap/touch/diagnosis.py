@@ -1,28 +1,35 @@
-"""Touch and contact: what the taxels show that simulation leaves out, pad by pad, judged on recordings kept out.
+"""Touch and contact: what the taxels show that simulation leaves out, pad by pad, judged on recordings kept out; beside
+the joints' findings and in the files.
 
 Without the geometry of what is touched, the taxels alone still show the dead, the stuck and the exchanged ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
-from dexsim.gap.inquiry import Steps
-from dexsim.gap.judge import confidence
-from dexsim.gap.judge.errors import rms_interval
-from dexsim.gap.result import Diagnosis
-from dexsim.gap.rules import TOUCH
-from dexsim.gap.touch import constant_taxels, locate, report
-from dexsim.gap.touch.handed_on import handed
+from dexsim.gap.effects.catalogue import TOUCH_EFFECTS
+from dexsim.gap.effects.effect import Fit, PadFacts, PadSettings, ranged, times
+from dexsim.gap.inquiry import Diagnosis, Steps, TouchResult
+from dexsim.gap.judge import confidence, kept_out
+from dexsim.gap.judge.kept_out import rms_interval
+from dexsim.gap.report.sentence import sentence
+from dexsim.gap.rules import JUDGE, TOUCH
+from dexsim.gap.touch import judge
 from dexsim.gap.touch.judge import PadAnswer
 from dexsim.gap.touch.read import PadRun, TouchData, collect, stretches
-from dexsim.gap.touch.result import PadFacts, TouchResult
 from dexsim.gap.touch.search import PadOutcome, PadSearch
 from dexsim.recording.mechanism import Mechanism
 from dexsim.recording.schema import Recording
+from dexsim.tactile.config import COLUMNS
+from dexsim.tactile.file import RANGES
+from dexsim.tactile.pads import PAD_COLUMNS
 
 
 @dataclass
@@ -69,7 +76,7 @@ class Touch(Steps):
         self.result.tactile = bool(self.recordings)
         if self.recordings:
             self.data = collect(self.recordings, self.m, self.sensors)
-            self.constant = constant_taxels.found(self.recordings, self.sensors)
+            self.constant = judge.constant_taxels(self.recordings, self.sensors)
             self.result.notes += self.data.notes
         self.pads = [Pad(k, [r for r in self.data.runs if r.pad == k]) for k in self.data.pads()]
 
@@ -108,7 +115,7 @@ class Touch(Steps):
         error = np.zeros(self.sensors.shape)
         for pad in self.pads:
             if pad.search is not None and pad.outcome is not None:
-                off = locate.by_taxel(pad.search, pad.outcome.none)
+                off = judge.by_taxel(pad.search, pad.outcome.none)
                 error[pad.number, : len(off)] = off
                 self.result.error = error
 
@@ -128,7 +135,7 @@ class Touch(Steps):
             number = int(f["where"]["taxels"][0].split(":")[0])
             if number not in searched:
                 out.findings.append(f)
-                readings = constant_taxels.readings_of(self.recordings, f["where"]["taxels"])
+                readings = judge.readings_of(self.recordings, f["where"]["taxels"])
                 out.facts[out.names[number]] = PadFacts(readings, judged=False)
         if judged:
             times = [a.times for a in judged]
@@ -148,12 +155,12 @@ class Touch(Steps):
         out.recordings = sorted({*out.recordings, *answer.recordings()})
         if answer.structured():
             out.structured = True
-            out.depends_on += locate.depends_on(answer.search, answer.best, name)
-        out.curves.append(locate.curve(answer.search, name, answer.none, answer.best, bool(answer.kept)))
+            out.depends_on += judge.depends_on(answer.search, answer.best, name)
+        out.curves.append(judge.curve(answer.search, name, answer.none, answer.best, bool(answer.kept)))
 
     def report(self, d: Diagnosis) -> None:
         """Touch beside the joints, or by itself where none of them is judged."""
-        report.add(d, self.result)
+        into_diagnosis(d, self.result)
 
 
 def diagnose(
@@ -168,3 +175,194 @@ def diagnose(
     touch = Touch(recordings, m, held, seed, allowed, progress)
     touch.run()
     return touch.result
+
+
+# -- touch beside the joints ------------------------------------------------------------------------------------------
+# Touch beside the joints: one verdict, one list of findings, one figure of what is left.
+
+
+def _verdict(felt: TouchResult) -> str | None:
+    """The word for touch alone; None where it was not judged."""
+    if felt.before is None:
+        return "explained" if felt.findings else None
+    for f in felt.findings:
+        if f["confidence"] < JUDGE.firm:
+            f["hint"] = True
+    named = [{"effect": f["effect"], "held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
+    word = kept_out.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
+    return "partly_explained" if word == "explained" and felt.structured else word
+
+
+def into_diagnosis(d: Diagnosis, felt: TouchResult) -> None:
+    """Touch into a diagnosis: beside the joints, or by itself where none of them is judged (the verdict says so)."""
+    d.touch = felt
+    if d.data["verdict"] == "unusable":
+        _alone(d, felt)
+    else:
+        _beside(d, felt)
+
+
+def _alone(d: Diagnosis, felt: TouchResult) -> None:
+    """Touch where no joint could be judged."""
+    data = d.data
+    data["verdict"] = _verdict(felt) or "unusable"
+    data["noise_floor"] = {"position_rad": None, "how": "quantum", "tactile_N": felt.floor}
+    data["findings"] = data["findings"] + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] = dict(felt.nuisance)
+    if felt.before is not None:
+        _metric(data, felt)
+    else:
+        data["held_out"]["error"] = "tactile_rmse_N"
+    data["unexplained"]["depends_on"] = felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    d.sentence = sentence(data, d, felt.floor or 0.0)
+
+
+def _beside(d: Diagnosis, felt: TouchResult) -> None:
+    """Findings, the verdict of both, the metric of what was found."""
+    word = _verdict(felt)
+    if word is None:
+        return
+    data = d.data
+    joints = data["verdict"]
+    bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
+    rest = [f for f in data["findings"] if f["effect"] != "bad_channel"]
+    data["findings"] = bad + rest + sorted(felt.findings, key=lambda f: -f["confidence"])
+    data["nuisance"] |= felt.nuisance
+    if felt.floor is not None:
+        data["noise_floor"]["tactile_N"] = felt.floor
+    if "none" in (joints, word):
+        data["verdict"] = word if joints == "none" else joints
+    elif joints != word:
+        data["verdict"] = "partly_explained"
+    if not rest and (felt.findings or joints == "none") and felt.before is not None and word != "none":
+        _metric(data, felt)
+    data["unexplained"]["depends_on"] += felt.depends_on if data["verdict"] not in ("none", "explained") else []
+    d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
+
+
+def _metric(data: dict, felt: TouchResult) -> None:
+    (b, bl, bh), (a, al, ah) = felt.before, felt.after
+    data["held_out"] = {
+        "recordings": felt.recordings,
+        "error": "tactile_rmse_N",
+        "before": b,
+        "after": a,
+        "before_low": bl,
+        "before_high": bh,
+        "after_low": al,
+        "after_high": ah,
+        "how": "presses kept out of the fit",
+    }
+    gap = b**2 - felt.floor**2
+    data["unexplained"]["fraction_of_gap"] = (
+        round(float(np.clip((a**2 - felt.floor**2) / gap, 0.0, 1.0)), 4)
+        if gap > 0 and b > JUDGE.within * felt.floor
+        else 0.0
+    )
+
+
+# -- what is handed on to training ------------------------------------------------------------------------------------
+# What a diagnosis finds of touch and contact, as training takes it: `tactile.yaml` (`dexsim.tactile.file`).
+#
+# Which setting an effect writes stands in its class (`dexsim.gap.effects`).
+#
+# A world has one friction and one stiffness for all fingertips: their ranges hold what was found on every fingertip,
+# and what was believed where a fingertip was judged and nothing was found. The range of what is not sure holds what was
+# believed as well.
+
+SHARED = ("object.friction", "contact.stiffness")  # a world has one for all fingertips
+
+HEAD = """\
+# What diagnose.py found of touch and contact: python train.py task=grasp tactile_file=FILE (play.py too) lays it over
+# the tactile group and the task's ranges. value is the best guess; low to high is drawn anew in each world at each
+# episode.
+"""
+
+
+@dataclass
+class Handed:
+    """tactile, randomize: as the file holds them. said: a line for each finding; doubts: for the notes."""
+
+    tactile: dict[str, Any] = field(default_factory=dict)
+    randomize: dict[str, Any] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+
+
+def doubted(finding: dict[str, Any]) -> bool:
+    return finding["confidence"] < JUDGE.sure or bool(finding["indistinguishable"])
+
+
+def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
+    """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
+    out = Handed()
+    pads: dict[str, dict[str, Any]] = {}
+    drifts: dict[str, Any] = {}
+    for f in findings:
+        if not f["where"]["taxels"]:
+            continue
+        name, effect = names[int(f["where"]["taxels"][0].split(":")[0])], TOUCH_EFFECTS[f["effect"]]
+        pad = pads.setdefault(name, PadSettings(facts.get(name) or PadFacts(judged=False)))
+        doubt, drift = doubted(f), effect.drift(f, pad.fact)
+        if drift is not None:
+            drifts[name] = drift
+        lost = effect.hand_on(f, pad, doubt)
+        either = " or ".join(f["indistinguishable"] or [f["effect"]])
+        unsure = ", not sure: its range holds what was believed" if doubt else ""
+        out.said.append(f"{name}: {either}, confidence {f['confidence']:.2f}{unsure}")
+        if doubt:
+            out.doubts.append(
+                f"{f['effect']} on the {name}'s pad is not sure: in tactile.yaml its range holds what was "
+                f"believed as well{lost}"
+            )
+    for name, drift in drifts.items():
+        values = pads[name].values
+        values["gain"] = times(values.get("gain"), drift)
+        if "taxels" in values:
+            values["taxels"] = {k: times(g, drift) for k, g in values["taxels"].items()}
+    for name, pad in pads.items():
+        values = pad.values
+        if values:
+            for key in [k for k in values if k in PAD_COLUMNS]:
+                values[key] = ranged(values[key], *PAD_COLUMNS[key][1:3])
+            if "taxels" in values:
+                values["taxels"] = {k: ranged(g, *PAD_COLUMNS["gain"][1:3]) for k, g in values["taxels"].items()}
+            out.tactile.setdefault("pads", {})[name] = values
+    shared = {key: {name: pad.shared[key] for name, pad in pads.items() if key in pad.shared} for key in SHARED}
+    for key, by_pad in shared.items():
+        if by_pad:
+            out.randomize[key] = ranged(_hull(key, by_pad, facts), *RANGES[key][1:])
+    if "object.friction" in out.randomize:
+        out.tactile["friction"] = ranged(
+            _hull("object.friction", shared["object.friction"], facts), *COLUMNS["friction"][1:3]
+        )
+    return out
+
+
+def _hull(name: str, by_pad: dict[str, Fit], facts: dict[str, PadFacts]) -> Fit:
+    """One range for all fingertips: every fit, and what was believed of a fingertip that was judged and follows it."""
+    if name == "object.friction":
+        believed = [x.friction for pad, x in facts.items() if x.judged and x.slid and pad not in by_pad]
+    else:
+        believed = [x.stiffness for pad, x in facts.items() if x.judged and pad not in by_pad]
+    value, low, high = (np.array(x) for x in zip(*by_pad.values(), strict=True))
+    return float(value.mean()), float(min([*low, *believed])), float(max([*high, *believed]))
+
+
+def save_tactile(h: Handed, path: Path) -> bool:
+    """Writes the file, whole or not at all. Where there is nothing to hand on, returns False, and an earlier
+    diagnosis's file goes."""
+    content = {k: v for k, v in (("tactile", h.tactile), ("randomize", h.randomize)) if v}
+    if not content:
+        if path.is_file() and path.read_text(encoding="utf-8").startswith(HEAD):
+            path.unlink()
+        return False
+    text = (
+        HEAD
+        + "".join(f"# {line}\n" for line in h.said)
+        + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=130)
+    )
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+    return True

@@ -1,5 +1,5 @@
-"""One pad's answer judged on what was kept out of the fit: errors before and after, findings with their doubts, facts
-for training."""
+"""One pad's answer judged on what was kept out of the fit: errors before and after, where touch and its simulation
+part, findings with their doubts, facts for training."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 
 from dexsim.gap.effects.catalogue import TOUCH_EFFECTS, touch_confusable
-from dexsim.gap.effects.effect import word
+from dexsim.gap.effects.effect import Fit, PadFacts, word
+from dexsim.gap.effects.touch import TactileGain
+from dexsim.gap.inquiry import PadCurve
 from dexsim.gap.judge.confidence import kept
+from dexsim.gap.read.runs import spans
 from dexsim.gap.rules import JUDGE, TOUCH
-from dexsim.gap.touch import constant_taxels, locate
-from dexsim.gap.touch.fit import PadFit, TouchTrial
-from dexsim.gap.touch.handed_on import chord
 from dexsim.gap.touch.plant import PARAMS, contact, readings
-from dexsim.gap.touch.result import Fit, PadFacts
-from dexsim.gap.touch.search import PadOutcome, PadSearch
-from dexsim.recording.schema import TACTILE
+from dexsim.gap.touch.read import newtons
+from dexsim.gap.touch.search import PadFit, PadOutcome, PadSearch, TouchTrial
+from dexsim.recording.schema import TACTILE, Recording
+from dexsim.tactile.sensors import Sensors
 
 
 class PadAnswer:
@@ -34,7 +35,7 @@ class PadAnswer:
         self.none, self.best = outcome.none, outcome.best
         self.notes: list[str] = []
         self.bounds = search.intervals(self.best) if self.best.keys else {}
-        self.constant = constant_taxels.pressed(search.silent, self.pad)
+        self.constant = pressed(search.silent, self.pad)
         unmoved = {0} if self.constant is not None or not self.best.ids else set()
         self.stages = sorted({_stage(search, e) for e in self.best.ids} | unmoved)
         e0, e1 = (np.concatenate([held_out(search, t, k)[1] for k in self.stages]) for t in (self.none, self.best))
@@ -63,7 +64,7 @@ class PadAnswer:
             if gain is None:
                 found.append(self.constant)
             else:
-                constant_taxels.merge(gain, self.constant)
+                merge_constant(gain, self.constant)
         return found
 
     def _finding(self, e: str) -> dict[str, Any] | None:
@@ -89,7 +90,7 @@ class PadAnswer:
             "separating_experiment": effect.experiment if same else None,
             "where": {"joints": [], "taxels": taxels, "topics": [TACTILE]},
             "regime": effect.shows,
-            "when": locate.when(e, search, best),
+            "when": when(e, search, best),
             "parameters": parameters,
             "held_out": {"before": b, "after": a},
         }
@@ -242,3 +243,160 @@ def _silent_squares(search: PadFit) -> tuple[np.ndarray, np.ndarray]:
             a.append((r.z[on, k] - p[on, k]) ** 2)
             b.append((r.z[on, k] - value) ** 2)
     return (np.concatenate(a), np.concatenate(b)) if a else (np.zeros(0), np.zeros(0))
+
+
+def chord(force: np.ndarray, depth: np.ndarray) -> Fit | None:
+    """Stiffness [N/m] of a straight line through a law's points (force [n] N, depth [n] m): the least-squares one, and
+    force over depth under and over which a tenth of the force is felt; None where nothing is pressed."""
+    on = (force > 0.2) & (depth > 1e-4)
+    if on.sum() < 5:
+        return None
+    force, depth = force[on], depth[on]
+    order = np.argsort(force / depth)
+    felt = np.cumsum(force[order]) / force.sum()
+    low, high = (force / depth)[order][np.searchsorted(felt, [0.1, 0.9])]
+    return float(force @ depth / (depth @ depth)), float(low), float(high)
+
+
+# -- where touch and its simulation part ------------------------------------------------------------------------------
+# Where touch and its simulation part: by taxel, in time, and with what the rest of a pad's error goes.
+
+
+def by_taxel(pad: PadFit, t: TouchTrial) -> np.ndarray:
+    """[K] N, rms error of each taxel over all recordings."""
+    return np.sqrt(np.mean(np.concatenate([(r.z - readings(r, t.values)) ** 2 for r in pad.runs]), 0))
+
+
+def when(e: str, pad: PadFit, t: TouchTrial) -> list[dict]:
+    """Stretches in which the effect changes the readings by more than a quarter of its most."""
+    out = []
+    for r in pad.runs:
+        off = TOUCH_EFFECTS[e].changes(r, t, pad.base)
+        on = off > 0.25 * max(float(np.percentile(off, 99.5)), 1e-9)
+        out += [{"recording": r.recording, "start": round(a, 4), "end": round(b, 4)} for a, b in spans(r.t, on, 0.03)]
+    return out[:400]
+
+
+def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
+    """What the error that is left on a pad goes with, in words."""
+    error, load, depth, speed = [], [], [], []
+    for r in pad.runs:
+        e = np.abs(r.z - readings(r, t.values, t.gains, t.order)).max(1)
+        on = r.z.sum(1) > 0.2
+        error.append(e[on])
+        load.append(r.z.sum(1)[on])
+        depth.append(np.interp(r.t, r.grid, r.depth)[on])
+        speed.append(np.interp(r.t, r.grid, np.abs(np.gradient(r.depth, r.grid)))[on])
+    y = np.concatenate(error)
+    if len(y) < 20 or y.std() == 0:
+        return []
+    said = []
+    for what, parts in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
+        x = np.concatenate(parts)
+        c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
+        if abs(c) > 0.4:
+            said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
+    return [x for _, x in sorted(said, reverse=True)[:2]]
+
+
+def curve(pad: PadFit, name: str, none: TouchTrial, best: TouchTrial, whole: bool) -> PadCurve:
+    """The last recording of a pad for the page: all of it, or its last quarter, which was kept out of the fit."""
+    run = pad.runs[-1]
+    before, after = readings(run, none.values), readings(run, best.values, best.gains, best.order)
+    for k, value in pad.silent.items():
+        after[:, k] = value
+    load = None if run.load is None else np.interp(run.t, run.grid, run.load)
+    pick = run.t >= (run.t[0] if whole else run.t[0] + 0.75 * (run.t[-1] - run.t[0]))
+    measured, before, after = (x[pick].sum(1) for x in (run.z, before, after))
+    return PadCurve(name, run.recording, run.t[pick], measured, before, after, None if load is None else load[pick])
+
+
+# -- taxels that read the same for ever -------------------------------------------------------------------------------
+# Taxels that read the same for ever, dead or stuck: seen from the readings alone, without any geometry.
+
+
+def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[dict[str, Any]]:
+    """Findings `tactile_gain` from the taxels alone: those that stay constant while at least three neighbours on the
+    pad feel many counts. Their gain is 0."""
+    if sensors.layout is None:
+        return []
+    worst: dict[int, set[int]] = {}
+    beside = [sensors.beside(f) for f in range(sensors.layout.pads)]
+    seen = False
+    for r in recordings:
+        if r.tactile is None or r.tactile.value.ndim != 4 or len(r.tactile) < 20:
+            continue
+        seen = True
+        z = np.nan_to_num(r.tactile.value[..., 2])  # [T, F, K]
+        span = z.max(0) - z.min(0)
+        for f in range(min(span.shape[0], len(beside))):
+            bad = _constant(span[f], beside[f])
+            worst[f] = worst[f] & bad if f in worst else bad
+    if not seen:
+        return []
+    return [constant_finding([f"{f}:{k}" for k in sorted(taxels)], "constant while their neighbours feel a touch", 0.85)
+            for f, taxels in sorted(worst.items()) if taxels]  # fmt: skip
+
+
+def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
+    """Taxels [K] with no change although three neighbours changed by a tenth of the pad's largest."""
+    top = float(span.max())
+    if top <= 0 or len(span) < len(beside):
+        return set()
+    felt = span > 0.1 * top
+    return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= 3}
+
+
+def readings_of(recordings: list[Recording], taxels: list[str]) -> dict[int, float]:
+    """What constant taxels ("pad:k") of one pad read for ever [N], by number; under two counts it is 0."""
+    out = {}
+    for pad, k in (map(int, t.split(":")) for t in taxels):
+        values = [
+            (float(np.median(np.nan_to_num(newtons(r)[0][:, pad, k, 2]))), 2 * (r.tactile_lsb or 0.0))
+            for r in recordings
+            if r.tactile is not None and r.tactile.value.ndim == 4
+        ]
+        value, step = max(values)
+        out[k] = value if value > max(step, 1e-6) else 0.0
+    return out
+
+
+def constant_finding(names: list[str], regime: str, confidence: float) -> dict[str, Any]:
+    """Gains of 0 of taxels ("pad:k"), as `diagnosis.json` has a finding."""
+    return {
+        "effect": TactileGain.id,
+        "confidence": confidence,
+        "alternatives": [],
+        "indistinguishable": [],
+        "separating_experiment": None,
+        "where": {"joints": [], "taxels": names, "topics": [TACTILE]},
+        "regime": regime,
+        "when": [],
+        "parameters": {
+            "gain": {"value": 0.0, "low": 0.0, "high": 0.05, "unit": "1"},
+            "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""},
+        },
+        "held_out": None,
+    }
+
+
+def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
+    """The finding of a pad's taxels that read the same although the plant has them pressed. silent: their reading [N]
+    by number."""
+    if not silent:
+        return None
+    kinds = {"dead": [k for k, v in silent.items() if v == 0], "stuck": [k for k, v in silent.items() if v != 0]}
+    said = "; ".join(f"{kind}: {', '.join(map(str, taxels))}" for kind, taxels in kinds.items() if taxels)
+    return constant_finding([f"{pad}:{k}" for k in sorted(silent)], f"constant while they are pressed ({said})", 0.95)
+
+
+def merge_constant(gain: dict, dead: dict) -> None:
+    """Broken taxels into the finding of the pad's gains."""
+    p = gain["parameters"]["gain"]
+    count = len(gain["where"]["taxels"])
+    wide = lambda x: list(np.atleast_1d(x)) if len(np.atleast_1d(x)) == count else [float(x)] * count  # noqa: E731
+    for key, zero in (("value", 0.0), ("low", 0.0), ("high", 0.05)):
+        p[key] = [float(x) for x in wide(p[key])] + [zero] * len(dead["where"]["taxels"])
+    gain["where"]["taxels"] = [*gain["where"]["taxels"], *dead["where"]["taxels"]]
+    gain["parameters"]["taxels"]["value"] = ", ".join(gain["where"]["taxels"])
+    gain["regime"] += "; " + dead["regime"]

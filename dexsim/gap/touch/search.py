@@ -1,18 +1,381 @@
-"""Which touch effects a pad has: fits of the catalogue, added while they earn it on presses left out."""
+"""Which touch effects a pad has: its plant fitted to what was recorded, effects added while they earn it on presses
+left out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_compatible, touch_confusable
 from dexsim.gap.effects.effect import TouchEffect
-from dexsim.gap.effects.tactile_gain import TactileGain
+from dexsim.gap.effects.touch import TactileGain
+from dexsim.gap.plant.case import noise
+from dexsim.gap.read.runs import BLOCK
 from dexsim.gap.rules import TOUCH
-from dexsim.gap.touch.fit import PadFit, TouchTrial
-from dexsim.gap.touch.plant import PARAMS, readings
+from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
+from dexsim.gap.touch.read import PadRun
+
+# -- a pad's plant fitted ---------------------------------------------------------------------------------------------
+# A pad's plant fitted to what was recorded: which residuals count, least squares, gains of single taxels, intervals.
+
+OF_LAW = ("stiffness", "neighbours", "fraction", "c10", "c01")  # sizes that hang on how a force spreads over taxels
+PLACE = {"zero": 1.0, "along": 4.0, "across": 4.0}  # x the doubt about where the object is: bounds of the shifts
+
+
+@dataclass
+class Sample:
+    """Residuals of one stage in one recording: rows of `run` that count, and their noise."""
+
+    run: PadRun
+    stage: str
+    mask: np.ndarray  # [S, K] taxels, [G] cell, [S, 2] shear
+    sigma: np.ndarray  # the same shape
+    block: np.ndarray  # of each residual, unique over all recordings
+    train: np.ndarray  # of each residual
+
+
+@dataclass
+class TouchTrial:
+    """A hypothesis: effects, values, gains and order of taxels (None where not fitted), residuals in sigmas by
+    block."""
+
+    ids: tuple[str, ...]
+    values: dict[str, float]
+    gains: np.ndarray | None = None
+    order: np.ndarray | None = None
+    keys: tuple[str, ...] = ()
+    jac: np.ndarray | None = None
+    res: np.ndarray | None = None
+    left_out: np.ndarray | None = None
+    folds: list[dict[str, float]] = field(default_factory=list)  # values without one fold each
+
+
+class PadFit:
+    """One pad's readings and the plant fitted to them. held: names of recordings kept out; with none, the last quarter
+    of each recording's time; name: the pad's."""
+
+    def __init__(
+        self,
+        runs: list[PadRun],
+        held: set[str],
+        scale_known: bool,
+        thermometer: bool,
+        seed: int = 0,
+        allowed: set[str] | None = None,
+    ):
+        self.runs, self.scale_known, self.allowed = runs, scale_known, allowed
+        self.name = runs[0].name
+        self.rng = np.random.default_rng(seed)
+        self.load = all(r.load is not None for r in runs)
+        if not self.load:
+            for r in runs:
+                r.load = None
+        self.shear = all(r.shear is not None for r in runs) and self._slid()
+        self.noise = self._noise()
+        self.doubt = max(r.doubt for r in runs)
+        self.load_noise = 0.0
+        if self.load:
+            self.load_noise = max(float(np.median([noise(r.grid, r.load)[0] for r in runs])), 1e-3)
+        self.base = neutral()
+        self.silent = self._silent()
+        self.samples = self._samples(held)
+        train = np.concatenate([s.train for s in self.samples])
+        block = np.concatenate([s.block for s in self.samples])
+        self.train, self.block = train, block
+        names = sorted({b // 100000 for b in block[train]})
+        if len(names) >= 3:  # conditions left out in turn
+            self.fold = np.array([names.index(b // 100000) % 4 if b // 100000 in names else -1 for b in block])
+        else:
+            order = np.unique(block[train])
+            place = {b: min(3 * i // max(len(order), 1), 2) for i, b in enumerate(order)}
+            self.fold = np.array([place.get(b, -1) for b in block])
+        self.folds = [f for f in np.unique(self.fold[train]) if f >= 0]
+        self.warm = max(float(np.ptp(np.concatenate([r.warm for r in runs]))), 1e-9)
+        self.thermometer = thermometer
+
+    def _slid(self) -> bool:
+        return any(
+            np.ptp(r.slide[np.interp(r.grid, r.t, r.z.sum(1)) > 0.3], axis=0).max(initial=0.0) > 2e-4 for r in self.runs
+        )
+
+    def _noise(self) -> float:
+        """N, of one reading: from the counts, or the scatter about a local parabola where there are none."""
+        lsb = max(r.lsb for r in self.runs)
+        k = int(np.argmax(sum(r.z.sum(0) for r in self.runs)))
+        scatter = float(np.median([noise(r.t, r.z[:, k])[0] for r in self.runs]))
+        return max(lsb / np.sqrt(12), min(scatter, 5 * lsb) if lsb else scatter, 1e-4)
+
+    def _silent(self) -> dict[int, float]:
+        """Taxels whose reading never changes although they are pressed: taxel -> the reading [N] (0: dead, else
+        stuck)."""
+        z = np.concatenate([r.z for r in self.runs])
+        p = np.concatenate([readings(r, self.base) for r in self.runs])
+        step = max(r.lsb for r in self.runs)
+        still = np.ptp(z, axis=0) <= max(0.5 * step, 1e-9)
+        pressed = p.max(0) > max(8 * self.noise, 4 * step)
+        # the object may touch beside where the joints say: neighbours on both sides must feel it
+        near = [
+            sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside))
+            for beside in self.runs[0].beside
+        ]
+        pressed &= np.array(near)
+        stuck = still & (z[0] > 2 * step)
+        return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
+
+    def _samples(self, held: set[str]) -> list[Sample]:
+        out = []
+        for i, r in enumerate(self.runs):
+            v = self.base
+            expected = readings(r, v)
+            quiet = 1.0 * r.lsb
+            mask = ((r.z > quiet) | (expected > quiet)) & ~r.full
+            mask[:, list(self.silent)] = False
+            sigma = np.sqrt(
+                self.noise**2 + (TOUCH.plant * np.maximum(r.z, 0.0)) ** 2 + (TOUCH.timing * _rate(r.t, r.z)) ** 2
+            )
+            out.append(self._sample(r, i, "taxels", mask, sigma, r.t, held))
+            if self.load:
+                touched = (r.load > 0.05 * r.load.max()) | (cell(r, v) > 0.05)
+                wide = np.sqrt(
+                    self.load_noise**2 + (TOUCH.plant * r.load) ** 2 + (TOUCH.timing * _rate(r.grid, r.load)) ** 2
+                )
+                # the grid is denser than the readings: neighbours say the same
+                mine = touched & (np.arange(len(r.grid)) % 2 == 0)
+                out.append(self._sample(r, i, "cell", mine, wide, r.grid, held))
+            if self.shear:
+                n = r.grip
+                on = np.repeat((n > 0.3)[:, None], 2, 1)
+                wide = np.repeat(np.hypot(2 * self.noise, 0.03 * n)[:, None], 2, 1)
+                out.append(self._sample(r, i, "shear", on, wide, r.t, held))
+        return out
+
+    def _sample(self, r, i, stage, mask, sigma, t, held) -> Sample:
+        block = i * 100000 + {"taxels": 0, "cell": 20000, "shear": 40000}[stage] + ((t - t[0]) / BLOCK).astype(int)
+        train = np.full(len(t), r.recording not in held) if held else t < t[0] + 0.75 * (t[-1] - t[0])
+        spread = lambda x: np.broadcast_to(x.reshape(len(t), *[1] * (mask.ndim - 1)), mask.shape)[mask]  # noqa: E731
+        return Sample(r, stage, mask, sigma, spread(block), spread(train))
+
+    def residual(
+        self, v: dict[str, float], gains: np.ndarray | None = None, order: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Measured minus predicted, in sigmas, of everything that counts."""
+        out = []
+        for s in self.samples:
+            r = s.run
+            if s.stage == "taxels":
+                d = r.z - readings(r, v, gains, order)
+            elif s.stage == "cell":
+                d = r.load - cell(r, v)
+            else:
+                d = r.shear - shear(r, v)
+            out.append((d / s.sigma)[s.mask])
+        return np.concatenate(out)
+
+    def stage_of(self) -> np.ndarray:
+        """Number of the stage (0 taxels, 1 cell, 2 shear) of each residual."""
+        return np.concatenate(
+            [np.full(int(s.mask.sum()), ("taxels", "cell", "shear").index(s.stage)) for s in self.samples]
+        )
+
+    def _keys(self, ids: tuple[str, ...], mapped: bool = False) -> tuple[str, ...]:
+        effects = [TOUCH_EFFECTS[e] for e in ids]
+        keys = [k for e in effects for k in e.fits if not (e.by_taxel and mapped)]
+        # single taxels' gains leave nothing to a common one
+        keys += (
+            ([] if mapped and self.scale_known else ["scale"])
+            + ["zero", "along", "across", "spread"]
+            + (["skin"] if self.shear else [])
+        )
+        if not any("clock" in e.replaces for e in effects):
+            keys.append("clock")
+        return tuple(dict.fromkeys(keys))
+
+    def _bounds(self, key: str) -> tuple[float, float]:
+        p = PARAMS[key]
+        if key == "scale" and not self.scale_known:
+            return 0.05, 20.0
+        if key in PLACE:  # how well the joints know where the object is
+            return -PLACE[key] * self.doubt, PLACE[key] * self.doubt
+        if key == "drift":
+            return -0.7 / self.warm, 0.7 / self.warm
+        return p.low, p.high
+
+    def fit(
+        self,
+        ids: tuple[str, ...],
+        start: dict[str, float],
+        where: np.ndarray | None = None,
+        gains: np.ndarray | None = None,
+        order: np.ndarray | None = None,
+        evaluations: int = 60,
+        still: tuple[str, ...] = (),
+    ) -> TouchTrial:
+        """Least squares of the effects' numbers and the nuisances but `still` on residuals `where` (default: training),
+        from `start`."""
+        keys = tuple(k for k in self._keys(ids, gains is not None) if k not in still)
+        where = self.train if where is None else where
+        low, high = np.array([self._bounds(k) for k in keys]).T
+        scale = np.array([PLACE[k] * self.doubt / 3 if k in PLACE else PARAMS[k].scale for k in keys])
+        if "drift" in keys:
+            scale[keys.index("drift")] = 0.1 / self.warm
+        free = {k for k in keys if PARAMS[k].nuisance and not (k == "scale" and not self.scale_known)}
+        centre = np.array([PARAMS[k].neutral for k in keys])
+        soft = np.array([1.0 if k in free else 0.0 for k in keys])
+        x0 = np.clip(
+            [start.get(k, PARAMS[k].neutral) for k in keys], low + 1e-6 * (high - low), high - 1e-6 * (high - low)
+        )
+
+        def values(x):
+            fixed = {"scale": start["scale"]} if "scale" not in keys and "scale" in start else {}
+            return self.base | fixed | dict(zip(keys, (float(a) for a in x), strict=True))
+
+        def error(y):
+            x = y * scale
+            # a nuisance is believed within its scale: a prior as strong as one block of readings
+            return np.concatenate([self.residual(values(x), gains, order)[where], 3.0 * soft * (x - centre) / scale])
+
+        found = least_squares(
+            error,
+            x0 / scale,
+            bounds=(low / scale, high / scale),
+            loss="soft_l1",
+            f_scale=3.0,
+            diff_step=1e-2,
+            x_scale=1.0,
+            max_nfev=max(6, evaluations // max(len(keys), 1)),
+        )
+        v = values(found.x * scale)
+        n = int(where.sum())
+        return TouchTrial(ids, v, gains, order, keys, found.jac[:n] / scale, self.residual(v, gains, order))
+
+    def gain_map(self, trial: TouchTrial, where: np.ndarray) -> np.ndarray:
+        """Gains [K] of single taxels, closed form with a prior, on what the trial predicts without them."""
+        K = self.runs[0].z.shape[1]
+        up, down = np.zeros(K), np.zeros(K)
+        a = 0
+        for s in self.samples:
+            n = int(s.mask.sum())
+            if s.stage == "taxels":
+                use = np.zeros(s.mask.shape, bool)
+                use[s.mask] = where[a : a + n]
+                p = readings(s.run, trial.values, None, trial.order)
+                w = use / s.sigma**2
+                up += (w * p * s.run.z).sum(0)
+                down += (w * p * p).sum(0)
+            a += n
+        # readings of one press are alike: they count as fewer
+        independent = 0.1
+        return (independent * up + 1 / TOUCH.gain_prior**2) / (independent * down + 1 / TOUCH.gain_prior**2)
+
+    def loss(self, res: np.ndarray) -> np.ndarray:
+        """[B] squared (Huber) residuals by block, stages weighed so that each counts alike per residual."""
+        a = np.abs(res)
+        h = np.where(a <= 3, a * a, 6 * a - 9)
+        _, b = np.unique(self.block[self.train], return_inverse=True)
+        return np.bincount(b, h[self.train])
+
+    def cross(self, trial: TouchTrial) -> np.ndarray:
+        """[B] losses of the training blocks when their fold is left out of the fit."""
+        if trial.left_out is not None:
+            return trial.left_out
+        res = np.zeros(len(self.train))
+        for f in self.folds:
+            inside = self.train & (self.fold != f)
+            if inside.sum() < 50:
+                inside = self.train
+            again = self.fit(trial.ids, trial.values, inside, trial.gains, trial.order, 24)
+            if trial.gains is not None:
+                again.gains = self.gain_map(again, inside)
+                again.res = self.residual(again.values, again.gains, again.order)
+            mine = self.train & (self.fold == f)
+            res[mine] = again.res[mine]
+            trial.folds.append(again.values)
+        trial.left_out = self.loss(res)
+        return trial.left_out
+
+    def size(self, res: np.ndarray) -> float:
+        a = np.abs(res[self.train])
+        return float(np.where(a <= 3, a * a, 6 * a - 9).sum())
+
+    def _rounding(self, trial: TouchTrial) -> np.ndarray:
+        """[P] rms by which the numbers come back wrong from their own readings in whole counts, at three slightly
+        different levels: a held force rounds to the same side for as long as it is held, which no scatter shows."""
+        if not trial.keys or not any(r.lsb for r in self.runs):
+            return np.zeros(len(trial.keys))
+        kept = [r.z for r in self.runs]
+        off = []
+        try:
+            for level in (0.985, 1.0, 1.015):
+                for r in self.runs:
+                    exact = level * readings(r, trial.values, trial.gains, trial.order)
+                    r.z = np.round(exact / r.lsb) * r.lsb if r.lsb else exact
+                again = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 18)
+                off.append(
+                    [
+                        (again.values[k] - trial.values[k]) if k not in ("gain", "scale", "stiffness") else 0.0
+                        for k in trial.keys
+                    ]
+                )
+        finally:
+            for r, z in zip(self.runs, kept, strict=True):
+                r.z = z
+        return np.sqrt(np.mean(np.square(off), 0))
+
+    def intervals(self, trial: TouchTrial) -> dict[str, tuple[float, float]]:
+        """90 % intervals of the fitted numbers: the sandwich over blocks, with the disagreement of the folds, what
+        whole counts do to the fit and 1.5 % of the value (6 % where it hangs on how a force spreads) added in
+        squares."""
+        keys = trial.keys
+        fitted = self.fit(trial.ids, trial.values, None, trial.gains, trial.order, 12)
+        J, r = fitted.jac, np.clip(fitted.res[self.train], -3, 3)
+        scale = np.array([PARAMS[k].scale for k in fitted.keys])
+        Js = J * scale
+        _, b = np.unique(self.block[self.train], return_inverse=True)
+        scores = np.stack([np.bincount(b, Js[:, i] * r) for i in range(Js.shape[1])], 1)
+        scores = scores - scores.mean(0)
+        n = len(scores)
+        prior = np.diag([9.0 if PARAMS[k].nuisance else 0.0 for k in fitted.keys])
+        A = np.linalg.pinv(Js.T @ Js + prior + 1e-9 * np.eye(len(scale)))
+        cov = A @ (scores.T @ scores * n / max(n - 1, 1) + prior) @ A
+        variance = np.maximum(np.diag(cov), 0.0) * scale**2
+        self.cross(trial)
+        folds = (
+            np.array([[f[k] for k in fitted.keys] for f in trial.folds])
+            if len(trial.folds) > 1
+            else np.zeros((1, len(fitted.keys)))
+        )
+        m = len(folds)
+        variance += (m - 1) / max(m, 1) * ((folds - folds.mean(0)) ** 2).sum(0)
+        variance += self._rounding(fitted) ** 2
+        out = {}
+        for k, s in zip(fitted.keys, variance, strict=True):
+            x = trial.values[k]
+            half = 1.645 * float(np.sqrt(s + ((TOUCH.law if k in OF_LAW else 0.015) * x) ** 2))
+            low, high = self._bounds(k)
+            out[k] = (max(x - half, low), min(x + half, high))
+        return {k: v for k, v in out.items() if k in keys}
+
+    def gain_width(self, t: TouchTrial) -> np.ndarray:
+        """Half of the 90 % interval of each taxel's gain [K]: the disagreement of the folds, and 2 %."""
+        maps = [self.gain_map(t, self.train & (self.fold != f)) for f in self.folds]
+        if len(maps) < 2:
+            return np.full(len(t.gains), 0.1)
+        n = len(maps)
+        se = np.sqrt((n - 1) / n * ((np.array(maps) - np.mean(maps, 0)) ** 2).sum(0))
+        return 1.645 * np.hypot(se, 0.02)
+
+
+def _rate(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """|dx/dt| along the first axis, the largest of a sample and its neighbours."""
+    rate = np.abs(np.gradient(x, t, axis=0))
+    out = rate.copy()
+    out[1:] = np.maximum(out[1:], rate[:-1])
+    out[:-1] = np.maximum(out[:-1], rate[1:])
+    return out
+
 
 BOOTSTRAPS, STRETCH = 300, 3  # and of how many neighbouring blocks a stretch of theirs is
 

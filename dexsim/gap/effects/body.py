@@ -1,4 +1,4 @@
-"""Another mass on the links than the model's, or another direction of gravity."""
+"""What the drive moves: inertia, mass and gravity, a spring at the joint, a push from outside."""
 
 from __future__ import annotations
 
@@ -6,14 +6,54 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param
-from dexsim.gap.effects.position_offset import PositionOffset
+from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.effects.signals import PositionOffset
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
     import mujoco
 
     from dexsim.gap.plant.case import Case
+
+
+class Inertia(Effect):
+    """Another inertia of the rotor or the link than the model's."""
+
+    id = "inertia"
+    words = "has more (or less) inertia than the model"
+    shows = "at high acceleration"
+    experiment = "steps and a fast chirp"
+    motions = ("chirp",)
+    from_poses = True
+    slows = True
+    model_columns = ("armature",)
+
+    def variants(self, s: Scales) -> list[Variant]:
+        p = param("armature", "armature", "add", -0.7 * s.inertia, 6.0 * s.inertia, 0.0, "kg" if s.slide else "kg.m2")
+        return [Variant((p,), tuple((f * s.inertia,) for f in (0.08, 0.2, 0.5, 1.2, 3.0, -0.1, -0.3)))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return case.regimes["acceleration"]
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"armature": fit.entry("armature", "kg" if fit.case.scales.slide else "kg.m2")}
+
+    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+        return self.words.replace(
+            "more (or less)", "more" if finding["parameters"]["armature"]["value"] > 0 else "less"
+        )
+
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+        joint = spec.joint(case.joint)
+        armature = float(np.ravel(joint.armature)[0]) + values["armature"]
+        if armature >= 0:
+            joint.armature = armature
+            return [f"model.xml: armature of {case.joint} is {armature:.3g}"]
+        return [
+            f"{case.joint} has {-values['armature']:.3g} kg.m2 less inertia than the model's links and armature "
+            "together; change its links' inertia"
+        ]
+
 
 LIGHTEST = 0.95  # of a link's believed mass: what may be taken away at most
 
@@ -169,3 +209,90 @@ def add_mass(spec: mujoco.MjSpec, joint: str, mass: float, place: np.ndarray | N
     )
     where = "" if np.allclose(place, c0) else f" at {' '.join(f'{x:.4f}' for x in place)} m in its frame"
     return f"model.xml: {mass:.3g} kg {'added to' if mass > 0 else 'on'} {name}{where}"
+
+
+STIFFEST = 12.0  # x the joint's large torque over its range of motion: stiffer, it would hardly have moved
+
+
+class JointSpring(Effect):
+    """A spring at the joint that the model lacks: torque -(stiffness * q + preload), as MuJoCo's joint stiffness with
+    springref = -preload / stiffness."""
+
+    id = "joint_spring"
+    words = "is pulled towards a position by a spring that the model lacks"
+    shows = "with the position, also at rest"
+    experiment = "static poses over the whole range, and the drive off at each"
+    classes = ("static load",)
+    motions = ("holds",)
+    from_poses = True
+    model_columns = ("spring", "spring_preload")
+
+    def variants(self, s: Scales) -> list[Variant]:
+        unit = s.tau / s.span
+        if s.stiffness > unit:
+            return []
+        stiffness = param("stiffness", "spring", "set", 0.0, STIFFEST * unit, 0.0, "N/m" if s.slide else "N.m/rad")
+        preload = param("preload", "spring_preload", "set", -2.0 * s.tau, 2.0 * s.tau, 0.0, "N" if s.slide else "N.m")
+        starts = ((0.1, 0.0), (0.3, 0.0), (0.3, 0.2), (0.3, -0.2), (0.8, 0.0), (0.8, 0.4), (0.8, -0.4), (1.6, 0.0))
+        return [Variant((stiffness, preload), tuple((k * unit, p * s.tau) for k, p in starts))]
+
+    def unseen(self, s: Scales) -> str:
+        return "" if self.variants(s) else (
+            "its loop holds the joint stiffer than a spring that it can work against, and gains and gravity within "
+            "their tolerance do what a spring would"
+        )
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return np.abs(values["stiffness"] * case.regimes["position"] + values["preload"])
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        out = {
+            "stiffness": fit.entry("stiffness", f"{fit.force}/{fit.length}"),
+            "preload": fit.entry("preload", fit.force),
+        }
+        k, at = fit.value["stiffness"], fit.value["preload"]
+        if fit.interval["stiffness"][0] > 0:
+            ends = [-p / c for c in fit.interval["stiffness"] for p in fit.interval["preload"]]
+            out["rest"] = entry(-at / k, min(ends), max(ends), fit.length)
+        return out
+
+    def of_pose(self, values: dict[str, float], case: Case) -> bool:
+        return True
+
+    def to_model(self, spec: mujoco.MjSpec, case: Case, values: dict[str, float], note: dict) -> list[str]:
+        joint, k = spec.joint(case.joint), values["stiffness"]
+        if k <= 0:
+            return []
+        had = float(np.ravel(joint.stiffness)[0])
+        # angles of the file may be in degrees
+        unit = 180 / np.pi if spec.compiler.degree and not case.scales.slide else 1.0
+        rest = (had * float(joint.springref) / unit - values["preload"]) / (had + k)
+        joint.springref = rest * unit
+        # the first of a polynomial's coefficients where MuJoCo has several
+        joint.stiffness = [had + k, *np.ravel(joint.stiffness)[1:]] if np.size(joint.stiffness) > 1 else had + k
+        return [f"model.xml: stiffness of {case.joint} is {had + k:.3g}, its springref {rest:.3g}"]
+
+
+class ExternalForce(Effect):
+    """Something outside that pushes: a contact, a person, a cable.
+
+    It is no state of the joint, so no law of the plant has it: it is named where the recorded motor torque does not fit
+    the body at all, in stretches of time.
+    """
+
+    id = "external_force"
+    words = "is pushed by something outside: a contact, a person, a cable"
+    shows = "in stretches of time, whatever the joint does"
+    experiment = "the same commands again with nothing in reach and no cable pulled"
+    classes = ("weight or push",)
+    motions = ("holds",)
+    simulated = False
+
+    def variants(self, s: Scales) -> list[Variant]:
+        return []
+
+    def unseen(self, s: Scales) -> str:
+        return "" if s.effort else "no motor torque is recorded, without which a push is not told from a missing law"
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"torque": fit.entry("torque", fit.force)}

@@ -1,0 +1,169 @@
+"""Friction: dry, viscous, at breakaway, under load, before it slides."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param
+from dexsim.gap.plant.columns import Scales
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
+
+
+class CoulombFriction(Effect):
+    """Dry friction: tau_f sign(v), which may differ by direction."""
+
+    id = "coulomb_friction"
+    words = "has more (or less) dry friction than believed"
+    shows = "at reversals and low speed"
+    experiment = "slow triangles in both directions at constant load"
+    plain = ("coulomb_friction",)
+    classes = ("friction or play", "friction and load")
+    motions = ("triangles", "steps")
+    fitted_anyway = {"coulomb_friction": "torque"}
+    demo = {"coulomb_friction": 0.06}
+
+    def variants(self, s: Scales) -> list[Variant]:
+        nominal = s.nominal["coulomb_friction"]
+        top = max(1.2 * s.demand, 3 * nominal, 1e-9)
+        torque = param("torque", "coulomb_friction", "set", 0.0, top, nominal, "N.m")
+        asymmetry = param("asymmetry", "friction_asymmetry", "set", -1.5, 1.5)
+        starts = [(nominal + f * s.tau, 0.0) for f in (0.015, 0.03, 0.06, 0.12, 0.22, 0.4)]
+        if nominal > 0.02 * s.tau:
+            starts.append((0.5 * nominal, 0.0))
+        starts += [(nominal + 0.1 * s.tau, 0.8), (nominal + 0.1 * s.tau, -0.8)]
+        return [Variant((torque, asymmetry), tuple(starts))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return (case.regimes["speed"] > SLOW * case.scales.speed).astype(float)
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        out = {"torque": fit.entry("torque", fit.force, add=fit.case.scales.base_friction)}
+        return out | {"asymmetry": fit.entry("asymmetry", "1")}
+
+    def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
+        more = finding["parameters"]["torque"]["value"] > believed["coulomb_friction"] if believed else None
+        return self.words if more is None else self.words.replace("more (or less)", "more" if more else "less")
+
+
+class ViscousFriction(Effect):
+    """Friction that grows with speed: b v."""
+
+    id = "viscous_friction"
+    words = "has friction that grows with speed"
+    shows = "at high speed"
+    experiment = "constant speeds from slow to fast"
+    plain = ("viscous_friction",)
+    classes = ("with speed",)
+    motions = ("ladder",)
+
+    def variants(self, s: Scales) -> list[Variant]:
+        nominal, unit = s.nominal["viscous_friction"], s.tau / s.speed
+        starts = [(nominal + f * unit,) for f in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)]
+        if nominal > 0.03 * unit:
+            starts.append((0.5 * nominal,))
+        top = max(3 * unit, 4 * nominal)
+        return [
+            Variant((param("coefficient", "viscous_friction", "set", 0.0, top, nominal, "N.m.s/rad"),), tuple(starts))
+        ]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return case.regimes["speed"]
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        unit = f"{fit.force}.s/{fit.length}"
+        return {"coefficient": fit.entry("coefficient", unit, add=fit.case.scales.base_damping)}
+
+
+class StribeckFriction(Effect):
+    """Breakaway friction above the sliding level: peak exp(-|v / v_s|^n) sign(v), n 2 or 1."""
+
+    id = "stribeck_friction"
+    words = "needs a breakaway torque above its sliding friction"
+    shows = "at speeds between zero and v_s"
+    experiment = "very slow ramps from rest, and the same faster"
+    classes = ("friction or play",)
+    motions = ("triangles", "ladder")
+    demo = {"stribeck_peak": 0.06, "stribeck_speed": 0.25}
+
+    def variants(self, s: Scales) -> list[Variant]:
+        peak = param("peak", "stribeck_peak", "set", 0.0, 1.2 * s.demand, 0.0, "N.m")
+        v_s = param("v_s", "stribeck_speed", "set", 0.003 * s.speed, 0.35 * s.speed, 0.1 * s.speed, "rad/s")
+        starts = tuple((a * s.tau, b * s.speed) for a in (0.03, 0.08, 0.2, 0.45) for b in (0.02, 0.08, 0.25))
+        return [Variant((peak, v_s), starts, laws=(("exponential in speed", (("stribeck_exponent", 1.0),)),))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        m, s = case.regimes, case.scales
+        v = m["speed"]
+        near = np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2))
+        return near * ((v > 0.2 * (SLOW * s.speed)) | (np.abs(m["_torque"]) > 0))
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"peak": fit.entry("peak", fit.force), "v_s": fit.entry("v_s", f"{fit.length}/s")}
+
+
+class LoadFriction(Effect):
+    """Friction that grows with the torque that a gear transmits, more or less where the load drives it."""
+
+    id = "load_friction"
+    words = "has friction that grows with the load on its gear"
+    shows = "at high load"
+    experiment = "the same slow motion under two or more loads"
+    classes = ("friction and load",)
+    motions = ("triangles", "holds")
+    demo = {"load_friction": 0.25, "load_friction_backdriven": 0.25}
+
+    def variants(self, s: Scales) -> list[Variant]:
+        drive = param("fraction", "load_friction", "set", 0.0, 0.95, s.nominal["load_friction"])
+        back = param(
+            "fraction_backdriven", "load_friction_backdriven", "set", 0.0, 3.0, s.nominal["load_friction_backdriven"]
+        )
+        return [Variant((drive, back), ((0.04, 0.05), (0.1, 0.12), (0.2, 0.25), (0.35, 0.35), (0.3, 0.8)))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return np.abs(case.regimes["_load"]) * (case.regimes["speed"] > SLOW * case.scales.speed).astype(float)
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}
+
+
+GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: by which any dry friction gives way; more is the effect
+
+
+def give(s: Scales) -> float:
+    """How far any dry friction may give way before it slides [rad or m]."""
+    return GIVE_SLIDE if s.slide else GIVE
+
+
+class Presliding(Effect):
+    """Dry friction that gives way elastically before it slides.
+
+    The share z of the friction that is taken up grows along the way: dz = (1 - z sign(dq)) dq / distance (P. Dahl
+    1968).
+    """
+
+    id = "presliding"
+    words = "gives way elastically before its dry friction slides"
+    shows = "after reversals and in small motions"
+    experiment = "slow reversals about a pose, from far below a degree up, without and with a load"
+    classes = ("about a reversal",)
+    motions = ("triangles",)
+
+    def variants(self, s: Scales) -> list[Variant]:
+        low = give(s)
+        distance = param("distance", "presliding", "set", low, 50 * low, low, "m" if s.slide else "rad")
+        return [Variant((distance,), tuple((f * low,) for f in (2.5, 6.0, 15.0, 35.0)))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        q, v, run = case.regimes["position"], case.regimes["_speed"], case.plant.run_of
+        way = np.r_[0.0, np.abs(np.diff(q))]
+        turned = np.r_[True, (np.sign(v[1:]) != np.sign(v[:-1])) | (run[1:] != run[:-1])]
+        gone = np.cumsum(way)
+        since = gone - np.maximum.accumulate(np.where(turned, gone, 0.0))
+        return np.exp(-since / max(values.get("distance", give(case.scales)), 1e-12))
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"distance": fit.entry("distance", fit.length)}

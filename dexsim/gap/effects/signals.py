@@ -1,0 +1,196 @@
+"""What goes into a drive and comes out of it: delay and lag, the encoder, the current sensor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.plant.columns import Scales
+
+if TYPE_CHECKING:
+    from dexsim.gap.plant.case import Case
+
+
+class CommandDelay(Effect):
+    """A transport delay of the commands beyond what is believed."""
+
+    id = "command_delay"
+    words = "acts on its commands later than believed"
+    shows = "in proportion to speed"
+    experiment = "steps and a fast chirp"
+    plain = ("delay",)
+    classes = ("late",)
+    motions = ("steps", "chirp")
+    slows = True
+    jitters = True
+    demo = {"delay": 0.02}
+
+    def variants(self, s: Scales) -> list[Variant]:
+        delay = param("delay", "delay", "add", -s.nominal["delay"], 0.2, 0.0, "s")
+        return [Variant((delay,), ((0.003,), (0.006,), (0.012,), (0.02,), (0.035,), (0.08,)))]
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return np.abs(case.regimes["_command_rate"])
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"delay": fit.entry("delay", "s")}
+
+
+class Lag(Effect):
+    """A first-order lag of the drive's torque, or of the speed that its loop measures."""
+
+    id = "lag"
+    words = "builds its torque up with a lag"
+    shows = "at high acceleration"
+    experiment = "steps and a fast chirp"
+    classes = ("late",)
+    motions = ("steps", "chirp")
+    slows = True
+
+    def variants(self, s: Scales) -> list[Variant]:
+        out = [
+            Variant(
+                (param("time_constant", "lag", "set", 0.0, 0.3, s.nominal["lag"], "s"),),
+                ((0.003,), (0.006,), (0.012,), (0.025,), (0.06,)),
+                "drive",
+            )
+        ]
+        if s.nominal["kd"] > 0:
+            out.append(
+                Variant(
+                    (param("time_constant", "speed_lag", "set", 0.0, 0.3, 0.0, "s"),),
+                    ((0.006,), (0.012,), (0.03,), (0.08,)),
+                    "velocity filter",
+                    note={"of": "speed"},
+                )
+            )
+        return out
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        m = case.regimes
+        return np.abs(m["_torque_rate"]) if note.get("of", "drive") == "drive" else m["acceleration"]
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"time_constant": fit.entry("time_constant", "s")}
+
+
+class PositionOffset(Effect):
+    """An encoder's zero error."""
+
+    id = "position_offset"
+    words = "has an encoder zero error"
+    shows = "with the pose"
+    experiment = "static poses over the whole range"
+    classes = ("zero or gravity",)
+    motions = ("holds",)
+    misreads = True
+
+    def variants(self, s: Scales) -> list[Variant]:
+        if s.gravity < 0.02 * s.tau and not s.apart:  # a loop's own encoder alone turns all, and gravity alone tells
+            return []
+        p = param("offset", "position_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
+        starts = ((-0.2,), (-0.07,), (-0.02,), (0.02,), (0.07,), (0.2,))
+        if s.apart:  # of the encoder that reports, or of the loop's own as well
+            read = param("offset", "readout_offset", "add", -0.6, 0.6, 0.0, "m" if s.slide else "rad")
+            return [Variant((read,), starts, "readout"), Variant((p,), starts, "both encoders")]
+        return [Variant((p,), starts)]
+
+    def unseen(self, s: Scales) -> str:
+        return "" if self.variants(s) else "gravity hardly acts on the joint, so its zero leaves no trace"
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        return {"offset": fit.entry("offset", fit.length)}
+
+    def of_pose(self, values: dict[str, float], case: Case) -> bool:
+        return True
+
+
+class PositionScale(Effect):
+    """An encoder's scale error, or its eccentricity."""
+
+    id = "position_scale"
+    words = "has an encoder that is not linear in the position"
+    shows = "with the pose"
+    experiment = "the full range against a protractor or the stops"
+    misreads = True
+    parts_motor = True
+
+    def variants(self, s: Scales) -> list[Variant]:
+        out = [
+            Variant(
+                (param("scale", "position_scale", "set", 0.7, 1.4, 1.0),),
+                ((0.85,), (0.94,), (0.98,), (1.02,), (1.06,), (1.15,)),
+                "scale",
+            )
+        ]
+        if s.apart:  # of the encoder that reports alone: the loop does not know
+            read = param("scale", "readout_scale", "set", 0.7, 1.4, 1.0)
+            out.insert(0, Variant((read,), out[0].starts, "scale of the readout"))
+        if not s.slide and s.span > 0.5:
+            e = min(0.2, 0.3 * s.span)
+            params = (
+                param("ecc_sin", "eccentric_sin", "set", -e, e, 0.0, "rad"),
+                param("ecc_cos", "eccentric_cos", "set", -e, e, 0.0, "rad"),
+            )
+            out.append(
+                Variant(params, ((0.2 * e, 0.0), (-0.2 * e, 0.0), (0.0, 0.2 * e), (0.0, -0.2 * e)), "eccentricity")
+            )
+            # its zero may have been set anywhere along the turn, and not where the model has it
+            params = (params[0], param("ecc_cos", ("eccentric_cos", "position_offset"), "add", -e, e, 0.0, "rad"))
+            out.append(
+                Variant(
+                    params,
+                    ((0.05 * e, 0.2 * e), (-0.05 * e, -0.2 * e), (0.2 * e, 0.2 * e), (-0.2 * e, 0.2 * e)),
+                    "eccentricity, its zero elsewhere",
+                    dear=0.08,
+                )
+            )
+        return out
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        q = case.regimes["position"]
+        if "scale" in values:
+            return np.abs(q)
+        return np.abs(values.get("ecc_sin", 0.0) * np.sin(q) + values.get("ecc_cos", 0.0) * (np.cos(q) - 1))
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        if "scale" in fit.value:
+            return {"scale": fit.entry("scale", "1")}
+        size = np.hypot(fit.value["ecc_sin"], fit.value["ecc_cos"])
+        half = 0.5 * max(np.ptp(fit.interval["ecc_sin"]), np.ptp(fit.interval["ecc_cos"]))
+        return {"eccentricity": entry(size, max(size - half, 0.0), size + half, "rad")}
+
+    def of_pose(self, values: dict[str, float], case: Case) -> bool:
+        return True
+
+
+class CurrentSensor(Effect):
+    """Gain, offset or lost sign of the reading of the current: the motion is unaffected."""
+
+    id = "current_sensor"
+    words = "shows its effort with a wrong gain or offset"
+    shows = "in the effort alone"
+    experiment = "a hold under a known load"
+    classes = ("static load",)
+    effort_only = True
+
+    def variants(self, s: Scales) -> list[Variant]:
+        if not s.effort:
+            return []
+        gain = param("gain", "effort_gain", "set", -1.5, 3.0, 1.0)
+        offset = param("offset", "effort_offset", "set", -s.tau, s.tau, 0.0, "N.m")
+        return [Variant((gain, offset), ((0.7, 0.0), (1.3, 0.0), (1.0, 0.1 * s.tau), (1.0, -0.1 * s.tau), (-1.0, 0.0)))]
+
+    def unseen(self, s: Scales) -> str:
+        return super().unseen(s) if s.effort else "no effort is recorded (or current_per_torque is unknown)"
+
+    def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
+        return np.abs((values.get("gain", 1.0) - 1) * case.regimes["_torque"] + values.get("offset", 0.0))
+
+    def parameters(self, fit: FittedEffect) -> dict[str, Any]:
+        out = {"gain": fit.entry("gain", "1")}
+        per = fit.table.current([fit.case.joint])[0]
+        known = bool(np.isfinite(per))
+        return out | {"offset": fit.entry("offset", "A" if known else fit.force, times=per if known else 1.0)}
