@@ -238,7 +238,8 @@ def load_policy(checkpoint: File, env: HandEnv) -> Policy:
 
     data = checkpoints.load(checkpoint, str(env.device))
     checkpoints.check_layout(data, checkpoints.layout_of(env), str(checkpoint))
-    return load(data, env, str(checkpoint))
+    policy: Policy = load(data, env, str(checkpoint))
+    return policy
 
 
 def train(

@@ -172,7 +172,7 @@ def golden(env: Any, policy: Any, model: Any, steps: int, seed: int) -> dict[str
     from dexsim.deploy import bundle
 
     observations = bundle.builder(env.task["name"])
-    seen: list[tuple] = []
+    seen: list[Any] = []  # the `Signals` of the task
     build = observations.build
     kept: dict[str, list] = {
         k: [] for k in ("observation", "q", "before", "target", *(f"signal_{n}" for n in observations.Signals._fields))

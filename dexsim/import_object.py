@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -113,12 +114,12 @@ def draw(shape: Shape, mesh: Path, picture: Path) -> None:
     from scipy.spatial import ConvexHull
 
     assert shape.grid is not None
-    whole = trimesh.load(mesh, force="mesh")
+    whole: trimesh.Trimesh = trimesh.load(mesh, force="mesh")  # type: ignore[assignment]  # what `force` asks for
     triangles = (whole.triangles * shape.file_scale - shape.file_centre) @ shape.file_axes
     light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
     figure = Figure(figsize=(13, 4.6), dpi=90, layout="constrained")
 
-    def solid(axes, faces: np.ndarray, colour) -> None:
+    def solid(axes: Any, faces: np.ndarray, colour: np.ndarray) -> None:
         normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
         shade = 0.45 + 0.55 * np.clip(normal @ light, 0, 1)

@@ -12,6 +12,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from dexsim.assets.objects import library, load_mesh, names, primitive_mass_properties
+from dexsim.assets.objects.bake import contact_sheet
 from dexsim.assets.objects.baking import UNIT, bake_grid, pack, shape_from_hulls, unpack
 from dexsim.assets.objects.geometry import (
     hull_planes,
@@ -96,6 +97,11 @@ def test_committed_library_is_what_the_formulas_give(name):
     assert stored.held_out == again.held_out and stored.grid.data.shape == again.grid.data.shape
     np.testing.assert_allclose(stored.grid.origin, again.grid.origin, atol=1e-8)
     assert np.abs(stored.grid.data - again.grid.data).max() <= 1.01 * UNIT
+
+
+def test_shapes_are_drawn_to_a_file_named_by_text(tmp_path):
+    contact_sheet(str(tmp_path / "shapes.png"), {n: library()[n] for n in GRID_SHAPES[:2]})
+    assert (tmp_path / "shapes.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_packing_keeps_every_stored_step():

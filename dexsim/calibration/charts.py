@@ -26,7 +26,7 @@ def lines(half: Half, path: Path, title: str) -> Path:
     for ax, joint in zip(axes, half.joints, strict=False):
         ax.set_title(joint, fontsize=9)
         levels, f = half.levels.get(joint), half.fits.get(joint)
-        if f is None:
+        if levels is None or f is None:  # what is fitted has levels
             ax.text(
                 0.5,
                 0.5,

@@ -28,7 +28,7 @@ from dexsim.tactile.layout import touch_shape
 
 KEYS = ("schema", "normalization", "current_sign", "joints", "touch", "source", "notes", "robot", "report", "servo")
 TOUCH_KEYS = ("lsb", "axis_sign", "threshold", "gain", "bias", "dead", "swapped", "rubber", "hysteresis", "stiffness")
-NORMALIZATIONS = ("matched", "paper")
+Normalization = Literal["matched", "paper"]
 ASSUMED_CURRENT_PER_TORQUE = 2.7
 """A per N.m until measured; see `dexsim.recording.realistic.CURRENT_PER_TORQUE`, where the figure is explained."""
 ASSUMED_LSB = 0.1
@@ -77,7 +77,7 @@ class Content(msgspec.Struct):
     """`calibration.yaml` as far as it is read."""
 
     schema: Literal[1] = 1
-    normalization: Literal[NORMALIZATIONS] = "matched"
+    normalization: Normalization = "matched"
     current_sign: Sign | dict[str, Sign] = -1
     joints: dict[str, Joint | None] | None = None
     touch: Touch | None = None
@@ -183,10 +183,12 @@ class Calibration:
             assumed.append("current_max of some joints is not measured: current_per_torque times torque_max taken")
         out["current_max"] = np.where(unmeasured, out["current_per_torque"] * out["torque_max"], out["current_max"])
         sign = content.current_sign
-        sign = [sign.get(j, -1) for j in hand.joints] if isinstance(sign, dict) else [sign] * J
+        signs = [sign.get(j, -1) for j in hand.joints] if isinstance(sign, dict) else [sign] * J
         return cls(
-            **out,
-            current_sign=np.array(sign, float),
+            current_per_torque=out["current_per_torque"],
+            current_max=out["current_max"],
+            torque_max=out["torque_max"],
+            current_sign=np.array(signs, float),
             normalization=how,
             **_touch(content.touch or Touch(), assumed, where, hand),
             hand=hand,

@@ -21,6 +21,7 @@ def finger_force(recording: Recording) -> tuple[Series, np.ndarray]:
     if recording.tactile is None:
         raise UserError(f"{recording.path}: has no /tactile: force cannot be calibrated without the fingertips' force")
     newtons = recording.tactile_newtons()
+    assert newtons is not None  # there is touch
     full = np.zeros(newtons.value.shape[:2], bool)
     if recording.meta["tactile_unit"] == "count":
         full = (np.abs(recording.tactile.value[..., 2]) >= 255).any(-1)
@@ -60,11 +61,11 @@ def levels_of(recording: Recording, hand: Hand) -> dict[str, Levels]:
                 if levels is not None:
                     out[joint] = levels
         return out
-    windows = _steady(force)
+    steady = _steady(force)
     for joint in joints:
         if joint in lost:
             continue
-        touched = [w for w in windows if force.value[w[0] : w[1], finger[joint]].mean() > CONTACT]
+        touched = [w for w in steady if force.value[w[0] : w[1], finger[joint]].mean() > CONTACT]
         times = [(force.t[a], force.t[b - 1], float("nan")) for a, b in touched]
         if len(times) >= 3:
             levels = _collect(recording, effort, force, full, finger[joint], column[joint], times)
@@ -101,7 +102,8 @@ def _pressing(recording: Recording, column: int, holds: list[tuple[float, float]
 
 def _steady(force: Series, width: float = 0.25) -> list[tuple[int, int]]:
     """Windows [first, last) in which no fingertip's force changes by more than 4 % of its largest."""
-    t, out, k = force.t, [], 0
+    out: list[tuple[int, int]] = []
+    t, k = force.t, 0
     if len(t) < 4:
         return out
     scale = np.maximum(force.value.max(0), 1.0)

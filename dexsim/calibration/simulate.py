@@ -175,6 +175,7 @@ def rolled_recording(hand: Hand, presses: int = 240, seed: int = 0, frames: int 
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
+    assert touch.raw is not None  # asked for above
     felt = np.zeros((n, F, layout.taxels, 3))
     felt[..., 2] = touch.raw.numpy()
     t = np.arange(n) * 2 / RATE
@@ -200,6 +201,7 @@ def delivered(recording: Recording, seed: int = 0) -> Recording:
     from dexsim.recording.realistic import realistic
 
     dense, out = recording.external_force, realistic(recording, seed)
+    assert dense is not None and out.tactile is not None  # our own recording has both
     t = out.tactile.t
     held = dense.value[np.clip(np.searchsorted(dense.t, t, side="right") - 1, 0, None)]
     out.external_force = Series(t, held, dense.topic, t.copy(), dense.frame)
@@ -218,6 +220,7 @@ def make_rolled(
     recording = rolled_recording(hand, seed=seed)
     if faults:
         rng = np.random.default_rng([seed, 1])
+        assert recording.tactile is not None  # our own recording has it
         z = recording.tactile.value[..., 2]
         z /= np.exp(0.15 * rng.standard_normal(z.shape[1:]))
         f = hand.others[0]
@@ -328,6 +331,7 @@ def _taxels(hand: Hand, run: mechanism.Run, finger: int, place: np.ndarray) -> n
     touch.shape_id.fill_(0)
     touch.shape_size[:] = torch.tensor([RADIUS, 0.0, 0.0])
     touch.launch()
+    assert touch.raw is not None  # asked for above
     out = np.zeros((n, F, layout.taxels, 3))
     out[..., 2] = touch.raw.numpy()
     return out

@@ -90,9 +90,9 @@ def _dead(
         for k in range(clean.shape[1]):
             between = np.zeros(len(clean))  # the weaker of two opposite sides, in the best of the four directions
             for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
-                sides = [_beside(k, step, way, gone, clean.shape[1] // rows, rows) for way in (1, -1)]
-                if None not in sides:
-                    between = np.maximum(between, clean[:, sides].min(1))
+                a, b = (_beside(k, step, way, gone, clean.shape[1] // rows, rows) for way in (1, -1))
+                if a is not None and b is not None:
+                    between = np.maximum(between, clean[:, [a, b]].min(1))
             pressed = between > strong
             if (
                 pressed.sum() >= 5
@@ -244,7 +244,7 @@ def _gains(out: Pad, clean: np.ndarray, load: np.ndarray) -> None:
         f"load {p:g}": (lambda rows, p=p: from_load(rows, p)) for p in (0.05, 0.1, 0.2, 0.4)
     }
     tried = {name: error(way) for name, way in ways.items()}
-    best = min(tried, key=tried.get)
+    best = min(tried, key=tried.__getitem__)
     if tried["neighbours"] < tried["equal"]:
         best = "neighbours"  # wide contacts: sums over many taxels hardly tell one from the next
     out.held_out_equal, out.held_out = tried["equal"], tried[best]
@@ -331,5 +331,5 @@ def _loop(force: np.ndarray, load: np.ndarray) -> float:
                 for a in at
             ]
         )
-    gap = np.abs(np.subtract(*means))
+    gap = np.abs(np.subtract(means[0], means[1]))
     return float(np.nanmean(gap) / force.max()) if np.isfinite(gap).any() else float("nan")

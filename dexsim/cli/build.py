@@ -22,7 +22,9 @@ def build_env(cfg: dict[str, Any], make_env: MakeEnv | None, facts: dict[str, An
     ``make_env`` replaces :func:`dexsim.tasks.make_env` (tests).
     """
     if make_env is None:
-        from dexsim.tasks import make_env
+        from dexsim import tasks
+
+        make_env = tasks.make_env
     where = cfg["device"]
     print(versions_line())
     facts = {

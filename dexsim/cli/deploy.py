@@ -216,6 +216,7 @@ def _imu(given: dict[str, str], b: Any) -> Any:
         raise UserError(
             f'imu=udp:{port}: no orientation came within 5 s; send lines of text "w x y z" to 127.0.0.1:{port}'
         )
+    assert imu.sender is not None  # kept to since its first line
     print(f"imu      lines of {imu.sender[0]}:{imu.sender[1]}; those of others are not read")
     return imu
 

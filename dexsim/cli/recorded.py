@@ -146,9 +146,8 @@ def run(play: dict[str, Any]) -> int:
         }[placed],  # fmt: skip
         flush=True,
     )
-    result = mechanism.replay(
-        recording, m, timestep, led_object.pairs(m.hand) if led else (), led_object.JOINT if placed != "none" else None
-    )
+    pairs = led_object.pairs(m.hand) if led and m.hand is not None else ()
+    result = mechanism.replay(recording, m, timestep, pairs, led_object.JOINT if placed != "none" else None)
     c = compare.compare(recording, result, m, forces=led)
     position, effort = c.position_rmse(), c.effort_rmse()
     rows = [
@@ -198,13 +197,14 @@ def _video(recording: Any, result: Any, m: Any, c: Any, path: Path) -> bool:
     clips = []
     address = [model.jnt_qposadr[model.joint(j).id] for j in recording.joints]
     state = recording.states.position
-    force, names = (None, None), ()
+    force: list[np.ndarray | None] = [None, None]
+    names: tuple[str, ...] = ()
     if c.force_unit == "N" and (c.finger_force is not None or c.finger_force_simulated is not None):
         names = m.hand.finger_names if m.hand else ()
-        force = tuple(
+        force = [
             None if s is None else np.stack([np.interp(frames, s[0], x) for x in s[1].T], 1)
             for s in (c.finger_force, c.finger_force_simulated)
-        )
+        ]
     if len(state):
         seen = result.qpos.copy()
         for a, column in zip(address, state.value.T, strict=True):

@@ -96,7 +96,7 @@ def _composed(config_dir: Path, choices: tuple[tuple[str, str], ...], stamps: tu
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(config_dir.resolve())):
             cfg = compose("config", overrides=overrides, return_hydra_config=True)
-            chosen = {k: v for k, v in OmegaConf.to_container(cfg.hydra.runtime.choices).items() if "/" not in k}
+            chosen = {k: v for k, v in cfg.hydra.runtime.choices.items() if "/" not in k}
     except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
         raise UserError(f"config files in {config_dir}: {_first_line(error)}") from None
     OmegaConf.set_struct(cfg, False)
@@ -140,8 +140,8 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
         value = item.value()
         if item.type != OverrideType.CHANGE and isinstance(group := cfg.get(key), DictConfig):
             raise UserError(
-                f"+{key}: is there already, a group of settings ({', '.join(f'{key}.{k}' for k in group)}): give those"
-                " one by one, or choose another group without the +"
+                f"+{key}: is there already, a group of settings ({', '.join(f'{key}.{k!s}' for k in group)}): give"
+                " those one by one, or choose another group without the +"
             )
         if item.type == OverrideType.CHANGE or _there(cfg, key):
             _check_type(key, OmegaConf.select(_parent(cfg, key), key.rpartition(".")[2]), value)
@@ -150,10 +150,12 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
         except (ValueError, TypeError):  # a name where a list has numbers
             parts = key.split(".")
             owners = (".".join(parts[:n]) for n in range(1, len(parts)))
-            owner = next((o for o in owners if isinstance(OmegaConf.select(cfg, o), ListConfig)), None)
-            if owner is None:
+            lists = [o for o in owners if isinstance(OmegaConf.select(cfg, o), ListConfig)]
+            if not lists:
                 raise
-            raise UserError(f"{key}: {owner} is a list, whose values are numbered: {owner}.0=..., or [..]") from None
+            raise UserError(
+                f"{key}: {lists[0]} is a list, whose values are numbered: {lists[0]}.0=..., or [..]"
+            ) from None
     return cfg
 
 
@@ -187,6 +189,7 @@ def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfi
         merged = OmegaConf.merge(cfg, presets[name])
     except OmegaConfBaseException as error:
         raise UserError(f"task.presets.{name}: {_first_line(error)}") from None
+    assert isinstance(merged, DictConfig)  # as both were
     gone = [i for i in items if i.type == OverrideType.DEL and OmegaConf.select(merged, i.key_or_group) is None]
     return override(merged, [i for i in items if i not in gone])
 
@@ -194,9 +197,11 @@ def apply_preset(cfg: DictConfig, name: str, items: list[Override]) -> DictConfi
 def resolve(cfg: DictConfig) -> dict[str, Any]:
     """The plain dict that the library gets: interpolations resolved, nothing missing."""
     try:
-        return OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        plain = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         raise UserError(f"settings: {_first_line(error)}") from None
+    assert isinstance(plain, dict)  # of a mapping
+    return {str(name): value for name, value in plain.items()}
 
 
 def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
@@ -207,7 +212,7 @@ def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
         if not inside and not (isinstance(node, DictConfig) and part in node):
             where = ".".join(parts[:depth])
             names = (
-                [f"{where}.{k}" if where else str(k) for k in node if k != "choices"]
+                [f"{where}.{k!s}" if where else str(k) for k in node if k != "choices"]
                 if isinstance(node, DictConfig)
                 else []
             )
@@ -228,7 +233,7 @@ def _parent(cfg: DictConfig, key: str) -> DictConfig | ListConfig:
 
 def _every_key(cfg: DictConfig, prefix: str = "") -> list[str]:
     keys = []
-    for key in cfg:
+    for key in map(str, cfg):
         keys.append(f"{prefix}{key}")
         if not OmegaConf.is_interpolation(cfg, key) and isinstance(cfg[key], DictConfig):
             keys += _every_key(cfg[key], f"{prefix}{key}.")
@@ -258,7 +263,7 @@ def _check_type(key: str, old: Any, new: Any) -> None:
         # list may take its place
         if set(old) <= {"value", "low", "high", "unit", "log"} and not isinstance(new, str):
             return
-        raise UserError(f"{key} is a group of settings ({', '.join(f'{key}.{k}' for k in old)}), not a single value")
+        raise UserError(f"{key} is a group of settings ({', '.join(f'{key}.{k!s}' for k in old)}), not a single value")
     if isinstance(old, bool) and not isinstance(new, bool):
         raise UserError(f"{key}={new}: must be true or false")
     if isinstance(old, (int, float)) and not isinstance(old, bool):

@@ -48,10 +48,10 @@ class Start:
 
 def for_train(argv: list[str], config_dir: Path) -> Start | None:
     """Settings of a training run; None when the command only asked for help or the settings (printed)."""
-    argv, only_show = _flags(argv, config_dir, "train")
-    if argv is None:
+    given, only_show = _flags(argv, config_dir, "train")
+    if given is None:
         return None
-    request = settings.parse(argv, config_dir)
+    request = settings.parse(given, config_dir)
     source = _last(request, "resume")
     data = _load(source) if source is not None else None
     with _blamed(source if data is not None else None, request):
@@ -78,16 +78,16 @@ def for_train(argv: list[str], config_dir: Path) -> Start | None:
 
 def for_play(argv: list[str], config_dir: Path) -> Start | None:
     """Settings of a replay; None when the command only asked for help or the settings (printed)."""
-    argv, only_show = _flags(argv, config_dir, "play")
-    if argv is None:
+    given, only_show = _flags(argv, config_dir, "play")
+    if given is None:
         return None
-    if any(a.startswith("replay=") and a not in ("replay=null", "replay=") for a in argv):  # commands, not a policy
+    if any(a.startswith("replay=") and a not in ("replay=null", "replay=") for a in given):  # commands, not a policy
         from dexsim.cli import recorded
 
-        play = recorded.settings(argv, config_dir)
+        play = recorded.settings(given, config_dir)
         return None if only_show and _show(play) else Start({}, play, play["replay"])
-    request = settings.parse(argv, config_dir)
-    own = OmegaConf.load(config_dir / "play.yaml")
+    request = settings.parse(given, config_dir)
+    own = _yaml(config_dir / "play.yaml")
     OmegaConf.set_struct(own, True)
     settings.override(own, [item for item in request.values if item.key_or_group in own])
     request.values = [item for item in request.values if item.key_or_group not in own]
@@ -151,6 +151,13 @@ def _flags(argv: list[str], config_dir: Path, script: str) -> tuple[list[str] | 
     return [a for a in argv if a != "--cfg"], "--cfg" in argv
 
 
+def _yaml(path: Path) -> DictConfig:
+    """One of our own files of settings, which is a mapping."""
+    cfg = OmegaConf.load(path)
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
 def _show(cfg: dict[str, Any]) -> bool:
     print(yaml.safe_dump(cfg, sort_keys=False), end="")
     return True
@@ -177,8 +184,10 @@ def _from_checkpoint(
 ) -> DictConfig:
     """The checkpoint's own config, settings of the earlier command forgotten and this command's applied. fresh: what is
     forgotten. source: its file, for messages."""
-    known: dict = OmegaConf.to_container(OmegaConf.load(config_dir / "config.yaml"))
-    own = {k: v for k, v in known.items() if k not in ("defaults", "sim")}  # a checkpoint from before has not all
+    known = _yaml(config_dir / "config.yaml")
+    plain = OmegaConf.to_container(known)
+    assert isinstance(plain, dict)
+    own = {str(k): v for k, v in plain.items() if k not in ("defaults", "sim")}  # a checkpoint from before has not all
     own |= dict.fromkeys(("model_file", "tactile_file", "objects", "kept_out"))  # new since
     own |= {"hand": "xhand", "hand_mirror": False, "hand_scale": 1.0, "object_scale": 1.0, "object_hulls": PARTS}
     stored = own | copy.deepcopy(data["config"]) | fresh
@@ -186,7 +195,7 @@ def _from_checkpoint(
         raise UserError(f"{source}: damaged checkpoint, its settings name another world (reality)")
     cfg = OmegaConf.create(stored)
     if "sim" in cfg:
-        cfg.sim = OmegaConf.merge(OmegaConf.load(config_dir / "config.yaml").sim, cfg.sim)
+        cfg.sim = OmegaConf.merge(known.sim, cfg.sim)
     OmegaConf.set_struct(cfg, True)
     cfg = _files(settings.choose(cfg, config_dir, request.choices), request)
     return settings.override(cfg, request.values)

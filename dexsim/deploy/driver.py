@@ -31,9 +31,9 @@ class HandState:
     sequence: int
     position: np.ndarray
     current: np.ndarray
-    temperature: np.ndarray | None = None
-    error: np.ndarray | None = None
-    tactile: np.ndarray | None = None
+    temperature: np.ndarray = None  # type: ignore[assignment]  # None becomes an array below, so nobody reads one
+    error: np.ndarray = None  # type: ignore[assignment]
+    tactile: np.ndarray = None  # type: ignore[assignment]
     velocity: np.ndarray | None = None
 
     def __post_init__(self) -> None:

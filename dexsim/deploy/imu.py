@@ -39,7 +39,8 @@ class UdpImu:
     """
 
     def __init__(self, port: int, host: str = "127.0.0.1", sender_port: int | None = None):
-        self.bad, self.foreign, self._last = 0, 0, None
+        self.bad, self.foreign = 0, 0
+        self._last: tuple[np.ndarray, float] | None = None
         self.sender: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, QUEUE)

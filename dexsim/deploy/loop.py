@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from dexsim.deploy.action import ActionRule
 from dexsim.deploy.bundle import Bundle
 from dexsim.deploy.driver import PASSIVE, POSITION, Clock, HandCommand, HandDriver, HandState
 from dexsim.deploy.imu import OrientationSource
-from dexsim.deploy.measure import ORIENTATION, for_bundle
+from dexsim.deploy.measure import ORIENTATION, TurnMeasure, for_bundle
 from dexsim.deploy.readings import bad_orientation, bad_place, bad_stamp, implausible
 from dexsim.deploy.recorder import ACTION, ERRORS, FORCE_COMMAND, GOAL, HEIGHT, OBSERVATION, TURNED, Recorder
 from dexsim.deploy.safety import Guard
@@ -31,7 +32,7 @@ from dexsim.errors import UserError
 from dexsim.tactile.layout import touch_shape
 
 HOMING, SETTLE, PLACE, RUN, RELAXED = "homing", "settle", "place", "run", "relaxed"
-SEEN = {ORIENTATION: 0.1, "place": 0.5}
+SEEN: dict[str, float] = {ORIENTATION: 0.1, "place": 0.5}
 """s that the object's last reading may be old where `LoopSettings.seen` does not say: an IMU's come a hundred a second;
 a camera's thirty, and fingers hide an object for a moment."""
 RELAX_TRIES, RELAX_EVERY = 100, 0.01
@@ -117,6 +118,16 @@ class Report:
 class Loop:
     """One bundle on one hand. See `LoopSettings` and `run`."""
 
+    # There from the first reading on: the newest that could be true, and what the phase needs, times in s
+    state: HandState
+    _began: float
+    _home_s: float
+    _from: np.ndarray
+    _rest: list[np.ndarray]
+    _seen: np.ndarray | None
+    _seen_at: float | None
+    _action: np.ndarray
+
     def __init__(
         self,
         bundle: Bundle,
@@ -164,19 +175,19 @@ class Loop:
             tuple(m["joints"]),
         )
         self.home = np.clip(self.home, self.guard.low, self.guard.high)
-        self.state: HandState | None = None
         self.target: np.ndarray | None = None
         self.phase = HOMING if settings.home else RUN
         self.why = ""
         self.stop = threading.Event()  # set it to end the run
-        self._beat, self._lock = None, threading.Lock()
+        self._beat: float | None = None
+        self._lock = threading.Lock()
         self._tripped: str | None = None
         self._sequence: int | None = None  # of the last reading that the driver gave, taken or not
         self._felt = False  # the first reading had taxels
         self._wrong: str | None = None  # why readings since the last good one were not taken
         self._coded_since: float | None = None  # since when every reading has an error code
         self._nonsense_since: float | None = None  # since when no action was finite
-        self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs, 0.5)
+        self._seen_limit = settings.seen if settings.seen is not None else SEEN.get(self.measure.needs or "", 0.5)
 
     # -- the run
     # -------------------------------------------------------------------------------------------------------------
@@ -213,7 +224,7 @@ class Loop:
                 _to_its_end(lambda: self._relax(self.report.ended or "the loop failed"))
             finally:
                 _to_its_end(lambda: self._shut(interval, watch))
-        if getattr(self.measure, "goals", 0):
+        if isinstance(self.measure, TurnMeasure) and self.measure.goals:
             self.report.counts["goals_reached"] += self.measure.goals
         return self.report
 
@@ -240,9 +251,9 @@ class Loop:
         while True:
             state, now = self.driver.read(), self.clock.now()
             wrong = "there is none" if state is None else implausible(state, now, self.bundle.hand, self._taxels)
-            if wrong is None and now - state.time > self.settings.stale:
+            if state is not None and wrong is None and now - state.time > self.settings.stale:
                 wrong = f"it is {1e3 * (now - state.time):.0f} ms old"
-            if wrong is None:
+            if state is not None and wrong is None:
                 break
             if now > limit:
                 raise UserError(
@@ -421,13 +432,18 @@ class Loop:
             self._seen, self._seen_at = None, now
             return True
         turned = self.measure.needs == ORIENTATION
-        seen = self.eye.orientation(now) if turned else self.eye.place(now)
+        # `__init__` has looked that the eye sees what the measure needs
+        seen = (
+            cast("OrientationSource", self.eye).orientation(now)
+            if turned
+            else cast("HeightSource", self.eye).place(now)
+        )
         self._unseen = (
             "there is no reading"
             if seen is None
             else bad_stamp(seen[1], now) or (bad_orientation if turned else bad_place)(seen[0])
         )
-        if self._unseen is not None:
+        if seen is None or self._unseen is not None:
             self.report.counts["object_not_seen"] += 1
             return self._seen_at is not None
         self._seen, self._seen_at = seen[0], min(float(seen[1]), now)
@@ -435,7 +451,8 @@ class Loop:
 
     def _policy(self, now: float) -> None:
         self._take(now)  # actions come between readings: act on what there is now
-        if not self._look(now):
+        assert self.target is not None  # since the first reading
+        if not self._look(now) or self._seen_at is None:
             return self._send(now, self.target, 1.0)
         if now - self._seen_at > self._seen_limit:
             return None  # the next turn lets go
@@ -455,7 +472,7 @@ class Loop:
             r = self.recorder
             r.put(OBSERVATION, now, observation[0])
             r.put(ACTION, now, action)
-            if self.measure.needs == ORIENTATION:
+            if isinstance(self.measure, TurnMeasure) and self.measure.goal is not None:
                 r.put(TURNED, now, np.asarray(self._seen, np.float32))
                 r.put(GOAL, now, self.measure.goal[0].numpy())
             elif self.measure.needs is not None:
@@ -469,6 +486,7 @@ class Loop:
 
     def _send(self, now: float, target: np.ndarray, current_share: float) -> None:
         """Limit, remember, send, record."""
+        assert self.target is not None  # since the first reading
         safe = self.guard.apply(
             target,
             self.target,
@@ -552,6 +570,7 @@ class Loop:
         """The watchdog's thread: relaxes the hand when the loop itself hangs, in a driver's call, say."""
         limit = self.settings.hang
         while not self.stop.wait(min(0.02, limit / 4)):
+            assert self._beat is not None  # before this thread began
             silent = self.clock.now() - self._beat
             if silent > limit and self._tripped is None and self.phase != RELAXED:
                 self._tripped = f"the loop did not turn for {1e3 * silent:.0f} ms, allowed {1e3 * limit:.0f}"

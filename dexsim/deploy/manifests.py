@@ -158,7 +158,7 @@ def check(raw: dict[str, Any], source: object, hand: Hand) -> Manifest:
     m = convert(raw, Manifest, source, AGAIN)
     if m.task == "rotate" and (m.task_settings is None or m.grip is None):
         raise UserError(f"{source}: lacks task_settings or grip, which task=rotate needs; {AGAIN}")
-    if m.task == "rotate":
+    if m.task == "rotate" and m.task_settings is not None:
         convert(m.task_settings.observe, Observe, f"{source}: task_settings.observe", AGAIN)
         if not np.linalg.norm(m.task_settings.goal.axis) > 1e-3:
             raise UserError(

@@ -53,10 +53,11 @@ class Measure:
 
     @torch.inference_mode()
     def observe(
-        self, state: HandState, seen: np.ndarray, command: float, target: np.ndarray, action: np.ndarray
+        self, state: HandState, seen: np.ndarray | None, command: float, target: np.ndarray, action: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame;
-        command 0..1."""
+        """One control step: (observation [1, D] float32, touch forces [P] N). seen [3] m: the object, palm frame, which
+        is needed; command 0..1."""
+        assert seen is not None
         s = self.signals(state, seen, command)
         force = s.touch_force[0].numpy()
         if not self.touch:  # it is shown and recorded all the same
@@ -145,16 +146,15 @@ class TurnMeasure:
             torch.zeros(1, 0, 0)
             if imu
             else torch.zeros(1, int(self.task["history"]), self.frame)
-            if fresh
+            if self._past is None
             else self._past
         )
         sent = observations_rotate.sent(
             _tensor(np.clip(np.nan_to_num(action), -1.0, 1.0)), _tensor(target), self._middle, self._half,
             self.task["observe"].get("last_action", "step"))  # fmt: skip
         return observations_rotate.Signals(
-            _tensor(state.position), _tensor(self._velocity(state)), q, self.goal if imu else q, sent, _tensor(force),
-            _tensor(centre),
-            _tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
+            _tensor(state.position), _tensor(self._velocity(state)), q, q if self.goal is None else self.goal, sent,
+            _tensor(force), _tensor(centre), _tensor(tips), past, torch.tensor([fresh]))  # fmt: skip
 
     def _aim(self, q: torch.Tensor) -> None:
         """The first goal, or the next where this one is reached."""

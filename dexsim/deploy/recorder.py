@@ -6,7 +6,7 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ class Recorder:
 
     def _run(self) -> None:
         w = self.writer
-        add = {
+        add: dict[str, Callable[..., None]] = {
             "command": w.add_command,
             "tactile": w.add_tactile,
             "temperature": w.add_temperature,

@@ -46,6 +46,7 @@ class ReplayHand:
         self._counts = None
         if recording.tactile is not None:
             newtons = recording.tactile_newtons()
+            assert newtons is not None  # there is touch
             self._counts = newtons.t, newtons.value / (calibration.lsb * calibration.axis_sign)
 
     def open(self) -> dict[str, str]:

@@ -124,6 +124,9 @@ class VendorXHand:
 
     def _cycle(self) -> None:
         """Send the last command, read the state that comes back."""
+        device = self._device
+        if device is None:
+            return  # closed while this thread waited
         with self._lock:
             command = self._command
         if command is not None:
@@ -131,12 +134,12 @@ class VendorXHand:
                 f = self._wire.finger_command[i]
                 f.id, f.kp, f.ki, f.kd = i, int(command.kp), int(command.ki), int(command.kd)
                 f.position, f.tor_max, f.mode = float(command.position[i]), int(command.tor_max[i]), int(command.mode)
-            self._device.send_command(self._id, self._wire)
+            device.send_command(self._id, self._wire)
             with self._lock:
                 if command.mode == PASSIVE and self._command is command:
                     self._passive.set()
         # True would send the last command again; False reads what the bus delivered
-        error, raw = self._device.read_state(self._id, command is not None)
+        error, raw = device.read_state(self._id, command is not None)
         if getattr(error, "error_code", 0) != 0:
             self.bad_reads, self.error = self.bad_reads + 1, str(getattr(error, "error_message", error))[:160]
             return

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
 from dexsim.import_hand import geometry
@@ -55,7 +56,7 @@ def build(
     excluded: pairs of bodies that do not meet each other.
     """
     out = Model("")
-    owner = {}  # body -> finger
+    owner: dict[int, int] = {}  # body -> finger
     for k, finger in enumerate(tree.fingers):
         b = finger.tip
         while b != tree.palm:
@@ -127,9 +128,9 @@ def build(
                 f'{inner}<geom class="visual" name="visual_{_t(m.body(b).name)}_{n}" mesh="{file.removesuffix(".obj")}"'
                 f' rgba="{_colour(m, g)}"/>'
             )
-        for c in kept:
-            if m.body_parentid[c] == b:
-                emit(c, depth + 1)
+        for child in kept:
+            if m.body_parentid[child] == b:
+                emit(child, depth + 1)
         lines.append(f"{pad}</body>")
 
     emit(tree.palm, 2)
@@ -188,7 +189,7 @@ def obj(vertices: np.ndarray, faces: np.ndarray) -> str:
     )
 
 
-def _n(values) -> str:
+def _n(values: ArrayLike) -> str:
     return " ".join(f"{float(x) + 0.0:.8g}" for x in np.atleast_1d(values))
 
 

@@ -121,7 +121,7 @@ def _stretched(m: mujoco.MjModel, finger: Finger, flexion: list[int], position: 
     for _ in range(2):
         for j in flexion[1:]:
             kept = q[j]
-            for angle in np.linspace(*m.jnt_range[j], 41):
+            for angle in np.linspace(m.jnt_range[j, 0], m.jnt_range[j, 1], 41):
                 q[j] = angle
                 if (reach := far()) > best + 1e-6:
                     best, kept = reach, angle

@@ -66,7 +66,7 @@ def moves(hand: Hand) -> list[Move]:
         finger = owner.get(j, -1)
         at = int(model.joint(name).qposadr[0])
         first = None
-        for angle in np.linspace(*hand.limits[j], STEPS):
+        for angle in np.linspace(hand.limits[j][0], hand.limits[j][1], STEPS):
             q = start.copy()
             q[at] = angle
             tips(q)

@@ -134,6 +134,7 @@ def cupped(s: Search, seed: int = 0, keep: np.ndarray | None = None) -> tuple[np
             best, cost = pose(found.x), float(found.cost)
         if np.sqrt(2 * cost / len(s.motions)) < GOOD:
             break
+    assert best is not None  # the first start is better than none
     return np.clip(best, m.jnt_range[:, 0], m.jnt_range[:, 1]), float(np.sqrt(2 * cost / len(s.motions)))
 
 
@@ -141,7 +142,7 @@ def opened(s: Search, closed: np.ndarray) -> np.ndarray:
     """The cupped hand with its fingers let go: OPEN of the way from stretched, farther or nearer where links would
     overlap; an opposing finger stays turned as it is."""
     bent = [j for k, x in enumerate(s.motions) for j in (x.flexion if k in s.thumbs else x.finger.joints)]
-    best, least = None, np.inf
+    best, least = closed, np.inf
     for share in (OPEN, 0.4, 0.2, 0.5, 0.1, 0.6, 0.0, 0.7):
         q = closed.copy()
         q[bent] = s.rest[bent] + share * (closed[bent] - s.rest[bent])
@@ -202,10 +203,10 @@ def meetings(s: Search, count: int = 1500, seed: int = 0) -> tuple[list[tuple[st
     every = set()
     apart = {(int(e) >> 16, int(e) & 0xFFFF) for e in m.exclude_signature}
     bodies = [b for b in range(1, m.nbody) if any(m.geom_contype[g] for g in range(m.ngeom) if m.geom_bodyid[g] == b)]
-    for i, a in enumerate(bodies):
-        for b in bodies[i + 1 :]:
-            if _can_meet(m, a, b) and not {(a, b), (b, a)} & apart:
-                every.add((m.body(a).name, m.body(b).name))
+    for i, one in enumerate(bodies):
+        for other in bodies[i + 1 :]:
+            if _can_meet(m, one, other) and not {(one, other), (other, one)} & apart:
+                every.add((m.body(one).name, m.body(other).name))
     kept = {p for p, n in touched.items() if n >= max(2, count // 500)}
     return sorted(every - kept), len(kept & every)
 

@@ -120,7 +120,9 @@ def fit(points: np.ndarray, most: int = 2) -> list[tuple[np.ndarray, np.ndarray,
     return two if np.abs(distance(points, two)).mean() < 0.75 * np.abs(distance(points, one)).mean() else one
 
 
-def _fitted(points: np.ndarray, middle: np.ndarray, axis: np.ndarray, along: np.ndarray, radius: float):
+def _fitted(
+    points: np.ndarray, middle: np.ndarray, axis: np.ndarray, along: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, float]:
     low, high = np.quantile(along, 0.02) + radius, np.quantile(along, 0.98) - radius
     if high - low < 1e-3:
         low = high = 0.5 * (low + high)

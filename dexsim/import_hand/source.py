@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -93,7 +94,7 @@ def _finite(m: mujoco.MjModel, path: Path) -> None:
             raise UserError(f"model {path}: {what} of '{name(k).name or k}' is {values[k]}: must be finite numbers")
 
 
-def _parsed(path: Path, read) -> mujoco.MjSpec:
+def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
     try:
         return read()
     except (ValueError, RuntimeError) as error:
@@ -120,7 +121,7 @@ def _meshes_there(spec: mujoco.MjSpec, path: Path) -> None:
 def _one_tree(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     """Leave one tree with hinges: objects, floors and tables are not the hand."""
 
-    def joints(body) -> list:
+    def joints(body: Any) -> list[Any]:
         return [*body.joints, *(j for b in body.bodies for j in joints(b))]
 
     trees = {b.name or f"body {k}": (b, joints(b)) for k, b in enumerate(spec.worldbody.bodies)}

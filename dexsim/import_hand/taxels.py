@@ -137,8 +137,8 @@ def read(path: Path) -> dict[str, Pad]:
             raise UserError(f"taxels {path}: line {line}: must be finite, the normal with a length")
         by.setdefault(str(row["finger"]), []).append(values)
     out = {}
-    for finger, values in by.items():
-        table = np.array(values)
+    for finger, lines in by.items():
+        table = np.array(lines)
         normal = unit(table[:, 3:6])
         helper = np.eye(3)[np.abs(normal.mean(0)).argmin()]
         tangent = unit(np.cross(np.cross(normal, helper), normal))

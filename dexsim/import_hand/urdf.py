@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dexsim import files
 from dexsim.errors import UserError
@@ -132,7 +133,7 @@ def _convert(path: Path, to: Path) -> Path:
     import trimesh
 
     try:
-        mesh = trimesh.load(path, force="mesh")
+        mesh: Any = trimesh.load(path, force="mesh")  # a Trimesh, or what has no faces
         if not len(mesh.faces):
             raise ValueError("it holds no triangles")
         mesh.export(to, include_texture=False)

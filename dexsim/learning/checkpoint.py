@@ -243,7 +243,8 @@ def provenance(data: dict[str, Any]) -> str:
 
 def rng_state() -> dict[str, Any]:
     """State of every global random generator, as tensors and plain numbers."""
-    name, keys, position, has_gauss, cached = np.random.get_state()
+    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
+    assert not isinstance(keys, str)  # the words of the Mersenne twister
     version, internal, gauss = random.getstate()
     return {
         "torch": torch.get_rng_state(),

@@ -45,7 +45,7 @@ def sample_without_waiting(actor: Any) -> None:
     `torch.normal` looks whether a standard deviation is negative, which makes the CPU wait for the GPU at every step;
     one that is an exponential or clamped to above 0 cannot be.
     """
-    distribution = getattr(actor, "distribution", None)
+    distribution: Any = getattr(actor, "distribution", None)
     if type(distribution) is not GaussianDistribution:
         return
 

@@ -93,12 +93,14 @@ class Lifeline:
             open_peers = len(self._peers)
             while open_peers:
                 for key, _ in selector.select():
-                    kind, text = _message(key.fileobj)
+                    end = key.fileobj
+                    assert isinstance(end, socket.socket)  # registered above
+                    kind, text = _message(end)
                     if kind in (BYE, b"") and (kind == BYE or self._closing):
-                        selector.unregister(key.fileobj)
+                        selector.unregister(end)
                         open_peers -= 1
                         continue
-                    self._end(kind, text, self._peers[key.fileobj])
+                    self._end(kind, text, self._peers[end])
                     return
 
     def _end(self, kind: bytes, text: str, rank: int) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import torch
+from torch import Tensor
 
 from dexsim import typed
 from dexsim.errors import UserError
@@ -41,10 +42,10 @@ class Optimizer(msgspec.Struct):
 class Random(msgspec.Struct):
     """See :func:`dexsim.learning.checkpoint.rng_state`."""
 
-    torch: torch.Tensor
-    cuda: list[torch.Tensor]
-    numpy: tuple[str, torch.Tensor, int, int, float]
-    python: tuple[int, torch.Tensor, float | None]
+    torch: Tensor
+    cuda: list[Tensor]
+    numpy: tuple[str, Tensor, int, int, float]
+    python: tuple[int, Tensor, float | None]
 
 
 class Settings(msgspec.Struct):

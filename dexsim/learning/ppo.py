@@ -12,6 +12,7 @@ from typing import Any
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # rsl-rl imports GitPython, which fails where git is not installed
 
 import torch
+from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
@@ -55,7 +56,7 @@ def agent_errors() -> Iterator[None]:
         raise UserError(f"agent settings: {str(error).splitlines()[0]}") from error
 
 
-def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> Policy:
+def load_policy(data: dict[str, Any], env: Any, path: str, typed: names.Typed = frozenset()) -> MLPModel:
     """The trained actor of a checkpoint, deterministic, for ``env``. Raises UserError where the two do not fit.
 
     Args:

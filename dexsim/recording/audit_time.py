@@ -152,7 +152,7 @@ def stamps(all_series: list[Series]) -> Iterator[Finding]:
                 end=float(t[jumps[-1] + 1]),
             )
     if len(offsets) > 1:
-        low, high = min(offsets, key=offsets.get), max(offsets, key=offsets.get)
+        low, high = min(offsets, key=offsets.__getitem__), max(offsets, key=offsets.__getitem__)
         apart = offsets[high] - offsets[low]
         if apart > 2 * SKEW_S:
             yield Finding(
@@ -235,11 +235,12 @@ def command_lead(r: Recording, reach: float = 0.5, step: float = 0.005) -> float
         if command is None or position is None:
             continue
         half = len(grid) // 2
-        parts = [
+        found = [
             _lead(command[part], position[part], int(reach / step))
             for part in (slice(None), slice(0, half), slice(half, None))
         ]
-        if all(p is not None for p in parts) and max(parts) - min(parts) <= 3:
+        parts = [p for p in found if p is not None]
+        if len(parts) == len(found) and max(parts) - min(parts) <= 3:
             leads.append(parts[0] * step)
     return float(np.median(leads)) if leads else None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -165,7 +165,9 @@ def spikes(r: Recording) -> Iterator[Finding]:
     """Single samples of position, command and effort far from their neighbours."""
     s = r.states
     for series, name in ((s.position, "position"), (r.commands, "command"), (s.effort, "effort")):
-        for j, joint in enumerate(r.joints if series is not None and len(series) else ()):
+        if series is None or not len(series):
+            continue
+        for j, joint in enumerate(r.joints):
             x = series.value[:, j]
             at = np.flatnonzero(of_effort(r, j) if name == "effort" else spiked(x, name))
             if len(at) and wrapped(x) is None:
@@ -459,12 +461,14 @@ def units(r: Recording) -> Iterator[Finding]:
             ratio = _ratio(drive + q, q)
             # a drive may follow less than it is asked, but none goes twenty times as far and beyond a turn
             far = ratio is not None and ratio > 20 and np.nanmax(np.abs(q)) > 2 * np.pi
-            nearest = min(RATIOS, key=lambda k: abs(np.log(ratio / k))) if far else None
+            nearest = min((abs(np.log(ratio / k)), k) for k in RATIOS)[1] if far and ratio is not None else None
             named = False
             for known, unit in RATIOS.items():
                 for k, whose in ((known, "position"), (1 / known, "command")):
+                    if ratio is None:
+                        continue
                     loose = whose == "position" and known == nearest and 0.5 < ratio / k < 1.3
-                    if ratio is not None and (abs(ratio / k - 1) < 0.1 or loose):
+                    if abs(ratio / k - 1) < 0.1 or loose:
                         named = True
                         yield finding(
                             s.position if whose == "position" else c,
@@ -492,9 +496,10 @@ def units(r: Recording) -> Iterator[Finding]:
         (r.supply_voltage, "supply voltage", 0.0, 100.0, "V"),
         (r.enabled, "enabled", 0.0, 1.0, "0 or 1"),
     )
-    for series, name, low, high, unit in plain:
-        if series is None:
+    for maybe, name, low, high, unit in plain:
+        if maybe is None:
             continue
+        series = maybe
         bad = (series.value < low) | (series.value > high)
         if name == "duty":  # a wrapped one is found as such
             bad[:, [wrapped(x) is not None for x in series.value.T]] = False
@@ -542,7 +547,7 @@ def units(r: Recording) -> Iterator[Finding]:
             yield finding(r.imu, f"the acceleration at rest is {g:.3g}: in g, not m/s2?")
 
 
-def _effort_units(r: Recording, finding) -> Iterator[Finding]:
+def _effort_units(r: Recording, finding: Callable[..., Finding]) -> Iterator[Finding]:
     e = r.states.effort
     if e is None:
         return

@@ -242,9 +242,9 @@ def _scale(path: Path, quantity: str, unit: str, meta: Mapping[str, str]) -> flo
         "velocity": "position_unit",
         "effort": "effort_unit",
         "time": "time_unit",
-    }.get(quantity)
+    }.get(quantity, "")
     if not unit:
-        stated = meta.get(key or "")
+        stated = meta.get(key)
         if stated is None:
             return 1.0
         return UNITS["time"][stated] if quantity == "time" else schema.UNIT_KEYS[key][stated]

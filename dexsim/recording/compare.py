@@ -89,7 +89,8 @@ def compare(recording: Recording, run: Run, m: Mechanism, forces: bool = False) 
     out.fingers = m.hand.finger_names if m.hand is not None else ()
     if recording.tactile is not None:
         known = recording.tactile_lsb is not None
-        touch = recording.tactile_newtons() if known else recording.tactile
+        newtons = recording.tactile_newtons() if known else None
+        touch = recording.tactile if newtons is None else newtons
         out.finger_force = (touch.t, touch.value[..., 2].sum(2))
         out.force_unit = "N" if known else "count"
     if forces:

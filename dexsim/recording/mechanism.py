@@ -108,6 +108,7 @@ def mechanism(
         spec, robot, table, hand = own.spec, own.robot, own.table, own.hand
         joints = own.joints if joints is None else joints
     else:
+        assert model is not None  # else the folder is the xHand's
         path = Path(model).expanduser()
         spec = model_file.read(path, f"model={model}")
         _physical(spec.compile(), f"model={model}")
@@ -285,7 +286,7 @@ def drive(
     J = len(m.joints)
     out = {name: np.zeros((steps, J)) for name in ("position", "velocity", "torque", "target")}
     q_view, v_view, torque_view = engine.t.qpos[0].numpy(), engine.t.qvel[0].numpy(), servo.torque[0].numpy()
-    on = None if enabled is None else np.nan_to_num(enabled.value, nan=1.0) > 0.5
+    on = None if enabled is None else (enabled.t, np.nan_to_num(enabled.value, nan=1.0) > 0.5)
     state = {"k": 0, "command": 0, "enabled": 0}
 
     def before_each() -> None:
@@ -298,10 +299,9 @@ def drive(
                 now[place] = new
                 servo.send(torch.as_tensor(now)[None], stamp=float(stamps[state["command"]]))
             state["command"] += 1
-        while on is not None and state["enabled"] < len(on) and enabled.t[state["enabled"]] <= t:
-            servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = torch.as_tensor(on[state["enabled"]]).to(
-                servo.state.dtype
-            )
+        while on is not None and state["enabled"] < len(on[0]) and on[0][state["enabled"]] <= t:
+            said = torch.as_tensor(on[1][state["enabled"]])
+            servo.state[0, torch.as_tensor(place), servo.slots["enabled"]] = said.to(servo.state.dtype)
             state["enabled"] += 1
         if lead is not None:
             engine.t.qpos[0, q : q + 7] = torch.as_tensor(lead[k])
@@ -381,7 +381,7 @@ def replay(
     initial = np.full(len(m.joints), np.nan)
     state = recording.states.position
     for j, joint in enumerate(recording.joints):
-        seen = np.flatnonzero(np.isfinite(state.value[:, j])) if len(state) else []
+        seen = np.flatnonzero(np.isfinite(state.value[:, j])) if len(state) else np.zeros(0, int)
         if len(seen):
             initial[m.joints.index(joint)] = state.value[seen[0], j]
     end = max(recording.duration, float(recording.commands.t[-1])) + timestep

@@ -51,8 +51,9 @@ def read(
     remap, meta = dict(remap or {}), dict(meta or {})
     if path.suffix.lower() in columns.SUFFIXES:
         stated, findings = metadata.collect(path, {}, meta)
-        reading: _Reading = _TableReading(path, columns.read_table(path, remap, stated), remap, hand)
-        stated = reading.stated(stated)
+        table = _TableReading(path, columns.read_table(path, remap, stated), remap, hand)
+        reading: _Reading = table
+        stated = table.stated(stated)
     else:
         containers = [open_container(p) for p in _files(path)]
         reading = _Reading(path, containers, remap, hand)
@@ -91,7 +92,9 @@ class _Reading:
     """One file (or bag folder) being turned into a Recording."""
 
     def __init__(self, path: Path, containers: list[Container], remap: dict[str, str], hand: Hand | None = None):
-        self.path, self.findings, self.breaks, self.hand = path, [], [], hand or load_hand()
+        self.path, self.hand = path, hand or load_hand()
+        self.findings: list[Finding] = []
+        self.breaks: list[tuple[float, float]] = []
         self.streams: dict[str, list[_Stream]] = {}
         for c in containers:
             self._damage(c)
@@ -223,7 +226,8 @@ class _Reading:
         if ours not in self.sources:
             return np.zeros(0), []
         theirs, part = self.sources[ours]
-        times, out, bad, why, when, written = [], [], 0, "", NAN, []
+        times: list[float] = []
+        out, bad, why, when, written = [], 0, "", NAN, []
         for stream in self.streams[theirs]:
             try:
                 reader = make(stream.channel, stream.schema, part)
@@ -573,16 +577,16 @@ class _TableReading(_Reading):
             if "position" not in have:
                 return empty, []
             t, rows = table.samples("position")
-            rest = {}
+            rest, absent = {}, [empty] * len(rows)
             for q in have[1:]:
                 own, value = table.samples(q)
                 same = len(own) == len(t) and np.array_equal(own, t)
                 rest[q] = value if same else np.stack([_line(t, own, x) for x in value.T], 1)
-            out = [
-                decode.JointSample(
-                    table.joints, x, *(rest[q][i] if q in rest else empty for q in ("velocity", "effort")), None
+            out: list[Any] = [
+                decode.JointSample(table.joints, x, velocity, effort, None)
+                for x, velocity, effort in zip(
+                    rows, rest.get("velocity", absent), rest.get("effort", absent), strict=True
                 )
-                for i, x in enumerate(rows)
             ]
         elif ours == schema.COMMANDS:
             if "command" not in table.value:
@@ -595,7 +599,7 @@ class _TableReading(_Reading):
                 schema.DUTY: "duty",
                 schema.ENABLED: "enabled",
                 schema.SUPPLY: "supply_voltage",
-            }.get(ours)
+            }.get(ours, "")
             if quantity not in table.value:
                 return empty, []
             if quantity == "supply_voltage":

@@ -76,8 +76,9 @@ def realistic(
         effort.value = np.round(hardware.current_sign * value / hardware.current_lsb) * hardware.current_lsb
         meta |= {"effort_is": "current_A", "effort_sign": f"{hardware.current_sign:+d}"}
     out = replace(recording, states=States(position, None, effort), meta=meta)
-    if recording.tactile is not None:
-        held = _latest(recording.tactile_newtons(), t)
+    newtons = recording.tactile_newtons()
+    if newtons is not None:
+        held = _latest(newtons, t)
         counts = np.round(held.value * np.array(hardware.axis_sign) / hardware.taxel_lsb)
         held.value = np.clip(counts, [-128, -128, 0], [127, 127, 255])
         out.tactile = held

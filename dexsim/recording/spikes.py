@@ -102,6 +102,7 @@ def _on_purpose(v: np.ndarray) -> np.ndarray:
 def of_effort(r: Recording, j: int) -> np.ndarray:
     """[T] bool: spikes of a joint's effort, but for those that a jump of its target may have caused."""
     effort = r.states.effort
+    assert effort is not None  # asked for where there is effort
     out = spiked(effort.value[:, j], "effort")
     if not out.any() or not len(r.commands):
         return out

@@ -171,7 +171,8 @@ class PlayRecorder:
                 pieces = [row[a:b].reshape(s) for a, b, s in cut]
                 about, spin, rest = pieces[:7], pieces[7], pieces[8:]
                 turned = np.concatenate([rest.pop(0), spin]) if self._imu else None
-                track.add(about, turned, *rest[:4], rest[4] if len(rest) > 4 else None)
+                rows, target, gravity, done = rest[:4]
+                track.add(about, turned, rows, target, gravity, done, rest[4] if len(rest) > 4 else None)
 
     def recordings(self) -> list[Recording]:
         """What was recorded so far, one a world that has anything."""
@@ -215,6 +216,7 @@ class PlayRecorder:
         for k, recording in enumerate(self.recordings()):
             if realistic:
                 recording = as_hardware(recording, seed + k, self.env.servo.current_per_torque.double().cpu().numpy())
+            assert recording.config is not None  # ours have one
             world = yaml_text.parse(recording.config, path)["recorded_world"]["index"]
             to = self._paths(path)[world]
             write(to, recording)
@@ -230,6 +232,7 @@ class PlayRecorder:
         parts = [Series(t, rows[:, 1 + k * J : 1 + (k + 1) * J], STATES, t.copy()) for k in range(3)]
         pose = Series(t, rows[:, 1 + 3 * J :], OBJECT_POSE, t.copy(), "palm")
         world, servo = self._world(track.world, e.about)
+        assert e.gravity is not None  # set with the first row
         gravity = " ".join(f"{g:g}" for g in e.gravity)
         notes = f"world {track.world} of a play; object {world['object']['shape']}"
         meta = DEFAULTS | {

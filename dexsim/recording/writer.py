@@ -15,7 +15,7 @@ from mcap.writer import Writer as McapWriter
 from dexsim import files
 from dexsim.errors import UserError
 from dexsim.recording import cdr, schema
-from dexsim.recording.schema import Recording
+from dexsim.recording.schema import Recording, Series
 
 
 class Writer:
@@ -69,7 +69,8 @@ class Writer:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._count: dict[str, int] = {}
-        self._chunk_ns, self._last_flush = int(chunk_s * 1e9), None
+        self._chunk_ns = int(chunk_s * 1e9)
+        self._last_flush: int | None = None
         self._open = True
 
     def add_command(self, t: float, position: np.ndarray, stamp: float | None = None) -> None:
@@ -209,16 +210,19 @@ def _samples(r: Recording, w: Writer) -> Iterator[tuple[float, int, Any, tuple]]
         (r.tactile, w.add_tactile),
     )
     for order, (series, add) in enumerate(plain, start=2):
-        for i, t in enumerate([] if series is None else series.t):
-            yield t, order, add, (t, series.value[i])
-    for i, t in enumerate([] if r.object_pose is None else r.object_pose.t):
-        yield t, 7, w.add_object_pose, (t, r.object_pose.value[i], _stamp(r.object_pose, i))
+        if series is not None:
+            for i, t in enumerate(series.t):
+                yield t, order, add, (t, series.value[i])
+    if r.object_pose is not None:
+        for i, t in enumerate(r.object_pose.t):
+            yield t, 7, w.add_object_pose, (t, r.object_pose.value[i], _stamp(r.object_pose, i))
     for order, (series, add) in enumerate(((r.external_force, w.add_external_force), (r.imu, w.add_imu)), start=8):
-        for i, t in enumerate([] if series is None else series.t):
-            yield t, order, add, (t, series.value[i], series.frame, _stamp(series, i))
+        if series is not None:
+            for i, t in enumerate(series.t):
+                yield t, order, add, (t, series.value[i], series.frame, _stamp(series, i))
 
 
-def _stamp(series: Any, i: int) -> float | None:
+def _stamp(series: Series, i: int) -> float | None:
     if series.stamp is None or np.isnan(series.stamp[i]):
         return None
     return float(series.stamp[i])

@@ -46,19 +46,19 @@ _BALLOT = _EXCHANGE.format(
 
 
 @wp.func_native(_XOR)
-def lane_xor(v: float, mask: int) -> float:
+def lane_xor(v: float, mask: int) -> float:  # type: ignore[empty-body]
     """The value of the lane whose number differs by the bits of `mask`."""
     ...
 
 
 @wp.func_native(_FROM)
-def lane_from(v: float, lane: int) -> float:
+def lane_from(v: float, lane: int) -> float:  # type: ignore[empty-body]
     """The value of one lane."""
     ...
 
 
 @wp.func_native(_BALLOT)
-def lane_ballot(yes: bool) -> int:
+def lane_ballot(yes: bool) -> int:  # type: ignore[empty-body]
     """Bit k: whether lane k says yes."""
     ...
 
@@ -70,7 +70,7 @@ def lane_ballot(yes: bool) -> int:
     return __builtin_ffs(bits) - 1;
 #endif
 """)
-def lowest_bit(bits: int) -> int:
+def lowest_bit(bits: int) -> int:  # type: ignore[empty-body]
     """Number of the lowest bit that is set."""
     ...
 

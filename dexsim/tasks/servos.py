@@ -118,10 +118,10 @@ class ServoRandomizer:
         n, joints, columns = self.servo.params.shape
         drawn = [self.sampler.draw(f"servo.{name}", joints) for name in self.columns]
         u = self.sampler.uniform(joints, len(self.simulated))
-        drawn = torch.stack(drawn) if drawn else u[None, :, :, 0]
+        columns_of = torch.stack(drawn) if drawn else u[None, :, :, 0]
         wp.launch(
             self._kernel,
             dim=(n, min(LANES, joints * columns)),
-            inputs=[wp.from_torch(x) for x in (mask, drawn, u)] + self._args,
+            inputs=[wp.from_torch(x) for x in (mask, columns_of, u)] + self._args,
             device=str(self.servo.params.device),
         )

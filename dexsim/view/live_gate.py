@@ -158,11 +158,11 @@ def gated(gate: Gate) -> Iterator[None]:
         kw |= {"max_size": MOST_BYTES, "logger": logger, "open_timeout": HANDSHAKE_S, "create_connection": Connection}
         return serve(counted, *args, process_request=first, **kw)
 
-    ws.serve = with_gate
+    ws.serve = with_gate  # type: ignore[assignment, misc]  # for as long as the server is made
     try:
         yield
     finally:
-        ws.serve = serve
+        ws.serve = serve  # type: ignore[misc]
 
 
 def only_known(server: Any, checks: dict[str, Callable[[Any], bool]]) -> None:

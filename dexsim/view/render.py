@@ -10,15 +10,25 @@ import math
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 NO_GL = 3
 LONGEST_S = 60.0
 FASTEST = 60.0  # frames per second that a video needs at most
+
+class Camera(TypedDict):
+    """A view: a point [3] m, the distance from it [m], azimuth and elevation [deg]."""
+
+    lookat: list[float]
+    distance: float
+    azimuth: float
+    elevation: float
+
+
 # Palm frame = world frame: fingers along +x, palm normal +z. Three-quarter view from the fingers' side, a little above.
-CAMERA = {"lookat": [0.045, -0.01, 0.025], "distance": 0.38, "azimuth": 140.0, "elevation": -28.0}
+CAMERA: Camera = {"lookat": [0.045, -0.01, 0.025], "distance": 0.38, "azimuth": 140.0, "elevation": -28.0}
 
 
 def main(folder: Path, path: Path) -> int:

@@ -26,8 +26,8 @@ class Shot:
     MuJoCo's free camera has them; size: width, height in pixels; groups: which groups of geoms are drawn."""
 
     model: int
-    qpos: Sequence[float]
-    lookat: Sequence[float]
+    qpos: Sequence[float] | np.ndarray
+    lookat: Sequence[float] | np.ndarray
     distance: float
     azimuth: float
     elevation: float

@@ -48,7 +48,7 @@ def contact_sheet(path: str | Path, shapes: dict[str, Shape] | None = None) -> N
         kept = ", kept for evaluation" if shape.held_out else ""
         axes.set_title(f"{shape.name}: {len(shape.hulls)} hull(s), {1e6 * shape.volume:.0f} cm³{kept}", fontsize=8)
     figure.tight_layout()
-    files.picture(figure, path)
+    files.picture(figure, Path(path))
 
 
 def main() -> None:
@@ -57,11 +57,12 @@ def main() -> None:
     arguments = parser.parse_args()
     shapes = bake_all()
     stored = {f"{name}/{key}": array for name, shape in shapes.items() for key, array in pack(shape).items()}
-    np.savez_compressed(LIBRARY, **stored)
+    np.savez_compressed(LIBRARY, **stored)  # type: ignore[arg-type]  # its stub takes ** for allow_pickle
     print("name       hulls vertices   extents mm           cm3    kept out  grid          error mean/max mm")
     for shape in shapes.values():
         sizes = ",".join(str(len(h)) for h in shape.hulls)
         extents = " x ".join(f"{1e3 * e:.1f}" for e in shape.extents)
+        assert shape.grid is not None  # baked
         dims = "x".join(str(n) for n in shape.grid.data.shape)
         mean, largest = (1e3 * e for e in shape.grid_error)
         print(

@@ -68,6 +68,7 @@ def pack(shape: Shape) -> dict[str, np.ndarray]:
     The distances are whole `UNIT`s in 16 bits; second differences (along x, then y) leave small numbers wherever
     the distance is linear, which is what makes the file compress.
     """
+    assert shape.grid is not None  # a shape of kind "grid" has one
     units = np.round(shape.grid.data.astype(float) / UNIT)
     if np.abs(units).max() > 32767:
         raise ValueError(f"shape {shape.name}: distances beyond 65 mm do not fit the stored 16 bits")
@@ -97,6 +98,7 @@ def unpack(name: str, stored: dict[str, np.ndarray]) -> Shape:
     for axis in (1, 0):
         code = np.cumsum(code, axis=axis, dtype=np.int16)
     data = (code.astype(float) * UNIT).astype(np.float32)
+    mean, largest = (float(e) for e in stored["grid_error"])
     return Shape(
         name=name,
         kind="grid",
@@ -106,5 +108,5 @@ def unpack(name: str, stored: dict[str, np.ndarray]) -> Shape:
         volume=float(stored["volume"]),
         inertia_unit=stored["inertia_unit"],
         extents=np.ptp(np.concatenate(hulls), axis=0),
-        grid_error=tuple(float(e) for e in stored["grid_error"]),
+        grid_error=(mean, largest),
     )

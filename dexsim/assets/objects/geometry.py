@@ -82,24 +82,27 @@ def _cut(polygon: np.ndarray, plane: np.ndarray, tol: float) -> tuple[np.ndarray
     return np.array(inside), np.array(outside)
 
 
-def _outside_of(polygon: np.ndarray, normal: np.ndarray, planes: np.ndarray, keep_shared: bool, tol: float):
+def _outside_of(
+    polygon: np.ndarray, normal: np.ndarray, planes: np.ndarray, keep_shared: bool, tol: float
+) -> list[np.ndarray]:
     """The parts of a face (outward `normal`) that are not inside the polyhedron `planes`, as convex polygons.
 
     A face lying in one of the planes is kept where the two look the same way and `keep_shared` (one of two hulls
     keeps a surface that both have), and dropped where they face each other (the seam of two touching hulls).
     """
-    pieces = []
+    pieces: list[np.ndarray] = []
     rest = polygon
     for plane in planes:
         if np.abs(rest @ plane[:3] + plane[3]).max() <= tol:
             if plane[:3] @ normal > 0 and keep_shared:
                 return [polygon]
             continue
-        rest, out = _cut(rest, plane, tol)
+        inside, out = _cut(rest, plane, tol)
         if out is not None and len(out) >= 3:
             pieces.append(out)
-        if rest is None or len(rest) < 3:
+        if inside is None or len(inside) < 3:
             return pieces
+        rest = inside
     return pieces
 
 
@@ -233,7 +236,7 @@ def principal_axes(inertia: np.ndarray) -> np.ndarray:
     weight = np.abs(axes)
     for _ in range(3):
         row, column = np.unravel_index(np.argmax(weight), weight.shape)
-        order[row] = column
+        order[int(row)] = int(column)
         weight[row, :] = weight[:, column] = -1
     axes = axes[:, order] * np.sign(np.diag(axes[:, order]))
     if np.linalg.det(axes) < 0:

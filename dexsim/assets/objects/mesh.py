@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -40,7 +41,7 @@ def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
     if not path.is_file():
         raise UserError(f"mesh {path}: no such file")
     try:
-        mesh = trimesh.load(path, force="mesh")
+        mesh: Any = trimesh.load(path, force="mesh")  # a Trimesh, or what has neither vertices nor faces
     except Exception as error:  # trimesh raises whatever its reader for the format does
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(
@@ -131,8 +132,8 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
     """
     if not 1 <= parts <= MOST_PARTS:
         raise UserError(f"object_hulls={parts}: must be a whole number from 1 to {MOST_PARTS}")
+    paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(p) for p in path]
     single = isinstance(path, (str, Path))
-    paths = [Path(path)] if single else [Path(p) for p in path]
     if not 1 <= len(paths) <= MAX_HULLS:
         raise UserError(
             f"mesh parts: {len(paths)} files given, allowed 1 to {MAX_HULLS}; merge convex parts that lie close by"
@@ -140,7 +141,7 @@ def load_mesh(path: str | Path | Sequence[str | Path], scale: float = 1.0, parts
     if not (np.isfinite(scale) and scale > 0):
         raise UserError(f"mesh {paths[0]}: scale={scale}, must be a positive number; 0.001 for a file in millimetres")
     notes: list[str] = []
-    hulls = []
+    hulls: list[np.ndarray] = []
     split = False
     for file in paths:
         triangles, said = _read(file, scale)

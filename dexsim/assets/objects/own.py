@@ -145,15 +145,17 @@ def _read(path: Path) -> Shape:
         if int(d["format"]) != FORMAT:
             raise ValueError(f"format {int(d['format'])}, must be {FORMAT}")
         hulls = np.split(d["hulls"].astype(float), np.cumsum(d["hull_sizes"])[:-1])
+        mean, largest = (float(x) for x in d["grid_error"])
         shape = Shape(
             name=str(d["name"]), kind="grid", held_out=False, hulls=hulls,
             grid=Grid(d["origin"].astype(float), float(d["spacing"]), d["data"].astype(np.float32)),
             volume=float(d["volume"]), inertia_unit=d["inertia_unit"].astype(float),
-            extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=tuple(float(x) for x in d["grid_error"]),
+            extents=np.ptp(np.concatenate(hulls), axis=0), grid_error=(mean, largest),
             true_size=True, notes=tuple(str(x) for x in np.atleast_1d(d["notes"])), file_centre=d["file_centre"],
             file_axes=d["file_axes"], file_scale=float(d["file_scale"]),
         )  # fmt: skip
-        whole = shape.grid is not None and shape.grid.data.ndim == 3 and len(hulls) >= 1
+        assert shape.grid is not None  # made above
+        whole = shape.grid.data.ndim == 3 and len(hulls) >= 1
         good = all(h.ndim == 2 and h.shape[1] == 3 and np.isfinite(h).all() for h in hulls)
         if not (whole and good and np.isfinite(shape.grid.data).all() and shape.inertia_unit.shape == (3, 3)):
             raise ValueError("its arrays do not make a shape")

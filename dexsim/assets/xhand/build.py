@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dexsim.assets import xhand
 from dexsim.assets.xhand import shells
@@ -30,13 +31,16 @@ TIP_BIT, THUMB_TIP_BIT, THUMB_LINK_BIT = 4, 8, 16
 
 PALM_CENTRE = 0.065  # z of the palm frame on the root link's fingers axis (m)
 
+Point = tuple[float, float, float]
+Capsule = tuple[Point, Point, float]
+
 # Capsules (from, to, radius) in link frames, m, inside the measured bounds.
 # Only what an object in the palm can reach: the backs of palm and fingers have none.
-_PHALANX = [((0.003, 0, 0), (0.003, 0, 0.0584), 0.0081)]
+_PHALANX: list[Capsule] = [((0.003, 0, 0), (0.003, 0, 0.0584), 0.0081)]
 _PALM_RADIUS = 0.0115
 _PALM_Y = np.linspace(-0.0502 + _PALM_RADIUS, 0.0437 - _PALM_RADIUS, 4)
 _PALM_TOP = [0.082, 0.088, 0.089, 0.074]  # below each finger's root joint
-CAPSULES = {
+CAPSULES: dict[str, list[Capsule]] = {
     "right_hand_link": [
         ((0.025 - _PALM_RADIUS, y, 0.0135), (0.025 - _PALM_RADIUS, y, top), _PALM_RADIUS)
         for y, top in zip(_PALM_Y, _PALM_TOP, strict=True)
@@ -151,13 +155,13 @@ def shell_meshes() -> dict[str, tuple[str, str, shells.Mesh]]:
             low = (y + sign * half) * 1e-3
             mesh = shells.ear((0.0065, z * 1e-3), 0.0093, mm((-10, 84), (20, 84)), low - 0.0007, low + 0.0007, 1)
             out[f"knuckle_{name}_{side}"] = (palm, "shell", mesh)
-        low, high = (-0.0060, (y - 8.2) * 1e-3, 0.080), (0.0190, (y + 8.2) * 1e-3, (z - 8.3) * 1e-3)
-        out[f"knuckle_{name}"] = (palm, "shell", shells.rounded_box(low, high, 0.003))
+        corners = (-0.0060, (y - 8.2) * 1e-3, 0.080), (0.0190, (y + 8.2) * 1e-3, (z - 8.3) * 1e-3)
+        out[f"knuckle_{name}"] = (palm, "shell", shells.rounded_box(*corners, 0.003))
     return out
 
 
 # Visual cylinders: body -> (material, centre, axis, radius, half length), link frame.
-PINS = {
+PINS: dict[str, list[tuple[str, Point, Point, float, float]]] = {
     "right_hand_link": [("metal", (0, 0, 0.005), (0, 0, 1), 0.025, 0.005)],
     "right_hand_thumb_bend_link": [("metal", (0, 0, 0.0004), (0, 0, 1), 0.0089, 0.0094)],
     "right_hand_thumb_rota_link1": [
@@ -168,7 +172,7 @@ PINS = {
 }  # fmt: skip
 
 
-def _num(values) -> str:
+def _num(values: ArrayLike) -> str:
     return " ".join(f"{float(x) + 0.0:.9g}" for x in np.atleast_1d(values))
 
 
@@ -254,7 +258,7 @@ def _bits(body: str) -> tuple[int, int]:
 
 # Fingertips meet the hand itself through capsules inside them (within 2 mm of the skin): convex meshes against each
 # other cost more than everything else in a closed grasp. They meet the object through the mesh alone.
-PROXIES = {
+PROXIES: dict[str, list[Capsule]] = {
     "thumb": [((x, 0.017, 0.0015), (x, 0.0415, -0.001), 0.0085) for x in (-0.006, 0.006)],
     "finger": [((0.002, 0, 0.013), (0.0005, 0, 0.0335), 0.008)],
 }

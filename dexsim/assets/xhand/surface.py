@@ -168,15 +168,15 @@ def tip_points(lattice: Lattice, pad: PadShape, nu: int = 37, nv: int = 45,
 
     # Cast rays from the middle: around the cross-section at stations along b, then over the rounded end.
     mid_c = pad.waist / 2 + 0.001
-    starts, rays = [], []
+    begin, way = [], []
     angles = np.linspace(-np.pi / 2, 1.5 * np.pi, 49)[:-1]
     for b in np.linspace(pad.start, b1, 9):
-        starts += [(0.0, b, mid_c)] * len(angles)
-        rays += [(np.cos(t), 0.0, np.sin(t)) for t in angles]
+        begin += [(0.0, b, mid_c)] * len(angles)
+        way += [(np.cos(t), 0.0, np.sin(t)) for t in angles]
     for tilt in np.linspace(0.12, np.pi / 2, 12):
-        starts += [(0.0, b1, mid_c)] * len(angles)
-        rays += [(np.cos(t) * np.cos(tilt), np.sin(tilt), np.sin(t) * np.cos(tilt)) for t in angles]
-    starts, rays = np.array(starts), np.array(rays)
+        begin += [(0.0, b1, mid_c)] * len(angles)
+        way += [(np.cos(t) * np.cos(tilt), np.sin(tilt), np.sin(t) * np.cos(tilt)) for t in angles]
+    starts, rays = np.array(begin), np.array(way)
     # Under the tangent planes a ray ends where it meets the first of them; the rounded bounds are found by bisection.
     room, climb = offset[None, :] - under - starts @ planes.T, rays @ planes.T
     first = np.where(climb > 0.0, room / np.where(climb > 0.0, climb, 1.0), np.inf).min(axis=1)
