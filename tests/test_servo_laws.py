@@ -25,9 +25,10 @@ FREE = {"kp": 100.0, "kd": 0.0, "torque_limit": 0.4, "no_load_speed": 10.0}
 INERTIA = 1e-3
 
 
-def servo_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0, dt: float = 0.001) -> np.ndarray:
+def servo_motion(columns: dict, times, targets, seconds: float, v0=0.0, dt=0.001, gravity=0.0) -> np.ndarray:
     """[steps, 3] q, v, motor torque at the begin of each step: a free link on the servo's kernel in C MuJoCo."""
-    engine = make_engine(link_spec(INERTIA, dt, friction=STICKS), 1, engine="mujoco", fields=FIELDS, threads=1)
+    friction = STICKS + (HARD if gravity else "")
+    engine = make_engine(link_spec(INERTIA, dt, gravity, friction), 1, engine="mujoco", fields=FIELDS, threads=1)
     servo = Servo(engine, ["joint"], ServoTable.from_dict({"joints": {"joint": columns}}), control_period=0.005)
     engine.t.qvel[:] = v0
     out, k = [], 0
@@ -41,7 +42,7 @@ def servo_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0,
     return np.array(out)
 
 
-def plant_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0, dt: float = 0.001) -> np.ndarray:
+def plant_motion(columns: dict, times, targets, seconds: float, v0=0.0, dt=0.001, gravity=0.0) -> np.ndarray:
     """[steps, 2] q, motor torque of the same link in the search's plant."""
     steps = round(seconds / dt)
     t = dt * np.arange(steps)
@@ -53,6 +54,7 @@ def plant_motion(columns: dict, times, targets, seconds: float, v0: float = 0.0,
         ("supply", 1.0),
         ("enabled", 1.0),
         ("warmth", columns.get("warmth", 0.0)),
+        ("gravity_cos", 0.1 * gravity * 0.008),
     ):
         series[:, SERIES_INDEX[name]] = value
     row = nominal_row(ServoTable.from_dict({"joints": {"joint": columns}}).nominal(["joint"])[0], 0.0)
@@ -364,6 +366,26 @@ def test_warmth_acts_on_friction_that_grows_with_load(motion):
     columns = {"kp": 100.0, "torque_limit": 0.05, "load_friction": 0.5, "thermal_friction": -0.01, "warmth": 40.0}
     q = motion(columns, [0.0], [1e4], 0.2)[:, 0]
     assert q[-1] == pytest.approx(0.5 * 0.05 * (1 - 0.5 * 0.6) / INERTIA * 0.199**2, rel=0.02)
+
+
+HARD = ' solreffriction="0.002 1"'  # dry friction that stops as the plant's does, not along an exponential of 20 ms
+LOADED = {"load_friction_external": 0.4, "load_stribeck": 0.2, "load_stribeck_external": 0.4, "load_quadratic": 1e3,
+          "load_quadratic_external": 20.0}  # fmt: skip
+
+
+def test_a_gears_load_from_both_sides_is_one_law_in_servo_and_plant():
+    """A link under gravity that is lifted and let down: the two come together with the step; each column matters."""
+    columns = {"kp": 0.3, "kd": 0.006, "load_friction": 0.2, "load_friction_backdriven": 0.2, "stribeck_speed": 0.6}
+    times = np.arange(0.0, 2.0, 0.01)
+    targets = 0.5 * np.sin(2 * np.pi * times) + 0.1 * np.sin(2 * np.pi * 2.3 * times)
+    run_by = lambda motion, c, dt: motion(c, times, targets, 2.0, dt=dt, gravity=40.0)[:, 0]  # noqa: E731
+    q = run_by(servo_motion, columns | LOADED, 2.5e-4)
+    apart = np.abs(run_by(plant_motion, columns | LOADED, 2.5e-4) - q).max()
+    coarse = run_by(plant_motion, columns | LOADED, 1e-3) - run_by(servo_motion, columns | LOADED, 1e-3)
+    assert apart < 0.007 and apart < 0.4 * np.abs(coarse).max()
+    for name in LOADED:
+        without = np.abs(run_by(servo_motion, columns | LOADED | {name: 0.0}, 2.5e-4) - q).max()
+        assert without > 3 * apart, name
 
 
 @wp.kernel

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim import intervals
-from dexsim.actuator.columns import COLUMNS, INDEX
-from dexsim.actuator.reference import torque_along
+from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
+from dexsim.actuator.reference import load_level, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
 from dexsim.gap.judge import kept_out
@@ -276,23 +276,21 @@ def residual_torque(case: Case, runs: list[Run], trial: Trial, run: int) -> tupl
     if p("lag") > 0:
         motor = _lagged(t, motor, p("lag"))
     slope = 0.05 * max(case.scales.speed, 1e-9)
-    level = p("coulomb_friction") + p("stribeck_peak") * np.exp(-((v / p("stribeck_speed")) ** 2))
-    level = (
-        level
-        + np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction")) * np.abs(motor)
-        + case.constants.friction
-    )
-    friction = (
-        level * np.sign(v)
-        + 0.5 * p("friction_asymmetry") * level
-        + (p("viscous_friction") + case.constants.damping) * v
-    )
     ripple = p("torque_ripple") * np.sin(p("ripple_per_turn") * q + p("ripple_phase"))
     inertia = s("inertia") * p("inertia_scale") + p("armature")
     needed = inertia * a + p("gravity_scale") * s("gravity_cos") + s("rest")
     needed += p("spring") * q + p("spring_preload")
     needed += p("payload") * (s("load_cos") + s("load_inertia") * a) + p("own_payload") * (
         s("own_cos") + s("own_inertia") * a
+    )
+    fades = np.exp(-((v / p("stribeck_speed")) ** 2))
+    share = np.where(motor * v < 0, p("load_friction_backdriven"), p("load_friction"))
+    by_load = load_level({n: p(n) for n in FEATURES["load"]}, share, motor, inertia * a - needed, fades)
+    level = p("coulomb_friction") + p("stribeck_peak") * fades + by_load + case.constants.friction
+    friction = (
+        level * np.sign(v)
+        + 0.5 * p("friction_asymmetry") * level
+        + (p("viscous_friction") + case.constants.damping) * v
     )
     on = np.abs(v) > slope
     if r.enabled is not None:

@@ -16,14 +16,17 @@ from functools import cache
 
 import warp as wp
 
+from dexsim.actuator.columns import FEATURES as SERVO_FEATURES
 from dexsim.actuator.laws import (
     arrived,
     difference,
     eccentricity,
     eccentricity_slope,
+    gear_friction,
     hold,
     lag_share,
     load_share,
+    opposed_square,
     other_terms,
     pd,
     preslide,
@@ -58,6 +61,7 @@ P_COULOMB, P_ASYM, P_PEAK, P_VS, P_VISC, P_LOAD, P_BACK = (
         "load_friction", "load_friction_backdriven",
     )
 )  # fmt: skip
+P_LOADOUT, P_LOADPEAK, P_LOADPEAKOUT, P_SQUARE, P_SQUAREOUT = (INDEX[n] for n in SERVO_FEATURES["load"])
 P_RIPPLE, P_TURN, P_PHASE, P_OFFSET, P_SCALE = (
     INDEX[n] for n in ("torque_ripple", "ripple_per_turn", "ripple_phase", "position_offset", "position_scale")
 )
@@ -170,6 +174,7 @@ class Guess:  # the columns of one guess that every step asks for
     exponent: f64
     load: f64  # friction's share of the load, driving, and
     back: f64  # back-driven
+    carries: bool  # it is by the load from outside too, or falls with speed, or is by its square
     uneven: f64  # half the friction's asymmetry
     bias: f64
     spring: f64
@@ -292,6 +297,8 @@ def guess(c: Recorded, h: int, dt: f64):
     p.exponent = c.params[h, P_EXPONENT]
     p.load = c.params[h, P_LOAD]
     p.back = c.params[h, P_BACK]
+    for k in range(wp.static(len(SERVO_FEATURES["load"]))):
+        p.carries = p.carries or c.params[h, P_LOADOUT + k] != f64(0.0)
     p.uneven = f64(0.5) * c.params[h, P_ASYM]
     p.bias = c.params[h, P_BIAS]
     p.spring = c.params[h, P_SPRING]
@@ -568,14 +575,25 @@ def opened(t: Torque, v: f64, p: Guess, n: Now):
 
 
 @wp.func
-def dry_friction(torque: f64, v: f64, p: Guess, n: Now):
-    """Level [N.m] at the motor's speed; torque: the motor's of the step before."""
+def carried_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, share: f64, p: Guess):
+    """Level [N.m] by what the gear carries on both sides (BAM's models m3 to m6)."""
+    fading = gear_friction(torque, outside, c.params[h, P_LOADPEAK], c.params[h, P_LOADPEAKOUT])
+    fading += opposed_square(torque, outside, c.params[h, P_SQUARE], c.params[h, P_SQUAREOUT])
+    left = wp.exp(-stribeck_power(v / p.stribeck_speed, p.exponent))
+    return gear_friction(torque, outside, share, c.params[h, P_LOADOUT]) + left * fading
+
+
+@wp.func
+def dry_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, p: Guess, n: Now):
+    """Level [N.m] at the motor's speed; torque: the motor's of the step before; outside: what the joint feels else."""
     level = p.coulomb
     if p.peak > f64(0.0):
         power = stribeck_power(v / p.stribeck_speed, p.exponent)
         if power < f64(25.0):
             level += p.peak * wp.exp(-power)
     share = load_share(torque, v, p.load, p.back)
+    if p.carries:
+        return (level + carried_friction(c, h, torque, outside, v, share, p)) * n.friction
     return (level + share * wp.abs(torque)) * n.friction
 
 
@@ -789,7 +807,7 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         wave = ripple_wave(c.params[h, P_TURN] * x.q + c.params[h, P_PHASE], c.params[h, P_SHAPE])
         applied += p.ripple * wave[0]
     applied += p.bias
-    level = dry_friction(before, v_drive, p, n)
+    level = dry_friction(c, h, before, p.bias - load, v_drive, p, n)
     applied -= p.uneven * level
     stop_d = zero
     if x.q < p.low:
