@@ -340,6 +340,9 @@ def test_f_max_is_a_static_press_of_about_ten_newtons(env):
     full, half = fingertip_press(hand, servo), fingertip_press(hand, servo, drive=0.5)
     assert half == pytest.approx(full / 2, rel=0.05)  # static: proportional to torque
     assert fingertip_press(hand, servo, stiffness=20000.0) == pytest.approx(full, rel=0.05)  # and hardly of the rubber
+    unknown = {name: column | {"torque_limit": "unknown"} for name, column in servo["joints"].items()}
+    with pytest.raises(UserError, match="torque_limit of .* is unknown; state it"):
+        fingertip_press(hand, servo | {"joints": unknown})
 
 
 # -- ends

@@ -52,7 +52,7 @@ FIX = "BAM writes such a file with its fit"
 STRIBECK = ("m2", "m4", "m5", "m6")
 FALL = ("friction_stribeck", "dtheta_stribeck", "alpha")
 """What a model without Stribeck's curve has not."""
-LOADS = {
+LOADS: dict[str, dict[str, tuple[str, ...]]] = {
     "m3": {"load_friction_base": ("load_friction", "load_friction_backdriven", "load_friction_external")},
     "m5": {
         "load_friction_motor": ("load_friction", "load_friction_backdriven"),
@@ -115,7 +115,7 @@ def read(path: str | Path) -> Bam:
             " voltage: a Dynamixel, Feetech or Waveshare one"
         )
     bam = typed.convert(raw, Bam, f"BAM file {path}", FIX)
-    for name in (*(FALL if bam.model in STRIBECK else ()), *LOADS.get(bam.model, ())):
+    for name in (*(FALL if bam.model in STRIBECK else ()), *LOADS.get(bam.model, {})):
         if getattr(bam, name) is None:
             raise UserError(
                 f"BAM file {path}: {name}: missing in a file of model {bam.model}; must be said (0: none of it), for"
@@ -156,11 +156,13 @@ def to_bam(table: ServoTable, joint: str, armature: float, actuator: str = "xl33
         raise UserError(f"{where}: BAM's motors are driven by voltage; state drive: voltage and supply_voltage")
     if actuator.startswith(NOT_BY_VOLTAGE):
         raise UserError(f"actuator={actuator}: BAM drives it by current or torque; must be a motor driven by voltage")
-    said = {c.name: table.value(joint, c.name).value for c in COLUMNS}
+    said: dict[str, float] = {}
     known = {"kp", "torque_limit", "no_load_speed", *SAME.values(), *LOADED}
     for c in COLUMNS:
-        if said[c.name] is None or (c.name not in known and said[c.name] != c.neutral):
-            raise UserError(f"{where}.{c.name} ({said[c.name]}): BAM has no such parameter; must be {c.neutral:g}")
+        value = table.value(joint, c.name).value
+        if value is None or (c.name not in known and value != c.neutral):
+            raise UserError(f"{where}.{c.name} ({value}): BAM has no such parameter; must be {c.neutral:g}")
+        said[c.name] = value
     stall, no_load, supply = said["torque_limit"], said["no_load_speed"], table.supply_voltage
     if not 0 < stall < float("inf") or not no_load < float("inf"):
         raise UserError(f"{where}: torque_limit ({stall:g}), no_load_speed ({no_load:g}): BAM needs both, finite")
@@ -195,22 +197,22 @@ def _model(said: Mapping[str, float]) -> str:
 
 def main(argv: list[str]) -> int:
     """Returns the exit status. Raises UserError."""
-    own = {"in": None, "out": None, "joint": "*", "kp": None, "supply_voltage": None, "armature": None,
-           "actuator": "xl330"}  # fmt: skip
+    keys = ("in", "out", "joint", "kp", "supply_voltage", "armature", "actuator")
+    own = {"joint": "*", "actuator": "xl330"}
     for text in argv:
         key, equals, value = text.partition("=")
-        if not equals or key not in own:
-            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(own)}")
+        if not equals or key not in keys:
+            raise UserError(f"'{text}': expected key=value with one of the keys {', '.join(keys)}")
         own[key] = value
     for key in ("in", "out"):
-        if own[key] is None:
+        if key not in own:
             raise UserError(f"say {key}=FILE (python -m dexsim.actuator.bam --help)")
 
     def number(key: str, low: float) -> float:
         try:
-            value = float(own[key])
-        except (TypeError, ValueError):
-            raise UserError(f"{key}={own[key]}: must be a number") from None
+            value = float(own.get(key, ""))
+        except ValueError:
+            raise UserError(f"{key}={own.get(key)}: must be a number") from None
         if not low <= value < 1e6:
             raise UserError(f"{key}={own[key]}: must lie in [{low:g}, 1e6)")
         return value
@@ -218,8 +220,8 @@ def main(argv: list[str]) -> int:
     out = Path(own["out"]).expanduser()
     if own["in"].endswith(".json"):
         bam = read(own["in"])
-        table = to_servo(bam, number("kp", 0.0), number("supply_voltage", 1e-3), own["joint"])
-        content = yaml.safe_dump(table, sort_keys=False, width=120)
+        made = to_servo(bam, number("kp", 0.0), number("supply_voltage", 1e-3), own["joint"])
+        content = yaml.safe_dump(made, sort_keys=False, width=120)
         note = f"armature {bam.armature:.4g} kg m2 goes into the model or hand.yaml"
     else:
         table = ServoTable.load(Path(own["in"]).expanduser())

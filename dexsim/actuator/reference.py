@@ -129,12 +129,12 @@ def servo(
     play, rare = "play" in features, "rare" in features
     p = {name: np.asarray(params, dtype=float)[..., i] for name, i in INDEX.items()}
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
-    fresh = np.asarray(fresh) != 0.0
+    first = np.asarray(fresh) != 0.0
     turned = q if q_loop is None else np.asarray(q_loop, dtype=float)
     turning = v if v_loop is None else np.asarray(v_loop, dtype=float)
     two = play & ((p["backlash"] > 0.0) | (p["softness"] > 0.0))
-    v_drive = np.where(two & ~fresh, line_a + np.asarray(line_b) * v, v)
-    rotor_q = np.where(two & ~fresh, rotor + dt * v_drive, q)
+    v_drive = np.where(two & ~first, line_a + np.asarray(line_b) * v, v)
+    rotor_q = np.where(two & ~first, rotor + dt * v_drive, q)
     rotor_inertia = np.where(
         two, np.maximum(np.where(p["rotor"] == 0.0, base_armature, p["rotor"]), LEAST_ROTOR * inertia), 0.0
     )
@@ -146,11 +146,12 @@ def servo(
     )
     v_m = scale * turning
     q_m = p["position_scale"] * turned + p["position_offset"]
-    v_d, v_next, kd_blend, kind = v_m, v_m, 1.0, np.zeros_like(v)
+    kd_blend: Numbers = 1.0
+    v_d, v_next, kind = v_m, v_m, np.zeros_like(v)
     if rare:
         q_m = q_m + p["eccentric_sin"] * np.sin(turned) + p["eccentric_cos"] * (np.cos(turned) - 1.0)
         kd_blend = dt / (p["speed_lag"] + dt)
-        filtered = np.where(fresh, turning, filtered + kd_blend * (turning - filtered))
+        filtered = np.where(first, turning, filtered + kd_blend * (turning - filtered))
         v_d, v_next = scale * filtered, scale * (filtered + kd_blend * (turning - filtered))
         kind, target = p["deadband_kind"], target + p["coupling"] * dragging
 
@@ -270,7 +271,7 @@ def servo(
 
     gives = ("presliding" in features) & (p["presliding"] > 0.0)
     y = v_drive * dt / np.where(gives, p["presliding"], 1.0)
-    taken = np.where(gives & ~fresh, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
+    taken = np.where(gives & ~first, (taken + y) / (1.0 + np.abs(y)), np.where(gives, 0.0, taken))
     sliding = np.where(gives, np.where(two, own, level), 0.0)
     viscous = viscous + sliding * dt / np.where(gives, p["presliding"], 1.0) * (1.0 - taken * np.sign(v_drive)) / (
         1.0 + np.abs(y)
@@ -324,7 +325,21 @@ def servo(
 
 
 def _rotor(
-    p, of_motor, slope, on_drive, on_rotor, own, viscous, rotor_q, w, rotor_inertia, inertia, q, v, dt, gain
+    p: dict[str, np.ndarray],
+    of_motor: np.ndarray,
+    slope: Numbers,
+    on_drive: Numbers,
+    on_rotor: np.ndarray,
+    own: np.ndarray,
+    viscous: np.ndarray,
+    rotor_q: np.ndarray,
+    w: np.ndarray,
+    rotor_inertia: np.ndarray,
+    inertia: Numbers,
+    q: np.ndarray,
+    v: np.ndarray,
+    dt: float,
+    gain: Numbers,
 ) -> dict[str, np.ndarray]:
     """The rotor's step as a line in the link's velocity ("Play and elasticity" in `kernel.py`): qfrc_applied and
     armature of what passes to the link, line_a and line_b of the rotor's velocity. gain: stiffness of the loop

@@ -107,7 +107,10 @@ class Servo:
 
         j, c, s = len(self.joints), len(NAMES), len(self.slots)
         zeros = lambda *shape: wp.zeros(shape, dtype=real, device=device)  # noqa: E731
-        index = lambda values: wp.array(values, dtype=int, device=device)  # noqa: E731
+
+        def index(values: Any) -> wp.array:
+            return wp.array(values, dtype=int, device=device)
+
         self._params, self._state, self._torque = zeros(n, j, c), zeros(n, j, s), zeros(n, j)
         self._inertia, self._base_damping, self._base_frictionloss = zeros(n, j), zeros(n, j), zeros(n, j)
         self._base_armature, self._home, self._given = zeros(n, j), zeros(n, j), zeros(n)
@@ -272,11 +275,11 @@ class Servo:
         """([N, J] position, velocity) of what the reporting encoders turn with: the joints, or the rotors before a
         play."""
         q, v = self.engine.t.qpos[:, self.reported_q], self.engine.t.qvel[:, self._reported_dof]
-        if not self.at_rotor:
+        here = self._position_motor
+        if here is None or not self.at_rotor:
             return q, v
         rotor, a, b, fresh = (self.state[:, :, self.slots[name]] for name in ("rotor", "line_a", "line_b", "fresh"))
         w = torch.where(fresh != 0, v, a + b * v)
-        here = self._position_motor
         return torch.where(here & (fresh == 0), rotor + self.engine.dt * w, q), torch.where(here, w, v)
 
     # -- state ------------------------------------------------------------

@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -31,8 +31,9 @@ from dexsim import typed, yaml_text
 from dexsim.actuator.columns import COLUMNS, INDEX, NAMES, Column, did_you_mean
 from dexsim.errors import UserError
 
-DRIVES = ("torque", "voltage")
-SIDES = ("joint", "motor")
+Drive = Literal["torque", "voltage"]
+Side = Literal["joint", "motor"]
+DRIVES, SIDES = get_args(Drive), get_args(Side)
 KEYS = (
     "drive",
     "joints",
@@ -46,13 +47,12 @@ KEYS = (
 ALL = "*"
 
 
-Side = Literal[SIDES]
 
 
 class Content(msgspec.Struct):
     """`servo.yaml` around its columns, whose values `parse_value` reads. A per N.m, Hz, V."""
 
-    drive: Literal[DRIVES] = "torque"
+    drive: Drive = "torque"
     joints: dict[str, dict[str, Any] | None] | None = None
     current_per_torque: (
         typed.Positive | Literal["unknown"] | dict[str, typed.Positive | Literal["unknown"] | None] | None
@@ -113,7 +113,8 @@ def parse_value(raw: Any, column: Column, where: str) -> Value:
         numbers = [value]
     if any(n is None or math.isnan(n) for n in numbers):
         raise UserError(f"{where}: {raw!r} is not a number, [low, high], {{value, low, high}} or 'unknown'; {allowed}.")
-    for n in numbers:
+    assert low is not None and high is not None  # as looked at
+    for n in (low, high) if value is None else (value, low, high):
         if not column.low <= n <= column.high and n != column.neutral:
             raise UserError(f"{where}: {n:g} {column.unit} is out of range; {allowed}.")
     if low > high:

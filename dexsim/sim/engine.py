@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -75,7 +74,7 @@ class Engine:
 
     kind = ""
     _derived: Sequence[str] = ()  # fields by world that MuJoCo derives from the others
-    real: Any  # Warp's scalar of states
+    real: type  # Warp's scalar of states
     _warmstart: torch.Tensor  # [N, nv] accelerations that the solver begins with
 
     def __init__(self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]):

@@ -82,7 +82,7 @@ class MujocoEngine(Engine):
             sensors = [model.sensor(f"pair_{p.name}").id for p in self.pairs]
             first = [model.sensor_adr[s] for s in sensors]
             self._slots = int(model.sensor_intprm[sensors[0], 2])
-            self._contact_args = [wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False), wp.array(first, dtype=int, device="cpu")]
+            self._contact_args: list[wp.array] = [wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False), wp.array(first, dtype=int, device="cpu")]
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
         self._flags, self._disabled = int(model.opt.disableflags), b.expand("opt.disableflags")
@@ -135,7 +135,10 @@ class MujocoEngine(Engine):
             raise UserError("sim.engine=mujoco: friction under load from outside is read from a step of implicitfast, "
                             "implicit or Euler; the model's integrator is discrete")  # fmt: skip
         super().keep_outside()
-        view = lambda x: wp.array(x, dtype=wp.float64, device="cpu", copy=False)  # noqa: E731
+
+        def view(x: np.ndarray) -> wp.array:
+            return wp.array(x, dtype=wp.float64, device="cpu", copy=False)
+
         read = ("qfrc_smooth", "qfrc_damper", "qfrc_constraint", "qacc")
         level = self._fields.get("dof_frictionloss", self.mjm.dof_frictionloss[None].copy())
         self._before = np.zeros(self.t.qvel.shape)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -20,10 +20,10 @@ from warp._src import context
 def compile_together(program: Callable[[], None], device: str) -> int:
     """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what it
     reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
-    device = wp.get_device(device)
-    if not device.is_cuda:
+    where = wp.get_device(device)
+    if not where.is_cuda:
         return 0
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice(where):
         modules = listed(program)
         with ThreadPoolExecutor(max_workers=max(1, min(len(modules), os.cpu_count() or 1))) as pool:
             for done in [pool.submit(module.load, device, block_dim=block_dim) for module, block_dim in modules]:
@@ -41,21 +41,23 @@ def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
 
 @contextmanager
 def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
-    def launch(kernel, dim, inputs=(), outputs=(), *args, block_dim: int | None = None, **kwargs) -> None:
+    def launch(
+        kernel: wp.Kernel, dim: int | Sequence[int], *args: Any, block_dim: int | None = None, **kwargs: Any
+    ) -> None:
         # an empty launch compiles nothing; which types a generic kernel has, only a launch finds out
         if math.prod(dim if isinstance(dim, (tuple, list)) else (dim,)) and not kernel.is_generic:
             keep(kernel.module, int(block_dim or 256))
 
-    def once(condition, while_body=None, **kwargs) -> None:
+    def once(condition: wp.array, while_body: Callable[..., None], **kwargs: Any) -> None:
         while_body(**kwargs)
 
-    def suggested(kernel, device=None) -> tuple[int, int]:
+    def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
         return 256, 132  # the real one compiles the kernel to know; it decides about sizes only
 
     kept = [(owner, name, getattr(owner, name)) for owner, name in (
         (wp, "launch"), (context, "launch"), (wp, "capture_while"), (wp, "get_suggested_block_size"))]
     wp.launch = context.launch = launch
-    wp.capture_while, wp.get_suggested_block_size = once, suggested
+    wp.capture_while, wp.get_suggested_block_size = once, suggested  # type: ignore[assignment]  # what is called of them
     try:
         yield
     finally:

@@ -98,7 +98,7 @@ class WarpEngine(Engine):
             self._peak = wp.zeros(2, dtype=int)
             self._normal_sum = wp.zeros((worlds, P), dtype=int)
             self._force_sum = wp.zeros((worlds, P, 3), dtype=int)
-            self._table = wp.array(contact.pair_table(model, self.pairs), dtype=int) if P else None
+            self._table: wp.array | None = wp.array(contact.pair_table(model, self.pairs), dtype=int) if P else None
         for name in ("time", "qpos", "qvel", "qfrc_applied", "xpos", "xmat", "pair_normal", "pair_force", "flags"):
             setattr(self.t, name, wp.to_torch(getattr(w, name)))
         self.t.overflow = wp.to_torch(self._overflow)
@@ -123,7 +123,7 @@ class WarpEngine(Engine):
         return self._fields[name]
 
     def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
-        def program():
+        def program() -> None:
             for _ in range(substeps):
                 if before_each is not None:
                     before_each()
@@ -158,7 +158,7 @@ class WarpEngine(Engine):
     def set_state(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         self._begin(mask, qpos, qvel)
         self._forget_outside(mask)
-        if self.narrow is not None:
+        if self._simplex is not None:
             self._simplex.masked_fill_(mask[:, None, None], -1)
 
     def memory(self) -> dict:

@@ -92,8 +92,8 @@ class ByPad:
         self.mixes = self.crosstalk or bool((order != np.arange(t)).any())
         self.delayed = bool(own[COLUMNS.index("delay")].any())
         if self.crosstalk:
-            for i in np.flatnonzero(high[COLUMNS.index("crosstalk")]):
-                beside[i, : layout.count[i]] = layout.beside(int(i))
+            for row in np.flatnonzero(high[COLUMNS.index("crosstalk")]):
+                beside[row, : layout.count[row]] = layout.beside(int(row))
         tensor = lambda x, kind=torch.float32: torch.as_tensor(x, dtype=kind, device=device)  # noqa: E731
         self._low, self._wide, self._own = (
             tensor(low)[:, None],
@@ -167,9 +167,9 @@ class ByPad:
                 felt,
                 self._row["hysteresis"],
                 self._row["hysteresis_time"],
-                touch._m.now,
-                touch._m.last,
-                touch._m.state,
+                touch.imperfect.now,
+                touch.imperfect.last,
+                touch.imperfect.state,
                 m.skin,
             ]
             wp.launch(relax_pads, dim=self.shape, inputs=args, device=self.device)
@@ -186,7 +186,7 @@ class ByPad:
 
     def launch_stuck(self, touch: Tactile) -> None:
         """Readings that never change, over those that were just written into the ring."""
-        m = touch._m
+        m = touch.imperfect
         if self._m.stuck_at.shape[0]:
             args = [self._m.stuck, self._m.stuck_at, m.effects.lsb, m.tick, float(self.cfg.full_scale), m.ring]
             wp.launch(stick, dim=(self.shape[0], self._m.stuck_at.shape[0]), inputs=args, device=self.device)
@@ -194,7 +194,7 @@ class ByPad:
     def launch_choice(self, touch: Tactile) -> tuple[wp.array, wp.array, wp.array]:
         """(ring, ring_shear, chosen) to report: the sensor's own, or one slot with each pad's reading where pads have
         delays."""
-        m, own = touch._m, self._m
+        m, own = touch.imperfect, self._m
         if not self.delayed:
             return m.ring, m.ring_shear, m.chosen
         n, f, _ = self.shape

@@ -119,7 +119,7 @@ def stiffness_of(cfg: TactileConfig, kinds: Sequence[str]) -> list[float]:
                 f"tactile.stiffness.{cfg.law}: no value [{unit}] for pads of kind '{kind}'; given for:"
                 f" {', '.join(given) or 'none'} (key 'all' holds for every kind)"
             )
-        out.append(given.get(kind, given.get("all")))
+        out.append(given[kind] if kind in given else given["all"])
     return out
 
 
@@ -136,8 +136,8 @@ def _stiffness(value: object) -> dict[str, dict[str, float]]:
 
 
 def _number(key: str, value: object, low: float, high: float) -> float:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if not number or not low <= value <= high:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not isinstance(value, (int, float)) or not (math.isfinite(value) and low <= value <= high):
         raise UserError(f"tactile.{key}={value}: must be a number from {low:g} to {high:g}")
     return float(value)
 

@@ -91,7 +91,9 @@ def _checked(raw: Mapping[str, Any], hand: Hand) -> dict[str, dict[str, Any]]:
 def _pads(value: Any, hand: Hand) -> dict[str, Any]:
     """As given, once every pad and taxel is one of the hand's."""
     layout = hand_layout(hand)
-    if value and layout is None:
+    if layout is None:
+        if not value:
+            return dict(value)
         raise UserError(f"tactile.pads: hand={hand.name} has no touch pads; take it out of the file")
     for name, pad in pad_configs(value).items():
         if name not in layout.names:

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dexsim import files
 from dexsim.errors import UserError
 from dexsim.hand import Hand
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,10 @@ class TaxelLayout:
             kinds=tuple(p.get("kind", p["name"]) for p in pads),
             count=counts,
             area=area,
-            **out,
+            point=out["point"],
+            normal=out["normal"],
+            tx=out["tx"],
+            ty=out["ty"],
         )
 
 
@@ -249,6 +256,7 @@ def hand_layout(hand: Hand) -> TaxelLayout | None:
     pads, rows = [], set()
     for finger in hand.fingers:
         own = finger.pad
+        assert own is not None  # a hand that touches has one on every finger
         pad = load_layout(hand.folder / own.taxels, finger.body, finger.name, own.kind)
         if own.rows and len(pad["point"]) % own.rows:
             raise UserError(
@@ -281,7 +289,7 @@ def tip_layout(hand: Hand) -> TaxelLayout:
     ])  # fmt: skip
 
 
-def tip_points(model: object, geoms: Sequence[str]) -> list[np.ndarray]:
+def tip_points(model: mujoco.MjModel, geoms: Sequence[str]) -> list[np.ndarray]:
     """Corners [V, 3] (m, body frame) of the tips' collision meshes in a `mujoco.MjModel`: what other pads can feel."""
     import mujoco
 

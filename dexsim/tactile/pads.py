@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 
@@ -98,7 +99,7 @@ class PadConfig:
         return "c10" in self.params
 
 
-def pad_configs(value: object) -> dict[str, PadConfig]:
+def pad_configs(value: Mapping[str, Any]) -> dict[str, PadConfig]:
     """`tactile.pads` checked: a PadConfig by name of pad. Raises UserError naming the setting, its value and what is
     allowed."""
     typed.convert({"tactile": {"pads": _plain(value)}}, dict[str, dict[str, dict[str, Pad]]], "settings")

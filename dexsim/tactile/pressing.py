@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dexsim.assets.objects.shape import Shape
 from dexsim.tactile import reference as ref
 from dexsim.tactile.layout import TaxelLayout, gap_to_hull
 
@@ -61,7 +62,7 @@ def skin_of(
 
 
 def surface_points(
-    rng: np.random.Generator, shape: object, size: np.ndarray
+    rng: np.random.Generator, shape: Shape, size: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Random points of an object's surface, by area, and the outward normals there (object frame), without end."""
     kind = shape.kind
@@ -103,7 +104,7 @@ def presses(
     layout: TaxelLayout,
     pad: int,
     skin: Skin,
-    shape: object,
+    shape: Shape,
     size: np.ndarray,
     depths: tuple[float, ...],
     count: int,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from dexsim.assets.objects.shape import Grid
 from dexsim.tactile.kernel import MAX_STRAIN
 
 # -- signed distances (points q [..., 3] in the shape's frame; sizes as MuJoCo's) ------------------------------------
@@ -30,7 +31,7 @@ def sd_cylinder(q: np.ndarray, radius: float, half: float) -> np.ndarray:
     return np.hypot(np.maximum(r, 0.0), np.maximum(z, 0.0)) + np.minimum(np.maximum(r, z), 0.0)
 
 
-def sd_grid(q: np.ndarray, grid: object) -> np.ndarray:
+def sd_grid(q: np.ndarray, grid: Grid) -> np.ndarray:
     """Trilinear; outside the grid sqrt(gap^2 + value at the nearest point of the box ^2)."""
     q = np.asarray(q, dtype=float)
     top = np.array(grid.data.shape) - 1
@@ -46,7 +47,7 @@ def sd_grid(q: np.ndarray, grid: object) -> np.ndarray:
     return np.where(gap > 0.0, np.hypot(gap, np.maximum(v, 0.0)), v)
 
 
-def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: object = None) -> np.ndarray:
+def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None) -> np.ndarray:
     """Signed distance [m]; size as in `dexsim.tactile.sdf`."""
     if kind == "box":
         return sd_box(q, np.asarray(size))
@@ -56,10 +57,11 @@ def distance(kind: str, size: np.ndarray, q: np.ndarray, grid: object = None) ->
         return sd_capsule(q, size[0], size[1])
     if kind == "cylinder":
         return sd_cylinder(q, size[0], size[1])
+    assert grid is not None  # kind "grid" has one
     return size[0] * sd_grid(q / size[0], grid)
 
 
-def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: object = None, eps: float = 1e-6) -> np.ndarray:
+def normal(kind: str, size: np.ndarray, q: np.ndarray, grid: Grid | None = None, eps: float = 1e-6) -> np.ndarray:
     """Outward unit normal [..., 3] at the nearest surface point: the gradient of the distance."""
     g = np.stack(
         [distance(kind, size, q + e, grid) - distance(kind, size, q - e, grid) for e in eps * np.eye(3)], axis=-1

@@ -23,6 +23,11 @@ class Sensors:
         self.layout: TaxelLayout | None = hand_layout(hand)
 
     @property
+    def _pads(self) -> TaxelLayout:
+        assert self.layout is not None  # asked for only where the hand has touch
+        return self.layout
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Pads, and taxels of the largest; (0, 0) without touch."""
         return (0, 0) if self.layout is None else (self.layout.pads, self.layout.taxels)
@@ -42,22 +47,22 @@ class Sensors:
         """The taxels on the surfaces that the physics presses; where they are where a tip does not follow its pad, as
         with `tactile.lift=false`. Only with touch."""
         try:
-            return self.layout.lifted(self.tips)
+            return self._pads.lifted(self.tips)
         except UserError:
-            return self.layout
+            return self._pads
 
     def lattice(self, pad: int) -> tuple[int, int] | None:
         """Columns and rows of the lattice that a pad's taxels form, k = column * rows + row; None where none is
         known."""
         own = self.hand.fingers[pad].pad
-        return (int(self.layout.count[pad]) // own.rows, own.rows) if own is not None and own.rows else None
+        return (int(self._pads.count[pad]) // own.rows, own.rows) if own is not None and own.rows else None
 
     def beside(self, pad: int) -> list[list[int]]:
         """Taxels beside each taxel of a pad: in its lattice, or by where they lie where there is none."""
         lattice = self.lattice(pad)
         if lattice is not None:
             return neighbours(*lattice)
-        return _gabriel(self.layout.point[pad, : self.layout.count[pad]])
+        return _gabriel(self._pads.point[pad, : self._pads.count[pad]])
 
     def mixing(self, pad: int) -> np.ndarray:
         """[K, K]: a taxel's force shared equally by the taxels beside it (rows: who feels it)."""
@@ -73,15 +78,15 @@ class Sensors:
         if lattice is not None:
             columns, rows = lattice
             return columns // 2 * rows + rows // 2
-        p = self.layout.point[pad, : self.layout.count[pad]]
-        return int(np.argmin(np.linalg.norm(p - self.layout.centre()[pad], axis=1)))
+        p = self._pads.point[pad, : self._pads.count[pad]]
+        return int(np.argmin(np.linalg.norm(p - self._pads.centre()[pad], axis=1)))
 
     def skin(self, pad: int, fine: int) -> Skin:
         """A pad's surface, `fine` times finer than its lattice; its lifted taxels where there is none."""
         lattice = self.lattice(pad)
         if lattice is not None and min(lattice) >= 4:  # as many as the bicubic surface needs
-            return skin_of(self.layout, pad, *lattice, self.tips[pad], fine=fine)
-        n, on = int(self.layout.count[pad]), self.lifted
+            return skin_of(self._pads, pad, *lattice, self.tips[pad], fine=fine)
+        n, on = int(self._pads.count[pad]), self.lifted
         return Skin(on.point[pad, :n], on.normal[pad, :n], on.area[pad, :n])
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from dexsim.assets.objects.shape import Grid
+from dexsim.assets.objects.shape import Grid, Shape
 from dexsim.errors import UserError
 from dexsim.tactile.sdf import KINDS, Shapes
 
@@ -22,6 +22,9 @@ class TouchShape:
     grid: Grid | None = None
 
 
+Felt = TouchShape | Shape
+
+
 class ShapeSet:
     """Shapes by index, in the order given.
 
@@ -29,7 +32,7 @@ class ShapeSet:
     on an unknown kind or a grid that does not hold its shape.
     """
 
-    def __init__(self, shapes: Sequence, device: str = "cpu"):
+    def __init__(self, shapes: Sequence[Felt], device: str = "cpu"):
         self.names = tuple(s.name for s in shapes)
         self.kinds = np.array([_kind(s) for s in shapes], dtype=np.int32)
         self.grids: list[Grid | None] = []
@@ -50,8 +53,12 @@ class ShapeSet:
                 start, grid, bound = seen[id(s.grid)]
                 d, o, h = grid.data.shape, grid.origin, grid.spacing
             self.grids.append(grid)
-            dims.append(d), origin.append(o), spacing.append(h)
-            radius.append(bound[0]), middle.append(bound[1]), half.append(bound[2])
+            dims.append(d)
+            origin.append(o)
+            spacing.append(h)
+            radius.append(bound[0])
+            middle.append(bound[1])
+            half.append(bound[2])
             offset.append(start if grid is not None else 0)
         if at >= 2**30:
             raise UserError(f"distance grids hold {at} cells, at most {2**30 - 1} fit: use fewer or coarser ones")
@@ -111,13 +118,13 @@ def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-
     return Grid(low, float(spacing), out)
 
 
-def _kind(shape: object) -> int:
+def _kind(shape: Felt) -> int:
     if shape.kind not in KINDS:
         raise UserError(f"touch shape '{shape.name}': kind '{shape.kind}' is unknown; choose one of {', '.join(KINDS)}")
     return KINDS[shape.kind]
 
 
-def _checked(shape: object) -> Grid:
+def _checked(shape: Felt) -> Grid:
     g = shape.grid
     what = f"touch shape '{shape.name}'"
     if g is None:

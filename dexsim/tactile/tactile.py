@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from types import SimpleNamespace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -25,6 +26,18 @@ BLOCK_DIM = 128
 REGISTERS = 80
 """Most registers of its threads: 3 to 10 % faster than as many as the compiler likes (H200; `benchmarks.touch
 variants=true`)."""
+
+
+class Posed(Protocol):
+    """What touch asks of an engine (`dexsim.sim.engine.Engine`): worlds, device, poses and contact forces."""
+
+    n: int
+    device: str
+    wp: SimpleNamespace
+
+    def body(self, name: str) -> int: ...
+
+    def pair(self, name: str) -> int: ...
 
 
 class Tactile:
@@ -49,7 +62,7 @@ class Tactile:
 
     def __init__(
         self,
-        engine: object,
+        engine: Posed,
         layout: TaxelLayout,
         shapes: ShapeSet,
         object_body: str | Sequence[str],
@@ -97,7 +110,7 @@ class Tactile:
         with wp.ScopedDevice(self.device):
             self._pads = _pads(engine, layout, layout.lifted(tips) if cfg.lift and tips is not None else layout)
             self._law = _law(cfg, layout, needed=not solver or others)
-            self.tips = ShapeSet(_tip_shapes(layout, tips) if others else [], self.device)
+            self.tips = ShapeSet(_tip_shapes(layout, tips) if others and tips is not None else [], self.device)
             a = SimpleNamespace(
                 object_body=wp.array([engine.body(b) for b in bodies], dtype=int),
                 shape_id=wp.full((n, o), -1, dtype=int),
@@ -120,7 +133,8 @@ class Tactile:
         self.force, self.centre = self.force_clean, self.centre_clean
         self.raw_clean = self.raw = wp.to_torch(a.felt) if store else None
         self.raw3 = None
-        self._m = self.by_pad = None
+        self._m: SimpleNamespace | None = None
+        self.by_pad: ByPad | None = None
         self.params = wp.to_torch(a.params).T  # [N, C]; stored by column, so that the kernels read neighbours
         low = [[cfg.range(name)[0]] for name in COLUMNS]
         self._fixed = torch.tensor(low, dtype=torch.float32, device=self.device)  # [C, 1], what is not drawn
@@ -146,6 +160,12 @@ class Tactile:
         self.randomize(everyone)
         self.reset(everyone)
 
+    @property
+    def imperfect(self) -> SimpleNamespace:
+        """Arrays and kernels of the imperfect sensor; only with `cfg.measured`."""
+        assert self._m is not None
+        return self._m
+
     def _measure(self, seed: int) -> None:
         """Arrays and kernels of the imperfect sensor."""
         cfg, (n, f, t) = self.cfg, (self.engine.n, self.layout.pads, self.layout.taxels)
@@ -155,7 +175,7 @@ class Tactile:
         hysteresis, noise = cfg.used("hysteresis") if pad is None else pad.hysteresis, cfg.used("noise")
         with wp.ScopedDevice(self.device):
             e = Effects()
-            for name in Effects.vars:
+            for name in Effects.vars:  # type: ignore[attr-defined]  # wp.struct adds it
                 setattr(e, name, self._row[name])
             axes = np.stack([self.layout.tx, self.layout.ty], axis=2).astype(np.float32)
             self._m = m = SimpleNamespace(
@@ -273,12 +293,12 @@ class Tactile:
         wp.launch(stamp, dim=n, inputs=args, device=self.device)
         ring, ring_shear, chosen = (m.ring, m.ring_shear, m.chosen) if pad is None else pad.launch_choice(self)
         args = [ring, ring_shear, chosen, self._pads, xpos, xmat, m.force, m.centre, m.raw, m.raw3]
-        dim = [n, self.layout.pads]
+        grid = (n, self.layout.pads)
         if self.lanes:  # a block of one thread per taxel for each world and pad
             width = self._pads.taxel.shape[1]
-            wp.launch_tiled(m.report, dim=dim, inputs=args, block_dim=width, device=self.device)
+            wp.launch_tiled(m.report, dim=grid, inputs=args, block_dim=width, device=self.device)
         else:
-            wp.launch(m.report, dim=dim, inputs=args, device=self.device)
+            wp.launch(m.report, dim=grid, inputs=args, device=self.device)
 
 
 @lru_cache(maxsize=8)
@@ -292,7 +312,7 @@ def _tip_shapes(layout: TaxelLayout, tips: Sequence[np.ndarray]) -> list[TouchSh
     return [TouchShape(f"tip_{name}", "grid", grid) for name, grid in zip(layout.names, grids, strict=True)]
 
 
-def _pads(engine: object, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
+def _pads(engine: Posed, layout: TaxelLayout, felt: TaxelLayout) -> Pads:
     """The layout on the device, with its taxels where `felt` has them."""
     centre, radius = felt.bound()
     out = Pads()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dexsim.errors import UserError
@@ -29,7 +30,8 @@ def make_env(
     mode = cfg["task"].get("mode", "palm")
     if mode not in ("palm", "fingertips"):
         raise UserError(f"task.mode={mode}: must be palm or fingertips")
-    tasks = {"grasp": GraspEnv, "rotate": RotateEnv if mode == "palm" else FingertipEnv}
+    rotate = RotateEnv if mode == "palm" else FingertipEnv
+    tasks: dict[str, Callable[..., HandEnv]] = {"grasp": GraspEnv, "rotate": rotate}
     name = cfg["task"]["name"]
     if name not in tasks:
         near = difflib.get_close_matches(name, tasks, 1)

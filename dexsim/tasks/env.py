@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import torch
@@ -84,6 +85,10 @@ class HandEnv(VecEnv):
     `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """
 
+    nan_count: torch.Tensor
+    _wrong: torch.Tensor | None
+    _sources: tuple[str, ...]
+
     def __init__(self, cfg: dict, n_worlds: int, device: str, seed: int, engine: str = "auto"):
         self.cfg, self.task, sim = cfg, cfg["task"], cfg["sim"]
         self.hand = hand_of(cfg)
@@ -128,7 +133,7 @@ class HandEnv(VecEnv):
         self.reality = Reality(cfg["reality"], self.rng, self.hand) if present(cfg) else None
         if self.reality is not None:
             self.reality.change_model(spec)
-        self._drawn = None
+        self._drawn: mujoco.MjModel | None = None
         self.drawn_spec = spec.copy()  # with the shells and skins that only a picture needs
         for geom in list(spec.geoms):
             if not geom.contype and not geom.conaffinity:
@@ -274,6 +279,7 @@ class HandEnv(VecEnv):
 
     def results(self) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """What `step` returns, copied: the next step writes over the environment's own."""
+        assert self._log_values is not None  # since the first step
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         extras = {"time_outs": self.time_out.clone(), "log": log}
         return self.get_observations(), self.reward.clone(), self.done.to(torch.long), extras
@@ -455,7 +461,7 @@ class HandEnv(VecEnv):
         e, dev, hand = self.engine, self.device, self.hand
         mjm = e.mjm
 
-        def long(x):
+        def long(x: Any) -> torch.Tensor:
             return torch.as_tensor(x, dtype=torch.long, device=dev)
 
         self.joint_q, self.joint_v = long(e.qpos_index(hand.joints)), long(e.dof_index(hand.joints))
@@ -477,7 +483,7 @@ class HandEnv(VecEnv):
     def _buffers(self) -> None:
         n, dev, J, F = self.num_envs, self.device, self.num_actions, self.fingers
 
-        def zeros(*shape, dtype=torch.float32):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self._episode_length = zeros(dtype=torch.long)
@@ -490,8 +496,8 @@ class HandEnv(VecEnv):
         self.reward = zeros()
         # worlds of which an observation was not finite: of any group, then of each
         self._blind = torch.zeros(1 + MOST_GROUPS, n, dtype=torch.bool, device=dev)
-        self._wrong: torch.Tensor | None = None  # world-steps that were not finite since the last `check`, by source
-        self._sources: tuple[str, ...] = ()
+        self._wrong = None  # world-steps that were not finite since the last `check`, by source
+        self._sources = ()
         self._steps_since = 0
         self._action_in = zeros(J)
         self._log_names: tuple[str, ...] = ()
@@ -516,7 +522,8 @@ class HandEnv(VecEnv):
             state_kernels.Places, joint_q=self.joint_q, joint_v=self.joint_v, object_q=object_q, object_v=object_v,
             tip_body=self.tip_body, tip_offset=self.tip_offset,
         )  # fmt: skip
-        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in state_kernels.Seen.vars})
+        kept = state_kernels.Seen.vars  # type: ignore[attr-defined]  # wp.struct adds it
+        seen = filled(state_kernels.Seen, **{name: getattr(self, name) for name in kept})
         self._read_args = [
             state.flags, state.qpos, state.qvel, wp.from_torch(self.servo.torque), state.pair_normal, state.xpos,
             state.xmat, at, seen,
@@ -549,11 +556,10 @@ class HandEnv(VecEnv):
 
     def drawn_model(self, world: int) -> mujoco.MjModel:
         """A model of one world as it is now, with the shells and skins, to render its qpos; reads from the device."""
-        if self._drawn is None:
-            self._drawn = self.drawn_spec.compile()
-        model = copy.copy(self._drawn)
+        drawn = self._drawn = self._drawn or self.drawn_spec.compile()
+        model = copy.copy(drawn)
         for slot in self.scene.slots:
-            g = self._drawn.geom(slot).id
+            g = drawn.geom(slot).id
             e = self.engine.geom(slot)
             for name in ("geom_pos", "geom_quat", "geom_size", "geom_dataid"):
                 value = self.engine.field(name)[world, e].cpu().numpy()
@@ -572,7 +578,7 @@ class HandEnv(VecEnv):
             if hasattr(held, "__dict__"):
                 vars(held).clear()
         held = None
-        vars(self).clear()
+        self.__dict__.clear()
         give_back()
 
     def check(self) -> None:

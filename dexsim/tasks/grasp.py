@@ -47,8 +47,9 @@ def privileged(joints: int, fingers: int) -> tuple[tuple[str, int], ...]:
 
 def _is_range(pair: Any) -> bool:
     """Two numbers, 0 <= low <= high <= 1."""
-    numbers = isinstance(pair, list) and [x for x in pair if isinstance(x, (int, float)) and not isinstance(x, bool)]
-    return bool(numbers) and len(pair) == len(numbers) == 2 and 0 <= pair[0] <= pair[1] <= 1
+    if not isinstance(pair, list) or len(pair) != 2:
+        return False
+    return all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in pair) and 0 <= pair[0] <= pair[1] <= 1
 
 
 class GraspEnv(HandEnv):
@@ -135,7 +136,7 @@ class GraspEnv(HandEnv):
         angles = self.hand.pose("open").tolist() if pose is None else [pose[j] for j in self.hand.joints]
         self.pose0 = torch.tensor(angles, device=dev)
 
-        def zeros(*shape, dtype=torch.float32):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self.command, self.command_left = zeros(), zeros()
@@ -169,9 +170,11 @@ class GraspEnv(HandEnv):
             kernels.Place, unit=self.unit, rise=self.rise, xy=wp.vec2(*self.centre0.tolist()), pose=self.pose0,
             low=self.q_low.contiguous(), high=self.q_high.contiguous(), lay=self.lay, delay_low=low, delay_high=high,
         )  # fmt: skip
-        names = ("q", "qd", "torque", "action", "last_action", "tip_force", "self_force", "object_pose")
-        names += ("object_velocity", "command", "thumb_command", "episode_length")
-        own = {name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in names}
+        state = ("q", "qd", "torque", "action", "last_action", "tip_force", "self_force", "object_pose")
+        moving = ("object_velocity", "command", "thumb_command", "episode_length")
+        own = {
+            name: getattr(self, "_episode_length" if name == "episode_length" else name) for name in state + moving
+        }
         self._state = filled(grasp_rewards.State, clearance=self.clearance.distance, **own)
         hand = ("opposing", "others", "roots", "root_closes", "tau_max", "inner", "inner_closes", "outer", "q_mid")
         tables = {name: getattr(self, name) for name in hand}
@@ -272,8 +275,8 @@ class GraspEnv(HandEnv):
 
     def memory(self) -> dict:
         names = ("command", "command_left", "push", "push_left", "push_wait", "first_xy", "z_seen", "vz_seen")
-        names += () if self.thumb_range is None else ("thumb_command",)
-        own = {name: getattr(self, name) for name in (*names, "z_history", "torque_bias", "outside_force")}
+        thumb = () if self.thumb_range is None else ("thumb_command",)
+        own = {name: getattr(self, name) for name in (*names, *thumb, "z_history", "torque_bias", "outside_force")}
         return super().memory() | own | {"z_delay": (self.z_delay, 0, self.z_history.shape[1] - 1)}
 
     def before_physics(self) -> None:
@@ -464,14 +467,14 @@ class GraspEnv(HandEnv):
             finger = self.hand.fingers[k]
             for j in finger.joints:
                 closing[j] = (0.8 if j in finger.flexion else 1.0) * rate * way[j]
-        closing = torch.as_tensor(closing, dtype=torch.float32, device=self.device)
+        step = torch.as_tensor(closing, dtype=torch.float32, device=self.device)
         age = torch.zeros(self.num_envs, device=self.device)
 
-        def policy(obs) -> torch.Tensor:
+        def policy(obs: Mapping) -> torch.Tensor:
             x = obs["actor"]
             # a finite difference of a noisy height is exactly zero only where an episode has just begun
             age.copy_(torch.where(x[:, vz] == 0, torch.zeros_like(age), age + self.dt))
             light = x[:, torque : torque + self.num_actions].abs() < (0.1 + 0.6 * x[:, command])[:, None]
-            return closing * (light & (age >= wait)[:, None])
+            return step * (light & (age >= wait)[:, None])
 
         return policy

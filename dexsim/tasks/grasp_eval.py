@@ -13,7 +13,7 @@ The command is constant in an episode, uniform in [0, 1] over episodes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,7 +22,12 @@ from dexsim import intervals
 from dexsim.tasks import base_path
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
+    from matplotlib.axes import Axes
+
+    from dexsim.tasks.grasp import GraspEnv
+
+Policy = Callable[..., torch.Tensor]  # a TensorDict of observations -> actions [N, J]
+Progress = Callable[[int, int, str], object]  # episodes done, of how many, what is played
 
 SETTLE, HOLD, RADIUS = 2.0, 5.0, 0.030  # s, s, m of a hand of UNIT_SPAN
 PUSH_WEIGHTS, PUSH_S = 2.0, 0.5
@@ -35,11 +40,11 @@ RESAMPLES = 1000  # of the bootstrap
 
 @torch.inference_mode()
 def evaluate(
-    env: HandEnv,
-    policy: Callable[..., torch.Tensor],
+    env: GraspEnv,
+    policy: Policy,
     episodes: int,
     seed: int,
-    progress: Callable[..., None] | None = None,
+    progress: Progress | None = None,
 ) -> dict:
     """Play `episodes` episodes, `env.num_envs` at a time, half as many again on shapes that were never trained on.
 
@@ -55,10 +60,10 @@ def evaluate(
     metrics["hold_rate_by_object"] = _by_object(trained, env) | _by_object(held_out, env)
     metrics["by_fingertip_share"] = by_share(trained)
 
-    def force_command(ax):
+    def force_command(ax: Axes) -> None:
         _force_plot(ax, trained, env)
 
-    def hold_by_command(ax):
+    def hold_by_command(ax: Axes) -> None:
         _hold_plot(ax, trained)
 
     plots = [force_command, hold_by_command]
@@ -70,8 +75,11 @@ def evaluate(
     }
 
 
-def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: str) -> dict:
-    parts, kept = [], (env._rows, env._cumulative)
+def _play_all(
+    env: GraspEnv, policy: Policy, episodes: int, rows: torch.Tensor, progress: Progress | None, label: str
+) -> dict:
+    parts: list[dict] = []
+    kept = (env._rows, env._cumulative)
     env.draw_from(rows)
     done = 0
     while done < episodes:
@@ -85,7 +93,15 @@ def _play_all(env, policy, episodes: int, rows: torch.Tensor, progress, label: s
     return out
 
 
-def _play(env, policy, keep_frames: bool, progress, label: str, done: int, episodes: int) -> dict:
+def _play(
+    env: GraspEnv,
+    policy: Policy,
+    keep_frames: bool,
+    progress: Progress | None,
+    label: str,
+    done: int,
+    episodes: int,
+) -> dict:
     """One episode in every world."""
     n, dev, dt, base = env.num_envs, env.device, env.dt, _base(env)
     steps = int(round((SETTLE + HOLD + sum(base.stages)) / dt))
@@ -193,13 +209,14 @@ def _angle(t: float) -> float:
     return np.pi / 2 * (np.clip((t - first) / TURN_S, 0, 1) + np.clip((t - second) / TURN_S, 0, 1))
 
 
-def _base(env) -> base_path.Base:
+def _base(env: GraspEnv) -> base_path.Base:
     """What the base goes through after the hold; checkpoints from before cannot say."""
     return base_path.of((env.task.get("evaluation") or {}).get("base", "turn"))
 
 
 def _carried(base: base_path.Base, down: torch.Tensor, t: float) -> torch.Tensor:
     """Gravity [N, 3] m/s2 of a hand whose base moves after the hold."""
+    assert base.gravity is not None  # it is turned instead
     g = base.gravity(t - SETTLE - HOLD) if t > SETTLE + HOLD else base_path.GRAVITY
     return torch.as_tensor(g, dtype=down.dtype, device=down.device).expand_as(down)
 
@@ -229,7 +246,7 @@ def _corr(a: np.ndarray, b: np.ndarray) -> float | None:
     return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 1e-9 and b.std() > 1e-9 else None
 
 
-def _metrics(r: dict, k: dict, env) -> dict:
+def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
     f_max, others = env.f_max, list(env.hand.others)
     n = len(others)
     able, able_k = must_hold(r, f_max, n), must_hold(k, f_max, n)
@@ -237,7 +254,7 @@ def _metrics(r: dict, k: dict, env) -> dict:
     carried = can_carry(r, f_max, n)
     held = r["held"].astype(bool)
     total, torque = _of(r["force"], others).sum(1), _flexing(r, env)
-    out = {
+    out: dict[str, Any] = {
         "episodes": int(len(held)), "episodes_kept_out": int(len(k["held"])),
         "hold_rate": _rate(r["held"], ~pushed & firm),
         "hold_rate_pushed": _rate(r["held"], pushed & able),
@@ -299,7 +316,7 @@ def _correlations(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
     return (a * b).sum(axis) / np.maximum(spread, 1e-12)
 
 
-def _by_object(r: dict, env) -> dict[str, float | None]:
+def _by_object(r: dict, env: GraspEnv) -> dict[str, float | None]:
     """Share of unpushed episodes held, command >= 0.1, by object."""
     names = np.array([env.scene.variants[int(v)].shape.name for v in r["shape"]])
     among = ~r["pushed"].astype(bool) & (r["command"] >= 0.1)
@@ -330,7 +347,7 @@ def _of(x: np.ndarray, columns: list[int]) -> np.ndarray:
     return np.ascontiguousarray(x[:, columns])
 
 
-def _flexing(r: dict, env) -> np.ndarray:
+def _flexing(r: dict, env: GraspEnv) -> np.ndarray:
     """Torque [E, K] N.m, closing, of the first flexion joint of each finger beside the opposing ones."""
     joints = [env.hand.fingers[k].flexion[0] for k in env.hand.others]
     return r["torque"][:, joints] * env.hand.closing[joints].astype(np.float32)
@@ -383,7 +400,7 @@ def _papers_columns(metrics: dict) -> list[tuple[str, tuple, list]]:
     ]
 
 
-def _tables(r: dict, k: dict, env) -> list:
+def _tables(r: dict, k: dict, env: GraspEnv) -> list:
     f_max, others = env.f_max, list(env.hand.others)
     n, names_of = len(others), [env.hand.finger_names[i] for i in others]
     rows = []
@@ -407,7 +424,7 @@ def _tables(r: dict, k: dict, env) -> list:
                 f"{error:.2f}",
             )
         )
-    tables = [
+    tables: list[tuple[str, tuple[str, ...], list[tuple]]] = [
         (
             "Hold and force by command",
             ("F_cmd", "episodes", "held %", "held pushed %", f"asked N ({n} fingers)", "got N", "error N/finger"),
@@ -415,14 +432,13 @@ def _tables(r: dict, k: dict, env) -> list:
         )
     ]
     mass_edges, mu_edges = [0.03, 0.065, 0.14, 0.31], [0.4, 0.67, 0.93, 1.21]
-    grid = []
+    grid: list[tuple] = []
     able = must_hold(r, f_max, n)
-    for a, b in zip(mass_edges[:-1], mass_edges[1:], strict=True):
-        line = [f"{1000 * a:.0f}-{1000 * min(b, 0.3):.0f} g"]
+    for light, heavy in zip(mass_edges[:-1], mass_edges[1:], strict=True):
+        line = [f"{1000 * light:.0f}-{1000 * min(heavy, 0.3):.0f} g"]
         for c, d in zip(mu_edges[:-1], mu_edges[1:], strict=True):
-            line.append(
-                _pct(held, able & (r["mass"] >= a) & (r["mass"] < b) & (r["friction"] >= c) & (r["friction"] < d))
-            )
+            among = (r["mass"] >= light) & (r["mass"] < heavy) & (r["friction"] >= c) & (r["friction"] < d)
+            line.append(_pct(held, able & among))
         grid.append(tuple(line))
     tables.append(
         (
@@ -463,7 +479,7 @@ def _pct(ok: np.ndarray, among: np.ndarray) -> str:
     return f"{100 * ok[among].mean():.1f}" if among.any() else "-"
 
 
-def _force_plot(ax, r: dict, env) -> None:
+def _force_plot(ax: Axes, r: dict, env: GraspEnv) -> None:
     held = r["held"].astype(bool)
     c = r["command"][held]
     for i in env.hand.others:
@@ -474,7 +490,7 @@ def _force_plot(ax, r: dict, env) -> None:
     ax.legend(markerscale=3)
 
 
-def _hold_plot(ax, r: dict) -> None:
+def _hold_plot(ax: Axes, r: dict) -> None:
     bins = np.minimum((r["command"] * BINS).astype(int), BINS - 1)
     pushed, held = r["pushed"].astype(bool), r["held"].astype(bool)
     x = (np.arange(BINS) + 0.5) / BINS

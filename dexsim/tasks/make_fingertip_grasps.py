@@ -87,7 +87,9 @@ def candidates(
 ) -> tuple[GraspSet, torch.Tensor]:
     """n hands with a cube between an opposing finger and others; targets still equal the angles. Also the direction and
     share of force of each pad [n, F, 3], which sum to zero. Raises UserError for a hand that finds none."""
-    hand, rows, shares = pads.hand, [], []
+    hand = pads.hand
+    rows: list[tuple[float, np.ndarray, np.ndarray]] = []
+    shares: list[np.ndarray] = []
     unit, most = hand.span / UNIT_SPAN, min(FINGERS_LEAST, len(hand.others))
     tried = 0
     while len(rows) < n:
@@ -132,8 +134,8 @@ def candidates(
         share[others] = -turn[:, 0] / len(others)
         rows.append((edge, q, np.concatenate([centre, quat.numpy()])))
         shares.append(share)
-    edge, q, pose = (torch.as_tensor(np.array(v), dtype=torch.float32) for v in zip(*rows, strict=True))
-    return GraspSet(edge, q, q.clone(), pose), torch.as_tensor(np.array(shares))
+    edges, angles, poses = (torch.as_tensor(np.array(v), dtype=torch.float32) for v in zip(*rows, strict=True))
+    return GraspSet(edges, angles, angles.clone(), poses), torch.as_tensor(np.array(shares))
 
 
 def press(env: HandEnv, pads: Pads, q: torch.Tensor, share: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
@@ -184,19 +186,19 @@ def holds(env: HandEnv, start: GraspSet, rng: torch.Generator) -> torch.Tensor:
     return ok
 
 
-def _by_fingertips(env) -> torch.Tensor:
+def _by_fingertips(env: RotateEnv) -> torch.Tensor:
     other = (env.finger_force - env.tip_force).clamp(min=0).sum(1) + env.palm_force
     opposing, others = (env.tip_force[:, list(f)].sum(1) > 0.05 for f in (env.hand.opposing, env.hand.others))
     return opposing & others & (other < OTHER) & ~env.nan
 
 
-def _begin(env, start: GraspSet) -> None:
+def _begin(env: RotateEnv, start: GraspSet) -> None:
     """Start world i from row i of `start`."""
     env.grasps, env.in_order = start, True
     env.reset_all()
 
 
-def _play(env, target: torch.Tensor) -> None:
+def _play(env: RotateEnv, target: torch.Tensor) -> None:
     """One control step of physics and servo alone: no episode ends."""
     env.target.copy_(target)
     env.servo.send(env.target)

@@ -148,20 +148,20 @@ def holds(env: HandEnv, start: GraspSet) -> torch.Tensor:
     return ok & ((env.tip_force > 0.02).sum(1) >= 1) & ~env.nan
 
 
-def _smallest(env) -> torch.Tensor:
+def _smallest(env: RotateEnv) -> torch.Tensor:
     """Smallest extent of each object [m]; of a cube, whose edges differ, as large as may be."""
     return torch.tensor([
         torch.inf if v.shape.name == CUBE else float(min(v.shape.extents)) * v.scale for v in env.scene.variants
     ])  # fmt: skip
 
 
-def _begin(env, start: GraspSet) -> None:
+def _begin(env: RotateEnv, start: GraspSet) -> None:
     """Start world i from row i of `start`."""
     env.grasps, env.in_order = start, True
     env.reset_all()
 
 
-def _play(env, seconds: float, towards: torch.Tensor | None = None) -> None:
+def _play(env: RotateEnv, seconds: float, towards: torch.Tensor | None = None) -> None:
     """Physics and servo alone: no episode ends. With `towards` [N, J] every finger moves there at SPEED, at most LEAD
     ahead of its joints, until its tip touches the cube; without, the targets stay."""
     touched = torch.zeros(env.num_envs, env.fingers + 1, dtype=torch.bool)

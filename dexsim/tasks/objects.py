@@ -7,6 +7,8 @@ randomization cannot compound; and what MuJoCo derives from a free body's mass a
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
@@ -37,7 +39,7 @@ class Objects:
         ]
         self.hand_geoms = torch.tensor(hand, device=dev)
 
-        def table(x, dtype=torch.float32):
+        def table(x: Any, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.as_tensor(np.asarray(x), dtype=dtype, device=dev)
 
         kinds, scales = [v.shape.kind for v in scene.variants], [v.scale for v in scene.variants]

@@ -22,8 +22,7 @@ class Patches:
 
     def __init__(self, layout: TaxelLayout, count: int | str, device: str):
         most = int(layout.point.shape[1])
-        whole = isinstance(count, int) and not isinstance(count, bool)
-        if count != BITS and not (whole and 1 <= count <= most):
+        if count != BITS and not (isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= most):
             raise UserError(f"task.observe.taxels={count}: must be {BITS}, or a number of a pad from 1 to {most}")
         self.bits = count == BITS
         k = 1 if self.bits else int(count)

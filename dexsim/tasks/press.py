@@ -28,7 +28,15 @@ def fingertip_press(
     if finger is None:
         finger = hand.finger_names[hand.others[(len(hand.others) - 1) // 2]]
     own, table = hand.fingers[hand.finger_names.index(finger)], ServoTable.from_dict(servo)
-    limit = [drive * table.value(hand.joints[j], "torque_limit").value for j in own.flexion]
+    told = [table.value(hand.joints[j], "torque_limit") for j in own.flexion]
+    limit = []
+    for j, v in zip(own.flexion, told, strict=True):
+        if v.value is None:
+            raise UserError(
+                f"hand {hand.folder}: force: cannot be told: the servo's torque_limit of {hand.joints[j]} is unknown;"
+                " state it in the servo table, or force [N] in hand.yaml"
+            )
+        limit.append(drive * v.value)
     if hand.force == "press":
         return _pressed(hand, own, limit, stiffness, flexion)
     return by_levers(hand, own, limit)

@@ -119,7 +119,7 @@ class RotateEnv(HandEnv):
         self.turn = rotation.about(self.axis, torch.tensor(math.radians(t["goal"]["angle"]), device=dev))
         self.gravity = torch.tensor([0.0, 0.0, -9.81], device=dev)
 
-        def zeros(*shape, dtype=torch.float32):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self.worlds = torch.arange(n, device=dev)
@@ -218,8 +218,8 @@ class RotateEnv(HandEnv):
 
     def memory(self) -> dict:
         names = ("goal", "home", "heading", "heading_rate", "goal_heading", "imu_tilt", "imu_past", "seen")
-        names += ("joint_bias", "tip_rot", "tip_last", "tip_velocity")
-        own: dict = {name: getattr(self, name) for name in names}
+        more = ("joint_bias", "tip_rot", "tip_last", "tip_velocity")
+        own: dict = {name: getattr(self, name) for name in names + more}
         own |= {name: (getattr(self, name), 0, 2**31) for name in ("successes", "since", "last_done")}
         own["imu_delay"] = self.imu_delay, 0, self.imu_past.shape[1] - 1
         return super().memory() | own | ({} if self.past is None else {"past": self.past})
@@ -237,6 +237,7 @@ class RotateEnv(HandEnv):
         s, m1 = self.sampler, mask[:, None]
         self.last_done.copy_(torch.where(mask, self.successes, self.last_done))
         g, of = self.grasps, self.allowed
+        assert g is not None  # since setup
         pick = self.worlds if self.in_order else of[(s.uniform() * len(of)).long().clamp(max=len(of) - 1)]
         self.give_object(mask, g.shape[pick], g.edge[pick])
         self.touch.randomize(mask, self.rng)
@@ -376,7 +377,7 @@ class RotateEnv(HandEnv):
         force, centre = self._felt()
         tips, sent = self.tips.flatten(1), self._last_action()
         imu = t["perception"] != "proprioception"
-        past = tips[:, None, :0] if imu else self.past
+        past = tips[:, None, :0] if self.past is None else self.past
         actor = observations.build(
             observations.Signals(
                 joint_position=angle,
@@ -393,7 +394,7 @@ class RotateEnv(HandEnv):
             t,
         )  # the deployed loop builds its own with the same function
         actor = torch.where(self.nan[:, None], torch.zeros_like(actor), actor)
-        if advance and not imu:
+        if advance and self.past is not None:
             self.past.copy_(actor.view_as(self.past))
         q = self.object_pose[:, 3:]
         critic = [
@@ -474,6 +475,7 @@ class RotateEnv(HandEnv):
 
     def _plain_centre(self) -> torch.Tensor:
         """Contact centres [N, 3 F] without force weighting: the mean position of the taxels that feel anything."""
+        assert self.touch.raw is not None  # asked for with observe.force_weighted=false
         on = (self.touch.raw > 0).float()
         count = on.sum(-1, keepdim=True)
         mean = torch.einsum("nft,ftc->nfc", on, self.taxel_point) / count.clamp(min=1)
@@ -507,6 +509,7 @@ class RotateEnv(HandEnv):
             seen += [(name, width, "privileged") for name, width in privileged(*self.sizes[:2])]
         limit, r = t["termination"], t["reward"]
         actor = [(name, width, f"{unit}; {text}") for name, width, unit, text in observations.rows(t, *self.sizes)]
+        assert self.grasps is not None  # since setup
         edge, what = 1000 * self.grasps.edge, "cubes" if self.names == (CUBE,) else ", ".join(self.names)
         return {
             "observations": {"actor": actor, "critic": seen},

@@ -19,7 +19,12 @@ from dexsim import intervals
 from dexsim.tasks.stable_grasps import CUBE
 
 if TYPE_CHECKING:
-    from dexsim.tasks.env import HandEnv
+    from matplotlib.axes import Axes
+
+    from dexsim.tasks.rotate import RotateEnv
+
+Policy = Callable[..., torch.Tensor]  # a TensorDict of observations -> actions [N, J]
+Progress = Callable[[int, int, str], object]  # trials done, of how many, what is played
 
 SHOWN, SHOWN_S = 4, 30.0  # worlds in the video, and how much of them (s)
 HEADER = (
@@ -38,11 +43,11 @@ HEADER = (
 
 @torch.inference_mode()
 def evaluate(
-    env: HandEnv,
-    policy: Callable[..., torch.Tensor],
+    env: RotateEnv,
+    policy: Policy,
     episodes: int,
     seed: int,
-    progress: Callable[..., None] | None = None,
+    progress: Progress | None = None,
 ) -> dict:
     """Play `episodes` trials, `env.num_envs` at a time.
 
@@ -62,22 +67,24 @@ def evaluate(
     metrics = summary(r["successes"], r["time"], r["end"] == "capped", cap, resamples, seed)
     if kept is not None:
         metrics["kept_out"] = summary(kept["successes"], kept["time"], kept["end"] == "capped", cap, resamples, seed)
-    metrics |= _by_object(env, [r] + [kept] * (kept is not None))
+    metrics |= _by_object(env, [r] if kept is None else [r, kept])
     last = r["last"][r["successes"] > 0].sum()
     metrics["seconds_between_successes"] = float(last / r["successes"].sum()) if r["successes"].sum() else None
     metrics["ends"] = {name: int((r["end"] == name).sum()) for name in (*env.ENDS, "capped")}
     metrics |= env.of_trials(r)
 
-    def successes(ax):
+    def successes(ax: Axes) -> None:
         _successes_plot(ax, r["successes"])
 
-    def survival(ax):
+    def survival(ax: Axes) -> None:
         _survival_plot(ax, r["time"], cap)
 
     return {"metrics": metrics, "tables": _tables(env, metrics, r), "frames": frames, "plots": [successes, survival]}
 
 
-def _trials(env, policy, cap: float, episodes: int, keep_frames: bool, progress) -> tuple[dict, dict | None]:
+def _trials(
+    env: RotateEnv, policy: Policy, cap: float, episodes: int, keep_frames: bool, progress: Progress | None
+) -> tuple[dict, dict | None]:
     """Arrays [E] of so many trials; the frames of the first."""
     parts: list[dict] = []
     while len(parts) * env.num_envs < episodes:
@@ -87,7 +94,7 @@ def _trials(env, policy, cap: float, episodes: int, keep_frames: bool, progress)
     return {k: np.concatenate([p[k] for p in parts])[:episodes] for k in parts[0] if k != "frames"}, frames
 
 
-def _kept_out(env, policy, cap: float, episodes: int, progress) -> dict:
+def _kept_out(env: RotateEnv, policy: Policy, cap: float, episodes: int, progress: Progress | None) -> dict:
     """Trials that begin with the objects kept out of the training."""
     was, env.graphs = env.graphs, False  # a recorded step begins with those of the training
     env.judge_kept_out(True)
@@ -98,7 +105,7 @@ def _kept_out(env, policy, cap: float, episodes: int, progress) -> dict:
         env.graphs = was
 
 
-def _by_object(env, parts: list[dict]) -> dict:
+def _by_object(env: RotateEnv, parts: list[dict]) -> dict:
     """Successes in a row by object, where there is more than one."""
     if len(env.names) < 2:
         return {}
@@ -142,7 +149,15 @@ def _interval(x: np.ndarray) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in (low, high)]
 
 
-def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episodes: int) -> dict:
+def _play(
+    env: RotateEnv,
+    policy: Policy,
+    cap: float,
+    keep_frames: bool,
+    progress: Progress | None,
+    done: int,
+    episodes: int,
+) -> dict:
     """One trial in every world."""
     n, dev, dt = env.num_envs, env.device, env.dt
     steps = int(round(cap / dt))
@@ -200,7 +215,7 @@ def _play(env, policy, cap: float, keep_frames: bool, progress, done: int, episo
     return out
 
 
-def row_of(env: HandEnv) -> tuple[str, ...]:
+def row_of(env: RotateEnv) -> tuple[str, ...]:
     """The four settings of a row of the paper's table."""
     o = env.task["observe"]
     none = env.task["perception"] == "proprioception"
@@ -211,7 +226,7 @@ def row_of(env: HandEnv) -> tuple[str, ...]:
     )
 
 
-def _tables(env, m: dict, r: dict) -> list:
+def _tables(env: RotateEnv, m: dict, r: dict) -> list:
     c = m["consecutive_successes"]
     spread = (
         c["all"] if len(c["all"]) <= 12 else np.percentile(c["all"], np.linspace(5, 95, 10), method="nearest").tolist()
@@ -246,7 +261,7 @@ def _range(pair: list) -> str:
     return " .. ".join("inf" if v is None else f"{v:.2f}" for v in pair)
 
 
-def _successes_plot(ax, successes: np.ndarray) -> None:
+def _successes_plot(ax: Axes, successes: np.ndarray) -> None:
     ax.plot(np.linspace(0, 100, len(successes)), np.sort(successes), drawstyle="steps-mid")
     ax.axhline(successes.mean(), linestyle="--", linewidth=1, color="0.4", label=f"average {successes.mean():.1f}")
     ax.set_xlabel("trials, sorted [%]")
@@ -255,7 +270,7 @@ def _successes_plot(ax, successes: np.ndarray) -> None:
     ax.legend()
 
 
-def _survival_plot(ax, time: np.ndarray, cap: float) -> None:
+def _survival_plot(ax: Axes, time: np.ndarray, cap: float) -> None:
     t = np.sort(time)
     fallen = t < cap
     left = 100 * (1 - np.arange(1, fallen.sum() + 1) / len(t))

@@ -65,7 +65,7 @@ class FingertipEnv(RotateEnv):
         self._check_fingertips()
         super().setup()
 
-        def zeros(*shape, dtype=torch.float32):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=dev)
 
         self.patches = None
@@ -127,8 +127,8 @@ class FingertipEnv(RotateEnv):
 
     def memory(self) -> dict:
         names = ("gravity", "start", "leaning", "other_force", "push", "push_left", "push_wait", "past_pose", "age")
-        names += ("camera_tilt", "camera_offset", "hidden", "visible", "seen_position")
-        own: dict = {name: getattr(self, name) for name in names}
+        more = ("camera_tilt", "camera_offset", "hidden", "visible", "seen_position")
+        own: dict = {name: getattr(self, name) for name in names + more}
         own["palm"] = self.palm, 0, len(PALMS) - 1
         own["camera_delay"] = self.camera_delay, 0, self.past_pose.shape[1] - 1
         return super().memory() | own
@@ -268,6 +268,7 @@ class FingertipEnv(RotateEnv):
         """As the base class, through `observe.taxels` where it is set."""
         if self.patches is None:
             return super()._felt()
+        assert self.touch.raw is not None  # asked for with observe.taxels
         force, local = self.patches.read(self.touch.raw)
         pos, rot = self.engine.t.xpos[:, self.tip_body].float(), self.engine.t.xmat[:, self.tip_body].float()
         return force, (pos + (rot @ local[..., None])[..., 0]).flatten(1)

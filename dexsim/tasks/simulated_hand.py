@@ -206,6 +206,7 @@ class SimulatedHand:
             counts = env.touch.raw3[0].double().numpy() / (self.calibration.lsb * self.calibration.axis_sign)
             tactile[:] = np.clip(np.round(counts), [-128, -128, 0], [127, 127, 255])
         else:
+            assert env.touch.raw is not None  # a hand that touches
             tactile[..., 2] = np.clip(np.round(env.touch.raw[0].double().numpy() / self.calibration.lsb), 0, 255)
         speed = np.round(env.servo.velocity()[0].double().numpy() / SPEED_LSB) * SPEED_LSB
         return HandState(now, self.sequence, position.astype(np.float32), current, np.full(len(position), 30.0),
@@ -385,7 +386,7 @@ class SimulatedXHand:
         self._args = (config, calibration, seed, camera, shape, grip)
         hand = hand_of(config)
         self.joints, self.taxels = len(hand.joints), touch_shape(hand)
-        self._process = None
+        self._process: multiprocessing.context.SpawnProcess | None = None
         self.hand: SimulatedHand | None = None
         self._queue: list[tuple[float, Any]] = []
 
@@ -413,7 +414,7 @@ class SimulatedXHand:
         self._process = process
         limit = time.monotonic() + 180.0
         while self._views["newest"].value < 0:  # kernels compile on a first start
-            if not self._process.is_alive():
+            if not process.is_alive():
                 raise UserError("the simulated hand's process ended at its start; its message stands above")
             if time.monotonic() > limit:
                 raise UserError("the simulated hand did not start within 180 s")
@@ -422,7 +423,7 @@ class SimulatedXHand:
 
     def read(self) -> HandState | None:
         if self.hand is not None:
-            return self._step()
+            return self._step(self.hand)
         v = self._views
         while True:
             k = v["newest"].value
@@ -495,16 +496,16 @@ class SimulatedXHand:
         row[:2], row[2:end], row[end:-2], row[-2:] = (self._number, mode), position, tor_max, (kp, self._object)
         v["sent"].value = self._number
 
-    def _step(self) -> HandState | None:
+    def _step(self, hand: SimulatedHand) -> HandState | None:
         """In place: the bus cycles that have passed since the last call."""
         passed = int((self.clock.now() - self.latency - self._zero) / BUS_PERIOD + 1e-6)
         while self._cycle <= passed:
             for c in self._commands:
-                self.hand.command(c)
+                hand.command(c)
             self._commands = []
             t = self._cycle * BUS_PERIOD
-            self.hand.advance(t)
-            self._state = self.hand.state(self._zero + t + self.latency)
+            hand.advance(t)
+            self._state = hand.state(self._zero + t + self.latency)
             self._cycle += 1
         return self._state
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -83,7 +84,7 @@ class NarrowPhase:
     def in_place(self) -> Iterator[None]:
         """Within this, `mujoco_warp.step` finds the contacts of hulls here."""
         theirs = collision_driver.convex_narrowphase
-        def convex(m, d, ctx, table):
+        def convex(m: mjw.Model, d: mjw.Data, ctx: Any, table: list[tuple[GeomType, GeomType]]) -> None:
             theirs(m, d, ctx, [pair for pair in table if pair not in KINDS])
             self.launch(ctx)
 
@@ -109,7 +110,7 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
               block_dim=32)
 
 
-def _filled(kind: type, source: object, prefix: str = ""):
+def _filled(kind: Any, source: object, prefix: str = "") -> Any:
     """A kernel's struct, with the arrays of the same names of `source`."""
     struct = kind()
     for name in kind.vars:
