@@ -377,8 +377,7 @@ def _not_the_hardest_last(b: dict, runs: list) -> list:
 def _off(rng: np.random.Generator, b: dict) -> dict:
     """What the believed figures are off by, as plant columns: draws from the tolerance that the tool states for
     each."""
-    from dexsim.gap.plant.case import BELIEF
-    from dexsim.gap.search.hypotheses import FILTER, LATE
+    from dexsim.gap.rules import BELIEF
 
     def draw(centre: float, sd: float, low: float, high: float) -> float:
         while not low <= (x := rng.normal(centre, sd)) <= high:
@@ -386,12 +385,13 @@ def _off(rng: np.random.Generator, b: dict) -> dict:
         return float(x)
 
     # the simulator's limit goes by the motor's own speed
-    off = {f"*{k}": draw(1.0, 0.5 * BELIEF, 1 - BELIEF, 1 + BELIEF) for k in REFIT} | {"limit_speed": 0.0}
+    far = BELIEF.tolerance
+    off = {f"*{k}": draw(1.0, 0.5 * far, 1 - far, 1 + far) for k in REFIT} | {"limit_speed": 0.0}
     off |= {
-        "+delay": draw(0.0, LATE / 3 / RATE, 0.0, LATE / RATE),
+        "+delay": draw(0.0, BELIEF.late / 3 / RATE, 0.0, BELIEF.late / RATE),
         "+lag": draw(0.25 / RATE, 0.25 / RATE, 0.0, 1.0 / RATE),
     }
-    return off | ({"+speed_lag": draw(1.0 / RATE, 0.3 * FILTER, 0.0, FILTER)} if b["kd"] > 0 else {})
+    return off | ({"+speed_lag": draw(1.0 / RATE, 0.3 * BELIEF.filter, 0.0, BELIEF.filter)} if b["kd"] > 0 else {})
 
 
 def _left(case, q: np.ndarray, none: np.ndarray, noise: float) -> float:

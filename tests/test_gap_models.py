@@ -18,6 +18,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.plant.mechanics import leaf_of
 from dexsim.gap.read.runs import Run, conditions
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
 
@@ -263,4 +264,4 @@ def test_what_only_looks_like_jitter_is_not_reported():
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))
     none = search.without_search().none
-    assert none.fit.loss > joint.LEFT and joint.estimate_jitter(search, none) is None
+    assert none.fit.loss > JUDGE.jitter_left and joint.estimate_jitter(search, none) is None

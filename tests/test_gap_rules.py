@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import test_gap_rules_belief
 import test_gap_rules_torque
 import test_gap_rules_touch
 from test_gap_least import Judged, judged
@@ -17,15 +18,18 @@ from dexsim.gap import locate, rules
 from dexsim.gap.compute import Deadline
 from dexsim.gap.diagnosis import Drives
 from dexsim.gap.effects.catalogue import EFFECTS, inseparable
+from dexsim.gap.effects.drive import temperature_follows
 from dexsim.gap.effects.effect import Variant, param
 from dexsim.gap.judge import conclude, confidence, full_model, handed_on, joint, kept_out
 from dexsim.gap.judge.joint import JointAnswer, stretched
 from dexsim.gap.plant.batch import Windows
+from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import search as selecting
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, thin
 from dexsim.gap.search.search import JointSearch
+from dexsim.gap.touch import judge as pad_judge
 from dexsim.gap.touch.diagnosis import doubted
 
 
@@ -56,22 +60,19 @@ def test_every_rule_says_what_it_is_and_its_test_exists():
         assert callable(TESTS[test]), name
 
 
-ROOMS = {"search": rules.SEARCH, "judge": rules.JUDGE, "touch": rules.TOUCH, "torque": rules.TORQUE}
-
-
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 @pytest.mark.parametrize("name", [name for name, *_ in rules.described()])
 def test_a_rule_that_is_moved_fails_its_test(name, factor):
     test = {n: t for n, *_, t in rules.described()}[name]
     room, _, rule = name.partition(".")
-    value = getattr(ROOMS[room], rule)
+    value = getattr(rules.ROOMS[room], rule)
     ratio = rule in RATIOS and value > 1  # x something: what is left of 1 is what decides
     try:
-        object.__setattr__(ROOMS[room], rule, type(value)(value**factor if ratio else value * factor))
+        object.__setattr__(rules.ROOMS[room], rule, type(value)(value**factor if ratio else value * factor))
         with pytest.raises(AssertionError):
             TESTS[test]()
     finally:
-        object.__setattr__(ROOMS[room], rule, value)
+        object.__setattr__(rules.ROOMS[room], rule, value)
 
 
 RATIOS = ("enough", "worse", "noise", "carries", "unsettled", "alike")
@@ -605,7 +606,196 @@ def test_a_motion_that_settles_it_is_planned_alone():
             assert next_recording.choose(None, search, None, None).chosen == motions, score
 
 
-TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | globals()
+# -- what is looked for, and what counts as a rival
+
+
+def takes_part(here: float, now: float, draft: float | None = None) -> bool:
+    """Whether a rival counts that leaves `now` where it was fitted, the hypothesis leaving `here`; draft: what its
+    draft leaves on short windows, where it has not been fitted yet."""
+    search = Made()
+    mine, other = (SimpleNamespace(id=n, variant=SimpleNamespace(params=())) for n in ("lag", "backlash"))
+    current, rival = (SimpleNamespace(loss=np.ones(40), fit=SimpleNamespace(loss=loss, params=[], x=np.zeros(0)),
+                                      members=(m,), ids=(m.id,), left_out=None)
+                      for loss, m in ((here, mine), (now, other)))  # fmt: skip
+    search.none_loss, search.fitted = np.full(40, 50.0), {} if draft is not None else {frozenset(("backlash",)): rival}
+    search._fix, search._on, search._dear = lambda *_: nullcontext(), lambda _: None, lambda _: 1.0
+    search.cross, search._by_condition, search.deadline = lambda _: None, lambda *_: [], Deadline()
+    search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.array(here))
+    search.draft = lambda *_: (None, None, SimpleNamespace(loss=draft))
+    search.finish = lambda *_, **__: rival
+    return bool(search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"][0])
+
+
+def test_what_cannot_follow_is_no_rival():
+    assert takes_part(1.0, 2.1) and not takes_part(1.0, 2.3)
+    assert takes_part(0.0, 0.15) and not takes_part(0.0, 0.25)
+    assert takes_part(1.0, 1.0, draft=2.8) and not takes_part(1.0, 1.0, draft=3.0)
+    assert takes_part(0.0, 0.0, draft=0.35) and not takes_part(0.0, 0.0, draft=0.45)
+
+
+def test_a_rival_that_wins_clearly_takes_the_place():
+    search, current = Made(), SimpleNamespace(members=(SimpleNamespace(id="lag"),))
+    search.fitted = {frozenset(("backlash",)): "rival"}
+    for own, overtakes in ((0.45, True), (0.53, False)):  # share of the draws, the rival's being 0.6
+        found = search._overtaken(current, {"lag": ([("backlash", 0.6)], own, 0.5)})
+        assert (found == "rival") is overtakes, own
+
+
+def test_a_plain_models_figure_differs_beyond_what_is_believed():
+    case, plain = SimpleNamespace(scales=SimpleNamespace(nominal={"kp": 1.0})), param("kp", "kp", "set", 0.0, 10.0)
+    assert selecting._differs(plain, 1.12, case) and not selecting._differs(plain, 1.08, case)
+
+
+def test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws():
+    for left, useless, earns in ((7.0, 0.06, True), (7.0, 0.09, False), (4.0, 0.12, True), (4.0, 0.18, False)):
+        search = Made()
+        search._boot = lambda x, useless=useless: np.sort(np.linspace(0, 1, 1000)) - useless
+        assert search._earns(trial(left), trial(10.0)) is earns, (left, useless)
+
+
+def test_the_short_list_asks_a_promise():
+    for share, tried in ((0.035, True), (0.025, False)):
+        assert bool(Made()._shortlist([row(share, 0.0)], 6, 1.5, ())) is tried, share
+
+
+def test_a_small_change_of_temperature_tells_nothing():
+    for warm, tells in ((2.2, True), (1.8, False)):
+        s = SimpleNamespace(warm=warm, voltage=False, nominal={"coulomb_friction": 0.1, "viscous_friction": 0.0})
+        assert (EFFECTS["thermal"].variants(s) != []) is tells, warm
+
+
+# -- how sure a name is
+
+
+def test_no_name_is_certain():
+    assert 0.97 < confidence.weigh(doubtful(), 10.0, 0.0, 10.0, 1.0) < 1.0
+
+
+def test_a_size_that_reaches_its_end_is_doubted():
+    p = param("size", "lag", "set", 0.0, 1.0)
+    for nothing, said in ((0.3, "size"), (0.2, "")):
+        case = SimpleNamespace(scales=SimpleNamespace(nominal={"lag": nothing}))
+        assert confidence.beyond([p], {"size": (0.0, 0.5)}, case) == said, nothing
+
+
+def test_less_than_half_a_count_is_doubted():
+    assert confidence.unresolved(0.6, 0.0, 1.0) == "" and confidence.unresolved(0.4, 0.0, 1.0) != ""
+
+
+def test_a_temperature_that_follows_the_clock_is_said():
+    rng, n = np.random.default_rng(0), 2000
+    t = np.arange(float(n))
+    for scatter, said in ((0.1, "the clock"), (0.18, "")):  # correlations of 0.94 and 0.85
+        heat = t / n + rng.normal(size=n) * scatter
+        case = SimpleNamespace(regimes={"temperature": heat},
+                               plant=SimpleNamespace(t=t, rows=lambda r: slice(None)))  # fmt: skip
+        assert temperature_follows(case, [0]) == said, scatter
+
+
+def test_when_an_effect_acts():
+    t = 0.01 * np.arange(300)
+    for level, acts in ((0.3, True), (0.2, False)):  # of its most, in the second of three seconds
+        off = np.repeat([1.0, level, 0.0], 100)
+        run = SimpleNamespace(t=t, recording="a")
+        effect = SimpleNamespace(changes=lambda *_, off=off: off)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pad_judge, "TOUCH_EFFECTS", {"lag": effect})
+            (span,) = pad_judge.when("lag", SimpleNamespace(runs=[run], base={}), None)
+        assert (span["end"] - span["start"] > 1.5) is acts, level
+
+
+def test_what_the_rest_depends_on_stands_out():
+    spot = lambda p, ratio: locate.Spot("j", "speed", 0.0, 1.0, ratio, 1.0, 2.0, 1.0, 0.3, p)  # noqa: E731
+    said = lambda *given: len(locate.control([spot(*given)])) == 1  # noqa: E731
+    assert said(0.04, 2.0) and not said(0.06, 2.0) and said(0.01, 1.25) and not said(0.01, 1.15)
+
+
+def test_jitter_is_looked_for_where_much_is_left():
+    for loss, looked_for in ((2.2, True), (1.8, False)):
+        answer = Judged(1.0, 0.1)
+        answer.member.effect.jitters = True
+        answer.best = SimpleNamespace(members=(answer.member,), fit=SimpleNamespace(loss=loss, params=[], x=[]))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(joint, "estimate_jitter", lambda *_: SimpleNamespace(entry=lambda: {}))
+            assert ("jitter" in judged(answer)["parameters"]) is looked_for, loss
+
+
+def test_a_little_friction_stays_in_the_model():
+    p, row_ = param("motor_share", "motor_share", "set", 0.0, 1.0), np.zeros((1, 1, len(PLANT_INDEX)))
+    row_[..., PLANT_INDEX["backlash"]] = 0.1
+    for share, moved in ((0.025, 0.025), (0.015, 0.0)):
+        made = SimpleNamespace(fit=SimpleNamespace(params=[p], x=np.array([share])))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(handed_on, "expand", lambda *_: row_)
+            assert handed_on.on_motor(SimpleNamespace(plant=None), made) == moved
+
+
+# -- what is kept out
+
+
+def test_the_end_of_a_recording_is_kept_out():
+    runs = [SimpleNamespace(name=n, duration=10.0) for n in "ab"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_out, "visits", lambda *_: ([], np.zeros((0, 2))))
+        parts = kept_out.split(runs, [], [0, 1], [])
+    assert all(7.0 < parts.span_train[i][1] < 8.0 and parts.span_test[i][1] == 10.0 for i in (0, 1))
+
+
+def test_a_condition_that_is_most_of_the_time_is_fitted():
+    for seconds, chosen in ((4.3, True), (4.7, False)):  # of the first of three, which visits all that the others do
+        runs = [SimpleNamespace(duration=s) for s in (seconds, 2.9, 7.1 - seconds)]
+        found = kept_out._condition(runs, [0, 1, 2], np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]]))
+        assert (found == 0) is chosen, seconds
+
+
+def moving_case(**regimes):
+    """A joint of which a regime's variable rises evenly."""
+    n = 1000
+    given = {k: np.linspace(0.0, 1.0, n) for k in ("_speed", "speed", "load", "acceleration", "position")}
+    given |= {"saturation": np.full(n, 2.0), "_asked": np.full(n, -1.0)} | regimes
+    return SimpleNamespace(joint="j", moved=True, regimes=given, scales=SimpleNamespace(peak_speed=1.0))
+
+
+def test_regimes_of_a_motion():
+    share = {k: float(x.mean()) for k, x in kept_out.regimes([moving_case()]).items()}
+    assert all(0.25 < share[f"large {k} of j"] < 0.35 for k in ("speed", "load", "acceleration"))
+    assert all(0.12 < share[f"j at its {k} end"] < 0.18 for k in ("upper", "lower"))
+    assert 0.87 < share["saturation of j while braking"] < 0.93
+
+
+def test_regimes_of_heat():
+    for span, there in ((5.5, True), (4.7, False)):
+        found = kept_out.regimes([moving_case(temperature=np.linspace(20.0, 20.0 + span, 1000))])
+        assert ("a warm j" in found) is there, span
+    found = kept_out.regimes([moving_case(temperature=np.linspace(20.0, 40.0, 1000))])
+    assert all(0.25 < found[f"a {k} j"].mean() < 0.35 for k in ("warm", "cold"))
+
+
+def test_a_regime_is_visited_for_a_while():
+    alone = lambda here, there: kept_out._alone(["x"], np.array([[here, there]]), [0], [1]) == ["x"]  # noqa: E731
+    assert alone(0.3, 0.0) and not alone(0.2, 0.0) and alone(1.0, 0.02) and not alone(1.0, 0.03)
+
+
+def test_a_recording_at_rest_tells_nothing():
+    def at_rest(moved: float, commanded: float) -> bool:
+        run = SimpleNamespace(joints=("j",), q=np.array([[0.0], [moved]]), cmd=np.array([[0.0], [commanded]]))
+        return diagnosing._at_rest([run])
+
+    assert at_rest(1.5e-3, 0.0) and not at_rest(2.5e-3, 0.0) and at_rest(0.0, 8e-5) and not at_rest(0.0, 1.2e-4)
+
+
+def test_a_belief_without_a_trace_is_not_refitted():
+    beliefs = [replace(param(k, k, "set", 0.0, 1.0, 0.5), nuisance=True) for k in ("kp", "kd")]
+    search = Started(np.zeros(100), np.zeros(100))
+    residual, jacobian = np.zeros(200), np.tile([0.025, 0.015], (200, 1))  # sigmas over the whole range
+    fit = lambda params, x0, **_: SimpleNamespace(x=x0, residual=residual, loss=1.0, jacobian=jacobian)  # noqa: E731
+    search.fitter.fit, search.case = fit, SimpleNamespace(unknown=(), scales=None)
+    search.all_nuisances = beliefs
+    search.start()
+    assert [p.key for p in search.nuisances] == ["kp"]
+
+
+TESTS = vars(test_gap_rules_touch) | vars(test_gap_rules_torque) | vars(test_gap_rules_belief) | globals()
 
 
 def test_windows_are_thinned_without_losing_a_limit_or_following_one_sweep():

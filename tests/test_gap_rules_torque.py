@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dexsim.actuator.columns import INDEX
-from dexsim.gap.judge import kept_out
+from dexsim.gap.judge import conclude, kept_out
 from dexsim.gap.read import inputs
 from dexsim.gap.read.stage_tests import Stage
 from dexsim.gap.rules import JUDGE
@@ -267,3 +267,83 @@ def test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them():
             patch.setattr(kept_out, "free_run", lambda case, params, x, *_: (np.full(10, x[0]), None))
             search = SimpleNamespace(whole=whole)
             assert logged_torque._alike(Followed(None), search, trial, {"kd": error}, [0], None) is stand, error
+
+
+def told(after: float) -> float:
+    """Confidence of a friction by load that the torque names, and that leaves `after` of 1 on what was kept out."""
+    n = SimpleNamespace(effect=inverse_dynamics.LOAD, value=0.2, low=0.1, high=0.3, speed=0.0, share=1.0, before=1.0,
+                        after=after, rival=None, text="friction that grows with the load")  # fmt: skip
+    case = SimpleNamespace(joint="j", scales=SimpleNamespace(slide=False, speed=1.0),
+                           regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_out, "intervals_of", lambda *_: [])
+        (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n]), ["a"])], ["j"], [], [])
+    return finding["confidence"]
+
+
+def test_what_the_torque_names_is_never_certain():
+    assert 0.9 < told(0.5) < 1.0
+
+
+def test_what_the_torque_names_must_help_in_what_was_kept_out():
+    assert 0.4 < told(0.99) < JUDGE.firm
+
+
+def test_what_the_torque_names_is_a_part_of_the_answer():
+    for left, word in ((0.65, "partly_explained"), (0.75, "unknown")):
+        data = {"findings": [], "noise_floor": {"position_rad": 0.0}, "unexplained": {}}
+        named_ = [SimpleNamespace(effect="load_friction", before=1.0, after=left)]
+        finding = {"effect": "load_friction", "where": {"joints": ["j"]}, "held_out": {"error": "effort_rmse_Nm"}}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(conclude, "sentence", lambda *_: "")
+            by_torque = [(SimpleNamespace(joint="j"), SimpleNamespace(named=named_), ["a"])]
+            conclude.add_behind(SimpleNamespace(data=data), [finding], by_torque)
+        assert data["verdict"] == word, left
+
+
+def fitted_from_torque(gravity=0.0, samples=1000, seconds=10.0) -> bool:
+    """Whether a joint's logged torque of 100 Hz is fitted without a model; gravity: of its torque."""
+    scales = SimpleNamespace(gravity=gravity, tau=1.0, others=False, nominal={})
+    case = SimpleNamespace(joint="j", index=0, moved=True, scales=scales)
+    run = SimpleNamespace(name="a", t=0.01 * np.arange(samples))
+    of = SimpleNamespace(u=np.zeros(samples), seconds=seconds, loaded=False)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, answer in (("readable", True), ("moved", ("motion", "body")), ("columns_of", of), ("solve", "fit")):
+            patch.setattr(logged_torque, name, lambda *_, answer=answer: answer)
+        patch.setattr(inverse_dynamics, "highest", lambda t: 10.0)
+        return logged_torque.identify_joints([case], [run], [0], []) != []
+
+
+def test_gravity_that_matters_is_fitted():
+    assert fitted_from_torque(gravity=0.015) and not fitted_from_torque(gravity=0.03)
+
+
+def test_a_torque_is_fitted_where_enough_was_logged():
+    assert fitted_from_torque(samples=550) and not fitted_from_torque(samples=450)
+    assert fitted_from_torque(seconds=5.5) and not fitted_from_torque(seconds=4.6)
+
+
+def forbidden(friction: float, speed: float = 0.5, way: float = 0.5, seconds: float = 1.0) -> bool:
+    """Whether a dry friction [N.m] is forbidden by a motion that 1 N.m began, of a joint whose large speed and span are
+    1."""
+    t = 0.01 * np.arange(300)
+    on = (t >= 1.0) & (t < 1.0 + seconds)
+    q = way * np.clip((t - 1.0) / (seconds - 0.01), 0.0, 1.0)
+    plant = SimpleNamespace(t=t, q=q, rows=lambda r: slice(None))
+    scales = SimpleNamespace(speed=1.0, span=1.0, slide=False)
+    case = SimpleNamespace(plant=plant, regimes={"_speed": speed * on}, scales=scales, sigma=0.0,
+                           constants=SimpleNamespace(friction=0.0))  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baseline, "_drive", lambda *_: {1: np.ones(300), -1: np.ones(300)})
+        patch.setattr(baseline, "_series", lambda *_: np.zeros(300))
+        return baseline.forbids(case, [0], friction) != ""
+
+
+def test_friction_must_let_a_recorded_motion_begin():
+    assert not forbidden(1.05) and forbidden(1.15)
+
+
+def test_a_motion_begins_with_speed_and_goes_somewhere():
+    assert forbidden(5.0, speed=0.07) and not forbidden(5.0, speed=0.04)
+    assert forbidden(5.0, way=0.03) and not forbidden(5.0, way=0.015)
+    assert forbidden(5.0, seconds=0.16) and not forbidden(5.0, seconds=0.07)

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS
+from dexsim.gap.effects.catalogue import TOUCH_CATALOGUE, TOUCH_EFFECTS, touch_confusable
+from dexsim.gap.rules import JUDGE
 from dexsim.gap.touch import judge
 from dexsim.gap.touch import search as pad_search
 from dexsim.gap.touch.diagnosis import Pad, Touch
@@ -51,6 +52,7 @@ def test_taxels_that_agree_speak_for_the_rest():
     assert rest([0.8] * 5) is not None and rest([0.8] * 4) is None
     assert rest([0.91] * 12) is not None and rest([0.93] * 12) is None
     assert rest([0.8] * 9) is not None and rest([0.8] * 3) is None
+    assert rest([0.8] * 9, width=0.09) is not None and rest([0.8] * 9, width=0.11) is None
 
 
 def test_a_pad_must_be_touched_for_a_while():
@@ -246,3 +248,115 @@ def test_what_is_left_of_a_pad_has_structure():
         search = SimpleNamespace(cross=lambda _, loss=loss: np.full(10, loss), train=np.ones(10, bool))
         answer = SimpleNamespace(search=search, best=None, left=left, floor=1.0)
         assert PadAnswer.structured(answer) is structure, (loss, left)
+
+
+class Recorded:
+    """Readings [T, F, K, 3] of a recording."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __len__(self):
+        return len(self.value)
+
+
+def test_taxels_that_never_change_are_named_surely():
+    assert JUDGE.sure < judge.pressed({3: 0.0}, 1)["confidence"] < 1.0
+    force = np.zeros((30, 1, 4, 3))
+    force[:, 0, 1:, 2] = np.arange(30.0)[:, None]
+    sensors = SimpleNamespace(layout=SimpleNamespace(pads=1),
+                              beside=lambda f: [[j for j in range(4) if j != k] for k in range(4)])  # fmt: skip
+    (found,) = judge.constant_taxels([SimpleNamespace(tactile=Recorded(force))], sensors)
+    assert found["where"]["taxels"] == ["0:0"] and JUDGE.sure < found["confidence"] < 0.95
+
+
+def test_what_is_left_of_a_pad_goes_with_something():
+    rng, n = np.random.default_rng(0), 4000
+    t, load = np.arange(float(n)), rng.uniform(1.0, 2.0, n)
+    for part, said in ((0.5, True), (0.36, False)):  # correlations of about 0.48 and 0.34
+        order = part * (load - 1.5) / 0.289 + np.sqrt(1 - part**2) * rng.normal(size=n)
+        error = np.argsort(np.argsort(order)) / n
+        run = SimpleNamespace(t=t, grid=t, z=load[:, None], depth=np.zeros(n), error=error[:, None])
+        pad, trial = SimpleNamespace(runs=[run]), TouchTrial((), {})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(judge, "readings", lambda r, *_: r.z - r.error)
+            assert (len(judge.depends_on(pad, trial, "thumb")) == 1) is said, part
+
+
+def test_a_little_crosstalk_may_be_another_law():
+    doubt = lambda low: TOUCH_EFFECTS["tactile_crosstalk"].doubt({"parameters": {"fraction": {"low": low}}})  # noqa: E731
+    assert doubt(0.13) and not doubt(0.17)
+
+
+def test_a_drift_needs_time():
+    for seconds, possible in ((22.0, True), (17.0, False)):
+        search = SimpleNamespace(thermometer=False, runs=["one"], warm=seconds)
+        assert TOUCH_EFFECTS["thermal"].possible(search) is possible, seconds
+
+
+def test_a_touch_rival_follows_about_as_well():
+    other = next(e for e in TOUCH_CATALOGUE if not e.by_taxel and not touch_confusable(e.id, "tactile_delay"))
+    for left, counts in ((2.3, True), (2.7, False)):  # x what the hypothesis leaves where it was fitted
+        search = Choosing(lambda ids, left=left: (1.0, left if other.id in ids else 1.0))
+        current, rival, base = (search.fit(ids, {}) for ids in (("tactile_delay",), (other.id,), ()))
+        search.without, search.scan, search._try = lambda *_, base=base: base, lambda *_: [other], lambda *_: None
+        rows, _ = PadSearch._rivals(search, current, "tactile_delay", {frozenset((other.id,)): rival})
+        assert (rows != []) is counts, left
+
+
+class Scanned(PadSearch):
+    """A search of one pad whose one effect would take a share of what is left, by a linear score."""
+
+    def __init__(self, share):
+        self.train, left = np.ones(100, bool), np.ones(100)
+        across = np.tile([1.0, -1.0], 50)
+        self.changed = np.sqrt(share) * left + np.sqrt(1 - share) * across
+        self.current = TouchTrial((), {}, keys=(), jac=np.zeros((100, 0)), res=left)
+
+    def _possible(self, current, effect):
+        return effect.id == "tactile_delay"
+
+    def residual(self, values, gains=None, order=None):
+        return self.current.res - self.changed
+
+
+def test_a_touch_effect_must_promise_something():
+    for share, tried in ((0.035, True), (0.025, False)):
+        search = Scanned(share)
+        assert (search.scan(search.current) != []) is tried, share
+
+
+def silent(pressed=1.0, beside=1.0, lsb=0.0, reading=0.0):
+    """Taxels that are called silent, the second of three reading the same for ever: with what the plant presses it and
+    what its neighbours read at most, in a noise of 0.01 N."""
+    rise = np.linspace(0.0, 1.0, 20)[:, None]
+    run = SimpleNamespace(z=rise * [beside, 0.0, beside] + [0.0, reading, 0.0], lsb=lsb, beside=[[1], [0, 2], [1]])
+    pad = SimpleNamespace(runs=[run], noise=0.01, base={})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pad_search, "readings", lambda *_: rise * [1.0, pressed, 1.0])
+        return PadFit._silent(pad)
+
+
+def test_a_silent_taxel_is_pressed_and_its_neighbours_feel():
+    assert silent(pressed=0.09) == {1: 0.0} and silent(pressed=0.07) == {}
+    assert silent(beside=0.09) == {1: 0.0} and silent(beside=0.07) == {}
+    assert silent(pressed=0.45, lsb=0.1) == {1: 0.0} and silent(pressed=0.35, lsb=0.1) == {}
+
+
+def test_a_reading_that_never_changes_is_stuck():
+    assert silent(pressed=0.0, lsb=0.1, reading=0.25) == {1: 0.25} and silent(pressed=0.0, lsb=0.1, reading=0.15) == {}
+
+
+def test_exchanged_taxels_save_more_than_noise():
+    for size, found in ((0.08, True), (0.06, False)):  # N; each saves (2 size)^2 / 2 in the other's place
+        place = size * np.eye(3, 30)
+        search = SimpleNamespace(runs=[SimpleNamespace(z=place[[1, 0, 2]].T)], noise=0.01)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pad_search, "readings", lambda *_, place=place: place.T)
+            assert (PadSearch._swaps(search, {}) is not None) is found, size
+
+
+def test_neighbours_of_a_dead_taxel_feel_the_touch():
+    near = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], [0, 1, 2]]
+    for share, dead in ((0.12, {0}), (0.08, set())):
+        assert judge._constant(np.array([0.0, share, share, share, 1.0]), near) == dead, share

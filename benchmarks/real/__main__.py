@@ -196,7 +196,7 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
     kept out."""
     from benchmarks.real.convert_panda import JOINTS, convert, plain
     from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.gap.judge.kept_out import KEEP_OUT
+    from dexsim.gap.rules import JUDGE
 
     made = convert(data, out / "recordings")
     wall, cpu = time.perf_counter(), time.process_time()
@@ -205,7 +205,7 @@ def panda(data: Path, out: Path, jobs: int) -> dict:
     )
     save(d, out)
     cpu = time.process_time() - cpu
-    rows, plainly = {}, plain(data, 1 - KEEP_OUT)
+    rows, plainly = {}, plain(data, 1 - JUDGE.kept_end)
     for j in JOINTS:
         v = d.servo.value(j, "coulomb_friction")
         x = plainly[j]

@@ -151,10 +151,7 @@ class Drives(Steps):
         self._without_pushes()
         for run in w.runs:
             run.smooth()
-        joints = range(len(w.runs[0].joints))
-        moving = any(max(float(np.ptp(r.q[:, j])) for r in w.runs) > 2e-3 for j in joints)
-        commanded = any(max(float(np.ptp(r.cmd[:, j])) for r in w.runs) > 1e-4 for j in joints)
-        if not moving and not commanded:
+        if _at_rest(w.runs):
             raise NothingToJudge(
                 "Nothing moves in these recordings: no command changes and no joint moves, so no drive can be judged"
             )
@@ -430,6 +427,13 @@ def cannot_be_seen(asked: set[str] | None, left_out: dict[str, str]) -> list[str
         for e in sorted(asked or ())
         if e in left_out
     ]
+
+
+def _at_rest(runs: Sequence[Run]) -> bool:
+    """Whether no joint moves in any run and no target changes."""
+    joints = range(len(runs[0].joints))
+    moving = any(max(float(np.ptp(r.q[:, j])) for r in runs) > JUDGE.moved for j in joints)
+    return not moving and not any(max(float(np.ptp(r.cmd[:, j])) for r in runs) > JUDGE.commanded for j in joints)
 
 
 def _unsettled(found: Outcome) -> bool:

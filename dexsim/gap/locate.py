@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexsim import intervals
+from dexsim.gap.rules import JUDGE
 
 BINS = 4  # of a regime variable, of equal numbers of samples
 DRAWS = 300  # of the bootstrap
@@ -122,8 +123,9 @@ def _edges(name: str, x: np.ndarray) -> Sequence[float] | np.ndarray:
     return np.unique(np.quantile(x, np.linspace(0, 1, BINS + 1)))
 
 
-def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:
-    """Benjamini-Hochberg over all bins: those that stand at `rate`, the largest first, positions before efforts."""
+def control(found: list[Spot]) -> list[Spot]:
+    """Benjamini-Hochberg over all bins: those that stand at `JUDGE.discovery`, the largest first, positions before
+    efforts."""
     if not found:
         return []
     order = np.argsort([s.p for s in found])
@@ -135,7 +137,7 @@ def control(found: list[Spot], rate: float = 0.05) -> list[Spot]:
     for s, value in zip(found, q, strict=True):
         s.q = float(value)
     return sorted(
-        [s for s in found if s.q <= rate and s.ratio > 1.2],
+        [s for s in found if s.q <= JUDGE.discovery and s.ratio > JUDGE.spot],
         key=lambda s: (s.of != "position", -s.rms * np.sqrt(s.share)),
     )
 

@@ -1,4 +1,10 @@
-"""The figures that decide: what each means, where its value came from, and which test fails if it is moved."""
+"""The figures that decide: what each means, where its value came from, and which test fails if it is moved.
+
+What stays elsewhere decides no name, confidence or verdict by itself: sizes, bounds and starts of an effect (in its
+class), what a test of a signal goes by (at the top of its file in `read/`), figures of the numerics (steps, damping,
+ridges, filters, grids, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets,
+lengths of short lists, how many drafts are looked at closely: more of it takes longer).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,8 @@ T = TypeVar("T", int, float)
 
 def _rule(value: T, means: str, source: str, test: str) -> T:
     """A figure: what it means, where its value came from, its test in tests/test_gap_rules.py (touch:
-    tests/test_gap_rules_touch.py, torque: tests/test_gap_rules_torque.py)."""
+    tests/test_gap_rules_touch.py, torque: tests/test_gap_rules_torque.py, beliefs:
+    tests/test_gap_rules_belief.py)."""
     made: T = field(default=value, metadata={"means": means, "source": source, "test": test})
     return made
 
@@ -139,6 +146,67 @@ class SearchRules:
         "effects on one joint",
         "by judgement: more of them can imitate anything",
         "test_a_joint_has_at_most_so_many_effects",
+    )
+    rival: float = _rule(
+        2.0,
+        "x the loss where it was fitted: a hypothesis that leaves more is no rival",
+        "by judgement: a rival follows about as well; what leaves twice as much wins no draw",
+        "test_what_cannot_follow_is_no_rival",
+    )
+    rival_noise: float = _rule(
+        0.2,
+        "x the noise squared that a rival may leave beside that",
+        "by judgement",
+        "test_what_cannot_follow_is_no_rival",
+    )
+    draft: float = _rule(
+        2.5,
+        "x the loss on short windows: a draft of a rival that leaves more is not fitted to its end",
+        "by judgement: above `rival`, for a draft is not yet at its best",
+        "test_what_cannot_follow_is_no_rival",
+    )
+    draft_noise: float = _rule(
+        0.4,
+        "x the noise squared that a draft of a rival may leave beside that",
+        "by judgement",
+        "test_what_cannot_follow_is_no_rival",
+    )
+    lead: float = _rule(
+        0.1,
+        "share of the bootstraps by which a rival must win more often to be taken in an effect's place",
+        "by judgement: 300 draws tell hardly less apart",
+        "test_a_rival_that_wins_clearly_takes_the_place",
+    )
+    differs: float = _rule(
+        0.01,
+        "of a parameter's room: what a plain model's figure must differ by from what is believed, beside its "
+        "tolerance",
+        "by judgement",
+        "test_a_plain_models_figure_differs_beyond_what_is_believed",
+    )
+    rare: float = _rule(
+        2.5,
+        "x `chance` for a first effect that removes from twice `least` on: few moments show it, and draws vary",
+        "by judgement: a limit that is reached twice is missed by some draws",
+        "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
+    )
+    rarer: float = _rule(
+        5.0,
+        "x `chance` for a first effect that removes four times `least`",
+        "by judgement",
+        "test_a_first_effect_of_few_moments_may_be_of_no_use_to_more_draws",
+    )
+    promise: float = _rule(
+        0.25,
+        "of `least`: what an effect must promise in the scan to be on the short list at all",
+        "by judgement: the scan is linear and promises too little of effects that are not",
+        "test_the_short_list_asks_a_promise",
+    )
+    warmth: float = _rule(
+        2.0,
+        "degC: a smaller change of temperature tells nothing of heat",
+        "by judgement: twice the resolution of a usual sensor",
+        "test_a_small_change_of_temperature_tells_nothing",
     )
 
 
@@ -367,6 +435,127 @@ class JudgeRules:
         "by judgement",
         "test_a_motion_that_settles_it_is_planned_alone",
     )
+    surest: float = _rule(
+        0.99,
+        "the largest confidence of a name",
+        "by judgement: what no draw refutes may still be what the catalogue lacks",
+        "test_no_name_is_certain",
+    )
+    at_end: float = _rule(
+        0.25,
+        "of a size's room by which nothing-missing must be away from an end that its interval reaches for that "
+        "end to count",
+        "by judgement",
+        "test_a_size_that_reaches_its_end_is_doubted",
+    )
+    resolved: float = _rule(
+        0.5,
+        "counts of the encoder: an effect that moves the joint by less is doubted",
+        "a reading is rounded to half a count",
+        "test_less_than_half_a_count_is_doubted",
+    )
+    ordered: float = _rule(
+        0.9,
+        "correlation of ranks from which on a temperature is said to follow the clock",
+        "by judgement",
+        "test_a_temperature_that_follows_the_clock_is_said",
+    )
+    acts: float = _rule(
+        0.25,
+        "of its most: from there on an effect acts, where stretches of time are told",
+        "by judgement",
+        "test_when_an_effect_acts",
+    )
+    discovery: float = _rule(
+        0.05,
+        "false-discovery rate of what the rest is said to depend on",
+        "the customary 5 % (Benjamini and Hochberg 1995)",
+        "test_what_the_rest_depends_on_stands_out",
+    )
+    spot: float = _rule(
+        1.2,
+        "x the residual elsewhere: what the rest is said to depend on is larger",
+        "by judgement",
+        "test_what_the_rest_depends_on_stands_out",
+    )
+    jitter_left: float = _rule(
+        2.0,
+        "x the noise squared that a hypothesis leaves, from which jitter of a delay is looked for",
+        "by judgement: the covariance of jitter is nothing where hardly more than noise is left",
+        "test_jitter_is_looked_for_where_much_is_left",
+    )
+    on_motor: float = _rule(
+        0.02,
+        "of the model's friction: a smaller share of it stays where the model has it",
+        "by judgement: within what friction is believed to",
+        "test_a_little_friction_stays_in_the_model",
+    )
+    kept_end: float = _rule(
+        0.25,
+        "of the time of a recording, where its end is kept out",
+        "the customary quarter",
+        "test_the_end_of_a_recording_is_kept_out",
+    )
+    kept_most: float = _rule(
+        0.45,
+        "of all time that may be kept out",
+        "by judgement: what is fitted must be more",
+        "test_a_condition_that_is_most_of_the_time_is_fitted",
+    )
+    large: float = _rule(
+        0.7,
+        "of the largest anywhere: from there on a speed, a load, an acceleration is a regime of its own",
+        "by judgement",
+        "test_regimes_of_a_motion",
+    )
+    ends: float = _rule(
+        0.15,
+        "of the motion at each end that is a regime of its own",
+        "by judgement",
+        "test_regimes_of_a_motion",
+    )
+    turning: float = _rule(
+        0.1,
+        "of the peak speed: from there on a joint moves, where braking is told from rest",
+        "by judgement",
+        "test_regimes_of_a_motion",
+    )
+    warmed: float = _rule(
+        5.0,
+        "degC: what a temperature must span for cold and warm to be regimes",
+        "by judgement: over twice what tells of heat at all",
+        "test_regimes_of_heat",
+    )
+    warm: float = _rule(
+        0.3,
+        "of that span, at each of its ends, that is cold and warm",
+        "by judgement",
+        "test_regimes_of_heat",
+    )
+    visited: float = _rule(
+        0.25,
+        "s in which a regime is visited",
+        "by judgement: a few periods of a loop and half a block of the bootstraps",
+        "test_a_regime_is_visited_for_a_while",
+    )
+    unseen: float = _rule(
+        0.1,
+        "of `visited`: what is fitted shows a regime no more where it is in it for less",
+        "by judgement",
+        "test_a_regime_is_visited_for_a_while",
+    )
+    moved: float = _rule(
+        0.002,
+        "rad or m: a joint whose positions span less has not moved",
+        "by judgement",
+        "test_a_recording_at_rest_tells_nothing",
+    )
+    commanded: float = _rule(
+        0.0001,
+        "rad or m: targets that span less have not changed",
+        "by judgement",
+        "test_a_recording_at_rest_tells_nothing",
+    )
 
 
 @dataclass(frozen=True)
@@ -486,6 +675,84 @@ class TouchRules:
         "x the noise, of what was fitted and of what was kept out: what is left has structure",
         "by judgement",
         "test_what_is_left_of_a_pad_has_structure",
+    )
+    constant: float = _rule(
+        0.85,
+        "confidence of taxels that never change while their neighbours feel a touch",
+        "by judgement: an object may pass between neighbours",
+        "test_taxels_that_never_change_are_named_surely",
+    )
+    constant_pressed: float = _rule(
+        0.95,
+        "confidence of taxels that never change while the plant has them pressed",
+        "by judgement: both the place of the object and the neighbours say so",
+        "test_taxels_that_never_change_are_named_surely",
+    )
+    goes_with: float = _rule(
+        0.4,
+        "correlation of ranks from which on what is left of a pad is said to go with a quantity",
+        "by judgement",
+        "test_what_is_left_of_a_pad_goes_with_something",
+    )
+    spread: float = _rule(
+        0.15,
+        "share that may pass to the taxels beside because pressure spreads by another law than the plant's",
+        "by judgement: laws of a foundation and of a half-space differ",
+        "test_a_little_crosstalk_may_be_another_law",
+    )
+    one_run: float = _rule(
+        20.0,
+        "s: in one shorter recording without a temperature a drift is anything that changes",
+        "by judgement",
+        "test_a_drift_needs_time",
+    )
+    rival: float = _rule(
+        2.5,
+        "x the error where it was fitted: a hypothesis that leaves more is no rival",
+        "by judgement",
+        "test_a_touch_rival_follows_about_as_well",
+    )
+    promise: float = _rule(
+        0.25,
+        "of `least`: what an effect must promise in the scan to be tried",
+        "as `search.promise`",
+        "test_a_touch_effect_must_promise_something",
+    )
+    felt: float = _rule(
+        8.0,
+        "x the noise that the plant must press a taxel with, and its neighbours read, for it to be called silent",
+        "by judgement",
+        "test_a_silent_taxel_is_pressed_and_its_neighbours_feel",
+    )
+    felt_counts: float = _rule(
+        4.0,
+        "counts, where those are coarser than the noise, of the same",
+        "by judgement",
+        "test_a_silent_taxel_is_pressed_and_its_neighbours_feel",
+    )
+    stuck: float = _rule(
+        2.0,
+        "counts from which on a reading that never changes is stuck, pressed or not",
+        "by judgement",
+        "test_a_reading_that_never_changes_is_stuck",
+    )
+    exchange: float = _rule(
+        200.0,
+        "x the noise squared that two exchanged taxels must save in each other's place",
+        "by judgement",
+        "test_exchanged_taxels_save_more_than_noise",
+    )
+    known: float = _rule(
+        0.1,
+        "half width of a gain's interval: a taxel whose gain is known less speaks for no other",
+        "by judgement",
+        "test_taxels_that_agree_speak_for_the_rest",
+    )
+    touched: float = _rule(
+        0.1,
+        "of the pad's largest change: neighbours that change by as much feel the touch",
+        "by judgement",
+        "test_neighbours_of_a_dead_taxel_feel_the_touch",
     )
 
 
@@ -650,15 +917,143 @@ class TorqueRules:
         "by judgement",
         "test_figures_of_the_torque_stand_where_the_loop_does_as_well_with_them",
     )
+    surest: float = _rule(
+        0.95,
+        "the largest confidence of an effect that the torque names",
+        "by judgement: one recording judges it",
+        "test_what_the_torque_names_is_never_certain",
+    )
+    unhelped: float = _rule(
+        0.5,
+        "share of its confidence that an effect keeps which does not help on the recording kept out",
+        "by judgement: a hint then",
+        "test_what_the_torque_names_must_help_in_what_was_kept_out",
+    )
+    partly: float = _rule(
+        0.7,
+        "x the torque's error before: where less is left by what the torque names alone, that is a part of the "
+        "answer",
+        "by judgement: half of the variance",
+        "test_what_the_torque_names_is_a_part_of_the_answer",
+    )
+    heavy: float = _rule(
+        0.02,
+        "of a joint's torque: gravity that matters",
+        "by judgement: within what figures are believed to",
+        "test_gravity_that_matters_is_fitted",
+    )
+    shortest: float = _rule(
+        5.0,
+        "s of motion from which on a logged torque is fitted",
+        "by judgement: ten blocks of the bootstraps",
+        "test_a_torque_is_fitted_where_enough_was_logged",
+    )
+    fewest: int = _rule(
+        500,
+        "samples from which on a logged torque is fitted",
+        "by judgement: shortest at 100 Hz",
+        "test_a_torque_is_fitted_where_enough_was_logged",
+    )
+    room: float = _rule(
+        1.1,
+        "x the torque that drove a joint from rest: dry friction that is larger would have held it",
+        "gravity and limits are off by a few percent, twice over",
+        "test_friction_must_let_a_recorded_motion_begin",
+    )
+    moving: float = _rule(
+        0.05,
+        "of a joint's large speed: from there on it has set itself in motion",
+        "by judgement",
+        "test_a_motion_begins_with_speed_and_goes_somewhere",
+    )
+    travel: float = _rule(
+        0.02,
+        "of a joint's span that a motion must go to be one",
+        "by judgement: shorter ones may be noise",
+        "test_a_motion_begins_with_speed_and_goes_somewhere",
+    )
+    motion_lasts: float = _rule(
+        0.1,
+        "s that a motion must last to be one",
+        "by judgement: shorter ones may be noise",
+        "test_a_motion_begins_with_speed_and_goes_somewhere",
+    )
 
 
-SEARCH, JUDGE, TOUCH, TORQUE = SearchRules(), JudgeRules(), TouchRules(), TorqueRules()
+@dataclass(frozen=True)
+class BeliefRules:
+    """What any machine may be off by: it is refitted with every hypothesis, and is no finding."""
+
+    tolerance: float = _rule(
+        0.05,
+        "relative: figures of a real machine are off from its data sheet by as much, and that is no finding",
+        "by judgement: what data sheets promise",
+        "test_a_figure_within_its_tolerance_is_no_finding",
+    )
+    late: float = _rule(
+        0.75,
+        "periods of its loop by which any drive may act on its commands late",
+        "a command waits for half a period on average, and a clock is read when it is read",
+        "test_any_drive_may_be_a_little_late",
+    )
+    filter: float = _rule(
+        0.003,
+        "s: a filter of the measured speed that any drive may have",
+        "by judgement: three periods of a loop of 1 kHz",
+        "test_any_drive_may_filter_its_speed",
+    )
+    gives: float = _rule(
+        0.002,
+        "rad by which what holds a joint gives before it slides; more is an effect",
+        "by judgement",
+        "test_what_holds_a_joint_gives_a_little",
+    )
+    gives_slide: float = _rule(
+        5e-05,
+        "m by which what holds a slide gives before it slides",
+        "by judgement, as `gives` at a radius of 25 mm",
+        "test_what_holds_a_joint_gives_a_little",
+    )
+    zero: float = _rule(
+        2.0,
+        "counts by which the zeros of two encoders may differ",
+        "zeros are set to a count or two",
+        "test_sensors_have_zeros",
+    )
+    effort_zero: float = _rule(
+        0.01,
+        "of the torque limit: what a reading of the effort may be off by at rest",
+        "by judgement",
+        "test_sensors_have_zeros",
+    )
+    prior: float = _rule(
+        30.0,
+        "samples that one belief weighs, at one standard deviation",
+        "by judgement: neighbouring residuals are not independent",
+        "test_a_belief_weighs_some_samples",
+    )
+    trace: float = _rule(
+        0.02,
+        "sigmas of the residuals that a belief must move over its range to be refitted at all",
+        "by judgement: less moves no other figure",
+        "test_a_belief_without_a_trace_is_not_refitted",
+    )
+
+
+SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = SearchRules(), JudgeRules(), TouchRules(), TorqueRules(), BeliefRules()
+ROOMS: dict[str, SearchRules | JudgeRules | TouchRules | TorqueRules | BeliefRules] = {
+    "search": SEARCH,
+    "judge": JUDGE,
+    "touch": TOUCH,
+    "torque": TORQUE,
+    "belief": BELIEF,
+}
 
 
 def described() -> list[tuple[str, float, str, str, str]]:
     """(name such as "search.least", value, meaning, source, test) of every rule."""
     return [
         (f"{room}.{f.name}", getattr(rules, f.name), *(f.metadata[k] for k in ("means", "source", "test")))
-        for room, rules in (("search", SEARCH), ("judge", JUDGE), ("touch", TOUCH), ("torque", TORQUE))
+        for room, rules in ROOMS.items()
         for f in fields(rules)
     ]

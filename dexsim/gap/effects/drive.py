@@ -10,6 +10,7 @@ import numpy as np
 from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
+from dexsim.gap.rules import JUDGE, SEARCH
 
 
 class TorqueLimit(Effect):
@@ -184,10 +185,6 @@ class SupplySag(Effect):
         return {k: fit.entry(k, f"1/({fit.force})") for k in keys}
 
 
-MIN_WARMTH = 2.0  # degC: a smaller change of temperature tells nothing
-ORDERED = 0.9  # correlation of ranks from which on a temperature follows the clock
-
-
 class Thermal(Effect):
     """Torque constant, friction or resistance that drift with the temperature."""
 
@@ -199,7 +196,7 @@ class Thermal(Effect):
     kinds = 2
 
     def variants(self, s: Scales) -> list[Variant]:
-        if s.warm < MIN_WARMTH:
+        if s.warm < SEARCH.warmth:
             return []
         out = []
         for of, column in (
@@ -230,8 +227,8 @@ class Thermal(Effect):
     def unseen(self, s: Scales) -> str:
         if s.warm <= 0:
             return "no temperature is recorded"
-        if s.warm < MIN_WARMTH:
-            return f"the temperature changes by {s.warm:.1f} degC, less than {MIN_WARMTH:g}"
+        if s.warm < SEARCH.warmth:
+            return f"the temperature changes by {s.warm:.1f} degC, less than {SEARCH.warmth:g}"
         return super().unseen(s)
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
@@ -259,15 +256,15 @@ def temperature_follows(case: Case, runs: Sequence[int]) -> str:
         t = case.plant.t[rows]
         warm.append(case.regimes["temperature"][rows])
         clock.append(k + (t - t[0]) / max(float(t[-1] - t[0]), 1e-9))
-    if abs(_rank_correlation(np.concatenate(clock), np.concatenate(warm))) > ORDERED:
+    if abs(_rank_correlation(np.concatenate(clock), np.concatenate(warm))) > JUDGE.ordered:
         return "the clock"
     if len(warm) < 3:
         return ""
     means = np.array([x.mean() for x in warm])
-    if abs(_rank_correlation(np.arange(float(len(means))), means)) > ORDERED:
+    if abs(_rank_correlation(np.arange(float(len(means))), means)) > JUDGE.ordered:
         return "the order of the recordings"
     gain = np.array([case.plant.nominal[r][INDEX["kp"]] for r in runs])
-    return "the gain" if abs(_rank_correlation(gain, means)) > ORDERED else ""
+    return "the gain" if abs(_rank_correlation(gain, means)) > JUDGE.ordered else ""
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

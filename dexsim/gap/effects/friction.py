@@ -8,6 +8,7 @@ import numpy as np
 
 from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param
 from dexsim.gap.plant.columns import Scales
+from dexsim.gap.rules import BELIEF
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -130,12 +131,9 @@ class LoadFriction(Effect):
         return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}
 
 
-GIVE, GIVE_SLIDE = 2e-3, 5e-5  # rad, m: by which any dry friction gives way; more is the effect
-
-
 def give(s: Scales) -> float:
     """How far any dry friction may give way before it slides [rad or m]."""
-    return GIVE_SLIDE if s.slide else GIVE
+    return BELIEF.gives_slide if s.slide else BELIEF.gives
 
 
 class Presliding(Effect):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects.effect import Fit, PadFacts, PadSettings, TouchEffect, fitted, instead, ranged, times, wide
+from dexsim.gap.rules import TOUCH
 from dexsim.gap.touch.plant import THICKNESS, readings, shear
 from dexsim.tactile.pads import PAD_COLUMNS
 
@@ -132,9 +133,6 @@ class TactileStiffening(TouchEffect):
         return "; its rubber is left out" if doubt else ""
 
 
-SPREAD = 0.15  # share that may pass because pressure spreads by another law (foundation or half-space) than the plant's
-
-
 class TactileCrosstalk(TouchEffect):
     """Neighbours that respond: part of a taxel's force shows on those beside it."""
 
@@ -148,16 +146,13 @@ class TactileCrosstalk(TouchEffect):
     widens = True
 
     def doubt(self, finding: dict[str, Any]) -> str:
-        if finding.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < SPREAD:
+        if finding.get("parameters", {}).get("fraction", {"low": 1.0})["low"] < TOUCH.spread:
             return "a contact's force may spread over the taxels as much wider than its law says"
         return ""
 
     def hand_on(self, finding: dict[str, Any], pad: PadSettings, doubt: bool) -> str:
         pad.values["crosstalk"] = fitted(finding["parameters"]["fraction"], 0.0 if doubt else None)
         return ""
-
-
-ONE_RUN = 20.0  # s: in one shorter recording without a temperature a drift is anything that changes
 
 
 class TactileDrift(TouchEffect):
@@ -174,7 +169,7 @@ class TactileDrift(TouchEffect):
     words_beside = {"of": "taxels"}
 
     def possible(self, search: PadSearch) -> bool:
-        return search.thermometer or len(search.runs) >= 2 or search.warm >= ONE_RUN
+        return search.thermometer or len(search.runs) >= 2 or search.warm >= TOUCH.one_run
 
     def begin(self, search: PadSearch) -> list[dict[str, float]]:
         return [{"drift": x / search.warm} for x in (0.15, -0.15)]

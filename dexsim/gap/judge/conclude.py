@@ -18,7 +18,7 @@ from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, wid
 from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
-from dexsim.gap.rules import JUDGE, SEARCH
+from dexsim.gap.rules import JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import baseline
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
@@ -355,7 +355,7 @@ def add_behind(d: Diagnosis, findings: list[dict], by_torque: Sequence[tuple]) -
             "after_high": None,
             "how": "the motor torque recorded there, from the motion, with what was fitted elsewhere",
         }
-        data["verdict"] = "partly_explained" if a < 0.7 * b else "unknown"
+        data["verdict"] = "partly_explained" if a < TORQUE.partly * b else "unknown"
         data["unexplained"]["fraction_of_gap"] = round((a / b) ** 2, 4)
     d.sentence = sentence(data, d, data["noise_floor"]["position_rad"])
 

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS
-from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import SHAPES, neutral_of
-from dexsim.gap.rules import JUDGE
+from dexsim.gap.rules import BELIEF, JUDGE
 
 EXACT = ("position_scale", "readout_scale")  # columns that no belief is off in
 
@@ -60,7 +60,7 @@ def holds_nothing(params: Sequence, spread: dict[str, tuple[float, float]], case
         zero = neutral_of(p, case)
         # a figure of the drive is believed to a few percent; an encoder's scale is what it is
         believed = p.mode in ("factor", "set") and p.columns[0] not in EXACT
-        give = BELIEF * abs(zero) if believed and abs(zero) < 1e8 else 0.0
+        give = BELIEF.tolerance * abs(zero) if believed and abs(zero) < 1e8 else 0.0
         # where an effect begins at a bound, the bound is nothing
         begins = p.mode == "set" and (
             (zero <= p.low and low <= p.low * (1 + 1e-6) + 1e-12) or (zero >= p.high and high >= p.high * (1 - 1e-6))
@@ -78,8 +78,8 @@ def beyond(params: Sequence, spread: dict[str, tuple[float, float]], case: Case)
             continue
         zero, room = neutral_of(p, case), 1e-3 * p.span
         low, high = spread[p.key]
-        if (low <= p.low + room and zero > p.low + 0.25 * p.span) or (
-            high >= p.high - room and zero < p.high - 0.25 * p.span
+        if (low <= p.low + room and zero > p.low + JUDGE.at_end * p.span) or (
+            high >= p.high - room and zero < p.high - JUDGE.at_end * p.span
         ):
             return p.key
     return ""
@@ -114,7 +114,7 @@ def unresolved(without: float, after: float, quantum: float) -> str:
     moved = float(np.sqrt(max(without**2 - after**2, 0.0)))
     return (
         ""
-        if moved >= 0.5 * quantum
+        if moved >= JUDGE.resolved * quantum
         else f"what it does to the motion ({1e3 * moved:.2g} mrad or mm) is less than half a count of the encoder"
     )
 
@@ -129,7 +129,7 @@ def weigh(e: Evidence, before: float, after: float, without: float, noise: float
     c = e.share * kept(e.earned) * trusted(before, after, noise)
     if e.members > 1:  # of what the others leave it has to explain most
         c *= trusted(without, after, noise)
-    return float(min(c, 0.99, JUDGE.doubted if e.reasons else 1.0))
+    return float(min(c, JUDGE.surest, JUDGE.doubted if e.reasons else 1.0))
 
 
 def doubt_beside_others(mine: list[Evidence]) -> None:

@@ -66,15 +66,12 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
     return out
 
 
-LITTLE = 0.02  # of the model's friction: a smaller share of it stays where the model has it
-
-
 def on_motor(case: Case, trial: Trial) -> float:
     """Share of the model's friction and damping of the joint that a trial has on the motor's side of a play or an
     elasticity; 0 where nothing parts the two."""
     params, x = trial.fit.params, trial.fit.x
     share = next((float(v) for p, v in zip(params, x, strict=True) if p.columns == ("motor_share",)), 0.0)
-    if share < LITTLE:
+    if share < JUDGE.on_motor:
         return 0.0
     row = expand(case.plant, params, x[None])[0, 0]
     parted = row[PLANT_INDEX["backlash"]] > 0.0 or row[PLANT_INDEX["softness"]] > 0.0

@@ -18,8 +18,8 @@ from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, LATE_GROUPS, at_bound, expand
 from dexsim.gap.read.runs import Run
-from dexsim.gap.rules import JUDGE
-from dexsim.gap.search.fit import PRIOR, Fitted, Fitter, intervals, prior_weight
+from dexsim.gap.rules import BELIEF, JUDGE
+from dexsim.gap.search.fit import Fitted, Fitter, intervals, prior_weight
 from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
@@ -149,7 +149,7 @@ class JointAnswer:
         alike = inseparable(mm.id, case, sorted({*self.kept.train, *self.kept.test}))
         same += [(e, 0.0) for e in alike if e not in dict(same)][: 2 - len(same)]
         signal = mm.effect.signal(case, raw, mm.variant.note)
-        active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
+        active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
         finding = {
             "effect": mm.id,
@@ -170,7 +170,7 @@ class JointAnswer:
                 "removed_high": round(gain[1], 4),
             },
         }
-        late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > LEFT else None
+        late = estimate_jitter(self.search, best) if mm.effect.jitters and best.fit.loss > JUDGE.jitter_left else None
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
@@ -328,13 +328,13 @@ def traded(fit: Fitted) -> np.ndarray:
     A = J.T @ J
     believed = prior_weight(fit.params) * span**2
     A[np.diag_indices(len(A))] += np.where(
-        mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * PRIOR)
+        mine, 1e-9 * max(np.trace(A), 1e-30), np.where(believed > 0, believed, 12.0 * BELIEF.prior)
     )
     i = np.flatnonzero(mine)
     out = np.zeros(len(span))
     if len(i):
         out[i] = np.maximum(np.diag(np.linalg.inv(A))[i] - np.diag(np.linalg.inv(A[np.ix_(i, i)])), 0.0)
-    return 1.645 * np.sqrt(PRIOR * out) * span
+    return 1.645 * np.sqrt(BELIEF.prior * out) * span
 
 
 def rms(squares: np.ndarray) -> float:
@@ -384,7 +384,6 @@ WINDOWS = 24  # at most, evenly over the recordings
 ALIKE = (0.05, 0.2)  # s: over which times that are off may be alike
 SPAN = 1.25  # s of commands that may act within a window of a second
 FALL = 0.5 * 1.645**2  # of the log likelihood at the ends of a 90 % interval
-LEFT = 2.0  # x the noise squared that a hypothesis leaves, from which jitter is looked for
 
 
 @dataclass

@@ -23,11 +23,6 @@ from dexsim.gap.rules import JUDGE
 # is not. So the condition is kept out whose regimes the other conditions visit too; and of recordings that alone visit
 # a regime which it does not, the end is kept out beside it.
 
-KEEP_OUT = 0.25  # of the time of a recording, where its end is kept out
-LARGE = 0.7  # of the largest anywhere: from there on a speed, a load, an acceleration is a regime of its own
-LEAST_TIME = 0.25  # s in which a regime is visited
-MOST = 0.45  # of all time that may be kept out
-
 
 @dataclass
 class Split:
@@ -51,22 +46,22 @@ def regimes(cases: Sequence[Case]) -> dict[str, np.ndarray]:
         m = c.regimes
         saturated = m["saturation"] > 1.0
         against = m["_asked"] * m["_speed"] < 0
-        moving = np.abs(m["_speed"]) > 0.1 * c.scales.peak_speed
+        moving = np.abs(m["_speed"]) > JUDGE.turning * c.scales.peak_speed
         out[f"saturation of {c.joint}"] = saturated
         out[f"saturation of {c.joint} while braking"] = saturated & against & moving
         for name in ("speed", "load", "acceleration"):
             x = np.abs(m[name])
-            out[f"large {name} of {c.joint}"] = x > LARGE * float(np.percentile(x, 99.8))
+            out[f"large {name} of {c.joint}"] = x > JUDGE.large * float(np.percentile(x, 99.8))
         if "temperature" in m:
             heat = m["temperature"]
             cold, hot = np.percentile(heat, [1, 99])
-            if hot - cold > 5.0:
-                out[f"a warm {c.joint}"] = heat > hot - 0.3 * (hot - cold)
-                out[f"a cold {c.joint}"] = heat < cold + 0.3 * (hot - cold)
+            if hot - cold > JUDGE.warmed:
+                out[f"a warm {c.joint}"] = heat > hot - JUDGE.warm * (hot - cold)
+                out[f"a cold {c.joint}"] = heat < cold + JUDGE.warm * (hot - cold)
         q = m["position"]
         low, high = np.percentile(q, [0.5, 99.5])
-        out[f"{c.joint} at its upper end"] = q > high - 0.15 * (high - low)
-        out[f"{c.joint} at its lower end"] = q < low + 0.15 * (high - low)
+        out[f"{c.joint} at its upper end"] = q > high - JUDGE.ends * (high - low)
+        out[f"{c.joint} at its lower end"] = q < low + JUDGE.ends * (high - low)
     return out
 
 
@@ -92,9 +87,9 @@ def split(runs: list[Run], held: list[int], group: list[int], cases: Sequence[Ca
     chosen = _condition(runs, group, time)
     if chosen is None:
         every = list(range(len(runs)))
-        cut = {i: (1 - KEEP_OUT) * runs[i].duration for i in every}
+        cut = {i: (1 - JUDGE.kept_end) * runs[i].duration for i in every}
         return Split(every, every, {i: (0.0, cut[i]) for i in every}, {i: (cut[i], runs[i].duration) for i in every},
-                     f"the last {100 * KEEP_OUT:.0f} % of each recording's time")  # fmt: skip
+                     f"the last {100 * JUDGE.kept_end:.0f} % of each recording's time")  # fmt: skip
     test = [i for i in range(len(runs)) if group[i] == chosen]
     train = [i for i in range(len(runs)) if i not in test]
     how = "one condition, " + ", ".join(runs[i].name for i in test)
@@ -121,11 +116,11 @@ def _condition(runs: Sequence[Run], group: Sequence[int], time: np.ndarray) -> i
         mine = [i for i in range(len(runs)) if group[i] == g]
         rest = [i for i in range(len(runs)) if group[i] != g]
         seconds = sum(runs[i].duration for i in mine)
-        if seconds > MOST * total or seconds >= sum(runs[i].duration for i in rest):
+        if seconds > JUDGE.kept_most * total or seconds >= sum(runs[i].duration for i in rest):
             continue
         here, there = time[:, mine].sum(1), time[:, rest].sum(1)
-        visited = here > LEAST_TIME
-        score = (int((visited & (there < LEAST_TIME)).sum()), -int(visited.sum()))
+        visited = here > JUDGE.visited
+        score = (int((visited & (there < JUDGE.visited)).sum()), -int(visited.sum()))
         if least is None or score <= least:
             best, least = g, score
     return best
@@ -142,9 +137,9 @@ def _ends(
     """Where the end of a fitted recording begins that is kept out too [s], by run: those that visit regimes which
     `test` does not, before that moment and after."""
     out: dict[int, float] = {}
-    missing = [k for k in range(len(time)) if time[k, test].sum() < LEAST_TIME <= time[k, train].sum()]
+    missing = [k for k in range(len(time)) if time[k, test].sum() < JUDGE.visited <= time[k, train].sum()]
     on = list(found.values())
-    begins = {run: (1 - KEEP_OUT) * runs[run].duration for run in train}
+    begins = {run: (1 - JUDGE.kept_end) * runs[run].duration for run in train}
 
     def served(run: int) -> list[int]:
         """Of the missing regimes those that the recording visits at its end and before: seen at its begin alone they
@@ -156,7 +151,7 @@ def _ends(
         return [
             k
             for k, x in inside.items()
-            if x[late].sum() * step >= 0.5 * LEAST_TIME and x[~late].sum() * step >= LEAST_TIME
+            if x[late].sum() * step >= 0.5 * JUDGE.visited and x[~late].sum() * step >= JUDGE.visited
         ]
 
     while missing:
@@ -172,7 +167,8 @@ def _ends(
 def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: Sequence[int]) -> list[str]:
     """Regimes that what is kept out visits and no fitted recording does."""
     here, there = time[:, list(test)].sum(1), time[:, list(train)].sum(1)
-    return [name for name, a, b in zip(names, here, there, strict=True) if a > LEAST_TIME and b < 0.1 * LEAST_TIME]
+    alone = (here > JUDGE.visited) & (there < JUDGE.unseen * JUDGE.visited)
+    return [name for name, so in zip(names, alone, strict=True) if so]
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from dexsim.gap.read.runs import Run, local_polynomial
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
 REPEATS = 0.5  # of a signal's samples like the one before: readings that are not rounded do not repeat
-BELIEF = 0.05  # nominal figures of a real machine are off by as much, and no finding before
 
 
 @dataclass
@@ -43,7 +42,7 @@ class Case:
     regimes: dict[str, np.ndarray] = field(default_factory=dict)  # what residuals are set against, by measurement row
     moved: bool = True
     loop_rate: float | None = None
-    # of what the model says, by nuisance, where more than BELIEF is known
+    # of what the model says, by nuisance, where more than `BELIEF.tolerance` is known
     factors: dict[str, tuple[float, float]] = field(default_factory=dict)
     # its friction was read off the recorded torque: what the loop's error does not show is not doubted but known
     told: bool = False

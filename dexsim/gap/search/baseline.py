@@ -20,10 +20,10 @@ import numpy as np
 from dexsim import intervals
 from dexsim.actuator.columns import INDEX as SERVO
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Param, expand
 from dexsim.gap.read.runs import BLOCK
-from dexsim.gap.rules import TORQUE
+from dexsim.gap.rules import BELIEF, TORQUE
 from dexsim.gap.search.fit import Fitter, Residuals
 from dexsim.gap.search.hypotheses import subset
 
@@ -32,9 +32,6 @@ GUESSES, BEST = 96, 1  # all over the bounds; of them so many are fitted, beside
 ITERATIONS = 8  # of the fit from each guess
 GAIN, LIMIT = (0.2, 5.0), (0.3, 2.0)  # x what is believed, where no range is stated
 LATEST = 0.08  # s
-MOVING = 0.05  # of the joint's large speed
-TRAVEL, LASTS = 0.02, 0.1  # of the joint's span, and s: shorter stretches may be noise
-BELIEVED = 1.1  # x the driving torque: gravity and limits are off by a few percent
 DRAWS = 400  # of the bootstrap
 UNITS = {"torque_limit": "N.m", "coulomb_friction": "N.m", "viscous_friction": "N.m.s/rad", "delay": "s"}
 
@@ -229,7 +226,7 @@ def refused(
         row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0]
         friction = float(row[INDEX["coulomb_friction"]])
         # than was believed: that is not this answer's
-        more = friction > (1 + BELIEF) * case.scales.nominal["coulomb_friction"] + 1e-12
+        more = friction > (1 + BELIEF.tolerance) * case.scales.nominal["coulomb_friction"] + 1e-12
         reason = forbids(case, train, friction, float(row[INDEX["friction_asymmetry"]])) if more else ""
         plain, after = by.get(joint), joints[joint]["after"]
         if reason:
@@ -293,17 +290,17 @@ def room_for_friction(case: Case, runs: Sequence[int]) -> dict[int, float]:
             continue
         drive, pull = _drive(case, r), _series(case, r, "gravity_cos") + _series(case, r, "rest")
         for way in (1, -1):
-            on = way * v > MOVING * case.scales.speed
+            on = way * v > TORQUE.moving * case.scales.speed
             edge = np.flatnonzero(np.diff(np.r_[0, on.astype(int), 0]))
             for a, b in zip(edge[::2], edge[1::2], strict=True):
                 if (
                     a == 0
-                    or t[b - 1] - t[a] < LASTS
-                    or abs(q[b - 1] - q[a]) < max(TRAVEL * case.scales.span, 20 * case.sigma)
+                    or t[b - 1] - t[a] < TORQUE.motion_lasts
+                    or abs(q[b - 1] - q[a]) < max(TORQUE.travel * case.scales.span, 20 * case.sigma)
                 ):
                     continue
                 a = max(a - 2, 0)  # the torque that set it off is from just before
-                out[way] = min(out[way], max(BELIEVED * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))
+                out[way] = min(out[way], max(TORQUE.room * float(np.max(drive[way][a:b] - way * pull[a:b])), 0.0))
     return out
 
 

@@ -9,12 +9,12 @@ from scipy.optimize import lsq_linear
 
 from dexsim.gap.plant.batch import JointPlant, Windows
 from dexsim.gap.plant.columns import INDEX, Param, expand
+from dexsim.gap.rules import BELIEF
 
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
-PRIOR = 30.0  # samples that one belief weighs: neighbouring residuals are not independent
 
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
 
@@ -26,7 +26,7 @@ def centre_of(params: list[Param]) -> np.ndarray:
 
 def prior_weight(params: list[Param]) -> np.ndarray:
     """[P] weight of each belief on the sum of squares, per squared unit of its parameter."""
-    return np.array([PRIOR / p.sd**2 if p.sd > 0 else 0.0 for p in params])
+    return np.array([BELIEF.prior / p.sd**2 if p.sd > 0 else 0.0 for p in params])
 
 
 def disbelief(params: list[Param], x: np.ndarray) -> float:

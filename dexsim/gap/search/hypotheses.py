@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,10 +12,10 @@ from dexsim.gap.effects.catalogue import CATALOGUE, compatible
 from dexsim.gap.effects.effect import Effect, Variant
 from dexsim.gap.effects.friction import give
 from dexsim.gap.plant.batch import JointPlant, Windows
-from dexsim.gap.plant.case import BELIEF, PHYSICAL, Case
+from dexsim.gap.plant.case import PHYSICAL, Case
 from dexsim.gap.plant.columns import INDEX, Param, Scales
 from dexsim.gap.read.runs import BLOCK
-from dexsim.gap.rules import SEARCH
+from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search.fit import Fitted, Fitter, Residuals, disbelief, slopes_of
 
 # -- a hypothesis -----------------------------------------------------------------------------------------------------
@@ -133,10 +133,18 @@ WITH_OTHERS = (
     "coupling_from",
     "warmth",
 )
-LATE = 0.75  # periods of its loop by which any drive may act on its commands late
-ZERO = 2.0  # counts of an encoder by which its zero may be off
-EFFORT_ZERO = 0.01  # of the torque limit: what a reading of the effort may be off by at rest
-FILTER = 3e-3  # s: a filter of the measured speed that any drive may have
+MEASURED = (
+    "kp",
+    "kd",
+    "torque_limit",
+    "no_load_speed",
+    "coulomb_friction",
+    "viscous_friction",
+    "load_friction",
+    "load_friction_backdriven",
+    "stribeck_peak",
+)
+"""Columns whose believed figures are off by a few percent; those of others are what they are."""
 
 
 def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
@@ -157,138 +165,102 @@ def unknown(name: str, s: Scales) -> tuple[Param, list[float]] | None:
 
 
 def refitted(case: Case) -> list[Param]:
-    """What is refitted with every hypothesis: believed figures inside +- 5 %, stated ranges, unknowns."""
-    c, s = case, case.scales
-    out = []
-    for name in (*USUAL, *(n for n in c.unknown if n not in USUAL)):
+    """What is refitted with every hypothesis: believed figures within `BELIEF.tolerance`, stated ranges, unknowns."""
+    out = _figures(case)
+    taken = {p.columns[0] for p in out}
+    return [*out, *_timing(case, taken), *_of_the_drive(case, taken), *_of_the_body(case), *_of_the_sensors(case)]
+
+
+def _within(key: str, column: str) -> Param:
+    """A factor on what is believed, within its tolerance."""
+    off = BELIEF.tolerance
+    return Param(key, (column,), "factor", 1 - off, 1 + off, 1.0, nuisance=True, sd=0.5 * off)
+
+
+def _figures(case: Case) -> list[Param]:
+    """The drive's figures that are believed, stated as a range or unknown."""
+    out, s = [], case.scales
+    for name in (*USUAL, *(n for n in case.unknown if n not in USUAL)):
         value = s.nominal[name]
-        if name in c.unknown:
+        if name in case.unknown:
             guess = unknown(name, s)
             if guess is not None:
                 out.append(guess[0])
-        elif name in c.ranges:
-            low, high = c.ranges[name]
+        elif name in case.ranges:
+            low, high = case.ranges[name]
             if name in ("kp", "kd") or (value > 0 and name in ("torque_limit", "no_load_speed")):
                 out.append(Param(name, (name,), "factor", low / value, high / value, 1.0, nuisance=True))
             else:
                 out.append(Param(name, (name,), "set", low, high, value, nuisance=True))
-        elif (
-            name
-            in (
-                "kp",
-                "kd",
-                "torque_limit",
-                "no_load_speed",
-                "coulomb_friction",
-                "viscous_friction",
-                "load_friction",
-                "load_friction_backdriven",
-                "stribeck_peak",
-            )
-            and 0 < value < 1e8
-        ):
-            out.append(Param(name, (name,), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF))
-    rate = c.loop_rate or 1000.0
-    taken = {p.columns[0] for p in out}
-    # a command waits for the loop's next period, half of one on average, and a clock is read when it is read; more is
-    # an effect, which
-    # training is given
+        elif name in MEASURED and 0 < value < 1e8:
+            out.append(_within(name, name))
+    return out
+
+
+def _timing(case: Case, taken: Set[str]) -> list[Param]:
+    """When a drive acts and reads. taken: columns that are refitted already.
+
+    A command waits for the loop's next period, half of one on average, and a clock is read when it is read; more is an
+    effect, which training is given. Of a loop that nothing is known of, it may be twice as much."""
+    known, rate = bool(case.loop_rate), case.loop_rate or 1000.0
+    nominal, out = case.scales.nominal, []
     if "delay" not in taken:
-        d, most = (
-            s.nominal["delay"],
-            (LATE if c.loop_rate else 2 * LATE) / rate,
-        )  # of a loop that nothing is known of, twice as much
-        out.append(
-            Param(
-                "delay",
-                ("delay",),
-                "add",
-                -min(d, most),
-                most,
-                0.0,
-                "s",
-                nuisance=True,
-                sd=most / (3 if c.loop_rate else 2),
-            )
-        )
+        most = (BELIEF.late if known else 2 * BELIEF.late) / rate
+        least, sd = -min(nominal["delay"], most), most / (3 if known else 2)
+        out.append(Param("delay", ("delay",), "add", least, most, 0.0, "s", nuisance=True, sd=sd))
     if "lag" not in taken:
-        out.append(
-            Param(
-                "lag",
-                ("lag",),
-                "add",
-                0.0,
-                1.0 / rate,
-                0.25 / rate,
-                "s",
-                nuisance=True,
-                sd=(0.25 if c.loop_rate else 0.5) / rate,
-            )
-        )
+        sd = (0.25 if known else 0.5) / rate
+        out.append(Param("lag", ("lag",), "add", 0.0, 1.0 / rate, 0.25 / rate, "s", nuisance=True, sd=sd))
     # a drive tells its speed from its encoder through some filter
-    if s.nominal["kd"] > 0 and "speed_lag" not in taken:
-        f, most = s.nominal["speed_lag"], max(FILTER, 2.0 / rate)
-        out.append(
-            Param(
-                "speed_lag",
-                ("speed_lag",),
-                "set",
-                max(f - most, 0.0),
-                f + most,
-                f + 1.0 / rate,
-                "s",
-                nuisance=True,
-                sd=0.3 * FILTER,
-            )
-        )
+    if nominal["kd"] > 0 and "speed_lag" not in taken:
+        f, most = nominal["speed_lag"], max(BELIEF.filter, 2.0 / rate)
+        low, start, sd = max(f - most, 0.0), f + 1.0 / rate, 0.3 * BELIEF.filter
+        out.append(Param("speed_lag", ("speed_lag",), "set", low, f + most, start, "s", nuisance=True, sd=sd))
     # what it acts on was sampled up to a period ago, and acts until the next sample: half a period on average
-    out.append(
-        Param(
-            "feedback_delay", ("feedback_delay",), "set", 0.0, 1.5 / rate, 0.5 / rate, "s", nuisance=True, sd=0.5 / rate
-        )
-    )
-    # what holds a joint gives a little before it slides
-    small = give(s)
-    out.append(Param("presliding", ("presliding",), "set", 0.0, small, 0.1 * small, nuisance=True))
+    late, half = ("feedback_delay",), 0.5 / rate
+    return [*out, Param("feedback_delay", late, "set", 0.0, 1.5 / rate, half, "s", nuisance=True, sd=half)]
+
+
+def _of_the_drive(case: Case, taken: Set[str]) -> list[Param]:
+    """What may be so or otherwise in any drive."""
+    s = case.scales
+    small = give(s)  # what holds a joint gives a little before it slides
+    out = [Param("presliding", ("presliding",), "set", 0.0, small, 0.1 * small, nuisance=True)]
     if not s.voltage and s.nominal["no_load_speed"] < 1e8:
-        if "braking_slope" not in taken and "braking_slope" not in c.stated:
+        if "braking_slope" not in taken and "braking_slope" not in case.stated:
             out.append(Param("braking_slope", ("braking_slope",), "set", -1.0, 1.0, PHYSICAL, nuisance=True))
         if s.nominal["kd"] > 0:  # a limit of the motor, or of a firmware that goes by its own reading
             out.append(Param("limit_speed", ("limit_speed",), "set", 0.0, 1.0, 0.5, nuisance=True))
-    low, high = c.factors.get("inertia", (1 - BELIEF, 1 + BELIEF))
-    out.append(
-        Param(
-            "inertia",
-            ("inertia_scale",),
-            "factor",
-            low,
-            high,
-            0.5 * (low + high),
-            nuisance=True,
-            sd=0.25 * (high - low),
-        )
-    )
+    return out
+
+
+def _of_the_body(case: Case) -> list[Param]:
+    """What the model says of inertia, gravity and friction."""
+    s, c = case.scales, case.constants
+    low, high = case.factors.get("inertia", (1 - BELIEF.tolerance, 1 + BELIEF.tolerance))
+    middle, sd = 0.5 * (low + high), 0.25 * (high - low)
+    out = [Param("inertia", ("inertia_scale",), "factor", low, high, middle, nuisance=True, sd=sd)]
     if s.gravity > 0.01 * s.tau:
-        out.append(
-            Param("gravity", ("gravity_scale",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF)
-        )
-    if c.constants.damping > 0:
-        d = BELIEF * c.constants.damping
+        out.append(_within("gravity", "gravity_scale"))
+    if c.damping > 0:
+        d = BELIEF.tolerance * c.damping
         out.append(Param("damping", ("viscous_friction",), "add", -d, d, 0.0, nuisance=True))
-    if c.constants.friction > 0 or c.constants.damping > 0:
+    if c.friction > 0 or c.damping > 0:
         # on which side of a play a model's friction acts it does not say; without a play it makes no difference
         out.append(Param("motor_share", ("motor_share",), "set", 0.0, 1.0, 0.5, nuisance=True))
+    return out
+
+
+def _of_the_sensors(case: Case) -> list[Param]:
+    """What a second encoder and a reading of the effort show."""
+    s, out = case.scales, []
     if s.apart:  # two encoders have two zeros, set to a count or two
-        z = ZERO * max(c.quantum, c.sigma)
+        z = BELIEF.zero * max(case.quantum, case.sigma)
         out.append(Param("zero", ("readout_offset",), "add", -z, z, 0.0, nuisance=True, sd=0.5 * z))
-    if c.sigma_torque > 0:
-        o = EFFORT_ZERO * (s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.tau)
+    if case.sigma_torque > 0:
+        o = BELIEF.effort_zero * (s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.tau)
         out.append(Param("effort_zero", ("effort_offset",), "add", -o, o, 0.0, nuisance=True, sd=0.5 * o))
-        out.append(
-            Param(
-                "effort_gain", ("effort_gain",), "factor", 1 - BELIEF, 1 + BELIEF, 1.0, nuisance=True, sd=0.5 * BELIEF
-            )
-        )
+        out.append(_within("effort_gain", "effort_gain"))
         # a drive may show what it last asked for, or what acts meanwhile
         out.append(Param("effort_fresh", ("effort_fresh",), "set", 0.0, 1.0, 0.5, nuisance=True))
     return out
@@ -305,7 +277,6 @@ EXTREMES = (
     "position error",
 )  # regime variables whose largest values are never thinned out
 EXTREME, OF_RUN = 12, 3  # windows that are kept for their extremes, and of one recording
-TRACE = 0.02  # sigmas of the residuals that a belief has to move over its range to be refitted at all
 PROBE = 0.3  # of its range by which a belief is moved to see whether it leaves a trace
 MAYBE = {"limit_speed": 0.0, "motor_share": 0.0}  # beliefs about a drive of which none is likelier: the simplest values
 
@@ -407,7 +378,7 @@ class JointHypotheses:
         if params:
             span = np.array([p.span for p in params])
             trace = np.sqrt((f.jacobian**2).mean(0)) * span
-            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > TRACE]
+            self.nuisances = [p for p, size in zip(params, trace, strict=True) if size > BELIEF.trace]
         keep = [i for i, p in enumerate(params) if p in self.nuisances]
         x = f.x[keep]
         # large residuals are effects still to be named: the threshold follows them down
@@ -504,7 +475,7 @@ class JointHypotheses:
         with self._fix(members):
             r = self.scan_fitter.residuals(params, x)
         trace = np.sqrt(np.mean((r[1:] - r[0]) ** 2, 1)) / PROBE
-        awake = trace > TRACE
+        awake = trace > BELIEF.trace
         return [p for p, on in zip(without_trace, awake, strict=True) if on], at[awake]
 
     def thorough(self, trial: Trial) -> Trial:

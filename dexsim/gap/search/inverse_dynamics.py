@@ -40,7 +40,6 @@ EDGE, SWING = 50, 2.0  # samples, and periods of the cutoff, at each end in whic
 MODEL_RATE = 250.0
 RATE = 100.0  # Hz: readings slower than this are too few for a second derivative
 PER_CUTOFF = 10.0  # samples kept a period of the filter's cutoff
-HEAVY = 0.02  # of a joint's torque: gravity that matters
 NAMES = ("inertia", "viscous_friction", "coulomb_friction", "offset")
 WEIGHT = ("gravity", "gravity_across")  # factors on gravity's torque, beyond the model's, that are fitted beside them
 
@@ -195,7 +194,7 @@ def columns_of(given: Sequence[tuple], j: int, efficiency: float = 1.0, loaded: 
         if b is not None
     ]
     if loaded is None:
-        loaded = bool(weights) and max(weights) > HEAVY
+        loaded = bool(weights) and max(weights) > TORQUE.heavy
     for m, b, *rest in given:
         q, v, torque = m.q[:, j], m.v[:, j], efficiency * m.u[:, j]
         load = np.zeros_like(q) if b is None else b.torque[:, j]

@@ -13,11 +13,10 @@ import numpy as np
 from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.signals import CommandDelay
 from dexsim.gap.read.runs import Run
-from dexsim.gap.rules import TORQUE
+from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
     BY_DIRECTION,
-    HEAVY,
     LAG,
     LOAD,
     NAMES,
@@ -40,8 +39,6 @@ if TYPE_CHECKING:
 
 # -- what inverse dynamics say of each joint --------------------------------------------------------------------------
 
-SHORTEST, FEWEST = 5.0, 500  # s, samples in all: of what is fitted
-
 
 def identify_joints(
     cases: Sequence[Case],
@@ -58,7 +55,7 @@ def identify_joints(
     of each run [s from its start]."""
     out, motions = [], {}
     for case in cases:
-        if model is None and (case.scales.gravity > HEAVY * case.scales.tau or case.scales.others):
+        if model is None and (case.scales.gravity > TORQUE.heavy * case.scales.tau or case.scales.others):
             continue
         use = [r for r in train if readable(runs[r], case.index)]
         judge = [r for r in test if readable(runs[r], case.index) and (r not in train or span_test is not None)]
@@ -81,8 +78,8 @@ def identify_joints(
         top = min(inverse_dynamics.highest(runs[r].t) for r in use)
         first = at(top)[0]
         if (
-            len(first.u) < FEWEST * min(PER_CUTOFF * top * float(np.median(np.diff(runs[use[0]].t))), 1.0)
-            or first.seconds < SHORTEST
+            len(first.u) < TORQUE.fewest * min(PER_CUTOFF * top * float(np.median(np.diff(runs[use[0]].t))), 1.0)
+            or first.seconds < TORQUE.shortest
         ):
             continue
         out.append((case, solve(at, top, seed), [runs[r].name for r in judge]))
@@ -116,7 +113,6 @@ def believe(given: Sequence[tuple]) -> list[str]:
     Friction of which nothing is believed, and then the inertia too, within what the residuals allow.
     """
     from dexsim.actuator.columns import INDEX as SERVO
-    from dexsim.gap.plant.case import BELIEF
 
     said = []
     for case, x, _ in given:
@@ -150,7 +146,7 @@ def believe(given: Sequence[tuple]) -> list[str]:
         case.unknown = tuple(n for n in case.unknown if n not in open_)
         case.told = True
         factor = x.value["inertia"] / max(case.scales.inertia, 1e-12)
-        if abs(factor - 1) < BELIEF and "inertia" not in x.refused:
+        if abs(factor - 1) < BELIEF.tolerance and "inertia" not in x.refused:
             half = max(0.5 * (x.high["inertia"] - x.low["inertia"]) / x.value["inertia"], 1e-3)
             case.factors["inertia"] = (factor - half, factor + half)
         said.append(
@@ -182,7 +178,7 @@ def hand_on(
         if not case.told or case.joint not in by:
             continue
         search, outcome = by[case.joint]
-        held = [f for f in d.data["findings"] if f["confidence"] >= 0.5 and case.joint in f["where"]["joints"]]
+        held = [f for f in d.data["findings"] if f["confidence"] >= JUDGE.firm and case.joint in f["where"]["joints"]]
         trial = search.polish(outcome.best if held else outcome.none)
         claimed = {c for m in trial.members for p in m.variant.params for c in p.columns}
         told = [
@@ -271,9 +267,9 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
                               "asymmetry": entry(2 * n.value / f, 2 * n.low / f, 2 * n.high / f, "1")}  # fmt: skip
             same = [LAG, CommandDelay.id] if n.effect == LAG else []
             signal = EFFECTS[n.effect].signal(case, {k: v["value"] for k, v in parameters.items()}, {})
-            active = signal > 0.25 * max(float(np.percentile(signal, 99.9)), 1e-12)
+            active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
-            confidence = min(n.share, 0.95) * (1.0 if helped > TORQUE.further else 0.5)
+            confidence = min(n.share, TORQUE.surest) * (1.0 if helped > TORQUE.further else TORQUE.unhelped)
             out.append(
                 {
                     "effect": n.effect,

@@ -137,7 +137,7 @@ class JointLosses(JointHypotheses):
         chance = (
             SEARCH.chance
             if old.members or gain < 2 * SEARCH.least
-            else (2.5 if gain < 4 * SEARCH.least else 5.0) * SEARCH.chance
+            else (SEARCH.rare if gain < 4 * SEARCH.least else SEARCH.rarer) * SEARCH.chance
         )
         return bool(np.quantile(self._boot(a - b), chance) > 0)
 
@@ -313,7 +313,7 @@ class JointScan(JointLosses):
         out = []
         for row in scan:
             g, p, m, _ = row
-            if g < 0.25 * SEARCH.least * min(1.0, SEARCH.rough / loss) or (
+            if g < SEARCH.promise * SEARCH.least * min(1.0, SEARCH.rough / loss) or (
                 p > 4 * SEARCH.price and loss < SEARCH.rough
             ):
                 continue

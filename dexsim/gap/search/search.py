@@ -11,9 +11,9 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
-from dexsim.gap.plant.case import BELIEF, Case
+from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
-from dexsim.gap.rules import SEARCH
+from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, subset
@@ -363,7 +363,7 @@ class JointSelection(JointScan):
                 ahead.append((others[0][1] - share - like, k, rival))
         for lead, k, rival in sorted(ahead, reverse=True):
             better = self.fitted.get(frozenset((rival, *(m.id for i, m in enumerate(current.members) if i != k))))
-            if lead > 0.1 and better is not None and not self._shrunk(better):
+            if lead > SEARCH.lead and better is not None and not self._shrunk(better):
                 return better
         return None
 
@@ -399,13 +399,14 @@ class JointSelection(JointScan):
                 trial = known
                 if trial is None:
                     draft = self.draft((*rest, other), np.concatenate([*kept, start]), current)
-                    if draft[2].loss > 2.5 * short + 0.4:  # one that cannot follow even short stretches is no rival
+                    # one that cannot follow even short stretches is no rival
+                    if draft[2].loss > SEARCH.draft * short + SEARCH.draft_noise:
                         continue
                     trial = self.finish(*draft, current, quick=True)
                 self._on(0.05)
                 self.fitted[frozenset(trial.ids)] = trial
                 # one that cannot follow even what it was fitted to is no rival
-                if trial.fit.loss < 2.0 * current.fit.loss + 0.2:
+                if trial.fit.loss < SEARCH.rival * current.fit.loss + SEARCH.rival_noise:
                     self.cross(trial)
                     others.append(trial)
             table = np.stack([mine * self._dear(current), *[self._left(t) * self._dear(t) for t in others], lost])
@@ -439,7 +440,7 @@ def _differs(plain: Param, x: float, case: Case) -> bool:
     """Whether the plain model's figure is another than what is believed, as far as that is believed."""
     nominal = case.scales.nominal[plain.columns[0]]
     unit = nominal if plain.mode == "factor" else 1.0
-    return abs(x * unit - nominal) > max(BELIEF * abs(nominal), 0.01 * plain.span * unit)
+    return abs(x * unit - nominal) > max(BELIEF.tolerance * abs(nominal), SEARCH.differs * plain.span * unit)
 
 
 FINER = 2  # steps of whole recordings, where an effect was found, in one of the windows'

@@ -84,7 +84,7 @@ class PadAnswer:
         taxels, parameters = self._parameters(e)
         return {
             "effect": e,
-            "confidence": round(float(min(share * kept(earned), 0.99)), 3),
+            "confidence": round(float(min(share * kept(earned), JUDGE.surest)), 3),
             "alternatives": [{"effect": x, "confidence": round(c, 3)} for x, c in rivals[:3]],
             "indistinguishable": [e, *(x for x, _ in same)] if same else [],
             "separating_experiment": effect.experiment if same else None,
@@ -127,7 +127,7 @@ class PadAnswer:
             return None
         moved = np.zeros(len(t.gains), bool) if t.order is None else t.order != np.arange(len(t.gains))
         width = search.gain_width(t)
-        sure = (width < 0.1) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
+        sure = (width < TOUCH.known) & ~moved & (sum(r.z.sum(0) for r in search.runs) > 0)
         sure[list(search.silent)] = False
         if sure.sum() < TOUCH.agree:
             return None
@@ -268,11 +268,11 @@ def by_taxel(pad: PadFit, t: TouchTrial) -> np.ndarray:
 
 
 def when(e: str, pad: PadFit, t: TouchTrial) -> list[dict]:
-    """Stretches in which the effect changes the readings by more than a quarter of its most."""
+    """Stretches in which the effect changes the readings by more than `JUDGE.acts` of its most."""
     out = []
     for r in pad.runs:
         off = TOUCH_EFFECTS[e].changes(r, t, pad.base)
-        on = off > 0.25 * max(float(np.percentile(off, 99.5)), 1e-9)
+        on = off > JUDGE.acts * max(float(np.percentile(off, 99.5)), 1e-9)
         out += [{"recording": r.recording, "start": round(a, 4), "end": round(b, 4)} for a, b in spans(r.t, on, 0.03)]
     return out[:400]
 
@@ -294,7 +294,7 @@ def depends_on(pad: PadFit, t: TouchTrial, name: str) -> list[str]:
     for what, parts in (("the force", load), ("the depth", depth), ("how fast it is pressed", speed)):
         x = np.concatenate(parts)
         c = float(np.corrcoef(np.argsort(np.argsort(x)), np.argsort(np.argsort(y)))[0, 1]) if x.std() > 0 else 0.0
-        if abs(c) > 0.4:
+        if abs(c) > TOUCH.goes_with:
             said.append((abs(c), f"{what} (touch of the {name}, rank correlation {c:.2f})"))
     return [x for _, x in sorted(said, reverse=True)[:2]]
 
@@ -334,16 +334,20 @@ def constant_taxels(recordings: list[Recording], sensors: Sensors) -> list[dict[
             worst[f] = worst[f] & bad if f in worst else bad
     if not seen:
         return []
-    return [constant_finding([f"{f}:{k}" for k in sorted(taxels)], "constant while their neighbours feel a touch", 0.85)
-            for f, taxels in sorted(worst.items()) if taxels]  # fmt: skip
+    regime = "constant while their neighbours feel a touch"
+    return [
+        constant_finding([f"{f}:{k}" for k in sorted(taxels)], regime, TOUCH.constant)
+        for f, taxels in sorted(worst.items())
+        if taxels
+    ]
 
 
 def _constant(span: np.ndarray, beside: list[list[int]]) -> set[int]:
-    """Taxels [K] with no change although three neighbours changed by a tenth of the pad's largest."""
+    """Taxels [K] with no change although three neighbours changed by `TOUCH.touched` of the pad's largest."""
     top = float(span.max())
     if top <= 0 or len(span) < len(beside):
         return set()
-    felt = span > 0.1 * top
+    felt = span > TOUCH.touched * top
     return {k for k, near in enumerate(beside) if span[k] == 0 and felt[near].sum() >= 3}
 
 
@@ -387,7 +391,8 @@ def pressed(silent: dict[int, float], pad: int) -> dict[str, Any] | None:
         return None
     kinds = {"dead": [k for k, v in silent.items() if v == 0], "stuck": [k for k, v in silent.items() if v != 0]}
     said = "; ".join(f"{kind}: {', '.join(map(str, taxels))}" for kind, taxels in kinds.items() if taxels)
-    return constant_finding([f"{pad}:{k}" for k in sorted(silent)], f"constant while they are pressed ({said})", 0.95)
+    regime = f"constant while they are pressed ({said})"
+    return constant_finding([f"{pad}:{k}" for k in sorted(silent)], regime, TOUCH.constant_pressed)
 
 
 def merge_constant(gain: dict, dead: dict) -> None:

@@ -115,14 +115,15 @@ class PadFit:
         p = np.concatenate([readings(r, self.base) for r in self.runs])
         step = max(r.lsb for r in self.runs)
         still = np.ptp(z, axis=0) <= max(0.5 * step, 1e-9)
-        pressed = p.max(0) > max(8 * self.noise, 4 * step)
+        least = max(TOUCH.felt * self.noise, TOUCH.felt_counts * step)
+        pressed = p.max(0) > least
         # the object may touch beside where the joints say: neighbours on both sides must feel it
         near = [
-            sum(z[:, b].max() > max(8 * self.noise, 4 * step) for b in beside) >= min(3, len(beside))
+            sum(z[:, b].max() > least for b in beside) >= min(3, len(beside))
             for beside in self.runs[0].beside
         ]
         pressed &= np.array(near)
-        stuck = still & (z[0] > 2 * step)
+        stuck = still & (z[0] > TOUCH.stuck * step)
         return {int(k): float(z[0, k]) for k in np.flatnonzero((still & pressed) | stuck)}
 
     def _samples(self, held: set[str]) -> list[Sample]:
@@ -473,7 +474,7 @@ class PadSearch(PadFit):
                     best = max(best, (2 * c * float(d @ clean) - c * c * dd) / max(total, 1e-12))
             found.append((1.0 if effect.by_taxel else best, effect))
         found.sort(key=lambda f: -f[0])
-        return [e for g, e in found[:most] if g > 0.25 * TOUCH.least]
+        return [e for g, e in found[:most] if g > TOUCH.promise * TOUCH.least]
 
     def _try(self, current: TouchTrial, effect: TouchEffect) -> TouchTrial | None:
         """The hypothesis with one effect more; None where it cannot be there."""
@@ -554,9 +555,8 @@ class PadSearch(PadFit):
         out, used = np.arange(K), set()
         gain = own[:, None] + own[None] - left - left.T
         # each of the two must fit the other's place far better than its own
-        good = (
-            (left < TOUCH.swapped * own[:, None]) & (left.T < TOUCH.swapped * own[None]) & (gain > 200 * self.noise**2)
-        )
+        fits = left < TOUCH.swapped * own[:, None]
+        good = fits & (left.T < TOUCH.swapped * own[None]) & (gain > TOUCH.exchange * self.noise**2)
         pairs = sorted(((gain[i, j], i, j) for i, j in zip(*np.nonzero(np.triu(good, 1)), strict=True)), reverse=True)
         for _, i, j in pairs:
             if i not in used and j not in used:
@@ -617,7 +617,7 @@ class PadSearch(PadFit):
                 if t.gains is None:
                     again = self.fit(t.ids, start, None, t.gains, t.order, 160)
                     t = again if self.size(again.res) < self.size(t.res) else t
-            if t is not None and (self.size(t.res) < 2.5 * self.size(current.res) or alike):
+            if t is not None and (self.size(t.res) < TOUCH.rival * self.size(current.res) or alike):
                 self.cross(t)
                 others.append((x.id, t))
         table = np.stack([self.cross(current), *[t.left_out for _, t in others], self.cross(base)])

@@ -1,0 +1,56 @@
+"""What any machine may be off by: each figure of `rules.BELIEF` decides what it says. `tests/test_gap_rules.py` moves
+each and sees its test fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from dexsim.gap.effects.effect import param
+from dexsim.gap.effects.friction import give
+from dexsim.gap.judge import confidence
+from dexsim.gap.search import hypotheses
+from dexsim.gap.search.fit import disbelief
+
+
+def test_a_figure_within_its_tolerance_is_no_finding():
+    p = param("kp_factor", "kp", "factor", 0.2, 5.0, 1.0)
+    nothing = lambda low: confidence.holds_nothing([p], {"kp_factor": (low, 1.2)}, SimpleNamespace())  # noqa: E731
+    assert nothing(1.04) and not nothing(1.06)
+
+
+def timing(kd: float = 0.0):
+    """What is refitted of when a drive with a loop of 1 kHz acts and reads, by key."""
+    case = SimpleNamespace(
+        loop_rate=1000.0, scales=SimpleNamespace(nominal={"delay": 0.01, "kd": kd, "speed_lag": 0.0})
+    )
+    return {p.key: p for p in hypotheses._timing(case, set())}
+
+
+def test_any_drive_may_be_a_little_late():
+    late = timing()["delay"]
+    assert 0.6e-3 < late.high < 0.9e-3 and late.low == -late.high and late.start == 0.0
+
+
+def test_any_drive_may_filter_its_speed():
+    assert 2.5e-3 < timing(kd=1.0)["speed_lag"].high < 4e-3 and "speed_lag" not in timing()
+
+
+def test_what_holds_a_joint_gives_a_little():
+    assert 1.5e-3 < give(SimpleNamespace(slide=False)) < 3e-3 and 4e-5 < give(SimpleNamespace(slide=True)) < 8e-5
+
+
+def test_sensors_have_zeros():
+    """Of encoders with counts of 1 mrad, and of a reading of the effort at a limit of 2 N.m."""
+    scales = SimpleNamespace(apart=True, nominal={"torque_limit": 2.0}, tau=1.0)
+    case = SimpleNamespace(scales=scales, quantum=1e-3, sigma=1e-4, sigma_torque=0.1)
+    by = {p.key: p for p in hypotheses._of_the_sensors(case)}
+    assert 1.5e-3 < by["zero"].high < 3e-3 and 0.015 < by["effort_zero"].high < 0.03
+    assert by["zero"].low == -by["zero"].high and by["effort_zero"].low == -by["effort_zero"].high
+
+
+def test_a_belief_weighs_some_samples():
+    p = replace(param("kp", "kp", "factor", 0.9, 1.1, 1.0), nuisance=True, sd=0.025)
+    assert 20.0 < disbelief([p], np.array([1.025])) < 45.0
