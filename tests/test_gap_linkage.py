@@ -9,7 +9,7 @@ import pytest
 
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import EFFECTS
-from dexsim.gap.plant.case import build
+from dexsim.gap.plant.case import build, dragged_by
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read.runs import Run
 
@@ -120,3 +120,81 @@ def test_a_linkage_is_one_finding_at_the_end_that_is_dragged():
     ]
     chain = [end("a", "b", 0.9), end("b", "c", 0.9)]
     assert conclude._linkages(chain, []) == chain
+
+
+def several(ratio: float = 0.0):
+    """Cases of six joints side by side, a to f, that move at their own rates; a's motor is linked with f."""
+    names, rates = "abcdef", (3.0, 4.1, 5.3, 6.7, 7.9, 2.3)
+    bodies = "".join(
+        f'<body pos="{k} 0 0"><joint name="{n}" axis="0 1 0" armature="5e-4"/>'
+        '<geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/></body>'
+        for k, n in enumerate(names)
+    )
+    spec = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/><worldbody>{bodies}</worldbody></mujoco>')
+    servo = {"kp": 1.0, "kd": 0.03, "torque_limit": 1.0, "coulomb_friction": 0.005}
+    table = ServoTable.from_dict({"joints": {"*": servo}})
+    runs = []
+    for number in range(3):
+        t = np.arange(0.0, 4.0, 0.01)
+        q = 0.4 * np.sin(np.outer(t, np.array(rates)) + number * np.arange(6.0))
+        run = Run(f"r{number}", tuple(names), t, q.copy(), t, q, table, np.array([0, 0, -9.81]))
+        for _ in range(2):  # the series are those of the motion itself
+            run.qs = None
+            cases = build(spec, [run])
+            run.q[:, 0] = moved(dragged_by(cases[0], [cases[5]]).plant, linkage=ratio, coupling_from=3)
+        run.q += np.random.default_rng(number).normal(0, 3e-4, q.shape)
+        run.qs = None
+        runs.append(run)
+    return build(spec, runs)
+
+
+def test_a_joint_further_off_takes_the_place_of_the_last():
+    cases = several()
+    a, f = cases[0], cases[5]
+    assert a.scales.others == ("b", "c", "d", "e")
+    far = dragged_by(a, [f])
+    assert far.scales.others == ("b", "c", "d", "f") and a.scales.others[3] == "e"
+    column = lambda case, name: case.plant.series[:, SERIES_INDEX[name]]  # noqa: E731
+    assert np.array_equal(column(far, "drag2"), column(a, "drag2"))
+    # as the plant of another joint, that knows f among its nearest, has it
+    near = dragged_by(cases[1], [cases[4], f])
+    for name in ("drag3", "drag_v3", "drag_a3", "pull3"):
+        assert np.array_equal(column(far, name), column(near, name)) and not np.array_equal(
+            column(far, name), column(a, name)
+        )
+    run = slice(0, 400)
+    assert far.regimes["_drag3"][run] == pytest.approx(f.plant.q[run] - f.plant.q[0])
+    e = cases[4]
+    again = dragged_by(a, [e])  # e once more, from its own plant, from finer samples
+    for name in ("drag3", "drag_v3", "drag_a3", "pull3"):
+        apart, size = (np.quantile(np.abs(x), 0.95) for x in (column(again, name) - column(a, name), column(a, name)))
+        assert apart < 0.1 * size, name
+
+
+@pytest.mark.parametrize("ratio", [0.4, 0.0])
+def test_a_linkage_with_a_joint_further_off_is_found(ratio):
+    from types import SimpleNamespace
+
+    from dexsim.gap.compute import TimeLimit
+    from dexsim.gap.diagnosis import Drives
+    from dexsim.gap.search.search import JointSearch
+
+    drives = object.__new__(Drives)
+    settings = SimpleNamespace(allowed={"joint_coupling"}, seed=0, device="cpu")
+    drives.w = SimpleNamespace(settings=settings, limit=TimeLimit(None), progress=None)
+    drives.cases, drives.unknown_controllers = several(ratio), set()
+    drives.parts, drives.fold_groups = SimpleNamespace(train=[0, 1, 2], span_train=None), [0, 1, 2]
+    drives._left = 1
+    search = drives._begun(0, lambda _: None)
+    assert isinstance(search, JointSearch)
+    first = search.run()
+    assert not first.best.members
+    answers = [(search, first)] + [(drives._begun(k, lambda _: None), None) for k in range(1, 6)]
+    drives._dragged_from_afar(answers)
+    found = answers[0][1]
+    if not ratio:
+        assert answers[0] == (search, first) and drives.cases[0].scales.others[3] == "e"
+        return
+    (member,) = found.best.members
+    assert member.variant.note["from_joint"] == "f" and drives.cases[0] is answers[0][0].case
+    assert float(found.best.fit.x[0]) == pytest.approx(ratio, rel=0.1)

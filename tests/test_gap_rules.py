@@ -193,6 +193,7 @@ class Selecting(Made):
     _on = cross = lambda *_: None
     thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
+    _instead = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
     _dear = lambda self, trial: 1.0  # noqa: E731
@@ -233,7 +234,7 @@ class Plainly(Selecting):
 @pytest.mark.parametrize("left, found", [(0.5, True), (0.95, False)])
 def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
     def effect(name, column):
-        variant = SimpleNamespace(refines=False, params=[SimpleNamespace(columns=(column,))])
+        variant = SimpleNamespace(refines=False, instead=False, params=[SimpleNamespace(columns=(column,))])
         return SimpleNamespace(id=name, plain=(column,), variants=lambda scales: [variant])
 
     fitted = [effect(e.id, e.plain[0]) for e in selecting.CATALOGUE if e.plain]
@@ -568,6 +569,22 @@ def test_rivals_are_told_apart_by_what_they_lose():
     search.scan_fitter = SimpleNamespace(loss=lambda x: x, evaluate=lambda *_: np.zeros(()))
     rows, own, _ = search.rivals(current, {"backlash": (other, np.zeros(0))})["lag"]
     assert rows[0][0] == "backlash" and rows[0][1] / own == pytest.approx(np.exp(-1), rel=0.01)
+
+
+def test_a_law_that_training_lacks_must_explain_far_more():
+    class Beside(Selecting):
+        _values = lambda self, trial: np.zeros(len(trial.members))  # noqa: E731
+
+    law = Variant((param("size", "lag", "set", 0.0, 1.0),), ((0.1,),), instead=True)
+    other = SimpleNamespace(id="load_friction", variants=lambda _: [law], excludes=lambda *_: False)
+    for before, after, taken in ((10.0, 4.0, True), (10.0, 6.0, False), (1.5, 0.1, False)):
+        search = Beside(lambda ids, a=after, b=before: (a if "load_friction" in ids else b,) * 2)
+        search.allowed, search.case.scales = None, None
+        current = search.fit((Member(EFFECTS["coulomb_friction"], replace(law, instead=False)),))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(selecting, "CATALOGUE", [other])
+            ids = JointSearch._instead(search, current).ids
+        assert ids == (("load_friction",) if taken else ("coulomb_friction",)), (before, after)
 
 
 def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:

@@ -28,7 +28,8 @@ from dexsim.gap.inquiry import (
 from dexsim.gap.judge import conclude, full_model, handed_on, kept_out
 from dexsim.gap.judge.conclude import Noise, add_behind, into_diagnosis
 from dexsim.gap.judge.joint import JointAnswer, Kept
-from dexsim.gap.plant.case import Case, coupled, refine_motion_by_fits, refined_cases
+from dexsim.gap.plant.case import Case, coupled, dragged_by, refine_motion_by_fits, refined_cases
+from dexsim.gap.plant.columns import DRAGGERS
 from dexsim.gap.read import inputs, stage_tests
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain, save
@@ -219,6 +220,7 @@ class Drives(Steps):
         answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
         if linked:
             self._search_again(answers)
+        self._dragged_from_afar(answers)
         for search, found in answers:
             case = search.case
             if not case.moved:
@@ -293,6 +295,54 @@ class Drives(Steps):
         renewed = map_joints(joints, lambda i, tell: self._search_of(unsettled[i], tell), w.settings.device, w.progress)
         for k, answer in zip(unsettled, renewed, strict=True):
             answers[k] = answer
+
+    def _dragged_from_afar(self, answers: Answers) -> None:
+        """Joints of which much is left, searched once more with one that drags them from further off in the mechanism
+        than those that their plants know (`_draggers`); `answers` is changed where that explains it."""
+        w, asked = self.w, {e.id for e in EFFECTS.values() if e.couples}
+        if w.settings.allowed is not None:
+            asked &= w.settings.allowed
+        if not asked or len(self.cases) < DRAGGERS + 2:
+            return
+        left = [
+            k
+            for k, (search, found) in enumerate(answers)
+            if found is not None
+            and search.case.moved
+            and search.case.joint not in self.unknown_controllers
+            and found.best.fit.loss > SEARCH.unsettled
+            and not any(m.effect.couples for m in found.best.members)
+        ]
+        near = {k: answers[k][0].case for k in left}
+        by = compute.each(len(left), lambda i: None if w.limit.stopped else self._dragger(*answers[left[i]]))
+        pulled = [(k, case) for k, case in zip(left, by, strict=True) if case is not None]
+        for k, case in pulled:
+            self.cases[k] = case
+        self._left = len(pulled)
+        again = lambda i, tell: self._search_of(pulled[i][0], tell)  # noqa: E731
+        renewed = map_joints([c.joint for _, c in pulled], again, w.settings.device, w.progress) if pulled else []
+        for (k, _), (search, found) in zip(pulled, renewed, strict=True):
+            old_search, old = answers[k]
+            coupled_now = found is not None and any(m.effect.couples for m in found.best.members)
+            if coupled_now and search._left(found.best).sum() < (1 - SEARCH.least) * old_search._left(old.best).sum():
+                answers[k] = search, found
+            else:
+                self.cases[k] = near[k]
+
+    def _dragger(self, search: JointSearch, found: Outcome) -> Case | None:
+        """The joint's case with the one further off, if any, that by the scan drags it, in the place of the last of
+        those that its plant knows."""
+        case = search.case
+        far = [c for c in self.cases if c.joint not in {case.joint, *case.scales.others} and c.moved]
+        groups = [far[i : i + DRAGGERS] for i in range(0, len(far), DRAGGERS)]
+        best, which = SEARCH.least, None
+        for group in groups:
+            told = search.drags(found.best, dragged_by(case, group))
+            for other in group:
+                gain, price = told.get(other.joint, (0.0, 1.0))
+                if gain > best and price * len(groups) <= SEARCH.price:
+                    best, which = gain, other
+        return None if which is None else dragged_by(case, [which])
 
     def _test_stages(self) -> None:
         """What recorded torque, duty and current say before any search; what they tell of friction is believed."""

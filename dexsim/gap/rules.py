@@ -135,6 +135,13 @@ class SearchRules:
         "by judgement",
         "test_joints_that_are_not_followed_are_looked_at_again",
     )
+    instead: float = _rule(
+        0.5,
+        "share of what likenesses leave on what was left out that a law which training has less exactly may leave in "
+        "their place",
+        "by judgement: what training can be given goes before what explains a little more",
+        "test_a_law_that_training_lacks_must_explain_far_more",
+    )
     otherwise: float = _rule(
         0.1,
         "of the loss: by as much what is known of the others must change it for a joint to be searched again",

@@ -98,6 +98,7 @@ class Variant:
     fixed: tuple[tuple[str, float], ...] = ()
     note: dict = field(default_factory=dict)
     refines: bool = False  # adds parameters to the first variant: tried only where that one was found
+    instead: bool = False  # the servo table has it less exactly: tried only in the place of likenesses that leave much
     dear: float = 0.0  # of the loss: by as much it must do better than simpler effects that it can imitate
     laws: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()  # other laws of the same effect: (name, constants)
 

@@ -122,7 +122,22 @@ class LoadFriction(Effect):
         back = param(
             "fraction_backdriven", "load_friction_backdriven", "set", 0.0, 3.0, s.nominal["load_friction_backdriven"]
         )
-        return [Variant((drive, back), ((0.04, 0.05), (0.1, 0.12), (0.2, 0.25), (0.35, 0.35), (0.3, 0.8)))]
+        by_motor = Variant((drive, back), ((0.04, 0.05), (0.1, 0.12), (0.2, 0.25), (0.35, 0.35), (0.3, 0.8)))
+        # of what the gear hands to the joint: a share of the motor's torque cannot say that a gear holds against its
+        # load by itself, nor what it loses to a load of the joint's own inertia
+        gear = "gear_load_friction"
+        by_gear = Variant(
+            (
+                param("fraction", gear, "set", 0.0, 5.0),
+                param("fraction_backdriven", f"{gear}_backdriven", "set", 0.0, 5.0),
+            ),
+            ((0.3, 0.3), (1.0, 1.0)),
+            "of the torque on the joint",
+            (("gear_load_unit", max(s.gravity, 0.3 * s.tau)),),
+            instead=True,
+            laws=(("Hertz contact", (("gear_load_power", 2 / 3),)),),
+        )
+        return [by_motor, by_gear]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return np.abs(case.regimes["_load"]) * (case.regimes["speed"] > SLOW * case.scales.speed).astype(float)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param, word
-from dexsim.gap.plant.columns import Param, Scales
+from dexsim.gap.plant.columns import DRAGGERS, Param, Scales
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -166,7 +166,7 @@ class JointCoupling(Effect):
 
     def variants(self, s: Scales) -> list[Variant]:
         out = []
-        for k, other in enumerate(s.others[:4]):
+        for k, other in enumerate(s.others[:DRAGGERS]):
             fixed, note = (("coupling_from", float(k)),), {"from_joint": other}
             # its target is dragged along; a linkage between motor, joint and the other; the pull at its other end
             for column, label, starts in (

@@ -15,6 +15,7 @@ from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
 from dexsim.actuator.reference import load_level, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
+from dexsim.gap.effects.effect import SLOW
 from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
@@ -52,6 +53,24 @@ def undamped(trial: Trial, kp: float) -> float:
     )
 
 
+NEARLY = ("gear_load_friction", "gear_load_friction_backdriven")  # handed on as `share_of_outside`
+
+
+def share_of_outside(case: Case, trial: Trial) -> float:
+    """Dry friction of a trial that grows with the torque on the joint, per torque from outside: the servo table knows
+    that torque without the joint's own inertia, and a line. As large as on average while the joint slid."""
+    row = expand(case.plant, trial.fit.params, trial.fit.x[None])[0, 0].copy()
+    for name, value in (f for m in trial.members for f in m.variant.fixed):
+        row[PLANT_INDEX[name]] = value
+    share, back, power, unit = (
+        row[PLANT_INDEX[f"gear_load_{n}"]] for n in ("friction", "friction_backdriven", "power", "unit")
+    )
+    slides = case.regimes["speed"] > SLOW * case.scales.speed
+    load, speed = case.regimes["_load"][slides], case.regimes["_speed"][slides]
+    by_load = np.where(load * speed < 0.0, back, share) * unit * (np.abs(load) / unit) ** power
+    return float(by_load.sum() / max(np.abs(load).sum(), 1e-12))
+
+
 def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str, float]:
     """Servo columns that go with the effects of a trial beside their fitted ones: which kind a deadband is, which of
     the mechanism's joints drags this one, the rotor's inertia [kg.m2] where the model has no armature to take it
@@ -61,6 +80,8 @@ def columns_beside(case: Case, trial: Trial, joints: Sequence[str]) -> dict[str,
         for name, value in x.variant.fixed:
             if name in INDEX:
                 out[name] = float(joints.index(x.variant.note["from_joint"])) if name == "coupling_from" else value
+    if "gear_load_friction" in fitted:
+        out["load_friction_external"] = share_of_outside(case, trial)
     if fitted & {"backlash", "softness"} and "rotor" not in fitted and case.constants.armature <= 0:
         out["rotor"] = float(case.plant.base()[0, PLANT_INDEX["rotor"]])
     return out
@@ -100,7 +121,7 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
             continue
         for name in p.columns:
             if name not in INDEX:
-                if not p.nuisance and name not in fields:
+                if not p.nuisance and name not in fields and name not in NEARLY:
                     left.append(f"{name}@{case.joint}")
                 continue
             column = COLUMNS[INDEX[name]]

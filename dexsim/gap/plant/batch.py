@@ -232,6 +232,10 @@ class JointPlant:
         out.series = np.concatenate(parts)
         return out
 
+    def grid(self, run: int) -> slice:
+        """Rows of a run in the series."""
+        return slice(self._grid[run], self._grid[run + 1])
+
     @property
     def runs(self) -> int:
         return len(self._t)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -15,7 +16,7 @@ from dexsim.actuator.reference import torque_along
 from dexsim.actuator.table import ALL, ServoTable
 from dexsim.gap import compute
 from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
-from dexsim.gap.plant.columns import INDEX, SERIES_INDEX, Scales, expand
+from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
 from dexsim.gap.read.runs import Run, local_polynomial
 
@@ -174,7 +175,7 @@ def moved(
                 exact["warmth"] = run.temperature[:, j] - REFERENCE
             if J > 1:
                 mech[i][1][j][:, SERIES_INDEX["others_torque"]] = np.delete(given[i], j, 1).sum(1)
-            for n, o in enumerate(dragging[:4]):
+            for n, o in enumerate(dragging[:DRAGGERS]):
                 exact[f"drag{n}"] = run.qs[:, o] - run.qs[0, o]
                 _linked(mech[i][0], mech[i][1][j], mech[i][1][o], n, constants[o].armature)
             if run.duty is not None:
@@ -283,7 +284,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         span=max(float(np.ptp(q)), 1e-9),
         sigma=sigma,
         nominal=nominal,
-        others=tuple(runs[0].joints[o] for o in others[:4]),
+        others=tuple(runs[0].joints[o] for o in others[:DRAGGERS]),
         others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99),
         load_torque=big(load_t),
         load_inertia=float(np.median(load_i)),
@@ -311,7 +312,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         elif value.low < value.high:
             ranges[name] = (value.low, value.high)
     regimes_extra = {"_gravity": gravity}
-    for k in range(4):
+    for k in range(DRAGGERS):
 
         def moved_by(i: int, k: int = k) -> np.ndarray:
             q = runs[i].qs
@@ -404,6 +405,23 @@ def _linked(times: np.ndarray, series: np.ndarray, other: np.ndarray, k: int, ar
         + other[:, SERIES_INDEX["rest"]]
     )
     series[:, SERIES_INDEX[f"pull{k}"]] = load
+
+
+def dragged_by(case: Case, others: Sequence[Case]) -> Case:
+    """The case with other joints, at most `DRAGGERS` of the same recordings, in the place of the last of those that may
+    drag it."""
+    first = DRAGGERS - len(others)
+    plant, regimes, series = copy.copy(case.plant), dict(case.regimes), case.plant.series.copy()
+    for n, other in enumerate(others, first):
+        for run in range(plant.runs):
+            here, there = plant.grid(run), other.plant.series[plant.grid(run)]
+            _linked(plant.dt * np.arange(len(there)), series[here], there, n, other.constants.armature)
+            series[here, SERIES_INDEX[f"drag{n}"]] = there[:, SERIES_INDEX["q"]] - there[0, SERIES_INDEX["q"]]
+        q = [other.plant.q[plant.rows(run)] for run in range(plant.runs)]
+        regimes[f"_drag{n}"] = np.concatenate([x - x[0] for x in q])
+    plant.set_series(series)
+    names = (*case.scales.others[:first], *(x.joint for x in others))
+    return replace(case, plant=plant, scales=replace(case.scales, others=names), regimes=regimes)
 
 
 def _draggers(model, joints, j, runs) -> list[int]:

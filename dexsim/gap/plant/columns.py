@@ -80,6 +80,10 @@ EXTRA: tuple[tuple[str, float, str, str], ...] = (
     ("readout_offset", 0.0, "rad", "added to what is reported, where the loop has another encoder"),
     ("com_out", 0.0, "m", "centre of the added mass, out from the hinge beyond the last link's centre of mass"),
     ("com_across", 0.0, "m", "the same, along the way it turns"),
+    ("gear_load_friction", 0.0, "1", "dry friction per torque that the gear hands to the joint, where it drives it"),
+    ("gear_load_friction_backdriven", 0.0, "1", "the same where the joint drives the gear"),
+    ("gear_load_power", 1.0, "1", "both are shares of unit * (|torque| / unit)^power; 2/3: Hertz's contact"),
+    ("gear_load_unit", 1.0, "N.m", "that unit"),
     ("late_by", 0.0, "s", "some of the commands act later by as much (to see what one command's time does)"),
     ("late_at", 0.0, "1", "which: those of group late_at, modulo LATE_GROUPS"),
     ("late_group", 1.0, "1", "commands in a row that are one group"),
@@ -112,6 +116,7 @@ SERIES: tuple[str, ...] = (
     "drag_v0", "drag_v1", "drag_v2", "drag_v3", "drag_a0", "drag_a1", "drag_a2", "drag_a3",  # its rate and acceleration
     "pull0", "pull1", "pull2", "pull3",  # torque on those joints' links that their own motors give, N.m
 )  # fmt: skip
+DRAGGERS = 4  # joints that may drag one, of which a plant knows the motion
 SERIES_INDEX: dict[str, int] = {name: i for i, name in enumerate(SERIES)}
 
 # parameters that say what an effect is like, not how large it is

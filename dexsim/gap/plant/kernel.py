@@ -88,6 +88,10 @@ XSUP, XOTH, XWARM, XDRAG, XON, XDRIVE = (
     X[n] for n in ("supply", "others_torque", "warmth", "drag0", "enabled", "drive")
 )
 P_OWN = INDEX["own_payload"]
+P_GEARLOAD, P_GEARBACK, P_GEARPOWER, P_GEARUNIT = (
+    INDEX[f"gear_load_{n}"] for n in ("friction", "friction_backdriven", "power", "unit")
+)
+PRESSED = 5e-3  # s in which the load comes to press a gear's flanks; that of the same step would be a loop
 XOWI, XOWC, XOWS = (X[n] for n in ("own_inertia", "own_cos", "own_sin"))
 XDV, XDA, XPULL = (X[n] for n in ("drag_v0", "drag_a0", "pull0"))
 P_LINKAGE, P_REACTION = INDEX["linkage"], INDEX["reaction"]
@@ -175,6 +179,10 @@ class Guess:  # the columns of one guess that every step asks for
     load: f64  # friction's share of the load, driving, and
     back: f64  # back-driven
     carries: bool  # it is by the load from outside too, or falls with speed, or is by its square
+    gear_load: f64  # friction by what the gear hands to the joint, driving it, and
+    gear_back: f64  # back-driven
+    gear_power: f64
+    gear_unit: f64
     uneven: f64  # half the friction's asymmetry
     bias: f64
     spring: f64
@@ -216,6 +224,7 @@ class State:  # of the joint
     since: f64  # s, since it was taken
     fresh: f64  # 1 before its first step (a bool's padding is copied with it, at the price of a division)
     older: f64  # what the age of its position makes of the torque that the loop asks for
+    borne: f64  # torque that the gear hands to the joint, as its friction feels it
 
 
 @wp.struct
@@ -299,6 +308,10 @@ def guess(c: Recorded, h: int, dt: f64):
     p.back = c.params[h, P_BACK]
     for k in range(wp.static(len(SERVO_FEATURES["load"]))):
         p.carries = p.carries or c.params[h, P_LOADOUT + k] != f64(0.0)
+    p.gear_load = c.params[h, P_GEARLOAD]
+    p.gear_back = c.params[h, P_GEARBACK]
+    p.gear_power = c.params[h, P_GEARPOWER]
+    p.gear_unit = c.params[h, P_GEARUNIT]
     p.uneven = f64(0.5) * c.params[h, P_ASYM]
     p.bias = c.params[h, P_BIAS]
     p.spring = c.params[h, P_SPRING]
@@ -575,6 +588,13 @@ def opened(t: Torque, v: f64, p: Guess, n: Now):
 
 
 @wp.func
+def borne_friction(borne: f64, v: f64, p: Guess):
+    """Level [N.m] by the torque that the gear hands to the joint."""
+    share = load_share(borne, v, p.gear_load, p.gear_back)
+    return share * p.gear_unit * wp.pow(wp.abs(borne) / p.gear_unit, p.gear_power)
+
+
+@wp.func
 def carried_friction(c: Recorded, h: int, torque: f64, outside: f64, v: f64, share: f64, p: Guess):
     """Level [N.m] by what the gear carries on both sides (BAM's models m3 to m6)."""
     fading = gear_friction(torque, outside, c.params[h, P_LOADPEAK], c.params[h, P_LOADPEAKOUT])
@@ -741,6 +761,9 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         dq = x.q - n.q  # the model was evaluated at the measured pose
         load = turned(n.gravity_cos, n.gravity_sin, dq)
     load += n.load + p.preload + p.spring * (x.q + half * dt * x.v)
+    by_gear = p.gear_load > zero or p.gear_back > zero
+    if by_gear and (n.held or x.fresh != zero):
+        x.borne = load
 
     # theta-method: the middle of the step where it is smooth, its end where it is stiff
     theta = f64(1.0)
@@ -808,6 +831,8 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         applied += p.ripple * wave[0]
     applied += p.bias
     level = dry_friction(c, h, before, p.bias - load, v_drive, p, n)
+    if by_gear:
+        level += borne_friction(x.borne, v_drive, p) * n.friction
     applied -= p.uneven * level
     stop_d = zero
     if x.q < p.low:
@@ -816,10 +841,14 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     if x.q > p.high:
         load += p.stop * (x.q + dt * x.v - p.high)
         stop_d = p.stop * f64(0.02)
+    was = x.v
     if p.two:
         x = two_bodies(c, x, t, applied, load, level, stop_d, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
+    if by_gear and not n.held:
+        link = wp.max(n.inertia - p.rotor, zero)
+        x.borne += lag_share(f64(PRESSED), dt) * (load + link * (x.v - was) / dt - x.borne)
     return x
 
 

@@ -3,6 +3,7 @@ left out."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -184,7 +185,7 @@ class JointScan(JointLosses):
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
             for variant in effect.variants(case.scales):
-                variant = None if variant.refines else self._narrow(variant)
+                variant = None if variant.refines or variant.instead else self._narrow(variant)
                 if variant is None:
                     continue
                 member = Member(effect, variant)
@@ -249,6 +250,17 @@ class JointScan(JointLosses):
                 self.other_start[member.id] = start
         out = [(g, float(np.mean(null >= g)), m, st) for g, m, st in best.values()]
         return sorted(out, key=lambda o: -o[0])
+
+    def drags(self, current: Trial, case: Case) -> dict[str, tuple[float, float]]:
+        """By joint that may drag this one in `case`, another case of it (`case.dragged_by`): (share of the squared
+        error that `current` leaves which a coupling with it would remove, its price)."""
+        asked = copy.copy(self)
+        asked.case, asked.scan_fitter = case, Fitter(case.plant, self.short, self.r)
+        asked.allowed, asked.rng = {e.id for e in CATALOGUE if e.couples}, np.random.default_rng(self.seed)
+        out: dict[str, tuple[float, float]] = {}
+        for gain, price, member, _ in asked.scan(current):
+            out.setdefault(member.variant.note["from_joint"], (gain, price))
+        return out
 
     def _saved(
         self,

@@ -86,7 +86,7 @@ class JointSelection(JointScan):
                 current, level = self._swap(current, pool, level)
         current = self._from_plain(current)
         if not self.deadline.over():
-            current = self._by_laws(self._refine(self._drop(current)))
+            current = self._by_laws(self._refine(self._instead(self._drop(current))))
         self._on(0.1)
         current, final = self._settled(current, pool)
         for m in current.members:
@@ -232,7 +232,7 @@ class JointSelection(JointScan):
             moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
             if not moved or (self.allowed is not None and effect.id not in self.allowed):
                 continue
-            variants = [v for v in effect.variants(self.case.scales) if not v.refines]
+            variants = [v for v in effect.variants(self.case.scales) if not v.refines and not v.instead]
             variant = self._narrow(variants[0]) if variants else None
             if variant is None or any(not fits_beside(Member(effect, variant), m) for m in members):
                 continue
@@ -330,6 +330,36 @@ class JointSelection(JointScan):
                     current = more
                     break
         return current
+
+    def _instead(self, current: Trial) -> Trial:
+        """The members that are confused with an effect replaced by a law of it that training has less exactly
+        (`Variant.instead`), where they leave more than noise and that law leaves but `SEARCH.instead` of it."""
+        mine = self._left(current).sum()
+        if mine < SEARCH.unsettled * len(self.blocks):
+            return current
+        best = current
+        sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]
+        values = np.split(self._values(current), sizes)
+        for effect in CATALOGUE:
+            rest = [k for k, m in enumerate(current.members) if not confusable(effect.id, m.id)]
+            if len(rest) == len(current.members) or (self.allowed is not None and effect.id not in self.allowed):
+                continue
+            for variant in (v for v in effect.variants(self.case.scales) if v.instead):
+                if self.deadline.over():
+                    return best
+                member, others = Member(effect, variant), tuple(current.members[k] for k in rest)
+                if any(not fits_beside(member, m) for m in others):
+                    continue
+                kept = [values[k] for k in rest]
+                drafts = [
+                    self.draft((*others, member), np.concatenate([*kept, np.array(start)]), current)
+                    for start in variant.starts
+                ]
+                trial = self.finish(*min(drafts, key=lambda d: d[2].loss), current)
+                left = self._left(trial).sum()
+                if left < SEARCH.instead * mine and left < self._left(best).sum() and not self._shrunk(trial):
+                    best = trial
+        return best
 
     def _by_laws(self, current: Trial) -> Trial:
         """Each member by every law that its effect may have: the hypothesis by the one that lasts best, the fits by the
