@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -13,6 +14,9 @@ from dexsim.actuator import bam
 from dexsim.actuator.columns import INDEX
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
+from dexsim.gap.plant.case import build
+from dexsim.gap.plant.columns import INDEX as PLANT
+from dexsim.gap.read.runs import Run
 from dexsim.paths import CONFIGS
 from dexsim.recording.mechanism import drive, mechanism
 from dexsim.recording.schema import COMMANDS, Series
@@ -121,6 +125,28 @@ def test_the_motion_is_bams_within_a_hundredth(tmp_path, model):
     apart, without = both(tmp_path, of(model), OF[model] or ("friction_base",))
     assert apart < 0.002, "a fifth of what is asked, so that each term can be told"
     assert min(without.values()) > 5 * apart, without
+
+
+def test_the_search_believes_a_bam_table_as_the_servo_moves_by_it(tmp_path):
+    """A recording of BAM's joint needs nothing beside its own table: the search's plant goes where the servo goes."""
+    t = np.arange(0.0, 3.0, 0.01)
+    goals = 1.2 * np.sin(2 * np.pi * 0.4 * t) + 0.15 * np.sin(2 * np.pi * 1.7 * t)
+    file = of("m6")
+    run = ours(tmp_path, file, t, goals, 3.0)
+    rows, table = slice(0, None, 10), ServoTable.from_dict(bam.to_servo(bam.Bam(**file), KP, VOLT))
+    seen = Run("x", ("joint",), t, goals[:, None], run.t[rows], run.position[rows], table, np.array([0, 0, -9.81]))
+    plant = build(mujoco.MjModel.from_xml_path(str(tmp_path / "rig.xml")), [seen])[0].plant
+
+    def off(**columns: float) -> float:
+        params = plant.base()[None].copy()
+        for name, value in columns.items():
+            params[..., PLANT[name]] = value
+        q = plant.simulate(params, plant.windows(None))[0][0]
+        return float(np.sqrt(np.mean((q - run.position[rows, 0]) ** 2)) / np.ptp(run.position))
+
+    apart = off()
+    assert apart < 0.01
+    assert min(off(**{name: 0.0}) for name in bam.LOADED if name != "load_friction_backdriven") > 2 * apart
 
 
 def test_the_motion_of_a_published_fit_is_bams_within_a_hundredth(tmp_path):
