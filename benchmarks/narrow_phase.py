@@ -4,14 +4,16 @@
                                       [out=narrow_phase.json]
 
 Random poses of every kind of pair that a hand and an object have; surfaces from 2 mm deep to 1.5 mm (the margin) apart.
-A sphere, a capsule, a box, a fingertip or another hull against hulls of the object library and against fingertips are
-dexsim's own kernels; spheres, capsules, boxes and cylinders among each other are left to MuJoCo-Warp's closed forms,
-and are measured too (`THEIRS`). The reference is C MuJoCo's `mj_geomDistance` in float64 with a tolerance of 1e-10 m,
-and where anybody disagrees with it, or it with itself, the exact answer in float64: of overlapping bodies the nearest
-facet of the hull of all differences of corners (Qhull), of others the nearest point of that hull (Lawson and Hanson's
-least distance programming). How often C MuJoCo was wrong is printed. Printed for each pair of types and both settings:
-percentiles of the error of the distance, of the angle of the normal and of the contact's place, and microseconds a pair
-of the narrow phase alone (of all worlds at once, cold: no pair has been there before).
+A sphere, a capsule, a box, a fingertip or another hull against hulls of the object library and against fingertips, and
+all but the sphere against cylinders, are dexsim's own kernels; spheres, capsules and boxes among each other and spheres
+against cylinders are left to MuJoCo-Warp's closed forms, and are measured too (`THEIRS`). The reference is C MuJoCo's
+`mj_geomDistance` in float64 with a tolerance of 1e-14 m, and where anybody disagrees with it, or it with itself, the
+exact answer in float64: of overlapping bodies the nearest facet of the hull of all differences of corners (Qhull), of
+others the nearest point of that hull (Lawson and Hanson's least distance programming), of cylinders the best of all
+features (`cylinder_exact.py`). How often C MuJoCo was wrong is printed. Printed for each pair of types and both
+settings: percentiles of the error of the distance, of the angle of the normal and of the contact's place, how many
+places are off by more than 1e-6 m, and microseconds a pair of the narrow phase alone (of all worlds at once, cold: no
+pair has been there before).
  No pose is left out of the distances. Normals and places are compared where they are well-posed: not where overlapping
 bodies have two ways out of equal length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two
 roundings; places also only where a corner of one body is nearest, since parallel edges and faces (`degenerate`, within
@@ -34,7 +36,7 @@ import warp as wp
 from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
-from benchmarks import tools
+from benchmarks import cylinder_exact, tools
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
@@ -42,15 +44,18 @@ from dexsim.sim.collision import NarrowPhase
 from dexsim.sim.collision.shapes import hull_corners
 
 MARGIN = 0.0015
+REFERENCE, MUJOCO_WARP = (1e-14, 200), (1e-6, 35)
+"""Tolerance [m] and most iterations of convex collision, of C MuJoCo and (its defaults) of MuJoCo-Warp. With 1e-10 C
+MuJoCo's normals of a cylinder are 1e-4 rad off."""
 OURS = (
     *(f"{a}-hull" for a in ("sphere", "capsule", "box", "fingertip", "hull")),
     *(f"{a}-fingertip" for a in ("sphere", "capsule", "box", "fingertip")),
+    *(f"{a}-cylinder" for a in ("capsule", "box", "fingertip", "hull")),
 )
-"""Pairs of types that dexsim's kernels serve, with a hull of an object or with a fingertip."""
-THEIRS = ("sphere-sphere", "sphere-capsule", "capsule-capsule", "sphere-box", "capsule-box", "sphere-cylinder",
-          "capsule-cylinder", "fingertip-cylinder")  # fmt: skip
-"""Pairs that are MuJoCo-Warp's under both settings. No geom of the xHand or of an object is a cylinder (an object of
-that name is a prism of 16 sides)."""
+"""Pairs of types that dexsim's kernels serve, with a hull of an object, a fingertip or a cylinder."""
+THEIRS = ("sphere-sphere", "sphere-capsule", "capsule-capsule", "sphere-box", "capsule-box",
+          "sphere-cylinder")  # fmt: skip
+"""Pairs that are MuJoCo-Warp's under both settings."""
 KINDS = (*OURS, *THEIRS)
 SETTINGS = ("hand", "mujoco")
 GEOM = {
@@ -66,11 +71,11 @@ ROUND = tuple(int(GEOM[k]) for k in ("sphere", "capsule"))
 def scene(kind: str) -> tuple[mujoco.MjModel, list[int], list[int]]:
     """A model of two bodies with a geom each, of the types that `kind` names; meshes that A and B may be."""
     spec = mujoco.MjSpec()
-    spec.option.ccd_tolerance = 1e-10
+    spec.option.ccd_tolerance, spec.option.ccd_iterations = REFERENCE
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
     names: dict[str, list[str]] = {"fingertip": [], "hull": []}
     for name in ("tip_thumb", "tip_finger"):
-        spec.add_mesh(name=name, uservert=_tip_vertices(name).ravel())
+        spec.add_mesh(name=name, uservert=tip_vertices(name).ravel())
         names["fingertip"].append(name)
     for shape in library().values():
         for k, vertices in enumerate(shape.hulls if shape.kind == "grid" else ()):
@@ -92,7 +97,7 @@ def scene(kind: str) -> tuple[mujoco.MjModel, list[int], list[int]]:
     return model, ids.get(types[0], [-1]), ids.get(types[1], [-1])
 
 
-def _tip_vertices(name: str) -> np.ndarray:
+def tip_vertices(name: str) -> np.ndarray:
     model = xhand.hand_spec().compile()
     mesh = model.mesh(name)
     adr, number = int(mesh.vertadr[0]), int(mesh.vertnum[0])
@@ -187,14 +192,14 @@ class Worlds:
 
     def __init__(self, model: mujoco.MjModel, n: int, device: str, setting: str):
         self.n, self.device, self.setting = n, device, setting
-        model.opt.ccd_tolerance = 1e-6
+        model.opt.ccd_tolerance, model.opt.ccd_iterations = MUJOCO_WARP
         with wp.ScopedDevice(device):
             self.m = mjw.put_model(model, batch_sizes={"geom_dataid": n, "geom_size": n})
             self.d = mjw.put_data(model, mujoco.MjData(model), nworld=n, nconmax=4, njmax=64)
             self.m.opt.warn_overflow = False
             self.m.opt.broadphase_filter = 0
             self.narrow = NarrowPhase(model, self.m, self.d) if setting == "hand" else None
-        model.opt.ccd_tolerance = 1e-10
+        model.opt.ccd_tolerance, model.opt.ccd_iterations = REFERENCE
 
     def put(self, poses: Poses) -> None:
         d, m = self.d, self.m
@@ -274,6 +279,8 @@ def _rivals(model: mujoco.MjModel, k: int, poses: Poses, u: np.ndarray) -> np.nd
         return np.where(np.abs(d[:, 2]) < 1e-3, 2, 1)
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return np.where(np.abs(d).min(1) < 1e-3, 2, 1)
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:  # its side, a cap
+        return np.where(np.minimum(np.abs(d[:, 2]), np.hypot(d[:, 0], d[:, 1])) < 1e-3, 2, 1)
     first, count, corners = hull_corners(model)
     out = np.empty(len(d), int)
     for m in np.unique(poses.mesh[:, k]):
@@ -311,9 +318,14 @@ def _core(model: mujoco.MjModel, poses: Poses, k: int, i: int) -> np.ndarray:
 
 
 def exact(model: mujoco.MjModel, poses: Poses, i: int) -> tuple[float, np.ndarray]:
-    """(distance in m, normal from A to B) of pose i in float64, of two cores with corners of which one is a solid."""
-    points = (_core(model, poses, 0, i)[:, None] - _core(model, poses, 1, i)[None]).reshape(-1, 3)
+    """(distance in m, normal from A to B) of pose i in float64, of two cores of which one is a solid."""
     radius = float(_radius(model, poses[i : i + 1])[0])
+    for k in np.flatnonzero(np.isin(model.geom_type, int(GEOM["cylinder"]))):
+        turn = poses.rot[i, k]
+        corners = (_core(model, poses, 1 - k, i) - poses.pos[i, k]) @ turn
+        dist, normal = cylinder_exact.answer(*poses.size[i, k, :2], corners)
+        return dist - radius, turn @ normal * (1 - 2 * k)
+    points = (_core(model, poses, 0, i)[:, None] - _core(model, poses, 1, i)[None]).reshape(-1, 3)
     faces = ConvexHull(points).equations  # unit normals outward, and minus the distance of the plane from the origin
     if faces[:, 3].max() <= 0.0:
         f = faces[faces[:, 3].argmax()]
@@ -339,9 +351,9 @@ def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.
         doubt |= near & np.where(got, np.abs(np.where(got, d, 0.0) - dist) > limit, dist < MARGIN - 1e-6)
         doubt |= got & ~near
     wrong = np.zeros(len(dist), bool)
-    # a cylinder has no corners, and of two spheres or capsules the differences have no volume: closed forms
-    solid = (int(mujoco.mjtGeom.mjGEOM_MESH), int(GEOM["box"]))
-    if not np.isin(model.geom_type, solid).any() or np.isin(model.geom_type, int(GEOM["cylinder"])).any():
+    # of two spheres or capsules the differences have no volume: closed forms
+    solid = (int(mujoco.mjtGeom.mjGEOM_MESH), int(GEOM["box"]), int(GEOM["cylinder"]))
+    if not np.isin(model.geom_type, solid).any():
         return (dist, normal, pos), wrong
     for i in np.flatnonzero(doubt):
         d, n = exact(model, poses, i)
@@ -387,6 +399,7 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
                         "over_1e-6": int((np.abs(r["dist"]) > 1e-6).sum()),
                         "dist_m": spread(r["dist"]), "degenerate_m": spread(r["degenerate"]),
                         "normal_rad": spread(r["angle"]), "point_m": spread(r["pos"]),
+                        "points_over_1e-6": int((r["pos"] > 1e-6).sum()),
                         "us_a_pair": round(float(np.median(times[setting])), 4)}  # fmt: skip
     return out
 
@@ -420,7 +433,8 @@ def main(argv: list[str]) -> dict:
             s = r[setting]
             print(
                 f"  {setting:8s}{s['contacts']} contacts, {s['missed']} missed, {s['extra']} too many,"
-                f" {s['over_1e-6']} wrong by more than 1e-6 m, {s['us_a_pair']:.3f} us a pair"
+                f" {s['over_1e-6']} wrong by more than 1e-6 m ({s['points_over_1e-6']} places),"
+                f" {s['us_a_pair']:.3f} us a pair"
             )
             for name in ("dist_m", "degenerate_m", "normal_rad", "point_m"):
                 print(f"    {name:13s}" + "  ".join(f"{k} {v:g}" for k, v in s[name].items()))

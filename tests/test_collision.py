@@ -168,7 +168,7 @@ def test_the_exact_reference_is_exact_and_knows_where_c_mujoco_is_wrong():
     assert bench.confirmed(model, poses, theirs[1])[0] > 0.1
 
 
-@pytest.fixture(scope="module", params=["capsule-hull", "box-hull", "hull-hull"])
+@pytest.fixture(scope="module", params=["capsule-hull", "box-hull", "hull-hull", "fingertip-cylinder"])
 def two_poses(request):
     """Poses, and the same a step later: 1 mm and 0.03 rad further."""
     model, a, b = bench.scene(request.param)

@@ -12,6 +12,7 @@ import warp as wp
 from worlds import grasp_env
 
 from benchmarks import tools
+from benchmarks.narrow_phase import tip_vertices
 from dexsim.assets.objects import library
 from dexsim.sim.collision import NarrowPhase
 from dexsim.sim.solver import NewtonSolver
@@ -57,8 +58,8 @@ def test_a_held_grasp_creeps_alike(fibers):
     torch.testing.assert_close(drift["hand"][held], drift["mujoco"][held], rtol=0.02, atol=1e-5)  # m/s
 
 
-def bouncing() -> mujoco.MjModel:
-    """A hull of the object library above a box, a contact that gives back most of its energy, no friction."""
+def bouncing(thing: str) -> mujoco.MjModel:
+    """A hull of the library or a cylinder above a box, a contact that gives back most of its energy, no friction."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.cone = 5e-4, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.integrator, spec.option.jacobian = (
@@ -77,14 +78,18 @@ def bouncing() -> mujoco.MjModel:
     body.ipos = [0.0, 0.0, 0.0]
     # explicit gyroscopic torque would add energy
     body.mass, body.inertia, body.explicitinertial = 0.1, [6e-5, 6e-5, 6e-5], True
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull", friction=[0.1, 0.01, 0.001], **spring)
+    if thing == "hull":
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull", friction=[0.1, 0.01, 0.001], **spring)
+    else:
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.025, 0.03, 0], friction=[0.1, 0.01, 0.001], **spring)
     return spec.compile()
 
 
-def test_what_bounces_keeps_as_much_energy(fibers):
-    """Up to three bounces of a tumbling hull, from six orientations: energy after 0.3 s as with MuJoCo-Warp's own, and
-    as C MuJoCo's."""
-    model = bouncing()
+@pytest.mark.parametrize("thing", ["hull", "cylinder"])
+def test_what_bounces_keeps_as_much_energy(fibers, thing):
+    """Up to three bounces of a tumbling hull or cylinder, from six orientations: energy after 0.3 s as with
+    MuJoCo-Warp's own, and as C MuJoCo's."""
+    model = bouncing(thing)
     n, steps = 6, 600
     rng = np.random.default_rng(0)
     q = rng.normal(size=(n, 4))
@@ -121,3 +126,59 @@ def test_what_bounces_keeps_as_much_energy(fibers):
         assert np.abs(trace["hand"][450] - trace[other][450]).max() < 5e-3 * start, other
         assert np.abs(end["hand"] - end[other]).max() < 0.02 * start, other
     assert trace["hand"][-1].max() < start  # nothing is gained
+
+
+def pinched() -> mujoco.MjModel:
+    """A cylinder lying between a fingertip and a capsule that press it with 3 N from both sides, and nothing below."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.cone, spec.option.impratio = 2e-3, mujoco.mjtCone.mjCONE_ELLIPTIC, 5
+    spec.option.integrator, spec.option.jacobian = (
+        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        mujoco.mjtJacobian.mjJAC_SPARSE,
+    )
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    spec.option.iterations, spec.option.ls_iterations = 30, 50
+    spec.add_mesh(name="tip", uservert=tip_vertices("tip_finger").ravel())
+    skin = {"margin": 0.00075, "condim": 4, "friction": [1.0, 0.01, 0.001], "solref": [0.008, 1.0]}
+    for name, side in (("tip", -1.0), ("capsule", 1.0)):
+        body = spec.worldbody.add_body(name=name, pos=[side * 0.06, 0.002 * side, 0.0])
+        body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-side, 0.0, 0.0], damping=2.0)
+        body.mass, body.inertia, body.explicitinertial = 0.05, [2e-5] * 3, True
+        if name == "tip":
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="tip", **skin)
+        else:
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.01, 0.015, 0.0], **skin)
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name, gainprm=[1.0] + 9 * [0.0])
+    thing = spec.worldbody.add_body(name="thing")
+    thing.add_freejoint(name="thing")
+    thing.mass, thing.inertia, thing.explicitinertial = 0.06, [3e-5] * 3, True
+    thing.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.02, 0.03, 0.0], **skin)
+    return spec.compile()
+
+
+def test_a_cylinder_held_by_a_fingertip_and_a_capsule(fibers):
+    """For half a second, turned askew in three ways (along the capsule it would have no single place of contact): it
+    stays in the pinch, and is where C MuJoCo has it."""
+    model = pinched()
+    steps, gravity = 250, lambda step: -9.81 if step > 60 else 0.0  # once it is held
+    turn = np.array([[0.97, 0.2, 0.1, 0.05], [0.9, -0.1, 0.15, 0.3], [0.8, 0.1, -0.2, 0.5]])
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    k, worlds = int(model.joint("thing").qposadr[0]), [mujoco.MjData(model) for _ in turn]
+    for data, q in zip(worlds, turn, strict=True):
+        data.qpos[k + 3 : k + 7] = q
+        data.ctrl[:] = 3.0
+    m, d = mjw.put_model(model), mjw.put_data(model, worlds[0], nworld=len(turn), nconmax=8, njmax=64)
+    d.qpos.assign(np.array([data.qpos for data in worlds], np.float32))
+    narrow, newton = NarrowPhase(model, m, d), NewtonSolver(m, d)
+    for step in range(steps):
+        m.opt.gravity.assign(np.array([[0, 0, gravity(step)]], np.float32))
+        with narrow.in_place(), newton.in_place():
+            mjw.step(m, d)
+    for step in range(steps):
+        model.opt.gravity[2] = gravity(step)
+        for data in worlds:
+            mujoco.mj_step(model, data)
+    want = np.array([data.qpos[k : k + 3] for data in worlds])
+    assert int(d.nacon.numpy()[0]) == sum(data.ncon for data in worlds) == 2 * len(turn)
+    assert (np.abs(want[:, 2]) < 3e-3).all()  # free, it would have fallen by 0.7 m
+    assert np.abs(d.qpos.numpy()[:, k : k + 3] - want).max() < 1e-5

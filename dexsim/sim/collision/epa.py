@@ -8,6 +8,8 @@ stands on that facet, and one look confirms it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from dexsim.sim.collision.gjk import GAIN, OVERLAP, difference
@@ -82,7 +84,7 @@ def three(f: int) -> wp.vec3i:
 
 @wp.func
 def grown(
-    a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i, above: float
+    a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i, above: float
 ) -> Facet:
     """The nearest facet of A - B, by one search. above [m]: from a corner at this height a face is not seen."""
     pos = wp.zeros(shape=(POINTS,), dtype=wp.vec3)
@@ -211,7 +213,7 @@ def grown(
 
 
 @wp.func
-def penetration(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
+def penetration(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
     """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose it,
     or have it on a face.
 

@@ -12,6 +12,8 @@ follows from that:
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from dexsim.sim.collision.shapes import Core, corner, support
@@ -153,13 +155,13 @@ def with_corner(s: Simplex, w: wp.vec3, i: int) -> Simplex:
 
 
 @wp.func
-def difference(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, i: int) -> wp.vec3:
+def difference(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, i: int) -> wp.vec3:
     """Corner of A minus corner of B, in B's frame [m]."""
     return R * corner(a, vertex, i & 0xFFFF) + p - corner(b, vertex, i >> 16)
 
 
 @wp.func
-def begin(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i) -> Simplex:
+def begin(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i) -> Simplex:
     """The simplex named by `first` (-1: none), where the bodies are now."""
     if first[0] < 0:
         i = support(a, vertex, -(wp.transpose(R) * p)) | (support(b, vertex, p) << 16)
@@ -174,7 +176,7 @@ def begin(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.
 
 
 @wp.func
-def outermost(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3) -> int:
+def outermost(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3) -> int:
     """The corner of A - B furthest from the plane through `beside` across u, on the side where that is further."""
     up = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
     down = support(a, vertex, -(wp.transpose(R) * u)) | (support(b, vertex, u) << 16)
@@ -184,7 +186,7 @@ def outermost(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p:
 
 
 @wp.func
-def enclose(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
+def enclose(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
     """A simplex that goes through the origin, with corners added until it has four. One corner alone stays what it is."""
     s = simplex
     if s.n == 2:
@@ -204,7 +206,7 @@ def enclose(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: w
 
 @wp.func
 def distance(
-    a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
+    a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
 ) -> Simplex:
     """The simplex of the nearest points of A and B (`v` from B to A, in B's frame).
 
@@ -243,7 +245,7 @@ def distance(
 
 
 @wp.func
-def touching(a: Core, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3) -> wp.vec4:
+def touching(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3) -> wp.vec4:
     """Normal (from A to B, in B's frame) and distance [m] of cores that touch with a corner, or whose enclosing corners are flat.
 
     There the difference of positions has no direction. So A is moved away by a little, along the line of centres, and the

@@ -1,4 +1,4 @@
-"""The two kernels of the narrow phase: for cores that are apart, and for cores that overlap.
+"""The kernels of the narrow phase: for cores that are apart, for cores that overlap, and for cylinders.
 
 Both take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed materials,
 friction, explicit pairs and what a contact is are decided where they always were.
@@ -11,9 +11,10 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
+from dexsim.sim.collision.cylinder import from_cylinder, rounder
 from dexsim.sim.collision.epa import Facet, penetration
 from dexsim.sim.collision.gjk import OVERLAP, distance, touching
-from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, Core, corner, corners, radius_of, support
+from dexsim.sim.collision.shapes import BOX, CAPSULE, CYLINDER, HULL, SPHERE, Core, Prism, corner, corners, radius_of, support
 
 
 # Each product and sum rounded by itself, as on a CPU. Fused, a cross product of parallel edges is no longer zero but what one of
@@ -258,3 +259,81 @@ def overlapping(
             normal = wp.vec3(h[0], h[1], h[2])
             q = corner(t.b, pairs.hull, support(t.b, pairs.hull, -normal))
             add(pairs, mat, out, k, t, q, -h[3] * normal, normal, h[3])
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
+def beside_cylinder(
+    pairs: Pairs,
+    mat: Materials,
+    # out
+    out: Contacts,
+):
+    """Each pair of a cylinder with a segment, box or hull: its contact. In the cylinder's frame; normals from it to the other."""
+    k = wp.tid()
+    if k >= wp.min(pairs.number[0], pairs.room):
+        return
+    geoms = pairs.geom[k]
+    first_kind = pairs.geom_type[geoms[0]]
+    second_kind = pairs.geom_type[geoms[1]]
+    first_is = first_kind == CYLINDER and (second_kind == BOX or second_kind == HULL)
+    if not first_is and (first_kind != CAPSULE or second_kind != CYLINDER):
+        return
+    world = pairs.world[k]
+    geom = wp.where(first_is, geoms[0], geoms[1])
+    other = wp.where(first_is, geoms[1], geoms[0])
+    margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world)
+    half = pairs.geom_size[world % pairs.geom_size.shape[0], geom]
+    size = pairs.geom_size[world % pairs.geom_size.shape[0], other]
+    kind = pairs.geom_type[other]
+    b = core_of(kind, size, pairs.geom_dataid[world % pairs.geom_dataid.shape[0], other], pairs.hull_first, pairs.hull_count)
+    if kind == HULL and b.count == 0:
+        return
+    radius = radius_of(kind, size)
+    mat_c = pairs.geom_xmat[world, geom]
+    R = wp.transpose(mat_c) * pairs.geom_xmat[world, other]
+    p = wp.transpose(mat_c) * (pairs.geom_xpos[world, other] - pairs.geom_xpos[world, geom])
+    cutoff = margin + gap + radius
+    home = pairs.slot[geoms[0], geoms[1]]
+    s = from_cylinder(half, b, pairs.hull, R, p, pairs.simplex[world, home], cutoff)
+    pairs.simplex[world, home] = wp.vec3i(s.i0, wp.where(s.n > 1, s.i1, -1), wp.where(s.n > 2, s.i2, -1))
+    dist = wp.length(s.g)
+    if dist >= cutoff:
+        return
+    middle = s.x - 0.5 * s.g
+    normal = s.g
+    if dist > 0.0:
+        normal = s.g / dist
+    else:
+        # they overlap, or nearly: the prism and the body, in the body's frame
+        a = Prism()
+        a.half = half
+        to_b = wp.transpose(R)
+        f = Facet()
+        t = distance(a, b, pairs.hull, to_b, -(to_b * p), wp.vec3i(-1, -1, -1), cutoff)
+        if t.inside != 0:
+            f = penetration(a, b, pairs.hull, to_b, -(to_b * p), wp.vec4i(t.i0, t.i1, t.i2, t.i3))
+        if f.found != 0:
+            q = nearest_of_b(pairs, b, wp.vec3i(f.i0, f.i1, f.i2), wp.vec3(f.l0, f.l1, f.l2))
+            normal = R * f.normal
+            middle = R * (q + 0.5 * f.depth * f.normal) + p
+            dist = -f.depth
+            w = rounder(half, b, pairs.hull, R, p, normal, wp.vec3i(f.i0 >> 16, f.i1 >> 16, f.i2 >> 16))
+            if w.found != 0:
+                normal = w.u
+                middle = wp.where(w.placed != 0, w.q, R * q + p + 0.5 * w.depth * w.u)
+                dist = -w.depth
+        elif t.inside == 0 and wp.length(t.v) > OVERLAP:
+            names = wp.vec3i(t.i0, wp.where(t.n > 1, t.i1, -1), wp.where(t.n > 2, t.i2, -1))
+            q = nearest_of_b(pairs, b, names, wp.vec3(t.l0, t.l1, t.l2))
+            dist = wp.length(t.v)
+            normal = -(R * t.v) / dist
+            middle = R * (q + 0.5 * t.v) + p
+        else:
+            h = touching(a, b, pairs.hull, to_b, -(to_b * p))
+            n = wp.vec3(h[0], h[1], h[2])
+            normal = R * n
+            dist = h[3]
+            middle = R * (corner(b, pairs.hull, support(b, pairs.hull, -n)) - 0.5 * h[3] * n) + p
+    pos = mat_c * (middle - (0.5 * radius) * normal) + pairs.geom_xpos[world, geom]
+    along = mat_c * wp.where(first_is, normal, -normal)
+    write(mat, out, pairs.room, geoms, pairs.id[k], world, margin, gap, dist - radius, pos, along)

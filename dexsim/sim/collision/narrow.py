@@ -15,11 +15,13 @@ from mujoco_warp._src.types import GeomType
 from mujoco_warp._src.warp_util import event_scope
 
 from dexsim.sim.collision import kernels
-from dexsim.sim.collision.shapes import BOX, CAPSULE, HULL, SPHERE, hull_corners
+from dexsim.sim.collision.shapes import BOX, CAPSULE, CYLINDER, HULL, SPHERE, hull_corners
 
 VERSION = "4.0.0"
 """The MuJoCo-Warp whose stages this replaces and calls; with another one the setting is refused (see `unsupported`)."""
-KINDS = {(GeomType(kind), GeomType.MESH) for kind in (SPHERE, CAPSULE, BOX, HULL)}
+ROUND = {(GeomType.CAPSULE, GeomType.CYLINDER), (GeomType.CYLINDER, GeomType.BOX), (GeomType.CYLINDER, GeomType.MESH)}
+"""Types of geom pairs with a cylinder that are ours."""
+KINDS = ROUND | {(GeomType(kind), GeomType.MESH) for kind in (SPHERE, CAPSULE, BOX, HULL)}
 """Types of geom pairs that are ours."""
 _DISTANCE_SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_GEOM{name}")) for name in ("DIST", "NORMAL", "FROMTO")]
 _MOST_CORNERS = 1 << 15  # corners are named by 16 bits
@@ -66,6 +68,7 @@ class NarrowPhase:
             slot[a, b] = slot[b, a] = k
         first, count, corners = hull_corners(model)
         self.number = len(ours)
+        self.cylinders = bool((model.geom_type[ours] == CYLINDER).any())
         if not self.number:
             return
         self.simplex = wp.full((d.nworld, self.number), wp.vec3i(-1, -1, -1), dtype=wp.vec3i)
@@ -108,6 +111,8 @@ def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> 
     threads = min(d.naconmax, 1 << 15)
     wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads], outputs=[n._out],
               block_dim=32)
+    if n.cylinders:
+        wp.launch(kernels.beside_cylinder, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out], block_dim=32)
 
 
 def _filled(kind: Any, source: object, prefix: str = "") -> Any:

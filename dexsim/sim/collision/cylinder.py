@@ -1,0 +1,389 @@
+"""Distance of a cylinder from a point, segment, box or hull that does not overlap it.
+
+A cylinder has no corners, so the search is over the other body's alone: as GJK keeps the corners nearest to the origin, this
+keeps those nearest to the cylinder, whose distance from a point is a closed form. On an edge the derivative of the distance
+grows steadily, so its root is bracketed; on a face the nearest point is where the cylinder reaches furthest along the face's
+normal. A face, edge or corner of the other body is exact, then, and nothing is said by a chord of the rim. All in the
+cylinder's frame: axis z, radius half[0], half length half[1].
+"""
+
+# Warp compiles these functions; its annotations know no items of vectors.
+# mypy: ignore-errors
+
+from __future__ import annotations
+
+import warp as wp
+
+from dexsim.sim.collision.gjk import DOUBT, GAIN, LOOKS, OVERLAP
+from dexsim.sim.collision.shapes import Core, corner, corners, support
+
+STEPS = 50
+"""Most steps to the root on an edge; every other one halves the bracket, so that the last is less than float32 resolves."""
+FAR = wp.constant(1.0e10)
+NEAR = wp.constant(0.02)
+"""How far [rad] a way out past an edge may be from where the prism had it."""
+LOWER = wp.constant(1.0e-8)
+"""What rounding makes of the heights [m] of the corners of one feature."""
+LEVEL = wp.constant(1.0e-5)
+"""A direction [rad] as near to square with the axis leads out through the side."""
+
+
+@wp.struct
+class Nearest:
+    """n: corners of the feature that is nearest (0: none). p: their places [m]. i: their numbers. x [m]: its nearest point.
+    g [m]: from the cylinder's nearest point to x; zero if they overlap."""
+
+    n: int
+    p0: wp.vec3
+    p1: wp.vec3
+    p2: wp.vec3
+    i0: int
+    i1: int
+    i2: int
+    x: wp.vec3
+    g: wp.vec3
+
+
+@wp.func
+def off(half: wp.vec3, x: wp.vec3) -> wp.vec3:
+    """From the point of the cylinder that is nearest to x, to x [m]; zero within."""
+    rho = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+    k = float(0.0)
+    if rho > half[0]:
+        k = (rho - half[0]) / rho
+    return wp.vec3(k * x[0], k * x[1], x[2] - wp.clamp(x[2], -half[1], half[1]))
+
+
+@wp.func
+def furthest(half: wp.vec3, u: wp.vec3) -> wp.vec3:
+    """The point of the cylinder that is furthest along u [m]; of a whole cap its centre."""
+    flat = wp.sqrt(u[0] * u[0] + u[1] * u[1])
+    k = float(0.0)
+    if flat > 0.0:
+        k = half[0] / flat
+    return wp.vec3(k * u[0], k * u[1], wp.where(u[2] > 0.0, half[1], -half[1]))
+
+
+@wp.func
+def none() -> Nearest:
+    s = Nearest()
+    s.g = wp.vec3(FAR, 0.0, 0.0)
+    return s
+
+
+@wp.func
+def nearer(s: Nearest, t: Nearest) -> Nearest:
+    if wp.dot(t.g, t.g) < wp.dot(s.g, s.g):
+        return t
+    return s
+
+
+@wp.func
+def on_corner(half: wp.vec3, a: wp.vec3, i: int) -> Nearest:
+    s = Nearest()
+    s.n = 1
+    s.p0 = a
+    s.i0 = i
+    s.x = a
+    s.g = off(half, a)
+    return s
+
+
+@wp.func
+def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
+    """What of the segment a, b is nearest to the cylinder."""
+    e = b - a
+    low = float(0.0)
+    high = float(1.0)
+    f_low = wp.dot(e, off(half, a))
+    f_high = wp.dot(e, off(half, b))
+    if f_low >= 0.0:
+        return on_corner(half, a, ia)
+    if f_high <= 0.0:
+        return on_corner(half, b, ib)
+    t = float(0.5)
+    side = int(0)
+    for step in range(STEPS):
+        # Regula falsi with the Illinois rule; where the edge goes from the side to the rim it is slow, hence the halving
+        t = (low * f_high - high * f_low) / (f_high - f_low)
+        if step % 2 == 1 or not (t > low and t < high):
+            t = 0.5 * (low + high)
+        f = wp.dot(e, off(half, a + t * e))
+        if f == 0.0 or t == low or t == high:
+            break
+        if f < 0.0:
+            low = t
+            f_low = f
+            if side < 0:
+                f_high = 0.5 * f_high
+            side = -1
+        else:
+            high = t
+            f_high = f
+            if side > 0:
+                f_low = 0.5 * f_low
+            side = 1
+        if high - low < 2.0e-7:
+            break
+    s = Nearest()
+    s.n = 2
+    s.p0 = a
+    s.p1 = b
+    s.i0 = ia
+    s.i1 = ib
+    s.x = a + t * e
+    g = off(half, s.x)
+    s.g = g - (wp.dot(g, e) / wp.dot(e, e)) * e  # exactly across the edge
+    if g[0] != 0.0 or g[1] != 0.0:
+        # and across the line of the side, or the rim's tangent: these tell the direction better than a small difference
+        beside = wp.vec3(0.0, 0.0, 1.0)
+        if g[2] != 0.0:
+            beside = wp.normalize(wp.vec3(-s.x[1], s.x[0], 0.0))
+        c = wp.cross(e, beside)
+        if wp.dot(c, c) > 1.0e-3 * wp.dot(e, e):
+            s.g = (wp.dot(g, c) / wp.dot(c, c)) * c
+    return s
+
+
+@wp.func
+def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> Nearest:
+    """The triangle's nearest point if that is within, else `none`: then an edge has it, or one as near."""
+    n = wp.cross(b - a, c - a)
+    area = wp.length(n)
+    if area <= 1.0e-14:
+        return none()
+    n = n / area
+    if wp.dot(n, a) < 0.0:
+        n = -n
+    height = wp.dot(n, a)
+    y = furthest(half, n)
+    reach = wp.dot(n, y)
+    gap = height - reach
+    x = y + gap * n
+    if gap <= 0.0:
+        # the cylinder goes through the plane, here at least
+        gap = 0.0
+        x = (height / reach) * y
+    m = wp.cross(b - a, c - a)
+    if wp.dot(m, wp.cross(b - x, c - x)) <= 0.0 or wp.dot(m, wp.cross(c - x, a - x)) <= 0.0 or wp.dot(m, wp.cross(a - x, b - x)) <= 0.0:
+        return none()
+    s = Nearest()
+    s.n = 3
+    s.p0 = a
+    s.p1 = b
+    s.p2 = c
+    s.i0 = ia
+    s.i1 = ib
+    s.i2 = ic
+    s.x = x
+    s.g = gap * n
+    return s
+
+
+@wp.func
+def with_corner(half: wp.vec3, s: Nearest, w: wp.vec3, i: int) -> Nearest:
+    """What of the feature and one more corner is nearest to the cylinder; the corner has a part in it."""
+    if s.n == 1:
+        return on_edge(half, s.p0, w, s.i0, i)
+    best = on_face(half, s.p0, s.p1, w, s.i0, s.i1, i)
+    if s.n == 2 and best.n == 3:
+        return best
+    best = nearer(best, nearer(on_edge(half, s.p0, w, s.i0, i), on_edge(half, s.p1, w, s.i1, i)))
+    if s.n == 3:
+        best = nearer(best, on_edge(half, s.p2, w, s.i2, i))
+        best = nearer(best, on_face(half, s.p1, s.p2, w, s.i1, s.i2, i))
+        best = nearer(best, on_face(half, s.p2, s.p0, w, s.i2, s.i0, i))
+    return best
+
+
+@wp.func
+def begin(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i) -> Nearest:
+    """The nearest of the corners numbered in `first` (-1: none), where the body is now."""
+    i = first[0]
+    if i < 0 or i >= corners(b):
+        i = support(b, vertex, -(wp.transpose(R) * p))
+    s = on_corner(half, R * corner(b, vertex, i) + p, i)
+    for k in range(1, 3):
+        i = first[k]
+        if i >= 0 and i < corners(b) and i != s.i0 and (s.n < 2 or i != s.i1):
+            w = R * corner(b, vertex, i) + p
+            s = nearer(s, with_corner(half, s, w, i))
+    return s
+
+
+@wp.func
+def from_cylinder(
+    half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, first: wp.vec3i, cutoff: float
+) -> Nearest:
+    """What of the body b is nearest to the cylinder; g is zero if they overlap, or that cannot be told.
+
+    R, p: the body's frame in the cylinder's. first: numbers of corners to begin with. cutoff [m]: bodies that are shown to be
+    further apart need no exact answer; then |g| is at least the cutoff.
+    """
+    s = begin(half, b, vertex, R, p, first)
+    kept = s
+    least = float(FAR)
+    for _look in range(LOOKS):
+        gg = wp.dot(s.g, s.g)
+        if gg <= OVERLAP * OVERLAP:
+            least = FAR
+            break
+        norm = wp.sqrt(gg)
+        i = support(b, vertex, -(wp.transpose(R) * s.g))
+        w = R * corner(b, vertex, i) + p
+        promise = wp.dot(s.x - w, s.g) / norm
+        if promise <= GAIN or norm - promise >= cutoff:
+            return s
+        t = with_corner(half, s, w, i)
+        # no nearer, as far as |g| tells: what the next corner promises tells better (see gjk.distance)
+        if wp.dot(t.g, t.g) >= gg:
+            if promise >= least:
+                break
+            kept = s
+            least = promise
+        s = t
+    if least > DOUBT:
+        kept.g = wp.vec3(0.0)
+    return kept
+
+
+@wp.struct
+class Way:
+    """A way out of an overlap past a feature of the body. found: 0 if there is none. u: unit direction from the cylinder to the
+    body. depth [m]: how far the feature must go along it. placed: whether it says where. q [m]: halfway between the furthest
+    points of both, where these are single."""
+
+    found: int
+    u: wp.vec3
+    depth: float
+    placed: int
+    q: wp.vec3
+
+
+@wp.func
+def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
+    """Along u for a feature with the point a, where the rim is furthest along it."""
+    w = Way()
+    w.found = 1
+    w.u = u
+    y = furthest(half, u)
+    w.depth = wp.dot(u, y - a)
+    w.q = y - 0.5 * w.depth * u
+    w.placed = wp.where(wp.abs(u[2]) > LEVEL and wp.abs(u[0]) + wp.abs(u[1]) > LEVEL, 1, 0)
+    return w
+
+
+@wp.func
+def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
+    """The way out for a corner through the side or through a cap, whichever is nearer to `about`."""
+    u = wp.vec3(0.0, 0.0, wp.where(about[2] > 0.0, 1.0, -1.0))
+    rho = wp.sqrt(a[0] * a[0] + a[1] * a[1])
+    if rho > 0.0 and wp.abs(about[2]) < 0.5:
+        u = wp.vec3(a[0] / rho, a[1] / rho, 0.0)
+    w = way(half, u, a)
+    w.q = a + 0.5 * w.depth * u
+    w.placed = 1
+    return w
+
+
+@wp.func
+def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
+    """The shortest way out for the line a, b among directions across it that are near `about`: over a rim, or past the side."""
+    e = wp.normalize(b - a)
+    c = wp.normalize(about - wp.dot(about, e) * e)
+    s = wp.cross(e, c)
+    low = float(-NEAR)
+    high = float(NEAR)
+    # the depth's derivative grows through zero where the depth is least
+    for _step in range(STEPS):
+        angle = 0.5 * (low + high)
+        u = wp.cos(angle) * c + wp.sin(angle) * s
+        slope = wp.dot(wp.cos(angle) * s - wp.sin(angle) * c, furthest(half, u) - a)
+        if slope < 0.0:
+            low = angle
+        else:
+            high = angle
+    w = Way()
+    if low == -NEAR or high == NEAR:
+        return w  # it is further off
+    angle = 0.5 * (low + high)
+    w = way(half, wp.cos(angle) * c + wp.sin(angle) * s, a)
+    beside = wp.cross(w.u, wp.vec3(0.0, 0.0, 1.0))
+    if wp.abs(w.u[2]) <= LEVEL and wp.abs(wp.dot(e, beside)) > LEVEL:
+        # a whole line of the side is furthest: where that and the edge cross
+        x = a + (wp.dot(furthest(half, w.u) - a, beside) / wp.dot(e, beside)) * e
+        w.q = x + 0.5 * w.depth * w.u
+        w.placed = 1
+    return w
+
+
+@wp.func
+def past_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, about: wp.vec3) -> Way:
+    """The way out along the normal of a triangle."""
+    w = Way()
+    n = wp.cross(b - a, c - a)
+    if wp.dot(n, n) > 0.0:
+        w = way(half, wp.normalize(wp.where(wp.dot(n, about) > 0.0, n, -n)), a)
+    return w
+
+
+@wp.func
+def past(half: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, about: wp.vec3, i: wp.vec3i) -> Way:
+    """The way out past the feature of corners c, near the direction `about`. Where their numbers i are the same it has fewer."""
+    if i[0] == i[1] and i[0] == i[2]:
+        return past_corner(half, c0, about)
+    if i[0] == i[1]:
+        return past_edge(half, c0, c2, about)
+    if i[0] == i[2] or i[1] == i[2]:
+        return past_edge(half, c0, c1, about)
+    return past_face(half, c0, c1, c2, about)
+
+
+@wp.func
+def lowest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> wp.vec3i:
+    """The numbers of the three corners that are least along d (in the body's frame); the last again where there are but two."""
+    i = wp.vec3i(0, 0, 0)
+    h = wp.vec3(FAR, FAR, FAR)
+    for k in range(corners(b)):
+        s = wp.dot(corner(b, vertex, k), d)
+        if s < h[0]:
+            h = wp.vec3(s, h[0], h[1])
+            i = wp.vec3i(k, i[0], i[1])
+        elif s < h[1]:
+            h = wp.vec3(h[0], s, h[1])
+            i = wp.vec3i(i[0], k, i[1])
+        elif s < h[2]:
+            h[2] = s
+            i[2] = k
+    if h[2] == FAR:
+        i[2] = i[1]
+    return i
+
+
+@wp.func
+def rounder(
+    half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, about: wp.vec3, on: wp.vec3i
+) -> Way:
+    """The way out of the round cylinder near that of the prism, whose facets are chords.
+
+    about: the prism's. on: the body's corners that it led past. Tried are the features that these and the body's three lowest
+    corners make, fewest corners first; it is the one than which no other corner is lower along its own way out.
+    """
+    three = lowest(b, vertex, wp.transpose(R) * about)
+    most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + DOUBT
+    best = Way()
+    for k in range(8):
+        i = on
+        if k < 3:
+            i = wp.vec3i(three[k], three[k], three[k])
+        elif k < 6:
+            i = wp.vec3i(three[(k + 1) % 3], three[(k + 1) % 3], three[(k + 2) % 3])
+        elif k == 6:
+            i = three
+        c0 = R * corner(b, vertex, i[0]) + p
+        w = past(half, c0, R * corner(b, vertex, i[1]) + p, R * corner(b, vertex, i[2]) + p, about, i)
+        if w.found != 0 and w.depth < most and best.found == 0:
+            other = R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * w.u))) + p
+            if wp.dot(w.u, c0 - other) <= LOWER:
+                best = w
+    return best
