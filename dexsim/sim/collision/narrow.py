@@ -49,7 +49,7 @@ def _hulls(model: mujoco.MjModel) -> list[np.ndarray]:
 
 
 class NarrowPhase:
-    """Contacts of the model's hulls, for N worlds of `m`.
+    """Contacts of the model's hulls and cylinders, for N worlds of `m`.
 
     Attributes:
       simplex: wp.array [N, P] vec3i, corners that were nearest in the last step, of each of the model's P pairs with a
