@@ -7,9 +7,6 @@ normal. A face, edge or corner of the other body is exact, then, and nothing is 
 cylinder's frame: axis z, radius half[0], half length half[1].
 """
 
-# Warp compiles these functions; its annotations know no items of vectors.
-# mypy: ignore-errors
-
 from __future__ import annotations
 
 import warp as wp

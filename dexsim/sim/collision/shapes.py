@@ -90,16 +90,16 @@ def support(core: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:
     return 0
 
 
-@wp.func
-def corner(core: Prism, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:  # type: ignore[no-redef]  # noqa: F811  (an overload)
+@wp.func  # type: ignore[no-redef]
+def corner(core: Prism, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:  # noqa: F811  (an overload)
     """Corner i in the geom's frame [m]: at the upper end if odd."""
     angle = (2.0 * wp.pi / float(SIDES)) * float(i >> 1)
     h = core.half
     return wp.vec3(h[0] * wp.cos(angle), h[0] * wp.sin(angle), wp.where((i & 1) != 0, h[1], -h[1]))
 
 
-@wp.func
-def support(core: Prism, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:  # type: ignore[no-redef]  # noqa: F811  (an overload)
+@wp.func  # type: ignore[no-redef]
+def support(core: Prism, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:  # noqa: F811  (an overload)
     """The corner that is furthest along d (in the geom's frame)."""
     turn = int(wp.round(wp.atan2(d[1], d[0]) * (float(SIDES) / (2.0 * wp.pi))))
     return ((turn & (SIDES - 1)) << 1) + wp.where(d[2] > 0.0, 1, 0)
