@@ -94,6 +94,10 @@ LATE_GROUPS = 128  # commands that are told apart where one of them acts late (`
 NAMES: tuple[str, ...] = tuple(c.name for c in SERVO_COLUMNS) + tuple(e[0] for e in EXTRA)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(NAMES)}
 NEUTRAL: np.ndarray = np.array([c.neutral for c in SERVO_COLUMNS] + [e[1] for e in EXTRA])
+NOT_NEGATIVE: tuple[int, ...] = tuple(
+    INDEX[name] for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband")
+)
+"""Columns that no sum of a belief and a correction may take below 0, where the plant's laws mean nothing."""
 
 # What the mechanism and the recording prescribe along a joint's trajectory, on the integration grid.
 SERIES: tuple[str, ...] = (
@@ -211,8 +215,7 @@ def expand(plant: JointPlant, params: list[Param], x: np.ndarray) -> np.ndarray:
                 p.apply(out, x[:, i], base)
     lag = INDEX["stribeck_speed"]
     out[:, :, lag] = np.maximum(out[:, :, lag], 1e-4)
-    for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
-        c = INDEX[name]
+    for c in NOT_NEGATIVE:
         out[:, :, c] = np.maximum(out[:, :, c], 0.0)
     return out
 

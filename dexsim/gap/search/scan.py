@@ -12,7 +12,7 @@ from dexsim import intervals
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.effects.effect import Variant
 from dexsim.gap.plant.case import Case
-from dexsim.gap.plant.columns import INDEX, SHAPES, Param, at_bound, expand
+from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
 from dexsim.gap.search.fit import Fitter, disbelief, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, dear_of, fits_beside, subset
@@ -359,6 +359,6 @@ def expand_one(case: Case, params: list[Param], x: np.ndarray) -> np.ndarray:
 
 
 def legal(g: np.ndarray) -> np.ndarray:
-    for name in ("coulomb_friction", "viscous_friction", "delay", "backlash", "softness", "deadband"):
-        g[:, INDEX[name]] = np.maximum(g[:, INDEX[name]], 0.0)
+    for c in NOT_NEGATIVE:
+        g[:, c] = np.maximum(g[:, c], 0.0)
     return g
