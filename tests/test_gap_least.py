@@ -71,7 +71,7 @@ def test_a_name_is_doubted_by_the_interval_that_is_reported(monkeypatch, narrow,
     answer._fitted = lambda mm, bounds: ({}, bounds)
     answer.case = SimpleNamespace(joint="j", sigma=1e-3, quantum=0.0)
     answer.before = answer.after
-    answer.outcome = SimpleNamespace(confidence={}, folds={})
+    answer.outcome = SimpleNamespace(confidence={"lag": 0.5}, folds={})
     answer.search = SimpleNamespace(unasked=set(), r=SimpleNamespace(sigma_torque=1.0))
     answer.member.variant.params = []
     answer.member.effect.doubts, answer.member.effect.of_pose = lambda *_: [], lambda *_: False

@@ -326,8 +326,14 @@ class JudgeRules:
     )
     left_span: float = _rule(
         0.28,
-        "share beyond that over which a name loses half of its confidence",
-        "by judgement: half from a third on",
+        "share beyond that over which a name loses `left_costs` of its confidence",
+        "by judgement: all of it from a third on",
+        "test_what_stays_unexplained_costs_confidence",
+    )
+    left_costs: float = _rule(
+        0.5,
+        "share of its confidence that a name loses at most by what stays unexplained",
+        "by judgement: what follows only half of a gap may be another effect's likeness, or one of two that are there",
         "test_what_stays_unexplained_costs_confidence",
     )
     set_share: float = _rule(

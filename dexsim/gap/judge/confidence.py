@@ -92,9 +92,11 @@ def left_over(after: float, before: float, noise: float) -> float:
 
 
 def trusted(before: float, after: float, noise: float) -> float:
-    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to a
-    twentieth, half from a third on. What follows only half of a gap may be another effect's likeness."""
-    return 1.0 - 0.5 * float(np.clip((left_over(after, before, noise) - JUDGE.left_free) / JUDGE.left_span, 0.0, 1.0))
+    """Share of its confidence that a name keeps when a part of the squared error stays unexplained: all up to
+    `JUDGE.left_free`, `1 - JUDGE.left_costs` from `JUDGE.left_span` beyond it on. What follows only half of a gap may
+    be another effect's likeness."""
+    beyond_free = (left_over(after, before, noise) - JUDGE.left_free) / JUDGE.left_span
+    return 1.0 - JUDGE.left_costs * float(np.clip(beyond_free, 0.0, 1.0))
 
 
 def too_small(before: float, without: float, after: float, noise: float, alone: bool) -> str:

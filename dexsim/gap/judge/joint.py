@@ -217,7 +217,8 @@ class JointAnswer:
             else float(np.clip((error_without - after) / (JUDGE.earns * error_without + 1e-12), 0.0, 1.0))
         )
         evidence = confidence.Evidence(
-            mm.id, case.joint, outcome.confidence.get(mm.id, 0.5), earned, confidence.left_over(after, before, noise),
+            mm.id, case.joint, outcome.confidence[mm.id], earned,
+            confidence.left_over(after, before, noise),
             confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)
         nothing = confidence.holds_nothing(mm.variant.params, spread, case)
         if nothing:
