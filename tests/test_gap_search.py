@@ -183,9 +183,9 @@ def test_progress_says_the_time_left_while_one_joint_is_searched(capsys, monkeyp
     lines = capsys.readouterr().out.splitlines()
     assert [line.strip() for line in lines] == [
         "searching knuckle (1/1)",
-        "searching knuckle (1/1)",
-        "searching knuckle (1/1), about 36 s left",
-        "searching knuckle (1/1), about 16 s left",
+        "searching knuckle (1/1), 5 % done",
+        "searching knuckle (1/1), 25 % done, about 36 s left",
+        "searching knuckle (1/1), 50 % done, about 16 s left",
         "searched 1 in 20 s",
     ]
 

@@ -307,8 +307,9 @@ class Progress:
             return
         self.said, self.searched, spent = now, int(done), now - self.start
         left = f", about {spent * (total - done) / done:.0f} s left" if 0.1 <= done < total else ""
+        part = f", {100 * done / total:.0f} % done" if 0.0 < done < total else ""
         text = (
-            f"  searching {name} ({int(done) + 1}/{total}){left}"
+            f"  searching {name} ({int(done) + 1}/{total}){part}{left}"
             if done < total
             else f"  searched {total} in {spent:.0f} s"
         )
