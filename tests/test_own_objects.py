@@ -14,6 +14,10 @@ from dexsim.assets.objects.geometry import signed_distance
 from dexsim.cli import objects as settings
 from dexsim.errors import UserError
 from dexsim.sim.scene import SLOTS, hand_object_scene
+from dexsim.tasks.env import HandEnv
+from dexsim.tasks.grasp import GraspEnv
+from dexsim.tasks.rotate import RotateEnv
+from dexsim.tasks.rotate_fingertips import FingertipEnv
 
 
 @pytest.fixture(autouse=True)
@@ -140,7 +144,7 @@ def _plain(**given):
         ({"objects": ["cross"]}, "kept_out: 'cross' is trained on as well"),
         ({"objects": ["box"], "object_scale": 0}, "object_scale=0: must be a positive number"),
         ({"objects": ["box"], "object_hulls": 99}, "object_hulls=99: must be a whole number from 1 to 32"),
-        ({"objects": ["box"], "task": {"name": "press"}}, "objects=.*task=press has its own object"),
+        ({"objects": ["box"], "task": {"name": "press"}}, "task.name='press': must be one of grasp, rotate"),
         ({"kept_out": ["m.stl"], "task": {"name": "rotate", "mode": "fingertips"}},
          "kept_out=.*task=rotate_fingertips.*kept_out= is for task=grasp and task=rotate"),
     ],
@@ -148,6 +152,22 @@ def _plain(**given):
 def test_wrong_settings(given, said):
     with pytest.raises(UserError, match=said):
         settings.apply(_plain(**given))
+
+
+@pytest.mark.parametrize(
+    ("kind", "takes"), [(GraspEnv, True), (RotateEnv, True), (FingertipEnv, False), (HandEnv, False)]
+)
+def test_a_task_made_from_another_takes_objects_as_that_does(monkeypatch, kind, takes):
+    """By its class, whatever it is called."""
+    monkeypatch.setattr("dexsim.tasks.task_class", lambda task: type("Lift", (kind,), {}))
+    plain = _plain(objects=["box"], kept_out=["cross"])
+    plain["task"]["name"] = "lift"
+    if takes:
+        settings.apply(plain)
+        assert plain["task"]["objects"]["own"] == {"scale": 1.0, "hulls": 16}
+    else:
+        with pytest.raises(UserError, match="task=lift has its own object.*TAKES_OBJECTS = True"):
+            settings.apply(plain)
 
 
 def test_settings_reach_the_task(tmp_path):

@@ -16,10 +16,15 @@ def apply(plain: dict[str, Any]) -> None:
     if all(value is None for value in given.values()):
         return
     task = plain["task"]
-    if task.get("name") not in ("grasp", "rotate") or task.get("mode") == "fingertips":
+    from dexsim.tasks import task_class  # heavy, and only who gives objects needs it
+
+    if not task_class(task).TAKES_OBJECTS:
         key = next(k for k, value in given.items() if value is not None)
         name = "rotate_fingertips" if task.get("mode") == "fingertips" else task.get("name")
-        raise UserError(f"{key}={given[key]}: task={name} has its own object; {key}= is for task=grasp and task=rotate")
+        raise UserError(
+            f"{key}={given[key]}: task={name} has its own object; {key}= is for task=grasp and task=rotate"
+            " (a task of your own: TAKES_OBJECTS = True in its class)"
+        )
     for key, into in (("objects", "train"), ("kept_out", "held_out")):
         names = given[key]
         if names is None:

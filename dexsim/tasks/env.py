@@ -85,6 +85,8 @@ class HandEnv(VecEnv):
     `rise`: m by which its palm is higher than that of the hand that heights in task settings are for.
     """
 
+    TAKES_OBJECTS: bool = False
+    """Whether `objects=` and `kept_out=` may give it a user's own objects (`task.objects`)."""
     nan_count: torch.Tensor
     _wrong: torch.Tensor | None
     _sources: tuple[str, ...]

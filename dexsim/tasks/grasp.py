@@ -55,6 +55,8 @@ def _is_range(pair: Any) -> bool:
 class GraspEnv(HandEnv):
     """The grasp task; see the module."""
 
+    TAKES_OBJECTS = True
+
     def setup(self) -> None:
         t, n, dev = self.task, self.num_envs, self.device
         felt = (t.get("observe") or {}).get("touch", True)  # checkpoints from before have no such setting

@@ -50,7 +50,10 @@ def overlay(cfg: dict[str, Any]) -> dict[str, Any]:
             raise UserError(f"reality.{key}: unknown; a file of dexsim/configs/reality has {', '.join(sorted(KEYS))}")
     task = cfg["task"]["name"]
     if task not in world["tasks"]:
-        raise UserError(f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])}")
+        raise UserError(
+            f"reality={world['name']}: has no task '{task}'; it has {', '.join(world['tasks'])};"
+            f" write its settings under tasks: {task}: in that world's file (dexsim/configs/reality/)"
+        )
     cfg["sim"].update(world["sim"], engine="mujoco")
     cfg["belief"] = {"servo": cfg["servo"], "drive": math.prod(_middle(cfg, c) for c in ("efficiency", "torque_limit"))}
     cfg["servo"] = world["servo"]

@@ -77,6 +77,7 @@ class RotateEnv(HandEnv):
     successes [N]: goals reached in this episode.
     """
 
+    TAKES_OBJECTS = True
     PERCEPTION: tuple[str, ...] = ("imu", "proprioception")
     ENDS: tuple[str, ...] = ("dropped", "tipped", "nan")
     """How a trial can end but for the cap, in the order of `end_kind`."""

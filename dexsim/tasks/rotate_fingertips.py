@@ -40,6 +40,7 @@ class FingertipEnv(RotateEnv):
     """See the module. start [N, 4]: orientation as first held; gravity [N, 3] m/s2, palm frame; palm [N]: index into
     PALMS; other_force [N] N on anything but fingertips; hidden [N] s that the camera sees nothing yet; age [N] s."""
 
+    TAKES_OBJECTS = False  # its held poses are of a cube
     PERCEPTION = ("camera",)
     ENDS = ("dropped", "leaned", "nan")
 
