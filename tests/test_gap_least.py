@@ -63,23 +63,45 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
     assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)
 
 
-@pytest.mark.parametrize(("narrow", "wide", "doubted"), [(False, False, 0), (False, True, 1), (True, True, 1)])
-def test_a_name_is_doubted_by_the_interval_that_is_reported(monkeypatch, narrow, wide, doubted):
-    """Which of the two intervals, the fit's and the reported one, holds the size at which nothing is missing."""
+def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=False) -> confidence.Evidence:
+    """The evidence of a name against which nothing else speaks. fitted, reported: which of the two intervals, the fit's
+    and the reported one, holds the size at which nothing is missing; blurred: why the encoder does not resolve it."""
     answer = Judged(1.0, 0.1)
-    answer.widest, answer.bounds = narrow, wide
+    answer.widest, answer.bounds = fitted, reported
     answer._fitted = lambda mm, bounds: ({}, bounds)
-    answer.case = SimpleNamespace(joint="j", sigma=1e-3, quantum=0.0)
+    answer.case = SimpleNamespace(joint="j", sigma=0.1, quantum=0.0)
     answer.before = answer.after
-    answer.outcome = SimpleNamespace(confidence={"lag": 0.5}, folds={})
+    answer.outcome = SimpleNamespace(confidence={"lag": 1.0}, folds={})
     answer.search = SimpleNamespace(unasked=set(), r=SimpleNamespace(sigma_torque=1.0))
     answer.member.variant.params = []
     answer.member.effect.doubts, answer.member.effect.of_pose = lambda *_: [], lambda *_: False
     monkeypatch.setattr(confidence, "holds_nothing", lambda params, spread, case: spread)
-    for name in ("too_small", "unresolved"):
-        monkeypatch.setattr(confidence, name, lambda *_: "")
+    monkeypatch.setattr(confidence, "too_small", lambda *_: "")
+    monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)
     monkeypatch.setattr(joint, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
-    evidence = JointAnswer._weighed(answer, answer.member, {}, narrow, 1.0, 0.1, False)
-    assert len(evidence.reasons) == doubted and all("nothing is missing" in r for r in evidence.reasons)
-    assert evidence.confidence < 0.8 or not doubted
+    return JointAnswer._weighed(answer, answer.member, {}, fitted, 1.0, 0.1, False, borne_out)
+
+
+@pytest.mark.parametrize(
+    ("fitted", "reported", "least", "most"),
+    [
+        (False, False, JUDGE.sure, 1.0),
+        (False, True, JUDGE.firm, JUDGE.doubted),
+        (True, False, JUDGE.firm, JUDGE.doubted),
+        (True, True, 0.0, JUDGE.hinted),
+    ],
+)
+def test_a_name_is_doubted_by_either_interval_and_a_hint_by_both(monkeypatch, fitted, reported, least, most):
+    """Of which intervals hold the size at which nothing is missing."""
+    evidence = weighed(monkeypatch, fitted, reported)
+    assert least <= evidence.confidence <= most
+    assert len(evidence.reasons) == (fitted or reported) and all("nothing is missing" in r for r in evidence.reasons)
+
+
+def test_what_the_encoder_does_not_resolve_is_a_hint_where_nothing_surely_shows_it(monkeypatch):
+    """The motion passes over many counts: an effect of less than half a count shows in the mean of many readings. It is
+    doubted either way."""
+    hint, doubt = (weighed(monkeypatch, blurred="it is small", borne_out=x) for x in (False, True))
+    assert hint.confidence <= JUDGE.hinted and JUDGE.firm <= doubt.confidence <= JUDGE.doubted
+    assert hint.reasons == doubt.reasons == ["it is small"]

@@ -46,3 +46,19 @@ def test_a_readout_is_asked_for_where_there_are_two_encoders(apart):
         assert any(c.startswith("readout_") for c in columns) is apart
     search = JointSearch(case, [0], None, [0])
     assert any(p.key == "zero" for p in search.all_nuisances) is apart
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_offset_of_the_effort_beyond_what_its_zero_may_be_off_by_is_found(sign):
+    """Of a strong drive that hardly works, what the zero may be off by is large beside the torques that it gives: the
+    belief then stands further out than a tenth of them."""
+    runs, case = built({"torque_limit": 20.0, "no_load_speed": 60.0})
+    run, zero = runs[0], case.scales.effort_zero
+    effort = case.plant.simulate(case.plant.base()[None], case.plant.windows(None))[1][0]
+    noise = np.random.default_rng(0).normal(0.0, 1e-3, len(effort))
+    run.torque = (effort + sign * 2.5 * zero + noise)[:, None]
+    case = build(model(), runs)[0]
+    assert zero > 0.1 * case.scales.tau
+    search = JointSearch(case, [0], None, [0])
+    shares = {member.id: share for share, _, member, _ in reversed(search.scan(search.start()))}
+    assert shares["current_sensor"] > 0.9

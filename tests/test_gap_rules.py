@@ -468,6 +468,17 @@ def test_an_effect_that_harms_some_recordings_is_a_hint():
         assert (JointAnswer._harmed(answer, "without it") != "") is hint
 
 
+def test_what_was_kept_out_surely_shows_is_doubted_only():
+    """An effect that harms some recordings, by what it surely removes of the error on what was kept out."""
+    for surely, hint in ((0.13, True), (0.17, False)):
+        answer = Judged(1.0, 0.1)
+        answer._harmed = lambda without_it: "it harms some"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kept_out, "gain_interval", lambda *_, surely=surely: (surely, 0.9))
+            sure = judged(answer)["confidence"]
+        assert (sure < rules.JUDGE.firm) is hint and sure <= rules.JUDGE.doubted, surely
+
+
 def test_intervals_grow_with_what_is_left():
     p = param("time_constant", "lag", "set", -1e3, 1e3)
     fit = Fitted([p], np.array([0.0]), np.zeros(4), np.zeros((4, 1)), np.zeros(4, int), 1.0, np.zeros(1))

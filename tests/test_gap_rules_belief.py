@@ -11,6 +11,7 @@ import numpy as np
 from dexsim.gap.effects.effect import param
 from dexsim.gap.effects.friction import give
 from dexsim.gap.judge import confidence
+from dexsim.gap.plant.columns import Scales
 from dexsim.gap.search import hypotheses
 from dexsim.gap.search.fit import disbelief
 
@@ -44,7 +45,8 @@ def test_what_holds_a_joint_gives_a_little():
 
 def test_sensors_have_zeros():
     """Of encoders with counts of 1 mrad, and of a reading of the effort at a limit of 2 N.m."""
-    scales = SimpleNamespace(apart=True, nominal={"torque_limit": 2.0}, tau=1.0)
+    drive = SimpleNamespace(nominal={"torque_limit": 2.0}, tau=1.0)
+    scales = SimpleNamespace(apart=True, effort_zero=Scales.effort_zero.fget(drive))
     case = SimpleNamespace(scales=scales, quantum=1e-3, sigma=1e-4, sigma_torque=0.1)
     by = {p.key: p for p in hypotheses._of_the_sensors(case)}
     assert 1.5e-3 < by["zero"].high < 3e-3 and 0.015 < by["effort_zero"].high < 0.03

@@ -363,6 +363,13 @@ class JudgeRules:
         "by judgement: a tenth of the error itself",
         "test_an_effect_must_remove_a_part_of_what_was_kept_out",
     )
+    borne_out: float = _rule(
+        0.15,
+        "share of the squared error on what was kept out that an effect removes in all but a twentieth of its draws: "
+        "moving less than half a count of the encoder, or harming a recording, then makes it doubted, not a hint",
+        "between 0.11, the most in 118 empty cases of another plant, and 0.19, the least of five small true effects",
+        "test_what_was_kept_out_surely_shows_is_doubted_only",
+    )
     slack: float = _rule(
         0.05,
         "share of the squared error that may be lost where an effect does not act, by what was refitted beside it",

@@ -180,8 +180,11 @@ class CurrentSensor(Effect):
         if not s.effort:
             return []
         gain = param("gain", "effort_gain", "set", -1.5, 3.0, 1.0)
-        offset = param("offset", "effort_offset", "set", -s.tau, s.tau, 0.0, "N.m")
-        return [Variant((gain, offset), ((0.7, 0.0), (1.3, 0.0), (1.0, 0.1 * s.tau), (1.0, -0.1 * s.tau), (-1.0, 0.0)))]
+        # beyond what the zero may be refitted to: a start nearer by than the belief stands says that it should go back
+        far = max(0.1 * s.tau, 3.0 * s.effort_zero)
+        most = max(s.tau, 2.0 * far)
+        offset = param("offset", "effort_offset", "set", -most, most, 0.0, "N.m")
+        return [Variant((gain, offset), ((0.7, 0.0), (1.3, 0.0), (1.0, far), (1.0, -far), (-1.0, 0.0)))]
 
     def unseen(self, s: Scales) -> str:
         return super().unseen(s) if s.effort else "no effort is recorded (or current_per_torque is unknown)"

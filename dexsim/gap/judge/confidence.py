@@ -46,6 +46,11 @@ class Evidence:
         self.reasons.append(reason)
         self.confidence = min(self.confidence, JUDGE.hinted)
 
+    def doubt(self, reason: str) -> None:
+        """Makes it doubted."""
+        self.reasons.append(reason)
+        self.confidence = min(self.confidence, JUDGE.doubted)
+
     def plain(self) -> dict:
         """As it is written."""
         return asdict(self)
@@ -140,18 +145,16 @@ def doubt_beside_others(mine: list[Evidence]) -> None:
     for k, e in enumerate(mine):
         e.place = k
         if e.of_pose and len(slow) > 1:
-            _doubt(
-                e,
+            e.doubt(
                 f"{' and '.join(x.effect.replace('_', ' ') for x in slow)} together can be any torque that depends on "
                 "the pose",
             )
         doubtful = next((x for x in mine[:k] if x.confidence < JUDGE.doubted), None)
         if doubtful is not None:
-            _doubt(e, f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
+            e.doubt(f"it was found beside {doubtful.effect.replace('_', ' ')}, which is itself not sure")
         alike = next((x for x in mine[:k] if EFFECTS[e.effect].slows and EFFECTS[x.effect].slows), None)
         if alike is not None:
-            _doubt(
-                e,
+            e.doubt(
                 f"it was found beside {alike.effect.replace('_', ' ')}: both hold back what is fast, and one makes up "
                 "for what the other is off by",
             )
@@ -160,12 +163,7 @@ def doubt_beside_others(mine: list[Evidence]) -> None:
                 "it was found beside another joint's pull, whose own zero is not known: the two shift the joint alike"
             )
         if len(mine) >= JUDGE.crowd and k > 0:
-            _doubt(e, f"{len(mine)} effects on one joint: together they may stand for another")
-
-
-def _doubt(e: Evidence, reason: str) -> None:
-    e.reasons.append(reason)
-    e.confidence = min(e.confidence, JUDGE.doubted)
+            e.doubt(f"{len(mine)} effects on one joint: together they may stand for another")
 
 
 def of_touch(findings: list[dict], before: float, noise: float) -> list[str]:
@@ -190,9 +188,9 @@ def of_the_whole(all_: list[Evidence], coupled: dict[str, str], bad: set[str], s
     for e in all_:
         elsewhere = [j for j in misread if j != e.joint]
         if elsewhere and EFFECTS[e.effect].from_poses:
-            _doubt(e, f"the position of {elsewhere[0]} is not what it says, and with it what the other joints load")
+            e.doubt(f"the position of {elsewhere[0]} is not what it says, and with it what the other joints load")
         pulls = [j for j, k in coupled.items() if k == e.joint]
         if pulls and not EFFECTS[e.effect].couples:
-            _doubt(e, f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
+            e.doubt(f"{e.joint} drags {pulls[0]}, whose pull on it is not modelled")
         if e.joint in bad and not (EFFECTS[e.effect].effort_only and e.joint in signs):
-            _doubt(e, f"a signal of {e.joint} is not what it says")
+            e.doubt(f"a signal of {e.joint} is not what it says")

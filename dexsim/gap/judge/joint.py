@@ -132,8 +132,9 @@ class JointAnswer:
             if of_effort
             else (error_without, rms(self.after))
         )
-        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], was, left, effort_only)
         gain = kept_out.gain_interval((self.measured - q) ** 2, self.after, self.t)
+        borne_out = gain[0] >= JUDGE.borne_out
+        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], was, left, effort_only, borne_out)
         if left**2 > (1 - JUDGE.part) * was**2:
             evidence.hint(
                 f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
@@ -142,7 +143,7 @@ class JointAnswer:
         elif not effort_only and gain[0] < -JUDGE.slack:
             evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
         if not effort_only and (harmed := self._harmed(trial)):
-            evidence.hint(harmed)
+            (evidence.doubt if borne_out else evidence.hint)(harmed)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.set_share][:2]
@@ -203,11 +204,18 @@ class JointAnswer:
         return raw, spread
 
     def _weighed(
-        self, mm, raw: dict[str, float], spread: dict, error_without: float, after: float, effort_only: bool
+        self,
+        mm,
+        raw: dict[str, float],
+        spread: dict,
+        error_without: float,
+        after: float,
+        effort_only: bool,
+        borne_out: bool,
     ) -> confidence.Evidence:
         """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out
         without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the motion
-        then tells nothing of it)."""
+        then tells nothing of it). borne_out: whether what was kept out surely shows it."""
         case, outcome = self.case, self.outcome
         # the one effect of the reading: nothing else explains the effort
         before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (rms(self.before), case.sigma)
@@ -220,10 +228,12 @@ class JointAnswer:
             mm.id, case.joint, outcome.confidence[mm.id], earned,
             confidence.left_over(after, before, noise),
             confidence.left_over(after, error_without, noise), outcome.folds.get(mm.id, []), len(self.best.members), 0)
-        nothing = confidence.holds_nothing(mm.variant.params, spread, case)
+        nothing, as_reported = (
+            confidence.holds_nothing(mm.variant.params, x, case) for x in (spread, self._fitted(mm, self.bounds)[1])
+        )
         if nothing:
             evidence.reasons.append("its interval holds the size at which nothing is missing")
-        elif confidence.holds_nothing(mm.variant.params, self._fitted(mm, self.bounds)[1], case):
+        elif as_reported:
             evidence.reasons.append(
                 "its interval, as wide as what is left and the laws it may follow make it, holds the size at which "
                 "nothing is missing"
@@ -233,9 +243,9 @@ class JointAnswer:
             if effort_only
             else confidence.too_small(before, error_without, after, case.sigma, len(self.best.members) == 1)
         )
-        small = small or ("" if effort_only else confidence.unresolved(error_without, after, case.quantum))
-        if small:
-            evidence.reasons.append(small)
+        blurred = "" if effort_only or small else confidence.unresolved(error_without, after, case.quantum)
+        if small or blurred:
+            evidence.reasons.append(small or blurred)
         if mm.id in self.search.unasked:
             evidence.reasons.append("the search ended before all that it may be confused with was tried in its place")
         stopped = at_bound(mm.variant.params, raw, case)
@@ -246,7 +256,7 @@ class JointAnswer:
         evidence.reasons += mm.effect.doubts(case, sorted({*self.kept.train, *self.kept.test}))
         evidence.of_pose = mm.effect.of_pose(raw, case)
         evidence.confidence = confidence.weigh(evidence, before, after, error_without, noise)
-        if nothing or small:
+        if (nothing and as_reported) or small or (blurred and not borne_out):
             evidence.confidence = min(evidence.confidence, JUDGE.hinted)
         return evidence
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexsim.actuator.columns import COLUMNS as SERVO_COLUMNS
+from dexsim.gap.rules import BELIEF
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.batch import JointPlant
@@ -166,6 +167,11 @@ class Scales:
     leaf_mass: float = 0.0  # kg: of the last link, and of the joint's own
     own_mass: float = 0.0
     apart: bool = False  # the loop reads the motor's encoder, and what is reported is the joint's
+
+    @property
+    def effort_zero(self) -> float:
+        """What a reading of the effort may be off by at rest (N.m, N for a slide)."""
+        return BELIEF.effort_zero * (self.nominal["torque_limit"] if self.nominal["torque_limit"] < 1e8 else self.tau)
 
 
 @dataclass(frozen=True)

@@ -258,7 +258,7 @@ def _of_the_sensors(case: Case) -> list[Param]:
         z = BELIEF.zero * max(case.quantum, case.sigma)
         out.append(Param("zero", ("readout_offset",), "add", -z, z, 0.0, nuisance=True, sd=0.5 * z))
     if case.sigma_torque > 0:
-        o = BELIEF.effort_zero * (s.nominal["torque_limit"] if s.nominal["torque_limit"] < 1e8 else s.tau)
+        o = s.effort_zero
         out.append(Param("effort_zero", ("effort_offset",), "add", -o, o, 0.0, nuisance=True, sd=0.5 * o))
         out.append(_within("effort_gain", "effort_gain"))
         # a drive may show what it last asked for, or what acts meanwhile
