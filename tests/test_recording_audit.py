@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import recordings
 
-from dexsim.recording import Series, audit_time, read, write
+from dexsim.errors import UserError
+from dexsim.gap.read import inputs
+from dexsim.recording import Series, audit_time, mechanism, read, write
 from dexsim.recording.audit import KINDS, audit, table
 from dexsim.recording.command import main
-from dexsim.recording.schema import DUTY
+from dexsim.recording.schema import COMMANDS, DUTY
 
 
 def found(recording, kind):
@@ -292,6 +296,33 @@ def test_a_planted_fault_is_found(plant):
     if count is not None:
         assert hits[0].count == count
     assert all(f.kind in KINDS for f in findings)
+
+
+def test_a_recording_with_positions_only_is_told_at_once(tmp_path, capsys):
+    """In a CSV and in an MCAP, and where the column of the commands is empty; the fix stands in each message."""
+    t = np.arange(0.0, 6.0, 0.01)
+    rows = [f"{x:.2f},{0.3 * np.sin(2 * x):.5f}" for x in t]
+    (tmp_path / "a.csv").write_text("time,position.elbow\n" + "\n".join(rows) + "\n")
+    (tmp_path / "b.csv").write_text("time,position.elbow,command.elbow\n" + "\n".join(f"{x}," for x in rows) + "\n")
+    made = recordings.signal(6.0)
+    made.commands = Series.empty(COMMANDS, 2)
+    write(tmp_path / "c.mcap", made)
+    for name in ("a.csv", "b.csv", "c.mcap"):
+        assert main([str(tmp_path / name)]) == 1
+        out = capsys.readouterr().out
+        assert "no commands: diagnose and replay cannot use this recording" in out and "a column command.JOINT" in out
+        assert out.count("missing_topic") == 1, out
+    (tmp_path / "d.csv").write_text("time,position.elbow,command.elbow\n" + "\n".join(f"{x},0.1" for x in rows) + "\n")
+    assert found(read(tmp_path / "d.csv"), "missing_topic") == []
+
+
+def test_without_commands_diagnosis_and_replay_say_what_to_log(tmp_path):
+    made = recordings.signal(6.0, joints=("knuckle",))
+    made.commands = Series.empty(COMMANDS, 1)
+    for use, error in ((lambda: inputs.to_run(made, SimpleNamespace(joints=("knuckle",)), []), inputs.Unusable),
+                       (lambda: mechanism.replay(made, SimpleNamespace(joints=("knuckle",))), UserError)):  # fmt: skip
+        with pytest.raises(error, match=r"\(in a CSV: a column command\.JOINT\)"):
+            use()
 
 
 def test_sixteen_bits_wrapped_at_high_gain(tmp_path):

@@ -69,6 +69,7 @@ def audit(recording: Recording) -> list[Finding]:
         found += audit_time.stamps(series)
         found += audit_time.between_topics(r)
         for check in (
+            audit_values.commanded,
             audit_values.finite,
             audit_values.wraps,
             audit_values.spikes,

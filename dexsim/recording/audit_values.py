@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from dexsim.recording.schema import STATES, TACTILE, Finding, Recording, Series
+from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, STATES, TACTILE, Finding, Recording, Series
 from dexsim.recording.spikes import of_effort, spiked
 
 NAN = float("nan")
@@ -57,6 +57,13 @@ def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarr
         if series is not None and len(series):
             for j, joint in enumerate(r.joints):
                 yield series.topic, name, joint, series.t, series.value[:, j]
+
+
+def commanded(r: Recording) -> Iterator[Finding]:
+    """That nothing says what the joints were asked for."""
+    if not np.isfinite(r.commands.value).any():
+        text = f"no commands: diagnose and replay cannot use this recording; {COMMANDS_FIX}"
+        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "error")
 
 
 def finite(r: Recording) -> Iterator[Finding]:

@@ -23,7 +23,7 @@ from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
 from dexsim.hand import Hand, load_hand
 from dexsim.hand.schema import FILE as HAND_FILE
-from dexsim.recording.schema import COMMANDS, DEFAULTS, STATES, Recording, Series, States
+from dexsim.recording.schema import COMMANDS, COMMANDS_FIX, DEFAULTS, STATES, Recording, Series, States
 from dexsim.sim import ContactPair, make_engine
 
 if TYPE_CHECKING:
@@ -377,7 +377,7 @@ def replay(
     pairs: contact pairs to measure. follow: name of the free joint that is led along the recorded object's path.
     """
     if not len(recording.commands):
-        raise UserError(f"recording {recording.path} has no /joint_commands: nothing to replay")
+        raise UserError(f"recording {recording.path} has no commands: nothing to replay; {COMMANDS_FIX}")
     initial = np.full(len(m.joints), np.nan)
     state = recording.states.position
     for j, joint in enumerate(recording.joints):

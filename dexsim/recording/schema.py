@@ -163,6 +163,13 @@ class Finding:
     end: float = float("nan")
 
 
+COMMANDS_FIX = (
+    f"log what each joint is asked for in {COMMANDS} (in a CSV: a column command.JOINT); where it has another name say "
+    f"remap.{COMMANDS}=TOPIC (in a CSV: remap.command.JOINT=COLUMN)"
+)
+"""What to do about a recording without commands."""
+
+
 @dataclass
 class Series:
     """Samples of one quantity. t [T] host time [s since start], never decreasing; value [T, ...] with NaN for absent.

@@ -18,7 +18,7 @@ from dexsim.gap.effects.signals import CurrentSensor
 from dexsim.gap.read.runs import Run
 from dexsim.recording import spikes
 from dexsim.recording.mechanism import Mechanism, merged
-from dexsim.recording.schema import Recording, Series
+from dexsim.recording.schema import COMMANDS_FIX, Recording, Series
 
 # kinds of the reader's findings that make a channel's numbers wrong, whatever the physics
 SIGN = ("lost_sign", "sign_mismatch")  # faults of an effort that a sensor makes just as well as who recorded it
@@ -46,7 +46,7 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     if not len(recording.states.position):
         raise Unusable(f"{name}: commands without states: no /joint_states to compare with")
     if not len(recording.commands):
-        raise Unusable(f"{name}: states without commands: no /joint_commands, so what the servo was asked is unknown")
+        raise Unusable(f"{name}: states without commands: what the servo was asked is unknown; {COMMANDS_FIX}")
     column = [recording.joints.index(j) for j in joints]
     _without_spikes(recording, notes)
     notes += [f"{name}: {f.topic}: {f.text}" for f in recording.findings if f.kind == "time_not_monotonic"]
