@@ -59,7 +59,8 @@ def into_diagnosis(
     """The joints into a diagnosis that is empty but for its notes and its mechanism.
 
     answers: of each joint, judged and located; how: what was kept out, in words; channel: findings about signals, of
-    all joints; plains: the plain model of each joint."""
+    all joints; plains: the plain model of each joint. (One long list of steps: each needs what those before it found.)
+    """
     data, notes, m = d.data, d.notes, d.mechanism
     data["verdict"] = "none"
     findings: list[dict[str, Any]] = []

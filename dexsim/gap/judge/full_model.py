@@ -309,9 +309,20 @@ def _batch(
     given = torch.zeros_like(seen) if torque else None
     heated = "warmth" in varied or "rare" in servo.features
     changes = Changes(servo, worlds, now, steps, timestep, up, heated)
+    seen = _stepped(engine, servo, changes, seen, given)
+    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
+    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+
+
+def _stepped(
+    engine: Any, servo: Servo, changes: Changes, seen: torch.Tensor, given: torch.Tensor | None
+) -> torch.Tensor:
+    """The positions that each step of the engine shows [S, N, J], into `seen` where it is not faster otherwise; given
+    [S, N, J]: filled with the drives' torques."""
+    steps = len(seen)
     step = itertools.count()
     if engine.kind == "mujoco":  # one call, and nothing in a step that is not needed: there are 2000 a second
-        turned = None if servo.at_rotor else torch.zeros(steps, *engine.t.qpos.shape, dtype=real)
+        turned = None if servo.at_rotor else torch.zeros(steps, *engine.t.qpos.shape, dtype=engine.t.qpos.dtype)
         at, kept = engine.t.qpos.numpy(), None if turned is None else turned.numpy()
 
         def before_each() -> None:
@@ -338,8 +349,7 @@ def _batch(
             engine.step(1, servo.before_each)
             if given is not None:
                 given[k].copy_(servo.torque)
-    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
-    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
+    return seen
 
 
 class Changes:

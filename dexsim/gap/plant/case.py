@@ -166,22 +166,12 @@ def moved(
         )
         believed = [_drags(run, row[j], dragging) for run, row in zip(runs, rows, strict=True)]
         for i, run in enumerate(runs):
-            exact = {}
-            if run.supply is not None and servo.supply_voltage:
-                exact["supply"] = _mean(run.supply / servo.supply_voltage, run.t, 0.05)
-            if run.enabled is not None:
-                exact["enabled"] = (run.enabled[:, j] > 0.5).astype(float)
-            if run.temperature is not None:
-                exact["warmth"] = run.temperature[:, j] - REFERENCE
+            exact = _shown(run, j, servo)
             if J > 1:
                 mech[i][1][j][:, SERIES_INDEX["others_torque"]] = np.delete(given[i], j, 1).sum(1)
             for n, o in enumerate(dragging[:DRAGGERS]):
                 exact[f"drag{n}"] = run.qs[:, o] - run.qs[0, o]
                 _linked(mech[i][0], mech[i][1][j], mech[i][1][o], n, constants[o].armature)
-            if run.duty is not None:
-                exact["drive"] = run.duty[:, j]
-            elif run.torque is not None:
-                exact["drive"] = np.nan_to_num(run.torque[:, j])
             effort = None if run.torque is None else run.torque[:, j]
             out.add(
                 run.name,
@@ -201,6 +191,22 @@ def moved(
 
     used = dict(zip(wanted, compute.each(len(wanted), one), strict=True))
     return Motion(mech, constants, rows, others, used)
+
+
+def _shown(run: Run, j: int, servo: ServoTable) -> dict[str, np.ndarray]:
+    """What a recording prescribes of joint j's drive, by name of `SERIES`."""
+    exact = {}
+    if run.supply is not None and servo.supply_voltage:
+        exact["supply"] = _mean(run.supply / servo.supply_voltage, run.t, 0.05)
+    if run.enabled is not None:
+        exact["enabled"] = (run.enabled[:, j] > 0.5).astype(float)
+    if run.temperature is not None:
+        exact["warmth"] = run.temperature[:, j] - REFERENCE
+    if run.duty is not None:
+        exact["drive"] = run.duty[:, j]
+    elif run.torque is not None:
+        exact["drive"] = np.nan_to_num(run.torque[:, j])
+    return exact
 
 
 def _inertia(mech: Sequence[tuple[np.ndarray, np.ndarray]], j: int) -> float:
@@ -242,10 +248,7 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
             rows[i][j], voltage, runs[i].command_at(runs[i].t)[:, j], runs[i].q[:, j], runs[i].vs[:, j], clip=False
         )
     )
-    if voltage:
-        limit = rows[0][j][SERVO_INDEX["torque_limit"]]
-    else:
-        limit = rows[0][j][SERVO_INDEX["torque_limit"]]
+    limit = rows[0][j][SERVO_INDEX["torque_limit"]]
     estimates = [noise(run.t, run.q[:, j]) for run in runs]
     told = [i for i in range(len(runs)) if i not in plant.left_out]
     sigma, quantum = (_of_recordings([runs[i] for i in told], [estimates[i][k] for i in told]) for k in (0, 1))
@@ -256,40 +259,30 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
 
     gravity, load_t, load_i = series("gravity_cos"), series("load_cos"), series("load_inertia")
     spring = max(float(np.median([r[j][SERVO_INDEX["kp"]] for r in rows])) * (limit if voltage else 1.0), 1e-9)
-    big = lambda x, p=95: float(np.percentile(np.abs(x), p)) if len(x) else 0.0  # noqa: E731
     load = gravity + series("rest") + inertia * a
     tau_scale = max(
-        min(big(tau), 3 * big(load) + 1e-12) if big(tau) > 0 else big(load), 1e-3 * spring * max(np.ptp(q), 1e-6), 1e-9
+        min(_big(tau), 3 * _big(load) + 1e-12) if _big(tau) > 0 else _big(load), 1e-3 * spring * max(np.ptp(q), 1e-6),
+        1e-9,
     )
-    nominal = {name: float(np.median([r[j][i] for r in rows])) for i, name in enumerate(SERVO_NAMES)}
-    nominal["torque_limit"] = min(nominal["torque_limit"], 1e9)
-    nominal["no_load_speed"] = min(nominal["no_load_speed"], 1e9)
-    effort_noise = 0.0
-    if np.isfinite(plant.torque).mean() > 0.5:
-        e = [noise(run.t, np.nan_to_num(run.torque[:, j]))[0] for run in runs if run.torque is not None]
-        effort_noise = max(float(np.median(e)), 0.01 * big(plant.torque[np.isfinite(plant.torque)]), 1e-9)
-    warm = 0.0
-    if runs[0].temperature is not None:
-        heat = cat(lambda i: runs[i].temperature[:, j])
-        warm = float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
+    effort_noise = _effort_noise(plant, runs, j)
     scales = Scales(
         tau=tau_scale,
-        demand=max(big(asked, 99.8) if not voltage else limit, tau_scale),
-        speed=max(big(v), 1e-6),
-        peak_speed=max(big(v, 99.8), 1e-6),
-        error=max(big(cmd - plant.q, 90), sigma),
+        demand=max(_big(asked, 99.8) if not voltage else limit, tau_scale),
+        speed=max(_big(v), 1e-6),
+        peak_speed=max(_big(v, 99.8), 1e-6),
+        error=max(_big(cmd - plant.q, 90), sigma),
         stiffness=spring,
         inertia=inertia,
-        gravity=big(gravity, 99),
+        gravity=_big(gravity, 99),
         span=max(float(np.ptp(q)), 1e-9),
         sigma=sigma,
-        nominal=nominal,
+        nominal=_nominal(rows, j),
         others=tuple(runs[0].joints[o] for o in others[:DRAGGERS]),
-        others_torque=big(plant.series[:, SERIES_INDEX["others_torque"]], 99),
-        load_torque=big(load_t),
+        others_torque=_big(plant.series[:, SERIES_INDEX["others_torque"]], 99),
+        load_torque=_big(load_t),
         load_inertia=float(np.median(load_i)),
-        tilt={k: big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"},
-        warm=warm,
+        tilt={k: _big(np.hypot(series(f"tilt_{k}_cos"), 0)) for k in "xyz"},
+        warm=_warmth(runs, j),
         slide=constants.slide,
         voltage=voltage,
         effort=effort_noise > 0,
@@ -297,41 +290,19 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         base_friction=constants.friction,
         base_damping=constants.damping,
         armature=constants.armature,
-        own_torque=big(series("own_cos")),
+        own_torque=_big(series("own_cos")),
         own_inertia=float(np.median(series("own_inertia"))),
         leaf_mass=constants.leaf_mass,
         own_mass=constants.own_mass,
         apart=plant.loop == "motor" and plant.position == "joint",
     )
     table = runs[0].servo
-    ranges, unknown = {}, []
-    for name in SERVO_NAMES:
-        value = table.value(joint, name)
-        if value.unknown:
-            unknown.append(name)
-        elif value.low < value.high:
-            ranges[name] = (value.low, value.high)
-    regimes_extra = {"_gravity": gravity}
-    for k in range(DRAGGERS):
-
-        def moved_by(i: int, k: int = k) -> np.ndarray:
-            q = runs[i].qs
-            return q[:, others[k]] - q[0, others[k]] if k < len(others) else np.zeros(len(runs[i].t))
-
-        regimes_extra[f"_drag{k}"] = cat(moved_by)
-    regimes_extra["_error"] = cmd - plant.q
-    regimes_extra["_speed"] = v
-    regimes_extra["_command_rate"] = np.concatenate(
-        [np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs]
-    )
-    regimes_extra["_torque_rate"] = np.concatenate(
-        [np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)]
-    )
-    regimes_extra["_added"], regimes_extra["_added_own"] = load_t, series("own_cos")
-    regimes_extra["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
-    moved = scales.span > 6 * sigma
+    ranges, unknown = _open_figures(table, joint)
     regimes = _regimes(t, plant.run_of, q, v, a, load, tau, asked, limit, cmd, runs, j)
-    regimes |= regimes_extra
+    regimes |= {"_gravity": gravity} | _drags_of(runs, others)
+    regimes |= {"_error": cmd - plant.q, "_speed": v} | _rates(runs, torques, j)
+    regimes |= {"_added": load_t, "_added_own": series("own_cos")}
+    regimes["_others"] = cat(lambda i: np.abs(np.delete(torques[i], j, 1)).sum(1))
     stated = frozenset(n for k in (joint, ALL) for n in table.entries.get(k, {}))
     return Case(
         joint,
@@ -343,12 +314,64 @@ def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia
         quantum,
         effort_noise,
         ranges,
-        tuple(unknown),
+        unknown,
         stated,
         regimes,
-        moved,
+        scales.span > 6 * sigma,
         table.loop_rate,
     )
+
+
+def _big(x: np.ndarray, percentile: float = 95) -> float:
+    """A typical large size of x [n]; 0 of nothing."""
+    return float(np.percentile(np.abs(x), percentile)) if len(x) else 0.0
+
+
+def _nominal(rows: Sequence[np.ndarray], j: int) -> dict[str, float]:
+    """What is believed of joint j's drive, by column: the median of the recordings, limits that are none made
+    finite."""
+    nominal = {name: float(np.median([r[j][i] for r in rows])) for i, name in enumerate(SERVO_NAMES)}
+    return nominal | {k: min(nominal[k], 1e9) for k in ("torque_limit", "no_load_speed")}
+
+
+def _effort_noise(plant: JointPlant, runs: Sequence[Run], j: int) -> float:
+    """rms of the recorded torque's noise [N.m]; 0 where it was recorded for less than half of the time."""
+    if np.isfinite(plant.torque).mean() <= 0.5:
+        return 0.0
+    e = [noise(run.t, np.nan_to_num(run.torque[:, j]))[0] for run in runs if run.torque is not None]
+    return max(float(np.median(e)), 0.01 * _big(plant.torque[np.isfinite(plant.torque)]), 1e-9)
+
+
+def _warmth(runs: Sequence[Run], j: int) -> float:
+    """degC by which joint j's drive is warmer or colder than its data sheet, at most; 0 where its temperature hardly
+    changes or is not recorded."""
+    if runs[0].temperature is None:
+        return 0.0
+    heat = np.concatenate([run.temperature[:, j] for run in runs])
+    return float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
+
+
+def _open_figures(table: ServoTable, joint: str) -> tuple[dict[str, tuple[float, float]], tuple[str, ...]]:
+    """(columns that are believed in a range, those of which nothing is believed)."""
+    values = {name: table.value(joint, name) for name in SERVO_NAMES}
+    ranges = {n: (v.low, v.high) for n, v in values.items() if not v.unknown and v.low < v.high}
+    return ranges, tuple(n for n, v in values.items() if v.unknown)
+
+
+def _drags_of(runs: Sequence[Run], others: Sequence[int]) -> dict[str, np.ndarray]:
+    """How far the joints that may drag this one have moved since a recording's first sample."""
+
+    def moved_by(run: Run, k: int) -> np.ndarray:
+        return run.qs[:, others[k]] - run.qs[0, others[k]] if k < len(others) else np.zeros(len(run.t))
+
+    return {f"_drag{k}": np.concatenate([moved_by(run, k) for run in runs]) for k in range(DRAGGERS)}
+
+
+def _rates(runs: Sequence[Run], torques: Sequence[np.ndarray], j: int) -> dict[str, np.ndarray]:
+    """How fast joint j's command and torque change."""
+    command = [np.gradient(np.interp(r.t, r.cmd_t, r.cmd[:, j]), r.t) for r in runs]
+    torque = [np.gradient(x[:, j], r.t) for x, r in zip(torques, runs, strict=True)]
+    return {"_command_rate": np.concatenate(command), "_torque_rate": np.concatenate(torque)}
 
 
 def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[str, np.ndarray]:

@@ -142,28 +142,43 @@ def along(
             c, s, _ = _turned(axis[:, j], com[:, j] - anchor[:, j], mass[j], tilted, slide[j])
             put(j, f"tilt_{letter}_cos", c)
             put(j, f"tilt_{letter}_sin", s)
-    constants = []
-    for j, i in enumerate(ids):
-        limited = bool(model.jnt_limited[i])
-        low, high = model.jnt_range[i] if limited else (-1e9, 1e9)
-        constants.append(
-            JointConstants(
-                damping=float(model.dof_damping[dadr[j]]),
-                friction=float(model.dof_frictionloss[dadr[j]]),
-                low=float(low),
-                high=float(high),
-                slide=bool(slide[j]),
-                armature=float(model.dof_armature[dadr[j]]),
-                inertia=float(np.median(diag[:, j])),
-                gravity=float(np.abs(out[j, :, SERIES_INDEX["gravity_cos"]]).max()),
-                leaf=model.body(int(leaves[j])).name,
-                leaf_mass=float(model.body_mass[leaves[j]]),
-                own_mass=float(model.body_mass[bodies[j]]),
-                centre=model.body_ipos[leaves[j]].copy(),
-                places=places[j],
-            )
-        )
+    gravity = np.abs(out[:, :, SERIES_INDEX["gravity_cos"]]).max(1)
+    constants = [
+        _constants(model, ids[j], bodies[j], leaves[j], bool(slide[j]), places[j], diag[:, j], gravity[j])
+        for j in range(J)
+    ]
     return times, out, constants
+
+
+def _constants(
+    model: mujoco.MjModel,
+    joint: int,
+    body: int,
+    leaf: int,
+    slide: bool,
+    places: np.ndarray,
+    inertia: np.ndarray,
+    gravity: float,
+) -> JointConstants:
+    """What does not change along a motion. joint, body, leaf: numbers in the model; inertia [n]: along the motion;
+    gravity: its largest torque."""
+    dof = model.jnt_dofadr[joint]
+    low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-1e9, 1e9)
+    return JointConstants(
+        damping=float(model.dof_damping[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        low=float(low),
+        high=float(high),
+        slide=slide,
+        armature=float(model.dof_armature[dof]),
+        inertia=float(np.median(inertia)),
+        gravity=float(gravity),
+        leaf=model.body(int(leaf)).name,
+        leaf_mass=float(model.body_mass[leaf]),
+        own_mass=float(model.body_mass[body]),
+        centre=model.body_ipos[leaf].copy(),
+        places=places,
+    )
 
 
 def _evaluated(

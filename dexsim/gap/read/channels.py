@@ -45,6 +45,8 @@ OFTEN = 0.02  # of a recording's samples (and `FEW` at least): repeated ones of 
 FEW = 8  # samples
 FAR = 3.0  # x a joint's range, beyond which a position or a target is not that joint's
 
+Spans = list[tuple[float, float]]  # s
+
 
 def finding(
     kind: str, text: str, joint: str, topics: list[str], when: list[dict[str, Any]], confidence: float = 0.9
@@ -106,19 +108,10 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
     beat = {joint: common_rhythm(runs, joint) for joint in long}
 
     def add(
-        kind: str,
-        text: str,
-        run: Run,
-        joint: str,
-        topics: list[str],
-        spans: list[tuple[float, float]],
-        confidence: float = 0.9,
-        drop: bool = True,
+        kind: str, text: str, run: Run, joint: str, topics: list[str], spans: Spans, confidence: float = 0.9
     ) -> None:
         entry = found.setdefault((kind, joint), finding(kind, text, joint, topics, [], confidence))
         entry["when"] += [{"recording": run.name, "start": float(a), "end": float(b)} for a, b in spans]
-        if drop:
-            out[run.name, joint] = f"{kind}: {text}"
 
     for i, run in enumerate(runs):
         if (spans := _pauses(run)):
@@ -131,53 +124,50 @@ def inspect(runs: list[Run], model: mujoco.MjModel, known: dict[tuple[str, str],
             wrong = _wrong(runs, run, j, model)
             if wrong is not None:
                 add(wrong.kind, wrong.text, run, joint, wrong.topics, wrong.spans or whole, wrong.confidence)
+                out[run.name, joint] = f"{wrong.kind}: {wrong.text}"
                 continue
             if beat[joint] > 0:
                 between &= between_readings(run.t, q, beat[joint])  # joints of one bus are read one after the other
-                add(
-                    "stale",
-                    f"{joint} is read every {1e3 * beat[joint]:.3g} ms only; the samples between repeat it",
-                    run,
-                    joint,
-                    [STATES],
-                    whole,
-                    drop=False,
-                )
+                text = f"{joint} is read every {1e3 * beat[joint]:.3g} ms only; the samples between repeat it"
+                add("stale", text, run, joint, [STATES], whole)
                 continue
-            held, single = _held(run.t, q), repeated_samples(run.t, q)
-            for a, b in long[joint][i]:
-                held[a + 1 : b + 1] = True
-                if run.t[b] - run.t[a] > BLIND:
-                    blind.setdefault(run.name, []).append((float(run.t[a]), float(run.t[b])))
-            if held.any():
-                edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
-                add(
-                    "stale",
-                    f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old "
-                    "readings, sent again",
-                    run,
-                    joint,
-                    [STATES],
-                    [(run.t[a], run.t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)],
-                    drop=False,
-                )
-            elif single.any():
-                add(
-                    "stale",
-                    f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: "
-                    "old readings, sent again",
-                    run,
-                    joint,
-                    [STATES],
-                    [(run.t[0], run.t[-1])],
-                    drop=False,
-                )
-            stale |= held | single
+            repeated, said, lost = _repeated(run.t, q, joint, long[joint][i])
+            if lost:
+                blind.setdefault(run.name, []).extend(lost)
+            for text, spans in said:
+                add("stale", text, run, joint, [STATES], spans)
+            stale |= repeated
         if not between.all():
             stale |= between
         if stale.any() and (~stale).sum() >= 20:
             _keep(run, ~stale)
     return list(found.values()), out, blind
+
+
+def _repeated(
+    t: np.ndarray, q: np.ndarray, joint: str, long: Sequence[tuple[int, int]]
+) -> tuple[np.ndarray, list[tuple[str, Spans]], Spans]:
+    """(samples [S] that repeat an old reading, what is said of them with its stretches [s], those of the `long`
+    stretches that are too long to know the motion over)."""
+    held, single = _held(t, q), repeated_samples(t, q)
+    for a, b in long:
+        held[a + 1 : b + 1] = True
+    lost = [(float(t[a]), float(t[b])) for a, b in long if t[b] - t[a] > BLIND]
+    said: list[tuple[str, Spans]] = []
+    if held.any():
+        edge = np.flatnonzero(np.diff(np.r_[0, held.astype(int), 0]))
+        text = (
+            f"position of {joint} is repeated for {100 * held.mean():.0f} % of the time and then jumps: old "
+            "readings, sent again"
+        )
+        said.append((text, [(t[a], t[min(b, len(q)) - 1]) for a, b in zip(edge[::2], edge[1::2], strict=True)]))
+    elif single.any():
+        text = (
+            f"{100 * single.mean():.0f} % of the positions of {joint} repeat the one before while it moves: "
+            "old readings, sent again"
+        )
+        said.append((text, [(t[0], t[-1])]))
+    return held | single, said, lost
 
 
 @dataclass

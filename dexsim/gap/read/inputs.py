@@ -33,6 +33,46 @@ class Unusable(Exception):
 def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
     """The recording as plain arrays. Raises Unusable where it cannot be used; what is left out goes to notes."""
     name = recording.path.name
+    joints = _known_joints(recording, m, notes)
+    column = [recording.joints.index(j) for j in joints]
+    _without_spikes(recording, notes)
+    notes += [f"{name}: {f.topic}: {f.text}" for f in recording.findings if f.kind == "time_not_monotonic"]
+    t, q, good = _positions(recording, joints, column, notes)
+    ct, c, kept = _commands(recording, joints, column, good, notes)
+    if not kept:
+        raise Unusable(f"{name}: no joint has both commands and positions")
+    joints, column = tuple(joints[j] for j in kept), [column[j] for j in kept]
+    q, c = q[:, kept], c[:, kept]
+    start = _begin(name, t, ct, notes)
+    t, q = t[start:], q[start:]
+    table = m.table
+    if recording.meta.get("servo"):
+        table = ServoTable.from_dict(
+            merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")),
+            source=f"servo of {name}",
+        )
+    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
+    run.breaks = tuple(recording.breaks)
+    run.v = _at(recording.states.velocity, t, column)
+    run.torque = _torque(recording, table, joints, t, column, notes)
+    run.temperature = _at(recording.temperature, t, column)
+    if not any(f.kind == "wrap" and f.topic == "/joint_duty" for f in recording.findings):
+        run.duty = _at(recording.duty, t, column)
+    run.enabled = _at(recording.enabled, t, column, hold=True)
+    if run.enabled is not None:
+        run.enabled = np.where(np.isfinite(run.enabled), run.enabled, 1.0)  # a joint that it does not tell of is driven
+    if recording.supply_voltage is not None and len(recording.supply_voltage):
+        s = recording.supply_voltage
+        finite = np.isfinite(s.value)
+        if finite.any():
+            run.supply = np.interp(t, s.t[finite], s.value[finite])
+    return run
+
+
+def _known_joints(recording: Recording, m: Mechanism, notes: list[str]) -> tuple[str, ...]:
+    """The recording's joints that the model has, in its order. Raises Unusable where there are none, or no states or
+    commands."""
+    name = recording.path.name
     joints = tuple(j for j in m.joints if j in recording.joints)
     foreign = [j for j in recording.joints if j not in m.joints]
     if foreign:
@@ -47,10 +87,15 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         raise Unusable(f"{name}: commands without states: no /joint_states to compare with")
     if not len(recording.commands):
         raise Unusable(f"{name}: states without commands: what the servo was asked is unknown; {COMMANDS_FIX}")
-    column = [recording.joints.index(j) for j in joints]
-    _without_spikes(recording, notes)
-    notes += [f"{name}: {f.topic}: {f.text}" for f in recording.findings if f.kind == "time_not_monotonic"]
-    p = recording.states.position
+    return joints
+
+
+def _positions(
+    recording: Recording, joints: tuple[str, ...], column: list[int], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """(times [S], positions [S, J] without gaps, which of the joints have enough of them). Raises Unusable where they
+    are too few."""
+    name, p = recording.path.name, recording.states.position
     t, q = np.asarray(p.t, float), p.value[:, column]
     keep = np.r_[True, np.diff(t) > 1e-6] & np.isfinite(q).any(1)
     t, q = t[keep], q[keep].copy()
@@ -70,7 +115,15 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
             q[:, j] = PchipInterpolator(t[finite], q[finite, j], extrapolate=False)(t)
             q[:, j] = np.where(np.isfinite(q[:, j]), q[:, j], np.interp(t, t[finite], q[finite, j]))
         good.append(j)
-    ct, c = np.asarray(recording.commands.t, float), recording.commands.value[:, column].copy()
+    return t, q, good
+
+
+def _commands(
+    recording: Recording, joints: tuple[str, ...], column: list[int], good: list[int], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """(times [C] in order, targets [C, J], each held until the next, which of the `good` joints have any)."""
+    name = recording.path.name
+    t, c = np.asarray(recording.commands.t, float), recording.commands.value[:, column].copy()
     kept = []
     for j in good:
         finite = np.isfinite(c[:, j])
@@ -81,59 +134,50 @@ def to_run(recording: Recording, m: Mechanism, notes: list[str]) -> Run:
         first = int(np.argmax(finite))
         c[:, j] = np.where(index >= 0, c[np.maximum(index, 0), j], c[first, j])
         kept.append(j)
-    if not kept:
-        raise Unusable(f"{name}: no joint has both commands and positions")
-    joints = tuple(joints[j] for j in kept)
-    column = [column[j] for j in kept]
-    q, c = q[:, kept], c[:, kept]
-    # a command from before the first state still holds; the clock starts at the first state
-    order = np.argsort(ct, kind="stable")
-    ct, c = ct[order], c[order]
-    if ct[0] > t[-1]:
+    order = np.argsort(t, kind="stable")
+    return t[order], c[order], kept
+
+
+def _begin(name: str, t: np.ndarray, commands: np.ndarray, notes: list[str]) -> int:
+    """The first state from which on it is known what was asked; a command from before the first state still holds.
+    t [S], commands [C]: times. Raises Unusable where the two do not overlap."""
+    if commands[0] > t[-1]:
         raise Unusable(
-            f"{name}: the commands begin {ct[0] - t[-1]:.1f} s after the last state: the clocks do not belong together"
+            f"{name}: the commands begin {commands[0] - t[-1]:.1f} s after the last state: the clocks do not belong "
+            "together"
         )
-    if ct[0] > t[0] + 0.05:
-        # what held before is not known: begin where it is
-        start = np.searchsorted(t, ct[0])
-        if t[-1] - t[min(start, len(t) - 1)] < SHORTEST:
-            raise Unusable(f"{name}: states and commands overlap for less than {SHORTEST:g} s")
-        notes.append(f"{name}: the first {ct[0] - t[0]:.2f} s have no command and are left out")
-        t, q = t[start:], q[start:]
-    table = m.table
-    if recording.meta.get("servo"):
-        table = ServoTable.from_dict(
-            merged(table.to_dict(), yaml_text.parse(recording.meta["servo"], f"servo of {name}")),
-            source=f"servo of {name}",
-        )
-    run = Run(name, joints, ct, c, t, q, table, recording.gravity, notes=[], counted=m.joints)
-    run.breaks = tuple(recording.breaks)
-    run.v = _at(recording.states.velocity, t, column)
+    if commands[0] <= t[0] + 0.05:
+        return 0
+    start = int(np.searchsorted(t, commands[0]))
+    if t[-1] - t[min(start, len(t) - 1)] < SHORTEST:
+        raise Unusable(f"{name}: states and commands overlap for less than {SHORTEST:g} s")
+    notes.append(f"{name}: the first {commands[0] - t[0]:.2f} s have no command and are left out")
+    return start
+
+
+def _torque(
+    recording: Recording,
+    table: ServoTable,
+    joints: tuple[str, ...],
+    t: np.ndarray,
+    column: list[int],
+    notes: list[str],
+) -> np.ndarray | None:
+    """[S, J] the effort in the unit of the drive's torque; None where none was recorded or it is not what it says."""
     effort = recording.signed_effort()
-    if effort is not None and recording.effort_is != "none" and not _bad(recording, "/joint_states", "effort"):
-        values = _at(effort, t, column)
-        if values is not None and recording.effort_is == "current_A":
-            per = table.current(joints)
-            values = values / per[None]
-            if np.isnan(per).all():
-                notes.append(
-                    f"{name}: current_per_torque is unknown, so the current is not compared (dexsim calibrate "
-                    "measures it)"
-                )
-        if values is not None and np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0:
-            run.torque = values
-    run.temperature = _at(recording.temperature, t, column)
-    if not any(f.kind == "wrap" and f.topic == "/joint_duty" for f in recording.findings):
-        run.duty = _at(recording.duty, t, column)
-    run.enabled = _at(recording.enabled, t, column, hold=True)
-    if run.enabled is not None:
-        run.enabled = np.where(np.isfinite(run.enabled), run.enabled, 1.0)  # a joint that it does not tell of is driven
-    if recording.supply_voltage is not None and len(recording.supply_voltage):
-        s = recording.supply_voltage
-        finite = np.isfinite(s.value)
-        if finite.any():
-            run.supply = np.interp(t, s.t[finite], s.value[finite])
-    return run
+    if effort is None or recording.effort_is == "none" or _bad(recording, "/joint_states", "effort"):
+        return None
+    values = _at(effort, t, column)
+    if values is not None and recording.effort_is == "current_A":
+        per = table.current(joints)
+        values = values / per[None]
+        if np.isnan(per).all():
+            notes.append(
+                f"{recording.path.name}: current_per_torque is unknown, so the current is not compared (dexsim "
+                "calibrate measures it)"
+            )
+    told = values is not None and np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0
+    return values if told else None
 
 
 def _without_spikes(recording: Recording, notes: list[str]) -> None:

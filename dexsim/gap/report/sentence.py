@@ -14,32 +14,14 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     """The verdict in one or two sentences."""
     h = data["held_out"]
     metric = h["error"]
-    effort = metric.startswith("effort")
-    unit = (
-        ("mN" if metric.endswith("_N") else "mN.m")
-        if effort
-        else "mN"
-        if metric.startswith("tactile")
-        else "mm"
-        if metric.endswith("_m")
-        else "mrad"
-    )
+    effort, unit = metric.startswith("effort"), _unit(metric)
     if unit == "mN" and not effort:
         floor = data["noise_floor"].get("tactile_N")
     before, after = 1e3 * (h["before"] or 0), 1e3 * (h["after"] or 0)
     limit = f"the floor is {1e3 * floor:.2g}" if floor is not None and not effort else ""
     named = [f for f in data["findings"] if modelled(f) and not f.get("hint")]
-    pushed = [f for f in data["findings"] if entry(f) is not None and not modelled(f)]
     bad = [f for f in data["findings"] if f["effect"] == "bad_channel"]
-    prefix = (
-        f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} "
-        f"({bad[0]['regime']}). "
-        if bad
-        else ""
-    )
-    for f in pushed:
-        said = spoken(f, d.mechanism)
-        prefix += f"{said[:1].upper() + said[1:]} {words_of(f, d.mechanism)}{_size(f)}. "
+    prefix = _first_of_all(data["findings"], bad, d)
     if data["verdict"] == "none":
         return (
             prefix
@@ -69,6 +51,43 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
     if len(alone) == 1 and len(d.joints) > 1 and metric.startswith("position") and alone <= set(d.joints):
         of, mine = " of that joint", d.joints[next(iter(alone))]
         before, after = 1e3 * mine["before"], 1e3 * mine["after"]
+    said = prefix + _names(named, d)
+    if h["before"] is None:
+        return said
+    it = "it" if len(named) == 1 else "them"
+    tail = (
+        f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on "
+        "recordings not used for the fit"
+    )
+    return said + tail + (f"; {limit}." if limit else ".")
+
+
+def _unit(metric: str) -> str:
+    """The thousandth in which an error is told, of `held_out.error`."""
+    if metric.startswith("effort"):
+        return "mN" if metric.endswith("_N") else "mN.m"
+    if metric.startswith("tactile"):
+        return "mN"
+    return "mm" if metric.endswith("_m") else "mrad"
+
+
+def _first_of_all(findings: list[dict], bad: list[dict], d: Diagnosis) -> str:
+    """What comes before the verdict: signals that are not what they say (`bad`), and pushes from outside."""
+    said = (
+        f"{len(bad)} signal{'s are' * (len(bad) > 1) or ' is'} not what {'they say' if len(bad) > 1 else 'it says'} "
+        f"({bad[0]['regime']}). "
+        if bad
+        else ""
+    )
+    for f in findings:
+        if entry(f) is not None and not modelled(f):
+            where = spoken(f, d.mechanism)
+            said += f"{where[:1].upper() + where[1:]} {words_of(f, d.mechanism)}{_size(f)}. "
+    return said
+
+
+def _names(named: list[dict], d: Diagnosis) -> str:
+    """The two largest effects, where they sit, and how many more there are."""
     parts = []
     for f in named[:2]:
         words = words_of(f, d.mechanism)
@@ -80,14 +99,7 @@ def sentence(data: dict, d: Diagnosis, floor: float | None) -> str:
         parts[0] = parts[0][:1].upper() + parts[0][1:]
     left_out = len(named) - len(parts)
     more = f" ({left_out} more, below)" if left_out else ""
-    it = "it" if len(named) == 1 else "them"
-    if h["before"] is None:
-        return prefix + "; ".join(parts) + more + "."
-    tail = (
-        f" Without {it} simulation{of} is wrong by {number(before)} {unit}; with {it}, by {number(after)} on "
-        "recordings not used for the fit"
-    )
-    return prefix + "; ".join(parts) + more + "." + tail + (f"; {limit}." if limit else ".")
+    return "; ".join(parts) + more + "."
 
 
 ORDER = ("first", "second", "third", *(f"{n}th" for n in range(4, 40)))

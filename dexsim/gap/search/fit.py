@@ -242,6 +242,12 @@ class Fitter:
                 out.append(g)
         return np.array(out)
 
+    def _tried(self, params: list[Param], trial: np.ndarray, s: np.ndarray | None) -> np.ndarray:
+        """[K] loss and disbelief at each of trial [K, P], the initial states eliminated along s."""
+        res = self.residuals(params, trial)
+        centre = np.array([p.start for p in params], float)
+        return self.loss(self.eliminated(res, s)) + ((trial - centre) ** 2 @ prior_weight(params)) / res.shape[-1]
+
     def fit(
         self,
         params: list[Param],
@@ -275,10 +281,7 @@ class Fitter:
         it = 0
         while True:
             if fresh:
-                # small beside the value too: a range may be wide, and many effects are kinked where they begin
-                size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
-                size = np.where(belief, STEP_OF_BELIEF * span, size)
-                delta = np.where(x + size <= high, size, -size)
+                delta = _differences(params, x, step)
                 res, columns, s = self._slopes(params, x, delta, np.flatnonzero(~known))
                 if known.any() and moved is not None:
                     jac = jac + np.outer((res - last) - jac @ moved, moved) / max(float(moved @ moved), 1e-30)
@@ -292,24 +295,12 @@ class Fitter:
             b = -(jac * weight[:, None]).T @ res - believed * (x - centre) * span
             A[np.diag_indices(P)] += believed * span**2
             at_low, at_high = x <= low + 1e-12, x >= high - 1e-12
-            free = ~((at_low & (b < 0)) | (at_high & (b > 0)))
-            scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
-            lambdas = damping * np.array([1e-2, 0.1, 1.0, 10.0, 100.0, 1000.0])
-            steps = np.zeros((len(lambdas), P))
-            f = np.flatnonzero(free)
-            if len(f) == 0:
+            free = np.flatnonzero(~((at_low & (b < 0)) | (at_high & (b > 0))))
+            if len(free) == 0:
                 break
-            for i, lam in enumerate(lambdas):
-                M = A[np.ix_(f, f)] + lam * np.diag(scale[f])
-                try:
-                    steps[i, f] = np.linalg.solve(M, b[f])
-                except np.linalg.LinAlgError:
-                    steps[i, f] = np.linalg.lstsq(M, b[f], rcond=None)[0]
-            steps = np.clip(steps, -0.5, 0.5)
-            trial = np.clip(x + steps * span, low, high)
-            tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + (
-                (trial - centre) ** 2 @ believed
-            ) / len(res)
+            lambdas = damping * np.array([1e-2, 0.1, 1.0, 10.0, 100.0, 1000.0])
+            trial = np.clip(x + _damped(A, b, free, lambdas) * span, low, high)
+            tried = self._tried(params, trial, s)
             best = int(np.argmin(tried))
             gain = (loss - float(tried[best])) / max(loss, 1e-30)
             # by slopes from elsewhere: here they are simulated before this is the end
@@ -328,9 +319,7 @@ class Fitter:
                     continue
                 # a kinked loss has no slope to follow: try sizes outright
                 trial = np.clip(self.pattern(params, x), low, high)
-                tried = self.loss(self.eliminated(self.residuals(params, trial), s)) + (
-                    (trial - centre) ** 2 @ believed
-                ) / len(res)
+                tried = self._tried(params, trial, s)
                 best = int(np.argmin(tried))
                 if not tried[best] < loss * (1 - tolerance):
                     break
@@ -383,6 +372,30 @@ class Fitter:
         s = raw[k + 1 :] - raw[0] if self.eliminate else None
         clean = self.eliminated(raw[: k + 1], s)
         return clean[0], (clean[1:] - clean[0]).T, s
+
+
+def _differences(params: list[Param], x: np.ndarray, step: float) -> np.ndarray:
+    """[P] steps of the finite differences at x, backward where forward would leave the bounds: `step` of a range, and
+    small beside the value too, for a range may be wide and many effects are kinked where they begin."""
+    low, high = np.array([p.low for p in params]), np.array([p.high for p in params])
+    span, belief = high - low, np.array([p.nuisance for p in params], bool)
+    size = step * np.minimum(span, np.maximum(STEP_OF_VALUE * np.abs(x - centre_of(params)), 0.03 * span))
+    size = np.where(belief, STEP_OF_BELIEF * span, size)
+    return np.where(x + size <= high, size, -size)
+
+
+def _damped(A: np.ndarray, b: np.ndarray, free: np.ndarray, lambdas: np.ndarray) -> np.ndarray:
+    """[K, P] steps of the normal equations A step = b in the `free` parameters, in spans and at most half of one, each
+    damped by one of lambdas [K]."""
+    scale = np.diag(A) + 1e-9 * max(np.trace(A), 1e-30)
+    steps = np.zeros((len(lambdas), len(b)))
+    for i, lam in enumerate(lambdas):
+        M = A[np.ix_(free, free)] + lam * np.diag(scale[free])
+        try:
+            steps[i, free] = np.linalg.solve(M, b[free])
+        except np.linalg.LinAlgError:
+            steps[i, free] = np.linalg.lstsq(M, b[free], rcond=None)[0]
+    return np.clip(steps, -0.5, 0.5)
 
 
 def slopes_of(f: Fitted) -> dict[str, np.ndarray]:

@@ -167,20 +167,15 @@ SWEEPS = 60  # over the beliefs, by which the scan moves them
 class JointScan(JointLosses):
     """The scan of the catalogue on one joint."""
 
-    def scan(self, current: Trial) -> list[tuple[float, float, Member, np.ndarray]]:
-        """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
+    def _guesses(
+        self, current: Trial, base: np.ndarray
+    ) -> tuple[list[np.ndarray], list[tuple[Member, np.ndarray]]]:
+        """The plant's rows of every effect that `current` has not, at each of its starts, the others as in base [R, C];
+        and (effect, start) of each."""
         case = self.case
-        params = current.fit.params
-        fitter = self.scan_fitter
-        with self._fix(current.members):
-            here = fitter.fit(params, x0=current.fit.x, iterations=0)
-            self.short_slopes = slopes_of(here)
-            x = current.fit.x
-            raw, s = fitter.init_directions(params, x)
-            r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
-        base = expand_one(case, params, x)
         taken = {m.id for m in current.members}
-        guesses, owners = [], []
+        guesses: list[np.ndarray] = []
+        owners: list[tuple[Member, np.ndarray]] = []
         for effect in CATALOGUE:
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
@@ -198,6 +193,20 @@ class JointScan(JointLosses):
                         p.apply(g[None], np.array([value]), case.plant.base())
                     guesses.append(legal(g))
                     owners.append((member, np.array(start)))
+        return guesses, owners
+
+    def scan(self, current: Trial) -> list[tuple[float, float, Member, np.ndarray]]:
+        """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
+        case = self.case
+        params = current.fit.params
+        fitter = self.scan_fitter
+        with self._fix(current.members):
+            here = fitter.fit(params, x0=current.fit.x, iterations=0)
+            self.short_slopes = slopes_of(here)
+            x = current.fit.x
+            raw, s = fitter.init_directions(params, x)
+            r0 = fitter.eliminated(raw[None], s)[0] if fitter.eliminate else raw
+        guesses, owners = self._guesses(current, expand_one(case, params, x))
         rows, dots, squares, cross = [], [], [], []
         J = here.jacobian * np.array([p.span for p in params]) if params else np.zeros((len(r0), 0))
         k = self.r.huber

@@ -229,20 +229,13 @@ def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> Pa
     if thing is None:
         return None
     dist = _distance(thing, point, R, p)
-    axis = normal[int(np.argmax(z.sum(0)))]
-    e1 = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(axis, e1)
+    e1, e2 = _tangents(normal[int(np.argmax(z.sum(0)))])
     # moving the object by +e in the pad's frame moves the pad's points by -e in the object's
     along, across = (_distance(thing, point - SHIFT * e, R, p) for e in (e1, e2))
     hull = None if thing.geom < 0 else _hull_depth(r, m, model, grid, thing, layout.bodies[f])
     near = skin.points[np.linalg.norm(skin.points - point[int(np.argmin(dist.min(0)))], axis=1) < 0.02]
     depth = -_distance(thing, near, R, p).min(1) if hull is None else hull
-    # path of the object over the pad: where the pad's pressed point lies in the object's frame, seen from the pad
-    middle = point[int(np.argmax(z.sum(0)))]
-    q = np.einsum("gij,j->gi", R, middle) + p
-    step = np.einsum("gji,gj->gi", R[:-1], np.diff(q, axis=0))  # pad over object, in the pad's axes
-    slide = -np.concatenate([np.zeros((1, 2)), np.cumsum(step @ np.stack([e1, e2], 1), 0)])
+    slide = _path(R, p, point[int(np.argmax(z.sum(0)))], e1, e2)
     shear, counted = None, z > 0
     if np.abs(force[..., :2]).max() > 0:
         # whole counts swallow the shear of taxels that hardly press
@@ -266,10 +259,7 @@ def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> Pa
         warm = np.interp(grid, r.temperature.t, np.nanmean(r.temperature.value, 1)) - coldest
     else:
         warm = grid + (r.start_ns - origin) * 1e-9
-    stiffness, friction = STIFFNESS, FRICTION
-    if thing.body is None:
-        o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
-        stiffness, friction = float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
+    stiffness, friction = _believed_contact(r, thing)
     return PadRun(
         r.path.name,
         f,
@@ -295,6 +285,29 @@ def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> Pa
         _doubt(model, layout.bodies[f], thing),
         counted,
     )
+
+
+def _tangents(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions along a surface, across each other; axis [3]: its normal."""
+    e1 = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
+    e1 /= np.linalg.norm(e1)
+    return e1, np.cross(axis, e1)
+
+
+def _path(R: np.ndarray, p: np.ndarray, middle: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> np.ndarray:
+    """[G, 2] m along e1 and e2: the path of the object over the pad, by where the pad's pressed point lies in the
+    object's frame, seen from the pad. R [G, 3, 3], p [G, 3]: from the pad's frame to the object's; middle [3]."""
+    q = np.einsum("gij,j->gi", R, middle) + p
+    step = np.einsum("gji,gj->gi", R[:-1], np.diff(q, axis=0))  # pad over object, in the pad's axes
+    return -np.concatenate([np.zeros((1, 2)), np.cumsum(step @ np.stack([e1, e2], 1), 0)])
+
+
+def _believed_contact(r: Recording, thing: _Thing) -> tuple[float, float]:
+    """(stiffness N/m, friction) that is believed of what is touched."""
+    if thing.body is not None:
+        return STIFFNESS, FRICTION
+    o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
+    return float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
 
 
 def _doubt(model: mujoco.MjModel, pad: str, thing: _Thing) -> float:
