@@ -9,18 +9,23 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import test_gap
-from test_gap import model, plant_run
+from test_gap import SERVO, model, plant_run
 
 import dexsim.gap
+from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, TOUCH_CATALOGUE, TOUCH_EFFECTS
-from dexsim.gap.plant.case import build
+from dexsim.gap.effects.effect import Variant
+from dexsim.gap.judge.kept_out import free_run
+from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import NAMES, SERIES
-from dexsim.gap.read.runs import conditions
+from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.search.fit import intervals
 from dexsim.gap.search.search import JointSearch
 
@@ -91,6 +96,64 @@ def steps(kind: int, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndar
     t = np.arange(0.0, seconds, 0.01)
     levels = np.random.default_rng([seed, kind]).uniform(-1.4, 1.4, int(seconds / 0.6) + 1)
     return t, levels[(t / 0.6).astype(int)]
+
+
+TWO = """<mujoco><worldbody>
+<body><joint name="a" axis="0 1 0" armature="5e-4"/><geom type="sphere" size="1e-3" mass="0.15" pos="0 0 -0.1"/></body>
+<body pos="1 0 0"><joint name="b" axis="0 1 0" armature="5e-4"/>
+ <geom type="sphere" size="1e-3" mass="0.15" pos="0 0 -0.1"/></body>
+</worldbody></mujoco>"""
+
+
+def moving(**servo: float) -> Case:
+    """Joint a of two that jump and swing at their limits while they grow warm, torques logged, as the plant itself
+    moves them. servo: columns other than SERVO's."""
+    t = np.arange(0.0, 3.0, 0.01)
+    jumps = np.stack([steps(k, 3.0)[1] for k in (0, 1)], 1)
+    command = jumps + 0.3 * np.sin(2 * np.pi * 2 * t)[:, None]
+    table = ServoTable.from_dict({"joints": {"*": SERVO | servo}, "loop_rate": 1000})
+    run = Run("moving", ("a", "b"), t, command, t, 0.8 * command, table, np.array([0, 0, -9.81]))
+    run.temperature = np.repeat((20.0 + 10.0 * t)[:, None], 2, 1)
+    for _ in range(2):  # the series are those of the motion itself
+        run.qs = None
+        run.smooth()
+        cases = build(mujoco.MjModel.from_xml_string(TWO), [run])
+        moved = [c.plant.simulate(c.plant.base()[None], c.plant.windows(None)) for c in cases]
+        run.q, run.torque = (np.stack([m[k][0] for m in moved], 1) for k in (0, 1))
+    run.qs = None
+    run.smooth()
+    return build(mujoco.MjModel.from_xml_string(TWO), [run])[0]
+
+
+@pytest.fixture(scope="module")
+def drives() -> tuple[Case, Case]:
+    """A drive at its limits, and a loop so soft that a spring can work against it."""
+    return moving(torque_limit=0.4, braking_slope=0.5), moving(kp=0.02, kd=0.004)
+
+
+def shown(case: Case, variant: Variant | None = None, x: Sequence[float] = ()) -> np.ndarray:
+    """[2, n] motion (rad) and the effort shown (N.m) with a variant of these sizes, or with what is believed."""
+    params, fixed = (list(variant.params), variant.fixed) if variant else ([], ())
+    return np.stack(free_run(case, params, np.array(x, float), case.plant.windows(None), fixed))
+
+
+@pytest.mark.parametrize("effect", [e for e in CATALOGUE if e.simulated], ids=lambda e: e.id)
+def test_the_plant_has_a_law_of_every_effect_that_is_simulated(drives, effect):
+    """One of the sizes that the search begins from moves the joint by a milliradian (of an effect of the effort's
+    sensor alone: what that shows, and the joint not at all), and each size by itself does something."""
+    case = next(c for c in drives if effect.variants(c.scales))
+    believed, of = shown(case), 1 if effect.effort_only else 0
+    for variant in effect.variants(case.scales):
+        by_start = np.stack([shown(case, variant, x) for x in variant.starts])
+        change = np.sqrt(np.mean((by_start - believed) ** 2, -1))
+        best = int(change[:, of].argmax())
+        assert change[best, of] > 1e-3, variant.label
+        assert not effect.effort_only or change[:, 0].max() == 0.0
+        for i, p in enumerate(variant.params):
+            x = list(variant.starts[best])
+            x[i] += (0.1 if x[i] + 0.1 * p.span < p.high else -0.1) * p.span
+            nudged = np.sqrt(np.mean((shown(case, variant, x) - by_start[best]) ** 2, -1))
+            assert nudged[of] > 1e-6, (variant.label, p.key)
 
 
 FAST = {"torque_limit": 0.3, "no_load_speed": 14.0, "braking_slope": 1.0}
