@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import test_gap_rules_belief
@@ -607,6 +608,25 @@ def followed(loss: float, now: float = 1.0, members=()) -> SimpleNamespace:
 def test_joints_that_are_not_followed_are_looked_at_again():
     assert not diagnosing._unsettled(followed(1.5)) and diagnosing._unsettled(followed(1.9))
     assert diagnosing._unsettled(followed(1.0, members=("lag",)))
+
+
+def test_of_encoders_along_one_chain_the_clearest_alone_moves_the_others():
+    chain = '<body><joint name="{}"/><geom size="0.1"/>{}</body>'
+    finger = chain.format("a", chain.format("b", chain.format("c", "")))
+    model = mujoco.MjModel.from_xml_string(f'<mujoco><worldbody>{finger}{chain.format("d", "")}</worldbody></mujoco>')
+
+    def found(removed: float, *effects: str) -> SimpleNamespace:
+        trial = lambda loss, of: SimpleNamespace(fit=SimpleNamespace(loss=loss), members=of)  # noqa: E731
+        members = [SimpleNamespace(effect=EFFECTS[e]) for e in effects]
+        return SimpleNamespace(none=trial(1.0 + removed, []), best=trial(1.0, members))
+
+    joints = [found(60.0, "position_offset"), found(80.0, "lag"), found(2.0, "position_offset"),
+              found(3.0, "position_scale")]  # fmt: skip
+    trials = diagnosing._moved_by(model, "abcd", joints)
+    assert [t is x.best for t, x in zip(trials, joints, strict=True)] == [True, True, False, True]
+    joints[2] = found(90.0, "position_offset")
+    trials = diagnosing._moved_by(model, "abcd", joints)
+    assert [t is x.best for t, x in zip(trials, joints, strict=True)] == [False, True, True, True]
 
 
 def test_a_joint_is_searched_again_where_the_others_move_it_otherwise():

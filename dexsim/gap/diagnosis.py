@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from dexsim.errors import UserError
@@ -284,9 +285,10 @@ class Drives(Steps):
             and search.case.joint not in self.unknown_controllers
             and _unsettled(found)
         ]
-        if len(unsettled) < 2 or any(found is None for _, found in answers):
+        found = [x for _, x in answers if x is not None]
+        if len(unsettled) < 2 or len(found) < len(answers):
             return
-        self._coupled_by([found.best for _, found in answers])
+        self._coupled_by(_moved_by(self.mj_model, [search.case.joint for search, _ in answers], found))
         unsettled = [
             k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), answers[k][1])
         ]
@@ -484,6 +486,24 @@ def _at_rest(runs: Sequence[Run]) -> bool:
     joints = range(len(runs[0].joints))
     moving = any(max(float(np.ptp(r.q[:, j])) for r in runs) > JUDGE.moved for j in joints)
     return not moving and not any(max(float(np.ptp(r.cmd[:, j])) for r in runs) > JUDGE.commanded for j in joints)
+
+
+def _moved_by(model: mujoco.MjModel, joints: Sequence[str], found: Sequence[Outcome]) -> list[Trial]:
+    """What was fitted to each joint, as the others are moved by it. Where an encoder misreads, joints along the same
+    chain seem to misread as well (gravity is turned for all of them): of one chain only the clearest is believed."""
+    chains = []
+    for joint in joints:
+        body = int(model.jnt_bodyid[model.joint(joint).id])
+        chains.append({body})
+        while body := int(model.body_parentid[body]):
+            chains[-1].add(body)
+    removed = [x.none.fit.loss - x.best.fit.loss for x in found]
+    misreads = [k for k, x in enumerate(found) if any(m.effect.misreads for m in x.best.members)]
+    clearer = lambda a, b: removed[a] > removed[b] and (chains[a] <= chains[b] or chains[b] <= chains[a])  # noqa: E731
+    return [
+        x.none if k in misreads and any(clearer(other, k) for other in misreads) else x.best
+        for k, x in enumerate(found)
+    ]
 
 
 def _unsettled(found: Outcome) -> bool:
