@@ -178,18 +178,26 @@ def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int,
 
 
 @wp.func
+def place(s: Nearest, k: int) -> wp.vec3:
+    return wp.where(k == 0, s.p0, wp.where(k == 1, s.p1, s.p2))
+
+
+@wp.func
+def number(s: Nearest, k: int) -> int:
+    return wp.where(k == 0, s.i0, wp.where(k == 1, s.i1, s.i2))
+
+
+@wp.func
 def with_corner(half: wp.vec3, s: Nearest, w: wp.vec3, i: int) -> Nearest:
     """What of the feature and one more corner is nearest to the cylinder; the corner has a part in it."""
-    if s.n == 1:
-        return on_edge(half, s.p0, w, s.i0, i)
-    best = on_face(half, s.p0, s.p1, w, s.i0, s.i1, i)
-    if s.n == 2 and best.n == 3:
-        return best
-    best = nearer(best, nearer(on_edge(half, s.p0, w, s.i0, i), on_edge(half, s.p1, w, s.i1, i)))
-    if s.n == 3:
-        best = nearer(best, on_edge(half, s.p2, w, s.i2, i))
-        best = nearer(best, on_face(half, s.p1, s.p2, w, s.i1, s.i2, i))
-        best = nearer(best, on_face(half, s.p2, s.p0, w, s.i2, s.i0, i))
+    best = none()
+    for k in range(s.n):  # not known in advance: a loop that is not unrolled compiles in a third of the time
+        a = place(s, k)
+        ia = number(s, k)
+        best = nearer(best, on_edge(half, a, w, ia, i))
+        if s.n == 3 or s.n - k == 2:
+            next = (k + 1) % s.n
+            best = nearer(best, on_face(half, a, place(s, next), w, ia, number(s, next), i))
     return best
 
 
@@ -200,11 +208,13 @@ def begin(half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, 
     if i < 0 or i >= corners(b):
         i = support(b, vertex, -(wp.transpose(R) * p))
     s = on_corner(half, R * corner(b, vertex, i) + p, i)
-    for k in range(1, 3):
+    k = int(1)
+    while k < 3:
         i = first[k]
         if i >= 0 and i < corners(b) and i != s.i0 and (s.n < 2 or i != s.i1):
             w = R * corner(b, vertex, i) + p
             s = nearer(s, with_corner(half, s, w, i))
+        k += 1
     return s
 
 
@@ -272,12 +282,15 @@ def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
 
 @wp.func
 def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
-    """The way out for a corner through the side or through a cap, whichever is nearer to `about`."""
+    """The way out for a corner through the side or through a cap, whichever is nearer to `about`, if it is below that."""
     u = wp.vec3(0.0, 0.0, wp.where(about[2] > 0.0, 1.0, -1.0))
     rho = wp.sqrt(a[0] * a[0] + a[1] * a[1])
+    below = rho <= half[0]
     if rho > 0.0 and wp.abs(about[2]) < 0.5:
         u = wp.vec3(a[0] / rho, a[1] / rho, 0.0)
+        below = wp.abs(a[2]) <= half[1]
     w = way(half, u, a)
+    w.found = wp.where(below, 1, 0)
     w.q = a + 0.5 * w.depth * u
     w.placed = 1
     return w
@@ -285,8 +298,9 @@ def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
 
 @wp.func
 def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
-    """The shortest way out for the line a, b among directions across it that are near `about`: over a rim, or past the side."""
-    e = wp.normalize(b - a)
+    """The shortest way out for the edge a, b among directions across it that are near `about`: over a rim, or past the side."""
+    length = wp.length(b - a)
+    e = (b - a) / length
     c = wp.normalize(about - wp.dot(about, e) * e)
     s = wp.cross(e, c)
     low = float(-NEAR)
@@ -306,11 +320,15 @@ def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
     angle = 0.5 * (low + high)
     w = way(half, wp.cos(angle) * c + wp.sin(angle) * s, a)
     beside = wp.cross(w.u, wp.vec3(0.0, 0.0, 1.0))
+    across = e
     if wp.abs(w.u[2]) <= LEVEL and wp.abs(wp.dot(e, beside)) > LEVEL:
-        # a whole line of the side is furthest: where that and the edge cross
-        x = a + (wp.dot(furthest(half, w.u) - a, beside) / wp.dot(e, beside)) * e
-        w.q = x + 0.5 * w.depth * w.u
+        across = beside  # a whole line of the side is furthest: where that and the edge cross
         w.placed = 1
+    at = wp.dot(furthest(half, w.u) - a, across) / wp.dot(e, across)
+    if w.placed != 0:
+        w.q = a + at * e + 0.5 * w.depth * w.u
+        if at < -LEVEL or at > length + LEVEL:
+            w.found = 0  # past its ends
     return w
 
 
@@ -367,9 +385,10 @@ def rounder(
     corners make, fewest corners first; it is the one than which no other corner is lower along its own way out.
     """
     three = lowest(b, vertex, wp.transpose(R) * about)
-    most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + DOUBT
+    most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + GAIN
     best = Way()
-    for k in range(8):
+    k = int(0)
+    while k < 8 and best.found == 0:
         i = on
         if k < 3:
             i = wp.vec3i(three[k], three[k], three[k])
@@ -379,8 +398,9 @@ def rounder(
             i = three
         c0 = R * corner(b, vertex, i[0]) + p
         w = past(half, c0, R * corner(b, vertex, i[1]) + p, R * corner(b, vertex, i[2]) + p, about, i)
-        if w.found != 0 and w.depth < most and best.found == 0:
+        if w.found != 0 and w.depth < most:
             other = R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * w.u))) + p
             if wp.dot(w.u, c0 - other) <= LOWER:
                 best = w
+        k += 1
     return best
