@@ -214,8 +214,9 @@ class Drives(Steps):
         linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
         if linked:
             first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
-            if all(t is not None for t in first):
-                self._coupled_by(first)
+            begun = [t for t in first if t is not None]
+            if len(begun) == len(first):
+                self._coupled_by(begun)
             w.clock.lap("model along the motion")
         self._test_stages()
         answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
@@ -290,7 +291,7 @@ class Drives(Steps):
             return
         self._coupled_by(_moved_by(self.mj_model, [search.case.joint for search, _ in answers], found))
         unsettled = [
-            k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), answers[k][1])
+            k for k in unsettled if not w.limit.stopped and _other(self._begun(k, lambda _: None), found[k])
         ]
         self._left = len(unsettled)
         joints = [self.cases[k].joint for k in unsettled]
@@ -306,17 +307,17 @@ class Drives(Steps):
             asked &= w.settings.allowed
         if not asked or len(self.cases) < DRAGGERS + 2:
             return
-        left = [
-            k
+        left = {
+            k: (search, found)
             for k, (search, found) in enumerate(answers)
             if found is not None
             and search.case.moved
             and search.case.joint not in self.unknown_controllers
             and found.best.fit.loss > SEARCH.unsettled
             and not any(m.effect.couples for m in found.best.members)
-        ]
-        near = {k: answers[k][0].case for k in left}
-        by = compute.each(len(left), lambda i: None if w.limit.stopped else self._dragger(*answers[left[i]]))
+        }
+        near, several = {k: search.case for k, (search, _) in left.items()}, list(left.values())
+        by = compute.each(len(left), lambda i: None if w.limit.stopped else self._dragger(*several[i]))
         pulled = [(k, case) for k, case in zip(left, by, strict=True) if case is not None]
         for k, case in pulled:
             self.cases[k] = case
@@ -324,9 +325,12 @@ class Drives(Steps):
         again = lambda i, tell: self._search_of(pulled[i][0], tell)  # noqa: E731
         renewed = map_joints([c.joint for _, c in pulled], again, w.settings.device, w.progress) if pulled else []
         for (k, _), (search, found) in zip(pulled, renewed, strict=True):
-            old_search, old = answers[k]
-            coupled_now = found is not None and any(m.effect.couples for m in found.best.members)
-            if coupled_now and search._left(found.best).sum() < (1 - SEARCH.least) * old_search._left(old.best).sum():
+            old_search, old = left[k]
+            if (
+                found is not None
+                and any(m.effect.couples for m in found.best.members)
+                and search._left(found.best).sum() < (1 - SEARCH.least) * old_search._left(old.best).sum()
+            ):
                 answers[k] = search, found
             else:
                 self.cases[k] = near[k]
@@ -359,8 +363,8 @@ class Drives(Steps):
         self.nothing_believed = [c.joint for c, _, _ in self.by_torque if "coulomb_friction" in c.unknown]
         w.notes += logged_torque.believe(self.by_torque)
         self.unknown_controllers = logged_torque.unknown_controllers(self.by_torque, self.stages, w.notes)
-        for x in self.behind[:4]:
-            w.say(f"  {x}")
+        for text in self.behind[:4]:
+            w.say(f"  {text}")
         w.clock.lap("stage tests")
 
     # -- locate, judge, report
@@ -528,7 +532,7 @@ def _step(runs: list[Run]) -> float:
     return float(min(1e-3, period / 2)) if period > 4e-4 else float(period)
 
 
-def _limits(model, runs: list[Run]) -> list[str]:
+def _limits(model: mujoco.MjModel, runs: list[Run]) -> list[str]:
     """Measured positions outside the model's range: the limit is taken away, and said."""
     notes = []
     for j, name in enumerate(runs[0].joints):

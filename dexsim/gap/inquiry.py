@@ -182,7 +182,7 @@ class Inquiry:
     limit: TimeLimit
     clock: Clock = field(default_factory=Clock)
     notes: list[str] = field(default_factory=list)
-    m: Mechanism | None = None
+    m: Mechanism = None  # type: ignore[assignment]  # the first that `read_files` finds out
     names: dict[Path, str] = field(default_factory=dict)
     recordings: list[Recording | None] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)

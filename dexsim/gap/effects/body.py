@@ -151,6 +151,7 @@ class Payload(Effect):
         place = None
         if "com_out" in values:
             c = case.constants
+            assert c.places is not None  # such a variant is only of a joint that has them
             place = c.centre + values["com_out"] * c.places[0] + values["com_across"] * c.places[1]
         return [add_mass(spec, case.joint, values["mass"], place, bool(note.get("own")))]
 
@@ -159,6 +160,7 @@ def centre_of_mass(case: Case, raw: dict[str, float], spread: dict[str, tuple[fl
     """[3] m: where the added mass sits in the last link's frame, with its interval. Along the hinge the joint feels
     nothing: there it is taken to sit as the link's own centre does."""
     c = case.constants
+    assert c.places is not None  # such a variant is only of a joint that has them
     value = c.centre + raw["com_out"] * c.places[0] + raw["com_across"] * c.places[1]
     half = np.sqrt(
         sum((0.5 * np.ptp(spread[k]) * way) ** 2 for k, way in zip(("com_out", "com_across"), c.places, strict=True))
@@ -187,9 +189,9 @@ def add_mass(spec: mujoco.MjSpec, joint: str, mass: float, place: np.ndarray | N
     place = c0 if place is None else np.asarray(place, float)
     if m0 + mass < 0.05 * m0:
         return f"{joint} carries {-mass:.3g} kg less than the model's links after it; change their masses"
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.body_iquat[leaf])
-    rotation = rotation.reshape(3, 3)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, model.body_iquat[leaf])
+    rotation = flat.reshape(3, 3)
     centre = (m0 * c0 + mass * place) / (m0 + mass)
     inertia = rotation @ np.diag(model.body_inertia[leaf]) @ rotation.T
     for m, r in ((m0, c0 - centre), (mass, place - centre)):

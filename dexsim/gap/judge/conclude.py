@@ -62,6 +62,7 @@ def into_diagnosis(
     all joints; plains: the plain model of each joint. (One long list of steps: each needs what those before it found.)
     """
     data, notes, m = d.data, d.notes, d.mechanism
+    assert m is not None  # that of the answers
     data["verdict"] = "none"
     findings: list[dict[str, Any]] = []
     for a in answers:
@@ -108,6 +109,7 @@ def into_diagnosis(
     _hand_on(d, m, [a for a in answers if a.case.joint not in {*refuted, *worse}], findings)
     data["baseline"] = baseline.overall(plains)
     if worse:
+        assert d.servo is not None  # `_hand_on` made it
         data["baseline"]["handed_on"] = baseline.hand_on(plains, d.servo, list(worse))
     findings = _linkages(findings, answers)
     quiet = {a.case.joint for a in answers if rms(a.before) <= JUDGE.within * noise.joints[a.case.joint]}

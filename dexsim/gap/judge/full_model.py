@@ -27,6 +27,7 @@ from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.handed_on import columns_beside, handed, model_changes, moved_friction, undamped
 from dexsim.gap.judge.kept_out import free_run
+from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import SERIES_INDEX, expand
 from dexsim.gap.read.runs import Run
@@ -264,7 +265,7 @@ def _batch(
     worlds: Sequence[World],
     device: str,
     timestep: float,
-    engine: str,
+    kind: str,
     torque: bool,
 ) -> list:
     spec = spec.copy()
@@ -272,7 +273,7 @@ def _batch(
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     N = len(worlds)
     # one thread: a step of some worlds is shorter than the way to another thread and back
-    engine = make_engine(spec, N, device, engine, fields=FIELDS, threads=1)
+    engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
     rows = np.stack([w.rows for w in worlds])
     table = copy.deepcopy(worlds[0].table)
     table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
@@ -385,7 +386,7 @@ class Changes:
 
     def _sends(self, i: int, w: World, ends: np.ndarray) -> None:
         """World i's targets by the step within which they are stamped; several of one step follow each other."""
-        at = np.searchsorted(ends, np.maximum.accumulate(w.stamps), side="right") if len(w.stamps) else []
+        at = np.searchsorted(ends, np.maximum.accumulate(w.stamps), side="right") if len(w.stamps) else np.zeros(0, int)
         last, turn, step = self._now[i], 0, -1
         for k, row, stamp in zip(at, w.targets, w.stamps, strict=True):
             if k == len(ends):
@@ -411,11 +412,12 @@ class Changes:
             servo.state[i, :, servo.slots["enabled"]] = up(on)
         if self._warm and k % self._renewed == 0:
             for i in self._warm:
-                at, heat = self._worlds[i].warmth
-                servo.params[i, :, SERVO_INDEX["warmth"]] = up([np.interp(k * self._timestep, at, x) for x in heat.T])
+                when, heat = self._worlds[i].warmth or (np.zeros(0), np.zeros((0, 0)))
+                now = [np.interp(k * self._timestep, when, x) for x in heat.T]
+                servo.params[i, :, SERVO_INDEX["warmth"]] = up(now)
 
 
-def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: Sequence[int]) -> np.ndarray:
+def _gravity(model: mujoco.MjModel, qpos: np.ndarray, dofs: np.ndarray) -> np.ndarray:
     """[N, J] torque [N.m] that holds the joints at rest at qpos [N, nq]: gravity less springs."""
     data, out = mujoco.MjData(model), []
     for q in qpos:
@@ -458,11 +460,11 @@ def confirm(
         for k, i in enumerate(group):
             found[i] = q[k * len(use) : (k + 1) * len(use)]
 
-    def told(case: Case, ws) -> np.ndarray:
+    def told(case: Case, ws: Windows) -> np.ndarray:
         """[n] bool: samples of the windows replayed, in recordings that tell of this joint."""
         return np.isin(ws.sample_window, use) & ~np.isin(ws.run[ws.sample_window], list(case.plant.left_out))
 
-    def error(q: list[np.ndarray], step: float, case: Case, ws) -> tuple[np.ndarray, np.ndarray]:
+    def error(q: list[np.ndarray], step: float, case: Case, ws: Windows) -> tuple[np.ndarray, np.ndarray]:
         """(simulated position, squared error) [n] of one joint at its samples."""
         on = told(case, ws)
         t = case.plant.t[ws.sample_row[on]] - ws.window_t[ws.sample_window[on]]

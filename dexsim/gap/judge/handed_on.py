@@ -134,14 +134,17 @@ def servo_changes(table: ServoTable, case: Case, trial: Trial, bounds: np.ndarra
                 value, lo, hi = x, low, high
             value, lo, hi = (float(np.clip(v, column.low, min(column.high, 1e9))) for v in (value, lo, hi))
             table.set(case.joint, name, round(value, 9), round(min(lo, value), 9), round(max(hi, value), 9))
-    lost = undamped(trial, table.value(case.joint, "kp").value)
-    kd = table.value(case.joint, "kd")
-    if lost > 0.0 and not kd.unknown:
+    kp, kd = table.value(case.joint, "kp"), table.value(case.joint, "kd")
+    assert kp.value is not None  # a table with an unknown one is refused
+    lost = undamped(trial, kp.value)
+    if lost > 0.0 and kd.value is not None:
         table.set(case.joint, "kd", *(round(max(x - lost, 0.0), 9) for x in (kd.value, kd.low, kd.high)))
     for name, value in columns_beside(case, trial, joints).items():
         table.set(case.joint, name, value)
     for name, more in moved_friction(case, trial).items():
         now = table.value(case.joint, name)
+        if now.value is None:
+            continue  # what is added to the unknown is unknown
         table.set(case.joint, name, *(round(x + more, 9) for x in (now.value, now.low, now.high)))
     if any(name.startswith("thermal_") for p in trial.fit.params for name in p.columns):
         warmth = case.plant.series[:, SERIES_INDEX["warmth"]]
@@ -174,7 +177,7 @@ def widen(table: ServoTable, case: Case, member: Member, confidence: float, earn
     for name in (name for p in member.variant.params for name in p.columns if name in INDEX):
         column, now = COLUMNS[INDEX[name]], table.value(case.joint, name)
         believed = float(np.clip(case.scales.nominal[name], column.low, min(column.high, 1e9)))
-        if now.unknown or now.low <= believed <= now.high:
+        if now.value is None or now.low <= believed <= now.high:
             continue
         reach = now.value + share * (believed - now.value)
         if now.low <= reach <= now.high:
@@ -210,7 +213,8 @@ def save_model(spec: mujoco.MjSpec, path: Path) -> None:
     `model_files` beside it, so that it loads from there; nothing is written anywhere else, whatever those paths say."""
     import shutil
 
-    spec, folder, places = spec.copy(), Path(spec.modelfiledir or "."), {}
+    spec, folder = spec.copy(), Path(spec.modelfiledir or ".")
+    places: dict[Path, str] = {}
     for things, where in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir), (spec.textures, spec.texturedir)):
         for thing in things:
             source = folder / (where or ".") / thing.file
@@ -342,20 +346,20 @@ def fit_stand_in(
     seed: int = 0,
 ) -> StandIn | None:
     """The stand-in of one joint; None where it would not take JUDGE.standin off the held-out error."""
-    x, y, block = [], [], []
+    xs, ys, parts = [], [], []
     for r in train:
         torque, on = residual_torque(case, runs, trial, r)
         t = runs[r].t - runs[r].t[0]
         if span_train and r in span_train:
             on = on & (t >= span_train[r][0]) & (t <= span_train[r][1])
-        x.append(basis(runs[r].qs[on, case.index], runs[r].vs[on, case.index]))
-        y.append(torque[on])
-        block.append(1000 * r + (t[on] / BLOCK).astype(int))
-    x, y, block = np.concatenate(x), np.concatenate(y), np.concatenate(block)
+        xs.append(basis(runs[r].qs[on, case.index], runs[r].vs[on, case.index]))
+        ys.append(torque[on])
+        parts.append(1000 * r + (t[on] / BLOCK).astype(int))
+    x, y = np.concatenate(xs), np.concatenate(ys)
     if len(y) < 60:
         return None
     scale = np.maximum(np.sqrt((x**2).mean(0)), 1e-12)
-    _, block = np.unique(block, return_inverse=True)
+    _, block = np.unique(np.concatenate(parts), return_inverse=True)
     count = int(block.max()) + 1
     gram = np.zeros((count, 4, 4))
     right = np.zeros((count, 4))
@@ -376,7 +380,12 @@ def fit_stand_in(
 
 
 def _held_out(
-    case: Case, runs: list[Run], trial: Trial, value: np.ndarray, test: list[int], span_test
+    case: Case,
+    runs: list[Run],
+    trial: Trial,
+    value: np.ndarray,
+    test: list[int],
+    span_test: dict[int, tuple[float, float]] | None,
 ) -> tuple[float, float]:
     """Held-out rms [rad] of free runs without and with the torque, which acts along the measured motion here."""
     plant = case.plant

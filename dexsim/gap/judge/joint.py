@@ -3,6 +3,7 @@ its residual lives, how much a delay varies."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -94,11 +95,9 @@ class JointAnswer:
             "fitted": self._followed(),
             "left": 0.0,
         }
-        return out | (
-            {"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)}
-            if self.effort_before is not None
-            else {}
-        )
+        if self.effort_before is not None and self.effort_after is not None:
+            out |= {"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)}
+        return out
 
     def mae(self) -> dict[str, tuple[float, float]]:
         """Mean |error| before and after by recording; one that was cut is several runs."""
@@ -106,16 +105,15 @@ class JointAnswer:
         for i in self.kept.test:
             pick = np.isin(run_of, [k for k in self.kept.test if runs[k].name == runs[i].name])
             if pick.any():
-                out[runs[i].name] = tuple(
-                    float(np.abs(self.measured - q)[pick].mean()) for q in (self.q_before, self.q_after)
-                )
+                before, after = (np.abs(self.measured - q)[pick].mean() for q in (self.q_before, self.q_after))
+                out[runs[i].name] = float(before), float(after)
         return out
 
     def judge(self, m: Mechanism) -> None:
         """Fills `found`: what was found, as `diagnosis.json` says it, and the evidence behind each."""
         self.found = [self._finding(mm, m) for mm in self.best.members]
 
-    def _finding(self, mm, m: Mechanism) -> dict[str, Any]:
+    def _finding(self, mm: Member, m: Mechanism) -> dict[str, Any]:
         case, best = self.case, self.best
         raw, spread = self._fitted(mm, self.bounds)
         self.raw[mm.id] = raw
@@ -126,10 +124,10 @@ class JointAnswer:
         )
         error_without = rms((self.measured - q) ** 2)
         effort_only = mm.effect.effort_only
-        of_effort = effort_only and self.effort_after is not None
+        of_effort = self.effort_after if effort_only else None
         was, left = (
-            (rms((self.torque - effort)[self.sensed] ** 2), rms(self.effort_after))
-            if of_effort
+            (rms((self.torque - effort)[self.sensed] ** 2), rms(of_effort))
+            if of_effort is not None
             else (error_without, rms(self.after))
         )
         gain = kept_out.gain_interval((self.measured - q) ** 2, self.after, self.t)
@@ -152,7 +150,7 @@ class JointAnswer:
         signal = mm.effect.signal(case, raw, mm.variant.note)
         active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
         self.spans[f"{mm.id}@{case.joint}"] = float(active.mean())
-        finding = {
+        finding: dict[str, Any] = {
             "effect": mm.id,
             "confidence": evidence.confidence,  # what the other findings say of it comes last
             "alternatives": [{"effect": e, "confidence": round(c, 3)} for e, c in rivals[:3]],
@@ -162,8 +160,8 @@ class JointAnswer:
             "regime": mm.effect.shows,
             "when": kept_out.intervals_of(active, case, self.kept.runs, sorted({*self.kept.train, *self.kept.test})),
             "parameters": mm.effect.parameters(FittedEffect(mm.variant, raw, spread, case, m.table)),
-            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(self.effort_after)}
-            if of_effort
+            "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(of_effort)}
+            if of_effort is not None
             else {
                 "before": error_without,
                 "after": rms(self.after),
@@ -188,7 +186,7 @@ class JointAnswer:
         harms = float(np.mean(gained < -JUDGE.slack * of)) > JUDGE.harm
         return "it helps in some recordings and harms in others, as what differs from run to run does" if harms else ""
 
-    def _fitted(self, mm, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    def _fitted(self, mm: Member, bounds: np.ndarray) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """Values and intervals of one effect's parameters, of `bounds` [P, 2]."""
         best = self.best
         index = [[p.key for p in best.fit.params].index(f"{mm.id}.{p.key}") for p in mm.variant.params]
@@ -205,7 +203,7 @@ class JointAnswer:
 
     def _weighed(
         self,
-        mm,
+        mm: Member,
         raw: dict[str, float],
         spread: dict,
         error_without: float,
@@ -368,7 +366,9 @@ def without(search: JointSearch, best: Trial, member: Member) -> Trial:
     return search.fit(rest, np.concatenate(kept) if kept else np.zeros(0), best, quick=True)
 
 
-def _curve(case, runs, rows, q0, q1, worst) -> Curve:
+def _curve(
+    case: Case, runs: Sequence[Run], rows: np.ndarray, q0: np.ndarray, q1: np.ndarray, worst: int
+) -> Curve:
     t, r = case.plant.t[rows], case.plant.run_of[rows]
     run = r[worst]
     pick = np.flatnonzero((r == run) & (np.abs(t - t[worst]) < 4.0))

@@ -230,13 +230,17 @@ def floor_beyond(
     return max(_apart([(of(a), of(b)) for a, b in pairs]), case.sigma)
 
 
+_Left = tuple[Run, np.ndarray, np.ndarray]
+"""What a fit leaves of a run: the run, times [S] s, values [S]."""
+
+
 def _common(a: Run, b: Run) -> np.ndarray:
     """Times since their starts [s] at which repeats are compared: they are aligned by their commands, which were sent
     at the same times from the start."""
     return np.arange(0.2, min(a.duration, b.duration) - 0.05, 0.01)
 
 
-def _apart(pairs) -> float:
+def _apart(pairs: Sequence[tuple[_Left, _Left]]) -> float:
     """Standard deviation by which what (run, times [S] s, values [S]) have in pairs of repeats scatters."""
     d = []
     for (a, ta, xa), (b, tb, xb) in pairs:
@@ -301,16 +305,16 @@ def rms_interval(
             counts.append(np.bincount(b))
     if not sums:
         return 0.0, 0.0, 0.0
-    sums, counts = np.concatenate(sums), np.concatenate(counts)
-    sums, counts = sums[counts > 0], counts[counts > 0]
+    total, count = np.concatenate(sums), np.concatenate(counts)
+    total, count = total[count > 0], count[count > 0]
     mean = lambda s, n, axis=-1: np.sqrt(s.sum(axis) / n.sum(axis))  # noqa: E731
-    values = intervals.draws((sums, counts), mean, seed, DRAWS)
-    return float(np.sqrt(sums.sum() / counts.sum())), float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))
+    values = intervals.draws((total, count), mean, seed, DRAWS)
+    return float(np.sqrt(total.sum() / count.sum())), float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))
 
 
 def intervals_of(active: np.ndarray, case: Case, runs: list[Run], use: list[int], join: float = 0.03) -> list[dict]:
     """Stretches of time in which `active` [n] bool holds, by recording, short gaps joined; the longest 400."""
-    out = []
+    out: list[dict] = []
     for r in use:
         rows = case.plant.rows(r)
         t, on = case.plant.t[rows], active[rows]

@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -150,8 +151,14 @@ class JointPlant:
         self.joint, self.constants, self.dt = joint, constants, dt
         self.voltage, self.loop, self.position, self.device = voltage, loop, position, device
         self.nominal: list[np.ndarray] = []
-        self._added, self._cmd_t, self._cmd = [], [], []
-        self._t, self._q, self._torque, self._start, self._grid, self._cmds = [], [], [], [], [0], [0]
+        self._added: list[tuple] = []
+        self._cmd_t: list[np.ndarray] = []
+        self._cmd: list[np.ndarray] = []
+        self._t: list[np.ndarray] = []
+        self._q: list[np.ndarray] = []
+        self._torque: list[np.ndarray] = []
+        self._start: list[float] = []
+        self._grid, self._cmds = [0], [0]
         self._rows = [0]
         self.left_out: set[int] = set()  # runs that tell nothing of this joint: no window is cut from them
         self.open_stage = 0  # 0 whole loop; 1 recorded motor torque; 2 recorded duty drives the joint
@@ -194,7 +201,8 @@ class JointPlant:
         self._consts[:] = (self.voltage, self.loop == "motor", self.position == "motor", c.damping, c.friction,
                            c.low, c.high, stiff, c.slide, 0)
         self.contact_stiffness = stiff
-        self._d, self._version = {}, next(_VERSIONS)
+        self._d: dict[Any, Any] = {}
+        self._version = next(_VERSIONS)
         self._ready = True
 
     def _fill(self, run: int) -> None:
@@ -257,7 +265,8 @@ class JointPlant:
 
         span: part of a run [s from its start] to keep to. every_run: also runs that tell nothing of this joint.
         """
-        window, window_t, step, part, of, row, run_of = [], [], [], [], [], [], []
+        window, window_t, step, part, of, run_of = [], [], [], [], [], []
+        row: list[int] = []
         for r in range(self.runs) if runs is None else runs:
             if r in self.left_out and not every_run:
                 continue
@@ -339,8 +348,8 @@ class JointPlant:
             for group in groups.values():
                 keep, steps, rest = self._inputs(windows, tuple(group), "cpu")
                 oq, ot = np.empty((H, len(keep))), np.empty((H, len(keep)))
-                out = [wp.array(x, dtype=wp.float64, device="cpu", copy=False) for x in (oq, ot)]
-                self._split(H, steps, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *out))
+                shared = (_up(oq, copy=False), _up(ot, copy=False))
+                self._split(H, steps, recorded(_up(params[:, group[0]]), _up(inits), _up(consts), *rest, *shared))
                 q[:, keep], torque[:, keep] = oq, ot
             return q, torque
         with _GPU:
@@ -354,8 +363,8 @@ class JointPlant:
                 for group, guess in zip(groups.values(), guesses, strict=True):
                     keep, steps, rest = self._inputs(windows, tuple(group), self.device)
                     size = H * len(keep)
-                    oq, ot = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
-                    given = recorded(guess, moves, constants, *rest, oq, ot)
+                    mine_q, mine_t = (mine.part(out, at + k * size, (H, len(keep))) for k in (0, 1))
+                    given = recorded(guess, moves, constants, *rest, mine_q, mine_t)
                     wp.launch(
                         pk.plant_kernel(),
                         dim=(len(steps), H),
@@ -426,7 +435,7 @@ class JointPlant:
         return np.stack(self.nominal)
 
 
-def _up(x: np.ndarray, dtype=wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:
+def _up(x: np.ndarray, dtype: Any = wp.float64, device: str = "cpu", copy: bool = True) -> wp.array:
     return wp.array(np.ascontiguousarray(x), dtype=dtype, device=device, copy=copy or device != "cpu")
 
 

@@ -151,7 +151,7 @@ def moved(
     for run in runs:
         run.smooth()
     found = compute.each(len(runs), lambda i: along(model, runs[i], joints, added))
-    mech, constants = [x[:2] for x in found], found[0][2]
+    mech, constants = [(times, series) for times, series, _ in found], found[0][2]
     rows = [_believed(run, joints) for run in runs]
     given = [_given(run, row, *m, voltage) for run, row, m in zip(runs, rows, mech, strict=True)] if J > 1 else []
     wanted = [j for j in range(J) if only is None or joints[j] in only]
@@ -237,7 +237,19 @@ def _of_recordings(runs: Sequence[Run], values: Sequence[float]) -> float:
     return float(np.median([np.median(x) for x in by.values()]))
 
 
-def _case(joint, j, plant, constants, runs, rows, torques, mech, others, inertia, voltage) -> Case:
+def _case(
+    joint: str,
+    j: int,
+    plant: JointPlant,
+    constants: JointConstants,
+    runs: Sequence[Run],
+    rows: Sequence[np.ndarray],
+    torques: Sequence[np.ndarray],
+    mech: Sequence[tuple[np.ndarray, np.ndarray]],
+    others: Sequence[int],
+    inertia: float,
+    voltage: bool,
+) -> Case:
     cat = lambda get: np.concatenate([get(i) for i in range(len(runs))])  # noqa: E731
     t = plant.t
     q, v, a = (cat(lambda i, n=n: getattr(runs[i], n)[:, j]) for n in ("qs", "vs", "as_"))
@@ -345,9 +357,10 @@ def _effort_noise(plant: JointPlant, runs: Sequence[Run], j: int) -> float:
 def _warmth(runs: Sequence[Run], j: int) -> float:
     """degC by which joint j's drive is warmer or colder than its data sheet, at most; 0 where its temperature hardly
     changes or is not recorded."""
-    if runs[0].temperature is None:
+    logged = [run.temperature[:, j] for run in runs if run.temperature is not None]  # of all runs or none
+    if not logged:
         return 0.0
-    heat = np.concatenate([run.temperature[:, j] for run in runs])
+    heat = np.concatenate(logged)
     return float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
 
 
@@ -374,7 +387,20 @@ def _rates(runs: Sequence[Run], torques: Sequence[np.ndarray], j: int) -> dict[s
     return {"_command_rate": np.concatenate(command), "_torque_rate": np.concatenate(torque)}
 
 
-def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[str, np.ndarray]:
+def _regimes(
+    t: np.ndarray,
+    run_of: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    load: np.ndarray,
+    tau: np.ndarray,
+    asked: np.ndarray,
+    limit: float,
+    cmd: np.ndarray,
+    runs: Sequence[Run],
+    j: int,
+) -> dict[str, np.ndarray]:
     """Variables [n] of each measured sample, that a residual may depend on."""
     small = 0.02 * np.percentile(np.abs(v), 95) + 1e-12
     since = np.concatenate([_since_reversal(t[rows], v[rows], small) for rows in _together(run_of)])
@@ -391,8 +417,9 @@ def _regimes(t, run_of, q, v, a, load, tau, asked, limit, cmd, runs, j) -> dict[
         "time": t.copy(),
     }
     out |= {"_torque": tau, "_asked": asked, "_load": load, "_friction": 0.0 * tau}
-    if runs[0].temperature is not None:
-        out["temperature"] = np.concatenate([r.temperature[:, j] for r in runs])
+    logged = [r.temperature[:, j] for r in runs if r.temperature is not None]  # of all runs or none
+    if logged:
+        out["temperature"] = np.concatenate(logged)
     J = len(runs[0].joints)
     for o in range(J):
         if o != j and J <= 16:
@@ -447,12 +474,12 @@ def dragged_by(case: Case, others: Sequence[Case]) -> Case:
     return replace(case, plant=plant, scales=replace(case.scales, others=names), regimes=regimes)
 
 
-def _draggers(model, joints, j, runs) -> list[int]:
+def _draggers(model: mujoco.MjModel, joints: Sequence[str], j: int, runs: Sequence[Run]) -> list[int]:
     """Other joints that move, the nearest in the kinematic tree first."""
     moved = [o for o in range(len(joints)) if o != j and max(np.ptp(r.qs[:, o]) for r in runs) > 0.01]
     body = [int(model.jnt_bodyid[model.joint(n).id]) for n in joints]
 
-    def chain(b):
+    def chain(b: int) -> list[int]:
         out = []
         while b:
             out.append(b)
@@ -461,7 +488,7 @@ def _draggers(model, joints, j, runs) -> list[int]:
 
     own = chain(body[j])
 
-    def far(o):
+    def far(o: int) -> tuple[float, int]:
         other = chain(body[o])
         shared = len(set(own) & set(other))
         return (len(own) - shared) + (len(other) - shared) - 0.1 * shared, o
@@ -469,7 +496,7 @@ def _draggers(model, joints, j, runs) -> list[int]:
     return sorted(moved, key=far)
 
 
-def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: Sequence[np.ndarray], voltage: bool) -> np.ndarray:
+def _given(run: Run, rows: np.ndarray, times: np.ndarray, series: np.ndarray, voltage: bool) -> np.ndarray:
     """[n, J] |motor torque| of each joint (servo columns rows [J, C]) at times [n] along the motion that is prescribed:
     by commands of those moments, which are finer than the samples. N.m"""
     cmd = run.command_at(times)

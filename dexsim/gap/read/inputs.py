@@ -193,6 +193,7 @@ def _without_spikes(recording: Recording, notes: list[str]) -> None:
             {"position": s.position, "command": recording.commands, "effort": s.effort}[quantity],
             recording.joints.index(f.joint),
         )
+        assert series is not None  # a finding is about what was recorded
         on = spikes.of_effort(recording, j) if quantity == "effort" else spikes.spiked(series.value[:, j], quantity)
         series.value = series.value.copy()
         series.value[on, j] = np.nan
@@ -390,7 +391,8 @@ def self_touch(
             mujoco.mj_collision(model, data)
             contacts = data.contact
             deep = np.flatnonzero(contacts.dist[: data.ncon] < -depth) if data.ncon else ()
-            pairs = {tuple(sorted(int(model.geom_bodyid[g]) for g in contacts.geom[c])) for c in deep}
+            bodies = (sorted(int(model.geom_bodyid[g]) for g in contacts.geom[c]) for c in deep)
+            pairs = {(a, b) for a, b in bodies}
             seen.append((run.name, float(t), pairs))
     counts: dict[tuple[int, int], int] = {}
     for _, _, pairs in seen:

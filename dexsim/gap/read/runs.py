@@ -45,9 +45,9 @@ class Run:
     left_out: frozenset[str] = frozenset()
     breaks: tuple[tuple[float, float], ...] = ()
     # filled by `smooth`
-    qs: np.ndarray | None = None
-    vs: np.ndarray | None = None
-    as_: np.ndarray | None = None
+    qs: np.ndarray = None  # type: ignore[assignment]  # asked for only after it
+    vs: np.ndarray = None  # type: ignore[assignment]
+    as_: np.ndarray = None  # type: ignore[assignment]
     # filled by `refined_cases`: times [n], position, speed, acceleration [n, J]
     fine: tuple[np.ndarray, ...] | None = None
 

@@ -130,7 +130,9 @@ def _logged(run: Run, j: int) -> _Logged | None:
     return _Logged(signal, run.t[on], logged[on], np.array(law)[:, on])
 
 
-def _slope(n, sx, sy, sxx, sxy, axis=-1):
+def _slope(
+    n: np.ndarray, sx: np.ndarray, sy: np.ndarray, sxx: np.ndarray, sxy: np.ndarray, axis: int = -1
+) -> np.ndarray:
     """Slopes of the lines through resampled blocks, of the blocks' sums: samples, x, y, x x and x y."""
     n, sx, sy, sxx, sxy = (s.sum(axis) for s in (n, sx, sy, sxx, sxy))
     return (n * sxy - sx * sy) / np.maximum(n * sxx - sx**2, 1e-30)

@@ -345,7 +345,7 @@ def _drawing(
     bodies = [model.body(i).name for i in range(model.nbody)]
     layout = sensors.layout
     for f, body in enumerate(() if layout is None else layout.bodies):
-        if body in bodies:
+        if layout is not None and body in bodies:
             b, n = data.body(body), layout.count[f]
             R = b.xmat.reshape(3, 3)
             pads.append((f, layout.point[f, :n] @ R.T + b.xpos))

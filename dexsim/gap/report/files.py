@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from dexsim import outputs
 from dexsim.gap.effects.catalogue import entry
+from dexsim.gap.effects.effect import Effect
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.judge import handed_on
 from dexsim.gap.judge.full_model import TASKS
@@ -246,11 +247,14 @@ class Where(Section):
         return unit_of(self.held_out["error"])[0]
 
     def _pads(self, taxels: np.ndarray, marked: set[str]) -> list[dict[str, Any]]:
-        out = []
-        for name in list(self.d.touch.pads)[:3]:
-            number_ = self.d.touch.names.index(name)
+        out: list[dict[str, Any]] = []
+        felt, m = self.d.touch, self.d.mechanism
+        if felt is None or m is None:
+            return out
+        for name in list(felt.pads)[:3]:
+            number_ = felt.names.index(name)
             ringed = {int(t.split(":")[1]) for t in marked if int(t.split(":")[0]) == number_}
-            lattice = self.d.mechanism.sensors.lattice(number_)
+            lattice = m.sensors.lattice(number_)
             out.append({"name": name, "map": Markup(pad(taxels[number_], ringed, lattice))})
         return out
 
@@ -260,10 +264,14 @@ class Where(Section):
         if h["before"] is None:
             return None
         unit, k = unit_of(h["error"])
-        scaled = lambda *x: tuple(None if v is None else k * v for v in x)  # noqa: E731
-        rows = [("before", *scaled(h["before"], h["before_low"], h["before_high"]), charts.BEFORE)]
+
+        def row(name: str, which: str, colour: str) -> tuple[str, float, float | None, float | None, str]:
+            low, high = (None if (v := h[f"{which}_{end}"]) is None else k * v for end in ("low", "high"))
+            return name, k * h[which], low, high, colour
+
+        rows = [row("before", "before", charts.BEFORE)]
         if any(f["effect"] != "bad_channel" for f in d.data["findings"]):
-            rows.append(("after", *scaled(h["after"], h["after_low"], h["after_high"]), charts.AFTER))
+            rows.append(row("after", "after", charts.AFTER))
         plain = d.data["baseline"] if h["error"].startswith("position") else {}
         if plain:
             rows.append(("plain model", k * plain["error"], None, None, charts.FLOOR))
@@ -311,7 +319,7 @@ class Findings(Section):
         """The metric of a finding's held-out error."""
         if not f["where"]["joints"]:
             return "tactile_rmse_N"
-        if (e := entry(f)) is not None and e.effort_only:
+        if isinstance(e := entry(f), Effect) and e.effort_only:
             return "effort_rmse_Nm"
         h = self.held_out["error"]
         return h if not h.startswith("tactile") else "position_rmse_rad"
@@ -449,6 +457,7 @@ class Details(Section):
     def _confirmed(self) -> dict[str, Any]:
         """The hypotheses in the engine that trains beside the search's own plant."""
         c = self.d.confirmation
+        assert c is not None  # as looked at by who asks
         return {
             "engine": c.engine,
             "step": f"{1e3 * c.step_s:g}",
@@ -516,10 +525,11 @@ def _rows(d: Diagnosis, unit: str, most: int | None = None) -> list[dict[str, st
         rows.append(
             _row(j, names, v, number(1e3 * plain[j]["error"]) if j in plain else "", f"{1e3 * v['sigma']:.2g} {unit}")
         )
-    for finger, v in (d.touch.pads if d.touch else {}).items():
-        mine = f"{d.touch.names.index(finger)}:"
-        names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
-        rows.append(_row(f"pad of the {finger}", names, v, "", f"{1e3 * v['noise']:.2g} mN"))
+    if d.touch is not None:
+        for finger, v in d.touch.pads.items():
+            mine = f"{d.touch.names.index(finger)}:"
+            names = [_name(f["effect"]) for f in found if any(t.startswith(mine) for t in f["where"]["taxels"])]
+            rows.append(_row(f"pad of the {finger}", names, v, "", f"{1e3 * v['noise']:.2g} mN"))
     return rows
 
 

@@ -18,6 +18,7 @@ from dexsim.errors import UserError
 from dexsim.gap.effects.catalogue import EFFECTS, entry, modelled, separating
 from dexsim.gap.effects.effect import Effect
 from dexsim.gap.inquiry import Diagnosis, Settings
+from dexsim.gap.plant.batch import JointPlant
 from dexsim.gap.plant.case import Case, build
 from dexsim.gap.plant.columns import INDEX, expand
 from dexsim.gap.read.runs import Run
@@ -84,7 +85,14 @@ def plan_next(
         d.notes.append(f"no commands for the next recording: {error}")
 
 
-def _choice(d: Diagnosis, s: Settings, m: Mechanism, outcomes, f: dict, rivals: list[str]):
+def _choice(
+    d: Diagnosis,
+    s: Settings,
+    m: Mechanism,
+    outcomes: Sequence[tuple[Case, JointSearch, Outcome]],
+    f: dict,
+    rivals: list[str],
+) -> Choice | None:
     """The motions on which the finding's hypotheses disagree most; None where they cannot be simulated or planned."""
     for case, search, outcome in outcomes:
         if case.joint not in f["where"]["joints"] or not outcome.best.members:
@@ -105,8 +113,10 @@ def _next_touch(d: Diagnosis, s: Settings, m: Mechanism, f: dict, recordings: Se
     """The presses again, as they were sent, with what was missing: nothing else is known to be safe against the
     object."""
     names = " from ".join(dict.fromkeys(f["indistinguishable"] or [f["effect"]]))
+    effect = entry(f)
+    assert effect is not None  # `modelled` says so
     why = (
-        f"to tell {names} on {place(f, m)}: {entry(f).experiment}; the same commands, with /external_force of a load "
+        f"to tell {names} on {place(f, m)}: {effect.experiment}; the same commands, with /external_force of a load "
         "cell recorded beside /tactile"
     )
     d.data["next_recording"] = {"why": why, "commands": None}
@@ -198,9 +208,9 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
             x[i] = np.clip(x[i] + 0.05 * q.span * (1 if x[i] + 0.05 * q.span <= q.high else -1), q.low, q.high)
             guesses.append(_guess(plant, a, x))
             moves.append(q)
-    q, _ = plant.simulate(np.stack(guesses), windows)
-    difference = (q[1] - q[0]) / case.sigma
-    J = ((q[2:] - q[0]) / case.sigma).T
+    seen, _ = plant.simulate(np.stack(guesses), windows)
+    difference = (seen[1] - seen[0]) / case.sigma
+    J = ((seen[2:] - seen[0]) / case.sigma).T
     stamp = t[windows.sample_row]
     out: dict[str, float] = {}
     for kind in {s.kind for s in p.segments}:
@@ -218,7 +228,7 @@ def disagreement(m: Mechanism, case: Case, search: JointSearch, a: Trial, b: Tri
     return out
 
 
-def _guess(plant, trial: Trial, x: np.ndarray) -> np.ndarray:
+def _guess(plant: JointPlant, trial: Trial, x: np.ndarray) -> np.ndarray:
     """[R, C] plant parameters of a hypothesis at x."""
     out = expand(plant, trial.fit.params, x[None])[0]
     for member in trial.members:

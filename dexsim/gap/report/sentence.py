@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexsim.gap.effects.catalogue import entry, modelled
+from dexsim.gap.effects.effect import Effect
 from dexsim.gap.inquiry import Diagnosis
 from dexsim.gap.report.charts import number
 from dexsim.recording.mechanism import Mechanism
@@ -125,15 +126,16 @@ def spoken(f: dict, m: Mechanism | None) -> str:
 
 def words_of(f: dict, m: Mechanism | None) -> str:
     """What an effect does, in words, with its direction where its size tells that."""
-    joint = next(iter(f["where"]["joints"]), None)
-    if joint is None:
-        return entry(f).words
+    joint, effect = next(iter(f["where"]["joints"]), None), entry(f)
+    assert effect is not None  # what has words is of the catalogue
+    if joint is None or not isinstance(effect, Effect):
+        return effect.words
     believed = {}
     if m is not None and joint in m.joints:
         row = m.joints.index(joint)
         friction = float(np.ravel(m.spec.joint(joint).frictionloss)[0])
         believed = {"coulomb_friction": float(m.column("coulomb_friction")[row]) + friction}
-    return entry(f).said(f, believed)
+    return effect.said(f, believed)
 
 
 def place(f: dict, m: Mechanism | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -420,7 +421,7 @@ class JointHypotheses:
         return fitter.eliminated(fitter.compare(q, tau, plants), s)
 
     def draft(
-        self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | None = None
+        self, members: tuple[Member, ...], starts: np.ndarray, like: Trial | SimpleNamespace | None = None
     ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
         """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
         params = self._params(members)

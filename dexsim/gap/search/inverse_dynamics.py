@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -235,6 +236,7 @@ def readable(run: Run, j: int) -> bool:
 
 
 def moved(run: Run, model: mujoco.MjModel | None, cutoff: float) -> tuple[Motion, Body | None]:
+    assert run.torque is not None  # as `readable` has looked
     m = motion(run.t, run.q, np.nan_to_num(run.torque), cutoff)
     return m, None if model is None else body(model, run.gravity, run.joints, m)
 
@@ -391,7 +393,13 @@ def _not_weighed(d: Columns) -> list[str]:
     return [n for n in at if max(reach.values()) * TORQUE.weighed < misfit(d.without(list(at)))]
 
 
-def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
+def _name(
+    own: Columns,
+    other: Columns,
+    mine: dict[str, np.ndarray],
+    theirs: dict[str, np.ndarray],
+    rng: np.random.Generator,
+) -> tuple[list[Named], np.ndarray]:
     """Further effects in the order in which they help on quarters left out, and the coefficients with the
     catalogue's."""
     chosen: list[str] = []
@@ -426,7 +434,7 @@ def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
         if tried[best].sum() > (1 - TORQUE.further) * now.sum() or np.quantile(gained, TORQUE.chance) <= 0:
             break
         wins = dict(zip(kinds, (np.argmin(table, 0)[None] == np.arange(len(kinds))[:, None]).mean(1), strict=True))
-        rival = max((k for k in wins if k != _kind(best)), key=wins.get, default="")
+        rival = max((k for k in wins if k != _kind(best)), key=wins.__getitem__, default="")
         out.append((best, float(wins[_kind(best)]), kinds.get(rival, "")))
         chosen.append(best)
         now, X, Y = tried[best], np.column_stack([X, mine[best]]), np.column_stack([Y, theirs[best]])
@@ -439,8 +447,8 @@ def _name(own, other, mine, theirs, rng) -> tuple[list[Named], np.ndarray]:
     for i, (name, share, rival) in enumerate(out):
         with_, without = (least(X[:, :k], own.u) for k in (base + 1 + i, base + i))
         a, b = np.std(other.u - Y[:, : base + i] @ without), np.std(other.u - Y[:, : base + 1 + i] @ with_)
-        c = size.get(name, (all_[base + i], below[base + i], above[base + i]))
-        named.append(Named(name, *map(float, c), share, rival, float(a), float(b)))
+        value, least_, most = size.get(name, (all_[base + i], below[base + i], above[base + i]))
+        named.append(Named(name, float(value), float(least_), float(most), share, rival, float(a), float(b)))
     return named, theta
 
 
@@ -475,21 +483,31 @@ def _intervals(
     return least(X, u), *np.quantile(draws, [0.05, 0.95], axis=0)
 
 
-def _further(own: Columns) -> dict:
+def _further(own: Columns) -> dict[str, Callable[[Columns], np.ndarray]]:
     """One more effect each, as a column of what was filtered."""
     top, span = float(np.abs(own.v).max()), own.span
-    out = {BY_DIRECTION: lambda d: np.abs(d.v), SQUARE: lambda d: d.v * np.abs(d.v), LAG: lambda d: d.rise}
+    out: dict[str, Callable[[Columns], np.ndarray]] = {
+        BY_DIRECTION: lambda d: np.abs(d.v),
+        SQUARE: lambda d: d.v * np.abs(d.v),
+        LAG: lambda d: d.rise,
+    }
     if own.loaded:
         out[LOAD] = lambda d: d.column(lambda q, v, load: np.abs(load) * np.sign(v))
     for part in SPEEDS:
-        out[f"{STRIBECK} (v_s {part * top:.3g})"] = lambda d, s=part * top: d.column(
-            lambda q, v, load: np.sign(v) * np.exp(-((v / s) ** 2))
-        )
+        out[f"{STRIBECK} (v_s {part * top:.3g})"] = partial(_stribeck, speed=part * top)
     for part in DISTANCES:
-        out[f"{GIVES} (over {part * span:.2g})"] = lambda d, s=part * span: d.column(
-            lambda q, v, load: _taken_up(q, s) - np.sign(v)
-        )
+        out[f"{GIVES} (over {part * span:.2g})"] = partial(_gives, way=part * span)
     return out
+
+
+def _stribeck(d: Columns, speed: float) -> np.ndarray:
+    """Dry friction that falls with speed [rad/s], exp(-(v / speed)^2)."""
+    return d.column(lambda q, v, load: np.sign(v) * np.exp(-((v / speed) ** 2)))
+
+
+def _gives(d: Columns, way: float) -> np.ndarray:
+    """Dry friction that is taken up over a way [rad], less what is there at once."""
+    return d.column(lambda q, v, load: _taken_up(q, way) - np.sign(v))
 
 
 def _taken_up(q: np.ndarray, distance: float) -> np.ndarray:

@@ -22,7 +22,9 @@ from dexsim.gap.search.inverse_dynamics import (
     NAMES,
     PER_CUTOFF,
     STRIBECK,
+    Body,
     Columns,
+    Motion,
     columns_of,
     moved,
     readable,
@@ -33,8 +35,11 @@ from dexsim.gap.search.inverse_dynamics import (
 )
 
 if TYPE_CHECKING:
+    Spans = dict[int, tuple[float, float]]  # by run: the part [s from its start] to keep to
+
     from dexsim.gap.inquiry import Diagnosis
     from dexsim.gap.plant.case import Case
+    from dexsim.gap.search.search import JointSearch, Trial
 
 
 # -- what inverse dynamics say of each joint --------------------------------------------------------------------------
@@ -62,8 +67,10 @@ def identify_joints(
         if not use or not case.moved:
             continue
 
-        def at(cutoff: float, case=case, use=use, judge=judge):
-            def piece(r: int, span):
+        def at(
+            cutoff: float, case: Case = case, use: list[int] = use, judge: list[int] = judge
+        ) -> tuple[Columns, Columns]:
+            def piece(r: int, span: Spans | None) -> tuple[Motion, Body | None, tuple[float, float] | None]:
                 if (r, cutoff) not in motions:
                     motions[r, cutoff] = moved(runs[r], model, cutoff)
                 return *motions[r, cutoff], None if span is None else span.get(r)
@@ -135,9 +142,8 @@ def believe(given: Sequence[tuple]) -> list[str]:
         values = {n: (x.value[n], max(x.low[n], 0.0), x.high[n]) for n in open_}
         if "coulomb_friction" in open_ and case.scales.nominal["friction_asymmetry"] == 0:
             per = 2.0 / x.value["coulomb_friction"]
-            values["friction_asymmetry"] = tuple(
-                float(np.clip(per * v, -2, 2)) for v in (x.value["offset"], x.low["offset"], x.high["offset"])
-            )
+            a, b, c = (float(np.clip(per * v["offset"], -2, 2)) for v in (x.value, x.low, x.high))
+            values["friction_asymmetry"] = a, b, c
         for name, (value, low, high) in values.items():
             for row in case.plant.nominal:
                 row[SERVO[name]] = value
@@ -189,6 +195,7 @@ def hand_on(
         ours = {n: case.scales.nominal[n] for n in told}
         if "inertia" in case.factors and "inertia_scale" not in claimed:
             ours["inertia"] = x.value["inertia"] / case.scales.inertia
+        assert d.servo is not None  # what is handed on
         if not told or not (case.joint in strange or _alike(case, search, trial, ours, test, span_test)):
             continue
         for name in told:
@@ -221,7 +228,14 @@ def unknown_controllers(given: Sequence[tuple], stages: Sequence, notes: list[st
     return out
 
 
-def _alike(case, search, trial, ours: dict[str, float], test: Sequence[int], span_test: dict | None) -> bool:
+def _alike(
+    case: Case,
+    search: JointSearch,
+    trial: Trial,
+    ours: dict[str, float],
+    test: Sequence[int],
+    span_test: Spans | None,
+) -> bool:
     """Whether what was kept out is followed as well with the torque's figures as with those that the closed loop was
     refitted to."""
     from dexsim.gap.judge.kept_out import free_run
@@ -383,7 +397,9 @@ def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int
     return out
 
 
-def _of_joint(pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator):
+def _of_joint(
+    pieces: Sequence[Columns], own: Sequence[bool], rng: np.random.Generator
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], float, float, float, bool] | None:
     """([(times, pushed) of each piece], largest push, quiet residual, share left by a plain fit, whether the rest
     fits); None where little is left.
 
@@ -450,7 +466,8 @@ def _trimmed(
     Driessen 2006)."""
     grams, sides = sums(A, u, block, count)
     squares, n = np.bincount(block, u * u, count), np.maximum(np.bincount(block, minlength=count), 1)
-    keep, best = max(int(HALF * count), 4), (np.inf, None, None)
+    keep, lowest = max(int(HALF * count), 4), np.inf
+    best = np.zeros(A.shape[1]), np.zeros(count, bool)
     for _ in range(STARTS):
         on = np.zeros(count, bool)
         on[rng.choice(count, min(max(A.shape[1], 4), count), replace=False)] = True
@@ -463,9 +480,9 @@ def _trimmed(
                 break
             on = now
         loss = float(energy[on].sum())
-        if loss < best[0]:
-            best = (loss, x, on)
-    return best[1], best[2]
+        if loss < lowest:
+            lowest, best = loss, (x, on)
+    return best
 
 
 def _spans(given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run]) -> dict[str, list[tuple[float, float]]]:

@@ -4,6 +4,7 @@ left out."""
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -164,6 +165,10 @@ class JointLosses(JointHypotheses):
 SWEEPS = 60  # over the beliefs, by which the scan moves them
 
 
+Scanned = tuple[float, float, Member, np.ndarray]
+"""Of one effect: share of the squared error that it removes, price, member, start."""
+
+
 class JointScan(JointLosses):
     """The scan of the catalogue on one joint."""
 
@@ -179,23 +184,23 @@ class JointScan(JointLosses):
         for effect in CATALOGUE:
             if effect.id in taken or (self.allowed is not None and effect.id not in self.allowed):
                 continue
-            for variant in effect.variants(case.scales):
-                variant = None if variant.refines or variant.instead else self._narrow(variant)
+            for whole in effect.variants(case.scales):
+                variant = None if whole.refines or whole.instead else self._narrow(whole)
                 if variant is None:
                     continue
                 member = Member(effect, variant)
-                for start in variant.starts:
+                for begun in variant.starts:
                     g = base.copy()
                     for name, value in variant.fixed:
                         g[:, INDEX[name]] = value
-                    for p, value in zip(variant.params, start, strict=True):
+                    for p, value in zip(variant.params, begun, strict=True):
                         value = float(np.clip(value, p.low, p.high))
                         p.apply(g[None], np.array([value]), case.plant.base())
                     guesses.append(legal(g))
-                    owners.append((member, np.array(start)))
+                    owners.append((member, np.array(begun)))
         return guesses, owners
 
-    def scan(self, current: Trial) -> list[tuple[float, float, Member, np.ndarray]]:
+    def scan(self, current: Trial) -> list[Scanned]:
         """Every effect against what `current` leaves: (share of squared error removed, price, member, start)."""
         case = self.case
         params = current.fit.params
@@ -273,7 +278,7 @@ class JointScan(JointLosses):
 
     def _saved(
         self,
-        owners,
+        owners: list[tuple[Member, np.ndarray]],
         dots: np.ndarray,
         squares: np.ndarray,
         cross: np.ndarray,
@@ -281,7 +286,7 @@ class JointScan(JointLosses):
         r: np.ndarray,
         params: list[Param],
         x: np.ndarray,
-    ):
+    ) -> list[tuple[float, Member, np.ndarray]]:
         """What each guess of the scan would save where beliefs, moved out to follow the data, may go back: [(share of
         the squared error with what beliefs gave for it, member, start)] by member, the best first.
 
@@ -327,11 +332,13 @@ class JointScan(JointLosses):
         starts = tuple(dict.fromkeys(tuple(s[i] for i in keep) for s in variant.starts))
         return replace(variant, params=tuple(variant.params[i] for i in keep), starts=starts)
 
-    def _shortlist(self, scan, size, loss, members):
+    def _shortlist(
+        self, scan: list[Scanned], size: int, loss: float, members: Sequence[Member]
+    ) -> list[Scanned]:
         """The best variants of the best effects, every kind of those that ask for it, and what the first is confused
         with."""
         seen: dict[str, int] = {}
-        out = []
+        out: list[Scanned] = []
         for row in scan:
             g, p, m, _ = row
             if g < SEARCH.promise * SEARCH.least * min(1.0, SEARCH.rough / loss) or (
@@ -349,7 +356,7 @@ class JointScan(JointLosses):
                 out.append(row)
         return out
 
-    def _hinted(self, listed, members, least: float):
+    def _hinted(self, listed: list[Scanned], members: Sequence[Member], least: float) -> list[Scanned]:
         """The list, and up to four more that, by the scan, save at least `least` of the squared error with what the
         beliefs give for it: where those moved out to follow the data, what is left shows little, and the right effect
         lets them go back."""

@@ -17,7 +17,7 @@ from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
 from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, subset
-from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, expand_one
+from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
 AGAIN = 2  # hypotheses from which the fit without any effect is begun again before one is claimed
@@ -33,7 +33,9 @@ class JointSelection(JointScan):
         self.none_loss = self._left(none)
         self._on(0.1)
         current = none
-        gains, price, scanned = {}, {}, []
+        gains: dict[str, float] = {}
+        price: dict[str, float] = {}
+        scanned: list[tuple[str, float, float]] = []
         rivals: dict[str, list[tuple[str, float]]] = {}
         confidence: dict[str, float] = {}
         per = len(self.blocks)
@@ -227,7 +229,8 @@ class JointSelection(JointScan):
         if enough or self.deadline.over() or (plain := self.plain()) is None:
             return current
         at = {p.key: (p, float(x)) for p, x in zip(*plain, strict=True)}
-        members, starts = [], []
+        members: list[Member] = []
+        starts: list[np.ndarray] = []
         for effect in CATALOGUE:
             moved = [c for c in effect.plain if c in at and c not in self.wide and _differs(*at[c], self.case)]
             if not moved or (self.allowed is not None and effect.id not in self.allowed):
@@ -255,7 +258,7 @@ class JointSelection(JointScan):
             return current
         return self._drop(trial)
 
-    def _pair(self, current: Trial, listed) -> Trial | None:
+    def _pair(self, current: Trial, listed: Sequence[Scanned]) -> Trial | None:
         best = None
         for i, (_, _, m1, s1) in enumerate(listed):
             for _, _, m2, s2 in listed[i + 1 :]:
@@ -270,7 +273,9 @@ class JointSelection(JointScan):
             return best
         return None
 
-    def _swap(self, current: Trial, pool, level):
+    def _swap(
+        self, current: Trial, pool: dict[str, tuple[Member, np.ndarray]], level: list[Trial]
+    ) -> tuple[Trial, list[Trial]]:
         """Each earlier member replaced by others of the pool, while the rest stays."""
         best = current
         for i, member in enumerate(current.members[:-1]):
@@ -309,8 +314,8 @@ class JointSelection(JointScan):
     def _refine(self, current: Trial) -> Trial:
         """Members with more parameters (an elasticity that hardens), where those earn their place."""
         for i, member in enumerate(current.members):
-            for variant in member.effect.variants(self.case.scales):
-                variant = self._narrow(variant) if variant.refines else None
+            for whole in member.effect.variants(self.case.scales):
+                variant = self._narrow(whole) if whole.refines else None
                 if variant is None or {p.key for p in member.variant.params} - {p.key for p in variant.params}:
                     continue
                 sizes = np.cumsum([len(m.variant.params) for m in current.members])[:-1]

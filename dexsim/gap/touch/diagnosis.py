@@ -189,6 +189,7 @@ def _verdict(felt: TouchResult) -> str | None:
         if f["confidence"] < JUDGE.firm:
             f["hint"] = True
     named = [{"effect": f["effect"], "held_out": True, "hint": f.get("hint", False)} for f in felt.findings]
+    assert felt.floor is not None and felt.before is not None and felt.after is not None  # with a force predicted
     word = kept_out.verdict(named, felt.floor, felt.before[0], felt.before[1], felt.after[0], felt.structured)
     return "partly_explained" if word == "explained" and felt.structured else word
 
@@ -241,6 +242,7 @@ def _beside(d: Diagnosis, felt: TouchResult) -> None:
 
 
 def _metric(data: dict, felt: TouchResult) -> None:
+    assert felt.floor is not None and felt.before is not None and felt.after is not None  # with a force predicted
     (b, bl, bh), (a, al, ah) = felt.before, felt.after
     data["held_out"] = {
         "recordings": felt.recordings,
@@ -296,7 +298,7 @@ def doubted(finding: dict[str, Any]) -> bool:
 def handed(findings: list[dict[str, Any]], facts: dict[str, PadFacts], names: Sequence[str]) -> Handed:
     """The settings that findings of touch ask for. facts: by name of pad; names: of the hand's pads [F]."""
     out = Handed()
-    pads: dict[str, dict[str, Any]] = {}
+    pads: dict[str, PadSettings] = {}
     drifts: dict[str, Any] = {}
     for f in findings:
         if not f["where"]["taxels"]:

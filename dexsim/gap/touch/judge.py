@@ -146,9 +146,10 @@ class PadAnswer:
             v = t.values if k is None else t.values | {key: self.bounds[key][k] for key in ("c10", "c01")}
             pairs = [(contact(r, v)[0], r.depth + v["zero"]) for r in self.search.runs]
             fits.append(chord(*(np.concatenate(x) for x in zip(*pairs, strict=True))))
-        if any(f is None for f in fits):
+        found = [f for f in fits if f is not None]
+        if len(found) < len(fits):
             return None
-        return fits[0][0], min(f[1] for f in fits), max(f[2] for f in fits)
+        return found[0][0], min(f[1] for f in found), max(f[2] for f in found)
 
     def _parameters(self, e: str) -> tuple[list[str], dict[str, Any]]:
         """(taxels concerned, parameters with intervals by the catalogue's keys)."""
@@ -175,6 +176,7 @@ class PadAnswer:
         """The same of a gain for every taxel: those that are off, and those that are exchanged."""
         t, pad = self.best, self.pad
         g = t.gains
+        assert g is not None  # of such an effect
         moved = [] if t.order is None else [int(k) for k in np.flatnonzero(t.order != np.arange(len(g)))]
         half = self.search.gain_width(t)
         off = [int(k) for k in np.flatnonzero(np.abs(g - 1) > np.maximum(TOUCH.gain_off, half))]
@@ -183,11 +185,12 @@ class PadAnswer:
         value = [round(float(g[k]), 4) for k in chosen]
         low = [max(v - float(half[k]), 0.0) for k, v in zip(chosen, value, strict=True)]
         high = [v + float(half[k]) for k, v in zip(chosen, value, strict=True)]
-        gain = {"value": value, "low": low, "high": high, "unit": "1"}
-        if len(chosen) == 1 or (len(chosen) and np.ptp(value) < 0.05):
-            gain |= {k: float(np.mean(gain[k])) for k in ("value", "low", "high")}
-        out = {"gain": gain, "taxels": {"value": ", ".join(names), "low": None, "high": None, "unit": ""}}
-        if moved:
+        each: dict[str, list[float]] = {"value": value, "low": low, "high": high}
+        alike = len(chosen) == 1 or (len(chosen) and np.ptp(value) < 0.05)
+        gain: dict[str, Any] = {k: float(np.mean(x)) if alike else x for k, x in each.items()} | {"unit": "1"}
+        taxels: dict[str, Any] = {"value": ", ".join(names), "low": None, "high": None, "unit": ""}
+        out = {"gain": gain, "taxels": taxels}
+        if t.order is not None and moved:
             pairs = sorted({tuple(sorted((k, int(t.order[k])))) for k in moved})
             out["taxels"]["swapped"] = [[f"{pad}:{a}", f"{pad}:{b}"] for a, b in pairs]
         return names, out

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from dexsim import yaml_text
+from dexsim.assets.objects.shape import Grid
 from dexsim.errors import UserError
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read.runs import local_polynomial, spans
@@ -74,7 +75,7 @@ class PadRun:
     stiffness: float = STIFFNESS
     friction: float = FRICTION
     doubt: float = 1.5e-4  # m by which the object may be elsewhere over the pad than the joints say
-    pressed: np.ndarray | None = None  # [S, K] taxels that `shear` sums
+    pressed: np.ndarray = None  # type: ignore[assignment]  # [S, K] taxels that `shear` sums; `_pad_run` says them
     memory: dict = field(default_factory=dict)  # contacts that were computed
 
     @property
@@ -114,7 +115,7 @@ class _Thing:
 
     kind: str
     size: np.ndarray
-    grid: object
+    grid: Grid | None
     body: str | None  # None: led along /object_pose
     geom: int = -1
 
@@ -122,6 +123,7 @@ class _Thing:
 def newtons(r: Recording) -> tuple[np.ndarray, bool]:
     """Readings [S, F, K, 3] in N and our axes, and whether the scale was stated."""
     lsb = r.tactile_lsb
+    assert r.tactile is not None  # asked for where touch was recorded
     return r.tactile.value * ((ASSUMED_LSB if lsb is None else lsb) * r.tactile_axis_sign), lsb is not None
 
 
@@ -136,8 +138,9 @@ def collect(recordings: list[Recording], m: Mechanism, sensors: Sensors) -> Touc
         return out
     origin = min((r.start_ns for r in recordings), default=0)
     temps = [r.temperature for r in recordings if r.tactile is not None]
-    out.thermometer = bool(temps) and all(x is not None and np.isfinite(x.value).any() for x in temps)
-    coldest = min((float(np.nanmin(x.value)) for x in temps), default=0.0) if out.thermometer else 0.0
+    warm = [x for x in temps if x is not None and np.isfinite(x.value).any()]
+    out.thermometer = bool(temps) and len(warm) == len(temps)
+    coldest = min((float(np.nanmin(x.value)) for x in warm), default=0.0) if out.thermometer else 0.0
     for r in recordings:
         if r.tactile is None or r.tactile.value.ndim != 4 or len(r.tactile) < 20:
             continue
@@ -156,7 +159,7 @@ def collect(recordings: list[Recording], m: Mechanism, sensors: Sensors) -> Touc
                 f"{r.path.name}: {int((~finite).any((1, 2, 3)).sum())} touch samples are not finite and count as 0"
             )
             force = np.where(finite, force, 0.0)
-        lsb = (ASSUMED_LSB if not known else r.tactile_lsb) if r.meta["tactile_unit"] == "count" else 0.0
+        lsb = 0.0 if r.meta["tactile_unit"] != "count" else r.tactile_lsb if r.tactile_lsb is not None else ASSUMED_LSB
         pressed = [f for f in range(layout.pads) if (force[:, f, :, 2].max(1) > max(2 * lsb, 0.05)).mean() > 0.01]
         things = _things(r, model, sensors)
         on = [f for f in pressed if layout.bodies[f] in [model.body(i).name for i in range(model.nbody)]]
@@ -211,8 +214,20 @@ def _things(r: Recording, model: mujoco.MjModel, sensors: Sensors) -> list[_Thin
     return out
 
 
-def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> PadRun | None:
+def _pad_run(
+    r: Recording,
+    m: Mechanism,
+    model: mujoco.MjModel,
+    sensors: Sensors,
+    f: int,
+    force: np.ndarray,
+    lsb: float,
+    things: list[_Thing],
+    origin: int,
+    coldest: float | None,
+) -> PadRun | None:
     layout = sensors.layout
+    assert layout is not None and r.tactile is not None  # as `collect` has looked
     K = int(layout.count[f])
     t = r.tactile.t
     z = force[:, f, :K, 2]
@@ -221,13 +236,14 @@ def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> Pa
     t, z = t[keep], z[keep]
     grid = np.arange(start, stop + 0.5 / RATE, 1 / RATE)
     rot, pos = _poses(r, m, model, grid, things, layout.bodies[f])
-    if rot is None:
+    if rot is None or pos is None:
         return None
     point, normal = sensors.lifted.point[f, :K], layout.normal[f, :K]
     skin = sensors.skin(f, fine=4)
-    thing, R, p = _nearest(things, rot, pos, point)
-    if thing is None:
+    nearest = _nearest(things, rot, pos, point)
+    if nearest is None:
         return None
+    thing, R, p = nearest
     dist = _distance(thing, point, R, p)
     e1, e2 = _tangents(normal[int(np.argmax(z.sum(0)))])
     # moving the object by +e in the pad's frame moves the pad's points by -e in the object's
@@ -255,7 +271,7 @@ def _pad_run(r, m, model, sensors, f, force, lsb, things, origin, coldest) -> Pa
         if r.meta["tactile_unit"] == "count"
         else np.zeros(z.shape, bool)
     )
-    if coldest is not None:
+    if coldest is not None and r.temperature is not None:
         warm = np.interp(grid, r.temperature.t, np.nanmean(r.temperature.value, 1)) - coldest
     else:
         warm = grid + (r.start_ns - origin) * 1e-9
@@ -306,6 +322,7 @@ def _believed_contact(r: Recording, thing: _Thing) -> tuple[float, float]:
     """(stiffness N/m, friction) that is believed of what is touched."""
     if thing.body is not None:
         return STIFFNESS, FRICTION
+    assert r.config is not None  # `_things` has it from there
     o = yaml_text.parse(r.config, f"{r.path.name}: attached config")["recorded_world"]["object"]
     return float(o.get("stiffness", STIFFNESS)), float(o.get("friction", FRICTION))
 
@@ -335,17 +352,19 @@ def _stretch(t: np.ndarray, total: np.ndarray) -> tuple[float, float]:
     return float(t[first]), float(min(t[first] + LONGEST, t[-1]))
 
 
-def _poses(r: Recording, m: Mechanism, model, grid, things, pad: str):
+def _poses(
+    r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray, things: list[_Thing], pad: str
+) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
     """For every thing: rotation [G, 3, 3] and position [G, 3] that take a point of the pad's body frame to the
     thing's."""
     data = mujoco.MjData(model)
     address, values = _posture(r, m, model, grid)
-    led = any(x.body is None for x in things)
-    poses = None
+    led, o = any(x.body is None for x in things), r.object_pose
+    path, turns = np.zeros((0, 3)), np.zeros((0, 4))
     if led:
-        o = r.object_pose
+        assert o is not None  # what is led has a path
         raw = np.stack([np.interp(grid, o.t, v) for v in o.value.T], 1)
-        poses = raw[:, :3], raw[:, 3:] / np.linalg.norm(raw[:, 3:], axis=1, keepdims=True)
+        path, turns = raw[:, :3], raw[:, 3:] / np.linalg.norm(raw[:, 3:], axis=1, keepdims=True)
     elif not address:
         return None, None
     body = model.body(pad).id
@@ -357,15 +376,17 @@ def _poses(r: Recording, m: Mechanism, model, grid, things, pad: str):
         A, a = data.xmat[body].reshape(3, 3), data.xpos[body]
         for k, thing in enumerate(things):
             if thing.body is None:
-                mujoco.mju_quat2Mat(quat, poses[1][i])
-                B, b = quat.reshape(3, 3), poses[0][i]
+                mujoco.mju_quat2Mat(quat, turns[i])
+                B, b = quat.reshape(3, 3), path[i]
             else:
                 B, b = data.geom_xmat[thing.geom].reshape(3, 3), data.geom_xpos[thing.geom]
             rot[k, i], pos[k, i] = B.T @ A, B.T @ (a - b)
     return rot, pos
 
 
-def _posture(r: Recording, m: Mechanism, model, grid: np.ndarray) -> tuple[list[int], np.ndarray]:
+def _posture(
+    r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray
+) -> tuple[list[int], np.ndarray]:
     """(addresses in qpos, values [G, n]) of the joints that were read."""
     p = r.states.position
     address, values = [], []
@@ -382,7 +403,9 @@ def _posture(r: Recording, m: Mechanism, model, grid: np.ndarray) -> tuple[list[
     return address, np.array(values).T if values else np.zeros((len(grid), 0))
 
 
-def _hull_depth(r, m, model, grid, thing: _Thing, pad: str) -> np.ndarray | None:
+def _hull_depth(
+    r: Recording, m: Mechanism, model: mujoco.MjModel, grid: np.ndarray, thing: _Thing, pad: str
+) -> np.ndarray | None:
     """[G] m: depth of the thing's geom in the pad's own collision geoms, which is what the physics presses (their
     margin rounds them); None where the pad has none that are convex."""
     body = model.body(pad).id
@@ -410,16 +433,18 @@ def _hull_depth(r, m, model, grid, thing: _Thing, pad: str) -> np.ndarray | None
     return out
 
 
-def _nearest(things, rot, pos, point):
+def _nearest(
+    things: list[_Thing], rot: np.ndarray, pos: np.ndarray, point: np.ndarray
+) -> tuple[_Thing, np.ndarray, np.ndarray] | None:
     """The thing that comes nearest to the pad, and its poses; None where none comes near."""
-    best = (NEAR, None)
+    least, nearest = NEAR, -1
     for k, thing in enumerate(things):
         gap = float(_distance(thing, point[::7], rot[k][::5], pos[k][::5]).min())
-        if gap < best[0]:
-            best = (gap, k)
-    if best[1] is None:
-        return None, None, None
-    return things[best[1]], rot[best[1]], pos[best[1]]
+        if gap < least:
+            least, nearest = gap, k
+    if nearest < 0:
+        return None
+    return things[nearest], rot[nearest], pos[nearest]
 
 
 def _distance(thing: _Thing, point: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@ left out."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,7 +49,7 @@ class TouchTrial:
     order: np.ndarray | None = None
     keys: tuple[str, ...] = ()
     jac: np.ndarray | None = None
-    res: np.ndarray | None = None
+    res: np.ndarray = field(default_factory=lambda: np.zeros(0))
     left_out: np.ndarray | None = None
     folds: list[dict[str, float]] = field(default_factory=list)  # values without one fold each
 
@@ -78,7 +79,8 @@ class PadFit:
         self.doubt = max(r.doubt for r in runs)
         self.load_noise = 0.0
         if self.load:
-            self.load_noise = max(float(np.median([noise(r.grid, r.load)[0] for r in runs])), 1e-3)
+            loads = [noise(r.grid, r.load)[0] for r in runs if r.load is not None]
+            self.load_noise = max(float(np.median(loads)), 1e-3)
         self.base = neutral()
         self.silent = self._silent()
         self.samples = self._samples(held)
@@ -138,7 +140,7 @@ class PadFit:
                 self.noise**2 + (TOUCH.plant * np.maximum(r.z, 0.0)) ** 2 + (TOUCH.timing * _rate(r.t, r.z)) ** 2
             )
             out.append(self._sample(r, i, "taxels", mask, sigma, r.t, held))
-            if self.load:
+            if self.load and r.load is not None:
                 touched = (r.load > 0.05 * r.load.max()) | (cell(r, v) > 0.05)
                 wide = np.sqrt(
                     self.load_noise**2 + (TOUCH.plant * r.load) ** 2 + (TOUCH.timing * _rate(r.grid, r.load)) ** 2
@@ -153,7 +155,9 @@ class PadFit:
                 out.append(self._sample(r, i, "shear", on, wide, r.t, held))
         return out
 
-    def _sample(self, r, i, stage, mask, sigma, t, held) -> Sample:
+    def _sample(
+        self, r: PadRun, i: int, stage: str, mask: np.ndarray, sigma: np.ndarray, t: np.ndarray, held: Collection[str]
+    ) -> Sample:
         block = i * 100000 + {"taxels": 0, "cell": 20000, "shear": 40000}[stage] + ((t - t[0]) / BLOCK).astype(int)
         train = np.full(len(t), r.recording not in held) if held else t < t[0] + 0.75 * (t[-1] - t[0])
         spread = lambda x: np.broadcast_to(x.reshape(len(t), *[1] * (mask.ndim - 1)), mask.shape)[mask]  # noqa: E731
@@ -229,11 +233,11 @@ class PadFit:
             [start.get(k, PARAMS[k].neutral) for k in keys], low + 1e-6 * (high - low), high - 1e-6 * (high - low)
         )
 
-        def values(x):
+        def values(x: np.ndarray) -> dict[str, float]:
             fixed = {"scale": start["scale"]} if "scale" not in keys and "scale" in start else {}
             return self.base | fixed | dict(zip(keys, (float(a) for a in x), strict=True))
 
-        def error(y):
+        def error(y: np.ndarray) -> np.ndarray:
             x = y * scale
             # a nuisance is believed within its scale: a prior as strong as one block of readings
             return np.concatenate([self.residual(values(x), gains, order)[where], 3.0 * soft * (x - centre) / scale])
@@ -363,7 +367,7 @@ class PadFit:
         """Half of the 90 % interval of each taxel's gain [K]: the disagreement of the folds, and 2 %."""
         maps = [self.gain_map(t, self.train & (self.fold != f)) for f in self.folds]
         if len(maps) < 2:
-            return np.full(len(t.gains), 0.1)
+            return np.full(self.runs[0].z.shape[1], 0.1)
         n = len(maps)
         se = np.sqrt((n - 1) / n * ((np.array(maps) - np.mean(maps, 0)) ** 2).sum(0))
         return 1.645 * np.hypot(se, 0.02)
@@ -574,7 +578,7 @@ class PadSearch(PadFit):
         """Sums of a block bootstrap of x [B], in stretches of neighbouring blocks."""
         return x[intervals.stretches(len(x), STRETCH, self.rng, BOOTSTRAPS)].sum(1)
 
-    def _drop(self, current: TouchTrial, trials) -> TouchTrial:
+    def _drop(self, current: TouchTrial, trials: dict[frozenset[str], TouchTrial]) -> TouchTrial:
         changed = True
         while changed and len(current.ids) > 1:
             changed = False
@@ -597,7 +601,9 @@ class PadSearch(PadFit):
             less.res = self.residual(less.values, less.gains, less.order)
         return less
 
-    def _rivals(self, current: TouchTrial, e: str, trials) -> tuple[list[tuple[str, float]], float]:
+    def _rivals(
+        self, current: TouchTrial, e: str, trials: dict[frozenset[str], TouchTrial]
+    ) -> tuple[list[tuple[str, float]], float]:
         """What else in the place of one effect would do (its share of bootstraps), and the effect's own share."""
         base = self.without(current, e)
         others = []
@@ -620,7 +626,7 @@ class PadSearch(PadFit):
             if t is not None and (self.size(t.res) < TOUCH.rival * self.size(current.res) or alike):
                 self.cross(t)
                 others.append((x.id, t))
-        table = np.stack([self.cross(current), *[t.left_out for _, t in others], self.cross(base)])
+        table = np.stack([self.cross(current), *[self.cross(t) for _, t in others], self.cross(base)])
         drawn = intervals.stretches(table.shape[1], STRETCH, self.rng, BOOTSTRAPS)
         shares = intervals.wins(table, drawn, TOUCH.told_apart)
         rows = sorted(
