@@ -8,6 +8,7 @@ to any floor. Imports inside functions count like those at the top; what stands 
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from pathlib import Path
 
@@ -37,6 +38,7 @@ NEVER = {"gap": {"deploy", "view"}, "tasks": {"recording"}}
 """What a part does not import though it stands lower."""
 CIRCLES: dict[frozenset[str], str] = {}
 """Circles of files that are allowed, each with its reason. None is."""
+WARP = re.compile(r"@wp\.(kernel|func|func_native|struct)\b|wp\.kernel\(")
 
 
 def door(node: ast.AST) -> bool:
@@ -165,14 +167,17 @@ def test_public_functions_have_types(tmp_path):
     assert not missing, "\n".join(missing)
 
 
-def test_mypy_passes_over_no_file_that_is_gone():
-    """Its list of files whose types are left to mend only shrinks."""
+def test_mypy_reads_every_file():
+    """None is passed over; it looks away from Warp's annotations and operators only where there are kernels."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mypy"]
-    passed_over = {m for part in settings["overrides"] if part.get("ignore_errors") for m in part["module"]}
+    assert settings["files"] == ["dexsim"] and "exclude" not in settings
+    assert not [part["module"] for part in settings["overrides"] if part.get("ignore_errors")]
     known = modules(ROOT)
-    assert settings["files"] == ["dexsim"]
-    assert passed_over <= known.keys(), passed_over - known.keys()
-    assert len(passed_over) < 0.45 * len(known), f"{len(passed_over)} of {len(known)} files are not checked"
+    eased = [m for part in settings["overrides"] if part.get("disable_error_code") for m in part["module"]]
+    for name in eased:
+        assert name in known, f"{name}: no such file"
+        warp = WARP.search(known[name].read_text(encoding="utf-8"))
+        assert warp, f"{name}: has no Warp function, so that mypy can check all of it"
 
 
 def test_the_check_sees_what_it_must(tmp_path):

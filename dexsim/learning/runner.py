@@ -111,7 +111,7 @@ class Runner(OnPolicyRunner):
             (folder / "git").rmdir()
         return self.logger.writer
 
-    def learn(  # type: ignore[override]
+    def learn(
         self,
         iterations: int,
         on_iteration: Callable[[dict[str, float]], None] = lambda row: None,

@@ -130,7 +130,7 @@ class PlayRecorder:
         wp.launch(self._kernel, dim=self._rows.shape[1:], inputs=self._args, device=self.env.engine.device)
         wp.launch(next_slot, dim=1, inputs=[self._rows.shape[0], self._slot], device=self.env.engine.device)
 
-    def _recorded_step(self, actions: torch.Tensor):
+    def _recorded_step(self, actions: torch.Tensor) -> tuple[Any, torch.Tensor, torch.Tensor, dict[str, Any]]:
         env, w = self.env, self.worlds
         self._slot.zero_()
         o = env.objects

@@ -10,7 +10,7 @@ import warp as wp
 
 
 @cache
-def _kernel(real):
+def _kernel(real: type) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def set_state(
         mask: wp.array(dtype=wp.bool),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +16,9 @@ import warp as wp
 
 from dexsim import files
 from dexsim.errors import UserError
+
+if TYPE_CHECKING:
+    from dexsim.tasks.env import HandEnv
 
 KEEP = 10
 """Files a run writes at most; `nan_count` goes on counting."""
@@ -67,7 +71,7 @@ class NanDump:
     many control steps its episode had lasted, the servo's columns and every model field that varies by world.
     """
 
-    def __init__(self, env):
+    def __init__(self, env: HandEnv):
         e, dev = env.engine, env.device
         self._env, self._count = env, 0
         live = {"qpos": e.t.qpos, "qvel": e.t.qvel, "time": e.t.time, "servo_state": env.servo.state}

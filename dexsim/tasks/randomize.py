@@ -124,7 +124,7 @@ class Sampler:
             self._ahead.clear()
         return None
 
-    def _read(self, path: str, node) -> None:
+    def _read(self, path: str, node: dict) -> None:
         for key, value in node.items():
             here = f"{path}.{key}"
             name = here.removeprefix("randomize.")
