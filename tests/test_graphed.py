@@ -26,8 +26,11 @@ def ppo(**settings) -> PPO:
     env = SimpleNamespace(num_envs=WORLDS, num_actions=3)
     cfg = {
         "num_steps_per_env": STEPS, "multi_gpu": None, "obs_groups": {"actor": ["a"], "critic": ["a", "b"]},
-        "actor": {**MODEL, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.6, "std_type": "log"}},
-        "critic": MODEL, "algorithm": {"class_name": "PPO", "num_learning_epochs": 3, "num_mini_batches": 4, **settings},
+        "actor": MODEL | {
+            "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.6, "std_type": "log"}
+        },
+        "critic": MODEL,
+        "algorithm": {"class_name": "PPO", "num_learning_epochs": 3, "num_mini_batches": 4, **settings},
     }  # fmt: skip
     with agent_errors():
         return PPO.construct_algorithm(obs, env, copy.deepcopy(cfg), "cpu")
@@ -57,7 +60,8 @@ def learn(alg: PPO, updater, updates: int, seed: int = 1) -> list[dict]:
 
 @pytest.mark.parametrize("settings", [
     {}, {"schedule": "fixed", "learning_rate": 3e-3}, {"desired_kl": 1e-4}, {"desired_kl": 10.0},
-    {"use_clipped_value_loss": False, "normalize_advantage_per_mini_batch": True, "entropy_coef": 0.1, "max_grad_norm": 0.01},
+    {"use_clipped_value_loss": False, "normalize_advantage_per_mini_batch": True, "entropy_coef": 0.1,
+     "max_grad_norm": 0.01},
 ])  # fmt: skip
 def test_it_learns_what_rsl_rl_learns(settings):
     """Three updates: losses, learning rate, weights, normalization and the optimizer's memory, to rounding."""
@@ -105,7 +109,8 @@ def test_the_adaptive_rate_moves_both_ways():
 
 @pytest.mark.parametrize("change, word", [
     (lambda a: setattr(a, "is_multi_gpu", True), "several"), (lambda a: setattr(a, "rnd", object()), "RND"),
-    (lambda a: setattr(a, "use_mixed_precision", True), "mixed"), (lambda a: setattr(a, "critic", torch.nn.Linear(1, 1)), "MLPModel"),
+    (lambda a: setattr(a, "use_mixed_precision", True), "mixed"),
+    (lambda a: setattr(a, "critic", torch.nn.Linear(1, 1)), "MLPModel"),
     (lambda a: setattr(a, "optimizer", torch.optim.SGD(a.actor.parameters(), lr=1.0)), "Adam"),
 ])  # fmt: skip
 def test_what_cannot_be_recorded_is_said(change, word):

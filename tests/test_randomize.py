@@ -49,7 +49,19 @@ def test_directions_and_quaternions_are_uniform():
     assert torch.allclose(q.T @ q / N, torch.eye(4, dtype=d.dtype) / 4, atol=0.03)
 
 
-@pytest.mark.parametrize("value", [[1.0], [2.0, 1.0], "wide", [None, 1.0], {"log": [0.0, 1.0]}, {"log": [-1.0, 1.0]}, [float("nan"), 1.0], [0.0, float("inf")]])
+@pytest.mark.parametrize(
+    "value",
+    [
+        [1.0],
+        [2.0, 1.0],
+        "wide",
+        [None, 1.0],
+        {"log": [0.0, 1.0]},
+        {"log": [-1.0, 1.0]},
+        [float("nan"), 1.0],
+        [0.0, float("inf")],
+    ],
+)
 def test_a_bad_range_is_named(value):
     with pytest.raises(UserError, match="randomize.object.mass"):
         sampler({"object": {"mass": value}})
@@ -63,7 +75,7 @@ def test_unknown_and_forbidden_ranges_are_named():
         s.check("object.mass", 0.001, 5)
 
 
-# -- servo ---------------------------------------------------------------------------------------------------------------
+# -- servo -------------------------------------------------------------------------------------------------------------
 
 JOINTS = ("a", "b")
 
@@ -81,7 +93,12 @@ class FakeServo:
     check_simulated = Servo.check_simulated
 
 
-TABLE = {"joints": {"*": {"kp": 4.0, "kd": 0.1, "torque_limit": 1.1, "delay": 0.01}, "b": {"kp": {"value": 2.0, "low": 1.8, "high": 2.6}}}}
+TABLE = {
+    "joints": {
+        "*": {"kp": 4.0, "kd": 0.1, "torque_limit": 1.1, "delay": 0.01},
+        "b": {"kp": {"value": 2.0, "low": 1.8, "high": 2.6}},
+    }
+}
 
 
 def test_factors_and_additions_are_of_the_nominal():
@@ -91,13 +108,22 @@ def test_factors_and_additions_are_of_the_nominal():
     for _ in range(20):  # never compounds
         r.draw(everyone)
     p = servo.params
-    for name, joint, low, high in (("kp", 0, 2.0, 6.0), ("delay", 0, 0.01, 0.03), ("delay", 1, 0.01, 0.03), ("deadband", 0, 0.0, 0.01),
-                                   ("kp", 1, 1.8, 2.6)):  # b's kp was fitted: its own interval counts
+    for name, joint, low, high in (
+        ("kp", 0, 2.0, 6.0),
+        ("delay", 0, 0.01, 0.03),
+        ("delay", 1, 0.01, 0.03),
+        ("deadband", 0, 0.0, 0.01),
+        ("kp", 1, 1.8, 2.6),
+    ):  # b's kp was fitted: its own interval counts
         x = p[:, joint, INDEX[name]]
         width = high - low
-        assert low - 1e-6 <= float(x.min()) < low + 0.02 * width and high - 0.02 * width < float(x.max()) <= high + 1e-6, (name, joint)
+        assert (
+            low - 1e-6 <= float(x.min()) < low + 0.02 * width and high - 0.02 * width < float(x.max()) <= high + 1e-6
+        ), (name, joint)
     others = [INDEX[n] for n in NAMES if n not in ("kp", "delay", "deadband")]
-    assert torch.equal(p[..., others], servo.nominal[:, others].expand(N, 2, len(others))), "absent limits stay infinite, no NaN"
+    assert torch.equal(p[..., others], servo.nominal[:, others].expand(N, 2, len(others))), (
+        "absent limits stay infinite, no NaN"
+    )
     assert {"kp", "torque_limit"} <= set(RELATIVE) and "delay" not in RELATIVE
 
 
@@ -114,7 +140,8 @@ def test_only_masked_worlds_get_new_drives():
 
 @pytest.mark.parametrize("cfg, word", [
     ({"kp": [-0.5, 1.0]}, "servo.kp"), ({"delay": [-0.05, 0.0]}, "servo.delay"), ({"delay": [0.0, 0.2]}, "servo.delay"),
-    ({"deadband": [0.0, 2.0]}, "servo.deadband"), ({"slop": [0.0, 0.1]}, "slop"), ({"backlash": [0.0, 0.1]}, "not simulated here"), ({"efficiency": [0.5, 3.0]}, "efficiency"),
+    ({"deadband": [0.0, 2.0]}, "servo.deadband"), ({"slop": [0.0, 0.1]}, "slop"),
+    ({"backlash": [0.0, 0.1]}, "not simulated here"), ({"efficiency": [0.5, 3.0]}, "efficiency"),
 ])  # fmt: skip
 def test_values_that_a_servo_cannot_have_are_refused(cfg, word):
     with pytest.raises(UserError, match=word):
@@ -132,7 +159,15 @@ def test_drawn_together_is_what_is_drawn_one_by_one():
     cfg = {"a": {"u": [1.0, 3.0], "log": {"log": [0.01, 1.0]}, "fixed": 2.5}}
 
     def ask(s: Sampler) -> list[torch.Tensor]:
-        return [s.draw("a.u"), s.uniform(2), s.draw("a.log", 3), s.normal(2, 2), s.draw("a.fixed"), s.draw("a.u", 2, 3), s.uniform()]
+        return [
+            s.draw("a.u"),
+            s.uniform(2),
+            s.draw("a.log", 3),
+            s.normal(2, 2),
+            s.draw("a.fixed"),
+            s.draw("a.u", 2, 3),
+            s.uniform(),
+        ]
 
     s, alone = sampler(cfg), sampler(cfg)
     with s.together("episode"):
@@ -147,7 +182,9 @@ def test_drawn_together_is_what_is_drawn_one_by_one():
         tolerance = 6 * float(b.double().std()) / a.numel() ** 0.5 + 1e-6
         assert abs(float(a.double().mean() - b.double().mean())) < tolerance
         assert abs(float(a.double().std() - b.double().std())) < tolerance
-        assert float(a.min()) == pytest.approx(float(b.min()), abs=6 * tolerance + 0.5 * (a.dim() == 3 and a.shape[1:] == (2, 2)))
+        assert float(a.min()) == pytest.approx(
+            float(b.min()), abs=6 * tolerance + 0.5 * (a.dim() == 3 and a.shape[1:] == (2, 2))
+        )
     assert 1.5 <= float(got[0].min()) and float(got[0].max()) <= 2.5, "a curriculum narrows it"
     assert float(got[1].min()) < 0.01 and float(got[1].max()) > 0.99, "and leaves what has no range alone"
     columns = torch.cat([x.reshape(N, -1) for x in got if float(x.std()) > 0], 1)

@@ -522,8 +522,8 @@ def test_friction_never_adds_energy():
     rng = np.random.default_rng(3)
     n = 32
     engine, servo = drive({"kp": 0.0}, n=n, inertia=1e-4, dt=0.002)
-    high = {"coulomb_friction": 0.02, "stribeck_peak": 0.02, "viscous_friction": 1e-3, "stribeck_speed": 5.0}
-    for name, high in (high | {"friction_asymmetry": 1.0, "load_friction": 0.5}).items():
+    most = {"coulomb_friction": 0.02, "stribeck_peak": 0.02, "viscous_friction": 1e-3, "stribeck_speed": 5.0}
+    for name, high in (most | {"friction_asymmetry": 1.0, "load_friction": 0.5}).items():
         servo.column(name)[:] = torch.as_tensor(rng.uniform(0.01, 1, (n, 1)) * high)
     engine.t.qvel[:] = torch.as_tensor(rng.normal(0, 5.0, (n, 1)))
     energy = [engine.t.qvel.numpy().copy() ** 2]

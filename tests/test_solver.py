@@ -53,7 +53,8 @@ def both(m, d, ours: NewtonSolver, warm: np.ndarray) -> dict[str, dict[str, np.n
         with wp.ScopedDevice("cpu"):
             call()
         found[name] = {
-            "qacc": d.qacc.numpy()[:, : m.nv], "Ma": d.efc.Ma.numpy()[:, : m.nv], "constraint": d.qfrc_constraint.numpy()[:, : m.nv],
+            "qacc": d.qacc.numpy()[:, : m.nv], "Ma": d.efc.Ma.numpy()[:, : m.nv],
+            "constraint": d.qfrc_constraint.numpy()[:, : m.nv],
             "force": d.efc.force.numpy(), "state": d.efc.state.numpy(), "iterations": d.solver_niter.numpy(),
             "overflow": d.overflow.numpy(),
         }  # fmt: skip
@@ -101,7 +102,9 @@ def test_forces_of_a_catch_are_those_of_mujoco_warp(catching):
             e.m.opt.iterations = limit
             assert_same(found, nefc, tolerance)  # (of the warm start: as near as the solver's own tolerance brings it)
             if not spoilt:
-                off.append(np.abs(found["theirs"]["qacc"] - found["ours"]["qacc"]) / np.abs(found["theirs"]["qacc"]).max())
+                off.append(
+                    np.abs(found["theirs"]["qacc"] - found["ours"]["qacc"]) / np.abs(found["theirs"]["qacc"]).max()
+                )
     assert np.percentile(off, 90) < 1e-6  # where all went the same way: rounding
     assert contacts > 5 * 4 * WORLDS  # there was something to solve
 
@@ -139,14 +142,17 @@ def kinds(fibers):
     mjm = mujoco.MjModel.from_xml_string(KINDS)
     m, d = mjw.put_model(mjm), mjw.put_data(mjm, mujoco.MjData(mjm), nworld=WORLDS, nconmax=40, njmax=160)
     rng = np.random.default_rng(1)
-    d.qpos.assign((d.qpos.numpy() + np.where(np.arange(mjm.nq) < 1, rng.uniform(-0.3, 0.3, (WORLDS, 1)), 0)).astype(np.float32))
+    d.qpos.assign(
+        (d.qpos.numpy() + np.where(np.arange(mjm.nq) < 1, rng.uniform(-0.3, 0.3, (WORLDS, 1)), 0)).astype(np.float32)
+    )
     d.qvel.assign(rng.normal(size=(WORLDS, mjm.nv)).astype(np.float32))
     mjw.step(m, d)
     return mjm, m, d
 
 
 def test_every_kind_of_row(kinds):
-    """A limit, dry friction, contacts of 1, 3, 4 and 6 directions; 25 dofs (not a multiple of what a lane reads at once)."""
+    """A limit, dry friction, contacts of 1, 3, 4 and 6 directions; 25 dofs (not a multiple of what a lane reads at
+    once)."""
     mjm, m, d = kinds
     assert unsupported(mjm, "cpu", d.njmax) is None
     rng, seen = np.random.default_rng(2), set()
@@ -160,10 +166,13 @@ def test_every_kind_of_row(kinds):
         mjw.step(m, d)
     state, row = mujoco.mjtConstraintState, mujoco.mjtConstraint
     for kind, how in (
-        (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARNEG), (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARPOS),
-        (row.mjCNSTR_LIMIT_JOINT, state.mjCNSTRSTATE_QUADRATIC), (row.mjCNSTR_CONTACT_FRICTIONLESS, state.mjCNSTRSTATE_QUADRATIC),
-        (row.mjCNSTR_CONTACT_ELLIPTIC, state.mjCNSTRSTATE_CONE), (row.mjCNSTR_CONTACT_ELLIPTIC, state.mjCNSTRSTATE_QUADRATIC),
-    ):  # fmt: skip
+        (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARNEG),
+        (row.mjCNSTR_FRICTION_DOF, state.mjCNSTRSTATE_LINEARPOS),
+        (row.mjCNSTR_LIMIT_JOINT, state.mjCNSTRSTATE_QUADRATIC),
+        (row.mjCNSTR_CONTACT_FRICTIONLESS, state.mjCNSTRSTATE_QUADRATIC),
+        (row.mjCNSTR_CONTACT_ELLIPTIC, state.mjCNSTRSTATE_CONE),
+        (row.mjCNSTR_CONTACT_ELLIPTIC, state.mjCNSTRSTATE_QUADRATIC),
+    ):
         assert (int(kind), int(how)) in seen, (kind, how)
 
 
@@ -201,6 +210,11 @@ def changed(**options) -> mujoco.MjModel:
     return model
 
 
+def model_with(end: str, more: str) -> mujoco.MjModel:
+    """The model with more before a closing tag."""
+    return mujoco.MjModel.from_xml_string(KINDS.replace(end, more + end))
+
+
 @pytest.mark.parametrize(
     "model, says",
     [
@@ -210,10 +224,8 @@ def changed(**options) -> mujoco.MjModel:
         (changed(integrator=mujoco.mjtIntegrator.mjINT_RK4), "integrator"),
         (changed(enableflags=mujoco.mjtEnableBit.mjENBL_SLEEP), "sleep"),
         (changed(disableflags=mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), "nothing"),
-        (mujoco.MjModel.from_xml_string(KINDS.replace("</worldbody>", "<body><freejoint/><geom size='.1'/></body>"
-                                                      "<body><freejoint/><geom size='.1'/></body></worldbody>")), "37 dofs"),
-        (mujoco.MjModel.from_xml_string(KINDS.replace("</mujoco>", "<equality><joint joint1='swing'/></equality></mujoco>")),
-         "equality"),
+        (model_with("</worldbody>", 2 * "<body><freejoint/><geom size='.1'/></body>"), "37 dofs"),
+        (model_with("</mujoco>", "<equality><joint joint1='swing'/></equality>"), "equality"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_serve_it_says(model, says):

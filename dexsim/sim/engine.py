@@ -77,7 +77,9 @@ class Engine:
     real: type  # Warp's scalar of states
     _warmstart: torch.Tensor  # [N, nv] accelerations that the solver begins with
 
-    def __init__(self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]):
+    def __init__(
+        self, model: mujoco.MjModel, worlds: int, device: str, fields: Sequence[str], pairs: Sequence[ContactPair]
+    ):
         if worlds < 1:
             raise UserError(f"worlds={worlds}: must be at least 1")
         self.mjm, self.n, self.device, self.dt = model, worlds, device, float(model.opt.timestep)
@@ -128,7 +130,9 @@ class Engine:
         """The same memory as `field`, as a Warp array of `real` (dof fields: [N, nv])."""
         raise NotImplementedError
 
-    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+    def step(
+        self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None
+    ) -> None:
         """substeps x (before_each, one physics step), then poses, contact forces and flags, then `after`.
 
         The callbacks only launch Warp kernels on arrays that exist already: MuJoCo-Warp records the sequence once
@@ -151,11 +155,17 @@ class Engine:
         self.set_state(mask, qpos, torch.zeros_like(self.t.qvel))
 
     def memory(self) -> dict[str, torch.Tensor | tuple[torch.Tensor, int, int]]:
-        """What one step leaves to the next, live: state, warm start, applied forces, model fields by world. Whole numbers
-        with their lowest and highest."""
+        """What one step leaves to the next, live: state, warm start, applied forces, model fields by world. Whole
+        numbers with their lowest and highest."""
         t = self.t
-        out = {"time": t.time, "qpos": t.qpos, "qvel": t.qvel, "qacc_warmstart": self._warmstart, "qfrc_applied": t.qfrc_applied,
-               "xfrc_applied": t.xfrc_applied}
+        out = {
+            "time": t.time,
+            "qpos": t.qpos,
+            "qvel": t.qvel,
+            "qacc_warmstart": self._warmstart,
+            "qfrc_applied": t.qfrc_applied,
+            "xfrc_applied": t.xfrc_applied,
+        }
         if self.wp.outside is not None:
             out["outside"] = t.outside
         for name in dict.fromkeys((*self.field_names, *self._derived)):
@@ -191,7 +201,8 @@ class Engine:
             p = self.peaks()
             raise UserError(
                 f"contact overflow (flags {flags:#x}{_pairs(flags)}): peak {p['contacts']:.1f} contacts a world of"
-                f" sim.nconmax={p['nconmax']} on average, {p['rows']:.0f} constraint rows of sim.njmax={p['njmax']}; raise the one that is full "
-                f"(e.g. sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
+                f" sim.nconmax={p['nconmax']} on average, {p['rows']:.0f} constraint rows of"
+                f" sim.njmax={p['njmax']}; raise the one that is full (e.g."
+                f" sim.nconmax={2 * int(p['nconmax'])} sim.njmax={2 * int(p['njmax'])})"
             )
         self.t.overflow.zero_()

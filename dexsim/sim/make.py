@@ -12,7 +12,8 @@ from dexsim.sim.engine import ContactPair, Engine
 
 
 def no_log_file() -> None:
-    """MuJoCo's warnings go to stderr; not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that somebody chose stays."""
+    """MuJoCo's warnings go to stderr; not also to MUJOCO_LOG.TXT in whatever folder the user is in. A file that
+    somebody chose stays."""
     log = mujoco.MjLogConfig.get()
     if log.logto_file and log.logfile == "MUJOCO_LOG.TXT":
         log.logto_file = False
@@ -35,8 +36,9 @@ def engine_of(engine: str, device: str) -> str:
 def newton_iterations(sim: Mapping[str, Any], engine: str) -> int:
     """Newton iterations at most of "warp" or "mujoco", from the settings `sim`.
 
-    C MuJoCo gets `iterations_mujoco`, or `iterations` where that is more: its iterations are cheap, it stops by itself when it
-    has converged (after 2 on average in a grasp), and cut off at 8 it throws an object out of a firm grasp now and then.
+    C MuJoCo gets `iterations_mujoco`, or `iterations` where that is more: its iterations are cheap, it stops by itself
+    when it has converged (after 2 on average in a grasp), and cut off at 8 it throws an object out of a firm grasp now
+    and then.
     """
     if engine == "warp":
         return int(sim["iterations"])
@@ -57,12 +59,14 @@ def make_engine(
     collision: str = "auto",
     solver: str = "auto",
 ) -> Engine:
-    """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a CPU).
+    """Compile `spec` and build the engine named by `engine`: "warp", "mujoco", or "auto" (Warp on CUDA, C MuJoCo on a
+    CPU).
 
     fields: model fields that vary by world. nconmax: contacts a world on average; njmax: constraint rows a world
-    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all. collision (MuJoCo-Warp only): who finds the contacts of
-    convex hulls: "hand" (`dexsim.sim.collision`), "mujoco" (MuJoCo-Warp itself), "auto" (hand, where it serves the model).
-    solver (MuJoCo-Warp only): who finds the contact forces: "hand" (`dexsim.sim.solver`), "mujoco", "auto", likewise.
+    (MuJoCo-Warp only). threads: CPU threads of C MuJoCo, 0 = all. collision (MuJoCo-Warp only): who finds the contacts
+    of convex hulls: "hand" (`dexsim.sim.collision`), "mujoco" (MuJoCo-Warp itself), "auto" (hand, where it serves the
+    model). solver (MuJoCo-Warp only): who finds the contact forces: "hand" (`dexsim.sim.solver`), "mujoco", "auto",
+    likewise.
     """
     no_log_file()
     engine = engine_of(engine, device)
@@ -72,11 +76,15 @@ def make_engine(
         raise UserError(f"sim.solver='{solver}': must be auto, hand or mujoco")
     device = "cuda:0" if device == "cuda" else device  # torch.cuda.set_device wants a number
     if engine == "mujoco" and device != "cpu":
-        raise UserError(f"sim.engine=mujoco runs on the CPU only, not on device={device}; use sim.engine=warp or device=cpu")
+        raise UserError(
+            f"sim.engine=mujoco runs on the CPU only, not on device={device}; use sim.engine=warp or device=cpu"
+        )
     if engine == "warp":
         from dexsim.sim.warp_engine import WarpEngine
 
-        return WarpEngine(spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax, collision, solver)
+        return WarpEngine(
+            spec.compile(), worlds, device, fields, pairs, deterministic, nconmax, njmax, collision, solver
+        )
     from dexsim.sim.mujoco_engine import MujocoEngine, compile_with_sensors
 
     return MujocoEngine(compile_with_sensors(spec, pairs), worlds, fields, pairs, threads)

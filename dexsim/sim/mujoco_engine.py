@@ -30,7 +30,10 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
     spec = spec.copy()
     slots = _SLOTS if sum(bool(g.contype or g.conaffinity) for g in spec.geoms) <= _FEW_GEOMS else _MANY_SLOTS
     field = mujoco.mjtConDataField
-    data = sum(1 << int(f) for f in (field.mjCONDATA_FOUND, field.mjCONDATA_FORCE, field.mjCONDATA_NORMAL, field.mjCONDATA_TANGENT))
+    data = sum(
+        1 << int(f)
+        for f in (field.mjCONDATA_FOUND, field.mjCONDATA_FORCE, field.mjCONDATA_NORMAL, field.mjCONDATA_TANGENT)
+    )
     for p in pairs:
         for kind, name in (p.first, p.second):
             if kind not in kinds:
@@ -38,8 +41,14 @@ def compile_with_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair]) -> m
             if (spec.geom(name) if kind == "geom" else spec.body(name)) is None:
                 raise UserError(f"contact pair: no {kind} named '{name}' in the model")
         spec.add_sensor(
-            name=f"pair_{p.name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds[p.first[0]], objname=p.first[1],
-            reftype=kinds[p.second[0]], refname=p.second[1], intprm=[data, 0, slots])
+            name=f"pair_{p.name}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=kinds[p.first[0]],
+            objname=p.first[1],
+            reftype=kinds[p.second[0]],
+            refname=p.second[1],
+            intprm=[data, 0, slots],
+        )
     return spec.compile()
 
 
@@ -49,13 +58,21 @@ class MujocoEngine(Engine):
     kind = "mujoco"
     _derived = _DERIVED
 
-    def __init__(self, model: mujoco.MjModel, worlds: int, fields: Sequence[str], pairs: Sequence[ContactPair], threads: int,
-                 real: type = wp.float64):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        worlds: int,
+        fields: Sequence[str],
+        pairs: Sequence[ContactPair],
+        threads: int,
+        real: type = wp.float64,
+    ):
         super().__init__(model, worlds, "cpu", fields, pairs)
         self.real = real
         self._launch = Launches("cpu")
-        # A diverged world must keep its NaN, to be seen and reset by the environment like on the other engine. And geoms
-        # that move by world are not where the compiler's bounding volumes have them: test every pair of two bodies.
+        # A diverged world must keep its NaN, to be seen and reset by the environment like on the other engine. And
+        # geoms that move by world are not where the compiler's bounding volumes have them: test every pair of two
+        # bodies.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         self.batch = mujoco.batch.Batch(model, worlds, threads)
         b = self.batch
@@ -82,13 +99,18 @@ class MujocoEngine(Engine):
             sensors = [model.sensor(f"pair_{p.name}").id for p in self.pairs]
             first = [model.sensor_adr[s] for s in sensors]
             self._slots = int(model.sensor_intprm[sensors[0], 2])
-            self._contact_args: list[wp.array] = [wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False), wp.array(first, dtype=int, device="cpu")]
+            self._contact_args: list[wp.array] = [
+                wp.array(self._sensordata, dtype=wp.float64, device="cpu", copy=False),
+                wp.array(first, dtype=int, device="cpu"),
+            ]
         self._fields = {name: b.expand(name) for name in dict.fromkeys((*fields, *_DERIVED))}
         self._fields_t = {k: torch.from_numpy(v) for k, v in self._fields.items()}
         self._flags, self._disabled = int(model.opt.disableflags), b.expand("opt.disableflags")
         self._fields_wp: dict[str, wp.array] = {}
         if model.nmocap:
-            raise UserError("sim.engine=mujoco: the model has mocap bodies, which it does not place; use sim.engine=warp")
+            raise UserError(
+                "sim.engine=mujoco: the model has mocap bodies, which it does not place; use sim.engine=warp"
+            )
         self._tree = kernels.tree(model, self._fields)
         self._pos = wp.zeros((N, model.nbody), dtype=wp.vec3d, device="cpu")
         self._quat = wp.zeros((N, model.nbody), dtype=wp.vec4d, device="cpu")
@@ -103,7 +125,9 @@ class MujocoEngine(Engine):
             self._fields_wp[name] = wp.array(self._fields[name], dtype=wp.float64, device="cpu", copy=False)
         return self._fields_wp[name]
 
-    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+    def step(
+        self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None
+    ) -> None:
         b = self.batch
         with wp.ScopedDevice("cpu"):
             if before_each is None and self.wp.outside is None:
@@ -142,7 +166,13 @@ class MujocoEngine(Engine):
         read = ("qfrc_smooth", "qfrc_damper", "qfrc_constraint", "qacc")
         level = self._fields.get("dof_frictionloss", self.mjm.dof_frictionloss[None].copy())
         self._before = np.zeros(self.t.qvel.shape)
-        arrays = [kernels.friction_rows(self.mjm), level, self._fields["dof_invweight0"], self._before, *map(self.batch.bind, read)]
+        arrays = [
+            kernels.friction_rows(self.mjm),
+            level,
+            self._fields["dof_invweight0"],
+            self._before,
+            *map(self.batch.bind, read),
+        ]
         self._outside_args = [*map(view, arrays), self.wp.qfrc_applied, self.wp.outside]
 
     def _one_step(self) -> None:
@@ -162,19 +192,32 @@ class MujocoEngine(Engine):
 
     def check_overflow(self) -> None:
         if bool((self.t.overflow & _LOST).any()):
-            raise UserError(f"contact overflow: a contact pair had {self._most.numpy()[0]} contacts, sim.engine=mujoco sums {self._slots}; "
-                            f"use sim.engine=warp, or pairs of fewer geoms")
+            raise UserError(
+                f"contact overflow: a contact pair had {self._most.numpy()[0]} contacts, sim.engine=mujoco sums"
+                f" {self._slots}; use sim.engine=warp, or pairs of fewer geoms"
+            )
         self.t.overflow.zero_()
 
     def _kinematics(self) -> None:
-        """Poses of the present qpos. The batch offers whole stages only, and each of its calls waits for all its threads."""
+        """Poses of the present qpos. The batch offers whole stages only, and each of its calls waits for all its
+        threads."""
         args = [self._tree, self.wp.qpos, self._pos, self._quat, self.wp.xpos, self.wp.xmat]
         self._launch("poses", kernels.poses, self.n, args)
 
     def _contacts(self) -> None:
         if not self.pairs:
             return
-        args = [*self._contact_args, self._slots, _LOST, self.wp.flags, FLAG_NAN, self.wp.pair_normal, self.wp.pair_force, self._overflow, self._most]
+        args = [
+            *self._contact_args,
+            self._slots,
+            _LOST,
+            self.wp.flags,
+            FLAG_NAN,
+            self.wp.pair_normal,
+            self.wp.pair_force,
+            self._overflow,
+            self._most,
+        ]
         self._launch("contacts", kernels.read_contacts, (self.n, len(self.pairs)), args)
         sound = self.t.flags.numpy() == 0
         self._peak[0] = max(self._peak[0], self._ncon.reshape(-1).max(initial=0, where=sound))

@@ -1,4 +1,5 @@
-"""What C MuJoCo's batch does not hand out by itself, as Warp kernels on its arrays: poses alone, contact forces, flags."""
+"""What C MuJoCo's batch does not hand out by itself, as Warp kernels on its arrays: poses alone, contact forces,
+flags."""
 
 # No `from __future__ import annotations`: Warp resolves these annotations from the closure.
 
@@ -6,7 +7,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
-FREE, BALL, SLIDE = (int(j) for j in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE))
+FREE, BALL, SLIDE = (
+    int(j) for j in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE)
+)
 ROW = 10
 """Numbers a slot of a contact sensor with found, force, normal, tangent."""
 
@@ -30,11 +33,15 @@ class Tree:
 def tree(model: mujoco.MjModel, expanded: dict[str, np.ndarray]) -> Tree:
     """The tree of `model`; `expanded` holds the fields that differ by world, [N, ...]."""
     t = Tree()
-    for name, field in (("parent", "body_parentid"), ("first_joint", "body_jntadr"), ("joints", "body_jntnum"), ("kind", "jnt_type"),
-                        ("address", "jnt_qposadr")):  # fmt: skip
+    for name, field in (
+        ("parent", "body_parentid"), ("first_joint", "body_jntadr"), ("joints", "body_jntnum"), ("kind", "jnt_type"),
+        ("address", "jnt_qposadr"),
+    ):  # fmt: skip
         setattr(t, name, wp.array(getattr(model, field), dtype=int, device="cpu"))
-    for name, field, kind in (("body_pos", "body_pos", wp.vec3d), ("body_quat", "body_quat", wp.vec4d), ("joint_pos", "jnt_pos", wp.vec3d),
-                              ("joint_axis", "jnt_axis", wp.vec3d), ("qpos0", "qpos0", wp.float64)):  # fmt: skip
+    for name, field, kind in (
+        ("body_pos", "body_pos", wp.vec3d), ("body_quat", "body_quat", wp.vec4d), ("joint_pos", "jnt_pos", wp.vec3d),
+        ("joint_axis", "jnt_axis", wp.vec3d), ("qpos0", "qpos0", wp.float64),
+    ):  # fmt: skip
         if field in expanded:
             setattr(t, name, wp.array(expanded[field], dtype=kind, device="cpu", copy=False))
         else:
@@ -126,7 +133,15 @@ def poses(
         y = turned(wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0)), q)
         z = turned(wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)), q)
         xmat[w, b] = wp.mat33(
-            float(x[0]), float(y[0]), float(z[0]), float(x[1]), float(y[1]), float(z[1]), float(x[2]), float(y[2]), float(z[2])
+            float(x[0]),
+            float(y[0]),
+            float(z[0]),
+            float(x[1]),
+            float(y[1]),
+            float(z[1]),
+            float(x[2]),
+            float(y[2]),
+            float(z[2]),
         )
 
 
@@ -144,9 +159,9 @@ def read_contacts(
     overflow: wp.array(dtype=int),
     most: wp.array(dtype=int),
 ):
-    """Sums of each pair's contact forces. A slot holds what the first member exerts on the second, in the frame (normal,
-    tangent, their cross product); the sum is of what acts on the first: minus. A world whose state is not finite has none:
-    what the sensors say of it is nonsense."""
+    """Sums of each pair's contact forces. A slot holds what the first member exerts on the second, in the frame
+    (normal, tangent, their cross product); the sum is of what acts on the first: minus. A world whose state is not
+    finite has none: what the sensors say of it is nonsense."""
     w, p = wp.tid()
     if (flags[w] & nan_bit) != 0:
         normal_sum[w, p] = float(0.0)
@@ -190,8 +205,9 @@ def check_worlds(
 
 
 def friction_rows(model: mujoco.MjModel) -> np.ndarray:
-    """[nv, 2] of the constraint that MuJoCo makes of a dof's dry friction: its impedance d, and B [1/s] of its reference
-    acceleration -B v (MuJoCo's documentation, "Computation", "Parameters" of the constraint solver, at no distance)."""
+    """[nv, 2] of the constraint that MuJoCo makes of a dof's dry friction: its impedance d, and B [1/s] of its
+    reference acceleration -B v (MuJoCo's documentation, "Computation", "Parameters" of the constraint solver, at no
+    distance)."""
     out = np.zeros((model.nv, 2))
     for i, (ref, imp) in enumerate(zip(model.dof_solref, model.dof_solimp, strict=True)):
         low, high = np.clip(imp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)

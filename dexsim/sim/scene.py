@@ -1,10 +1,10 @@
 """A hand with one free object whose shape, size, mass and centre of mass differ by world.
 
 One compiled model serves every shape: the object body carries geom slots (a box, a sphere, a capsule, and three convex
-hulls or as many as the shapes need), of which a world uses those that its shape needs; the others are parked a kilometre away (they turn with the
-object, so such a scene must not have planes, which have no end). Per world only
-`geom_*` and `body_*` fields differ, so that topology, kernels and graphs are shared. Measured against one model a
-shape group, this needs one graph and one compile (see docs/results/speed.md).
+hulls or as many as the shapes need), of which a world uses those that its shape needs; the others are parked a
+kilometre away (they turn with the object, so such a scene must not have planes, which have no end). Per world only
+`geom_*` and `body_*` fields differ, so that topology, kernels and graphs are shared. Measured against one model a shape
+group, this needs one graph and one compile (see docs/results/speed.md).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from dexsim.assets.objects import Shape
+
 OBJECT = "object"
 HULL_SLOTS = 3
 SLOTS = ("object_box", "object_sphere", "object_capsule", *(f"object_hull{i}" for i in range(HULL_SLOTS)))
@@ -28,8 +29,21 @@ _TILT = [0.99995, 0.01, 0.0, 0.0]
 _IPOS = [-2e-3, 1e-3, 1e-3]
 _IQUAT = [0.9998, 0.0, 0.02, 0.0]
 
-OBJECT_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "geom_pos", "geom_quat", "geom_size",
-                 "geom_dataid", "geom_rbound", "geom_aabb", "geom_friction", "geom_solref", "opt.gravity")
+OBJECT_FIELDS = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_iquat",
+    "geom_pos",
+    "geom_quat",
+    "geom_size",
+    "geom_dataid",
+    "geom_rbound",
+    "geom_aabb",
+    "geom_friction",
+    "geom_solref",
+    "opt.gravity",
+)
 """Model fields that vary by world in this scene."""
 
 
@@ -88,15 +102,25 @@ def hand_object_scene(hand: mujoco.MjSpec, shapes: Sequence[Shape], scales: Sequ
     body.explicitinertial = True
     body.mass, body.ipos, body.iquat = 0.1, _IPOS, _IQUAT
     body.inertia = [4e-5, 4.1e-5, 4.2e-5]
-    common = dict(pos=_OFFSET, quat=_TILT, contype=1, conaffinity=2, condim=4, group=3, rgba=[0.85, 0.45, 0.2, 1.0],
-                  friction=[1e-3, 1e-4, 1e-4])
+    common = dict(
+        pos=_OFFSET,
+        quat=_TILT,
+        contype=1,
+        conaffinity=2,
+        condim=4,
+        group=3,
+        rgba=[0.85, 0.45, 0.2, 1.0],
+        friction=[1e-3, 1e-4, 1e-4],
+    )
     g = mujoco.mjtGeom
     body.add_geom(name=SLOTS[0], type=g.mjGEOM_BOX, size=[0.08, 0.08, 0.08], **common)
     body.add_geom(name=SLOTS[1], type=g.mjGEOM_SPHERE, size=[0.08, 0, 0], **common)
     body.add_geom(name=SLOTS[2], type=g.mjGEOM_CAPSULE, size=[0.08, 0.08, 0], **common)
     hulls = [v for v in variants if v.shape.kind not in _PRIMITIVE_SLOT]
     if not hulls:  # the slots still need a mesh
-        spec.add_mesh(name="placeholder", uservert=np.array([[0, 0, 0], [.01, 0, 0], [0, .01, 0], [0, 0, .01]], float).ravel())
+        spec.add_mesh(
+            name="placeholder", uservert=np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], float).ravel()
+        )
         placeholder = "placeholder"
     else:
         placeholder = _mesh_name(hulls[0].shape, hulls[0].scale, 0)
@@ -115,8 +139,14 @@ def _variant_table(spec: mujoco.MjSpec, variants: list[Variant], slots: tuple[st
         if v.shape.kind not in _PRIMITIVE_SLOT:
             for k in range(len(v.shape.hulls)):
                 name = _mesh_name(v.shape, v.scale, k)
-                probe_body.add_geom(name=f"probe_{name}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=0,
-                                    contype=0, conaffinity=0)
+                probe_body.add_geom(
+                    name=f"probe_{name}",
+                    type=mujoco.mjtGeom.mjGEOM_MESH,
+                    meshname=name,
+                    mass=0,
+                    contype=0,
+                    conaffinity=0,
+                )
     m = probe.compile()
     dataid = np.full((V, S), m.geom(SLOTS[3]).dataid[0], dtype=np.int32)
     dataid[:, :3] = -1

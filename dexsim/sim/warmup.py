@@ -1,7 +1,7 @@
 """Compile many kernels at once: a first start takes as long as the longest of them, not as their sum.
 
-Warp compiles a kernel when it is first launched, one after another. Here a program's launches are first only listed, then all
-their modules are compiled on as many threads as there are cores, then the program may run.
+Warp compiles a kernel when it is first launched, one after another. Here a program's launches are first only listed,
+then all their modules are compiled on as many threads as there are cores, then the program may run.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from warp._src import context
 
 
 def compile_together(program: Callable[[], None], device: str) -> int:
-    """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what it
-    reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
+    """Compile what `program` launches on `device`; returns how many modules. The program runs without its kernels: what
+    it reads must not decide what it launches. On a CPU nothing is done: LLVM compiles one module at a time."""
     where = wp.get_device(device)
     if not where.is_cuda:
         return 0
@@ -34,7 +34,9 @@ def compile_together(program: Callable[[], None], device: str) -> int:
 def listed(program: Callable[[], None]) -> list[tuple[Any, int]]:
     """(module, threads a block) of each kernel that `program` launches, in order, none twice."""
     found: dict[tuple[int, int], tuple[Any, int]] = {}
-    with _instead_of_launching(lambda module, block_dim: found.setdefault((id(module), block_dim), (module, block_dim))):
+    with _instead_of_launching(
+        lambda module, block_dim: found.setdefault((id(module), block_dim), (module, block_dim))
+    ):
         program()
     return list(found.values())
 
@@ -54,8 +56,15 @@ def _instead_of_launching(keep: Callable[[Any, int], object]) -> Iterator[None]:
     def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
         return 256, 132  # the real one compiles the kernel to know; it decides about sizes only
 
-    kept = [(owner, name, getattr(owner, name)) for owner, name in (
-        (wp, "launch"), (context, "launch"), (wp, "capture_while"), (wp, "get_suggested_block_size"))]
+    kept = [
+        (owner, name, getattr(owner, name))
+        for owner, name in (
+            (wp, "launch"),
+            (context, "launch"),
+            (wp, "capture_while"),
+            (wp, "get_suggested_block_size"),
+        )
+    ]
     wp.launch = context.launch = launch
     wp.capture_while, wp.get_suggested_block_size = once, suggested  # type: ignore[assignment]  # what is called of them
     try:

@@ -13,8 +13,8 @@ import torch
 import warp as wp
 
 from dexsim.errors import UserError
-from dexsim.sim import contact
 from dexsim.sim import collision as narrow_phase
+from dexsim.sim import contact
 from dexsim.sim import solver as newton
 from dexsim.sim.begin import Begin
 from dexsim.sim.engine import FLAG_NAN, ContactPair, Engine
@@ -25,8 +25,8 @@ _STREAMS: dict[int, wp.Stream] = {}
 
 
 def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """Warp's view of a torch stream: one for each, kept. A second view of the same stream would, when the first is collected,
-    be unknown to Warp."""
+    """Warp's view of a torch stream: one for each, kept. A second view of the same stream would, when the first is
+    collected, be unknown to Warp."""
     if stream.cuda_stream not in _STREAMS:
         _STREAMS[stream.cuda_stream] = wp.stream_from_torch(stream)
     return _STREAMS[stream.cuda_stream]
@@ -83,7 +83,9 @@ class WarpEngine(Engine):
             if "opt.gravity" in fields:
                 self.m.opt.gravity = wp.array(np.tile(model.opt.gravity, (worlds, 1)), dtype=wp.vec3)
             self.d = mjw.put_data(model, mujoco.MjData(model), nworld=worlds, nconmax=nconmax, njmax=self.njmax)
-            self.narrow = narrow_phase.NarrowPhase(model, self.m, self.d) if collision != "mujoco" and not why_not else None
+            self.narrow = (
+                narrow_phase.NarrowPhase(model, self.m, self.d) if collision != "mujoco" and not why_not else None
+            )
             if self.narrow is not None and not self.narrow.number:
                 self.narrow = None
             self.newton = newton.NewtonSolver(self.m, self.d) if solver != "mujoco" and not no_solver else None
@@ -122,7 +124,9 @@ class WarpEngine(Engine):
     def wp_field(self, name: str) -> wp.array:
         return self._fields[name]
 
-    def step(self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None) -> None:
+    def step(
+        self, substeps: int, before_each: Callable[[], None] | None = None, after: Callable[[], None] | None = None
+    ) -> None:
         def program() -> None:
             for _ in range(substeps):
                 if before_each is not None:
@@ -162,7 +166,8 @@ class WarpEngine(Engine):
             self._simplex.masked_fill_(mask[:, None, None], -1)
 
     def memory(self) -> dict:
-        own = {} if self._simplex is None else {"simplex": (self._simplex, -(2**31), 2**31 - 1)}  # checked where it is used
+        # checked where it is used
+        own = {} if self._simplex is None else {"simplex": (self._simplex, -(2**31), 2**31 - 1)}
         return super().memory() | own
 
     def set_const(self) -> None:
@@ -179,9 +184,19 @@ class WarpEngine(Engine):
             wp.launch(
                 contact.add_contacts,
                 dim=d.naconmax,
-                inputs=[d.nacon, d.contact.geom, d.contact.worldid, d.contact.frame, d.contact.dim, d.contact.friction,
-                        d.contact.efc_address, d.efc.force, d.njmax, int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
-                        self._table],
+                inputs=[
+                    d.nacon,
+                    d.contact.geom,
+                    d.contact.worldid,
+                    d.contact.frame,
+                    d.contact.dim,
+                    d.contact.friction,
+                    d.contact.efc_address,
+                    d.efc.force,
+                    d.njmax,
+                    int(self.mjm.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL),
+                    self._table,
+                ],
                 outputs=[self._normal_sum, self._force_sum],
             )
             wp.launch(

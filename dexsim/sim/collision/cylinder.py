@@ -1,10 +1,10 @@
 """Distance of a cylinder from a point, segment, box or hull that does not overlap it.
 
-A cylinder has no corners, so the search is over the other body's alone: as GJK keeps the corners nearest to the origin, this
-keeps those nearest to the cylinder, whose distance from a point is a closed form. On an edge the derivative of the distance
-grows steadily, so its root is bracketed; on a face the nearest point is where the cylinder reaches furthest along the face's
-normal. A face, edge or corner of the other body is exact, then, and nothing is said by a chord of the rim. All in the
-cylinder's frame: axis z, radius half[0], half length half[1].
+A cylinder has no corners, so the search is over the other body's alone: as GJK keeps the corners nearest to the origin,
+this keeps those nearest to the cylinder, whose distance from a point is a closed form. On an edge the derivative of the
+distance grows steadily, so its root is bracketed; on a face the nearest point is where the cylinder reaches furthest
+along the face's normal. A face, edge or corner of the other body is exact, then, and nothing is said by a chord of the
+rim. All in the cylinder's frame: axis z, radius half[0], half length half[1].
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from dexsim.sim.collision.gjk import DOUBT, GAIN, LOOKS, OVERLAP
 from dexsim.sim.collision.shapes import Core, corner, corners, support
 
 STEPS = 50
-"""Most steps to the root on an edge; every other one halves the bracket, so that the last is less than float32 resolves."""
+"""Most steps to the root on an edge; every other one halves the bracket, so that the last is less than float32
+resolves."""
 FAR = wp.constant(1.0e10)
 NEAR = wp.constant(0.02)
 """How far [rad] a way out past an edge may be from where the prism had it."""
@@ -27,8 +28,8 @@ LEVEL = wp.constant(1.0e-5)
 
 @wp.struct
 class Nearest:
-    """n: corners of the feature that is nearest (0: none). p: their places [m]. i: their numbers. x [m]: its nearest point.
-    g [m]: from the cylinder's nearest point to x; zero if they overlap."""
+    """n: corners of the feature that is nearest (0: none). p: their places [m]. i: their numbers. x [m]: its nearest
+    point. g [m]: from the cylinder's nearest point to x; zero if they overlap."""
 
     n: int
     p0: wp.vec3
@@ -101,7 +102,8 @@ def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
     t = float(0.5)
     side = int(0)
     for step in range(STEPS):
-        # Regula falsi with the Illinois rule; where the edge goes from the side to the rim it is slow, hence the halving
+        # Regula falsi with the Illinois rule; where the edge goes from the side to the rim it is slow, hence the
+        # halving
         t = (low * f_high - high * f_low) / (f_high - f_low)
         if step % 2 == 1 or not (t > low and t < high):
             t = 0.5 * (low + high)
@@ -162,7 +164,11 @@ def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int,
         gap = 0.0
         x = (height / reach) * y
     m = wp.cross(b - a, c - a)
-    if wp.dot(m, wp.cross(b - x, c - x)) <= 0.0 or wp.dot(m, wp.cross(c - x, a - x)) <= 0.0 or wp.dot(m, wp.cross(a - x, b - x)) <= 0.0:
+    if (
+        wp.dot(m, wp.cross(b - x, c - x)) <= 0.0
+        or wp.dot(m, wp.cross(c - x, a - x)) <= 0.0
+        or wp.dot(m, wp.cross(a - x, b - x)) <= 0.0
+    ):
         return none()
     s = Nearest()
     s.n = 3
@@ -224,8 +230,8 @@ def from_cylinder(
 ) -> Nearest:
     """What of the body b is nearest to the cylinder; g is zero if they overlap, or that cannot be told.
 
-    R, p: the body's frame in the cylinder's. first: numbers of corners to begin with. cutoff [m]: bodies that are shown to be
-    further apart need no exact answer; then |g| is at least the cutoff.
+    R, p: the body's frame in the cylinder's. first: numbers of corners to begin with. cutoff [m]: bodies that are shown
+    to be further apart need no exact answer; then |g| is at least the cutoff.
     """
     s = begin(half, b, vertex, R, p, first)
     kept = s
@@ -256,9 +262,9 @@ def from_cylinder(
 
 @wp.struct
 class Way:
-    """A way out of an overlap past a feature of the body. found: 0 if there is none. u: unit direction from the cylinder to the
-    body. depth [m]: how far the feature must go along it. placed: whether it says where. q [m]: halfway between the furthest
-    points of both, where these are single."""
+    """A way out of an overlap past a feature of the body. found: 0 if there is none. u: unit direction from the
+    cylinder to the body. depth [m]: how far the feature must go along it. placed: whether it says where. q [m]: halfway
+    between the furthest points of both, where these are single."""
 
     found: int
     u: wp.vec3
@@ -282,7 +288,8 @@ def way(half: wp.vec3, u: wp.vec3, a: wp.vec3) -> Way:
 
 @wp.func
 def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
-    """The way out for a corner through the side or through a cap, whichever is nearer to `about`, if it is below that."""
+    """The way out for a corner through the side or through a cap, whichever is nearer to `about`, if it is below
+    that."""
     u = wp.vec3(0.0, 0.0, wp.where(about[2] > 0.0, 1.0, -1.0))
     rho = wp.sqrt(a[0] * a[0] + a[1] * a[1])
     below = rho <= half[0]
@@ -298,7 +305,8 @@ def past_corner(half: wp.vec3, a: wp.vec3, about: wp.vec3) -> Way:
 
 @wp.func
 def past_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, about: wp.vec3) -> Way:
-    """The shortest way out for the edge a, b among directions across it that are near `about`: over a rim, or past the side."""
+    """The shortest way out for the edge a, b among directions across it that are near `about`: over a rim, or past the
+    side."""
     length = wp.length(b - a)
     e = (b - a) / length
     c = wp.normalize(about - wp.dot(about, e) * e)
@@ -344,7 +352,8 @@ def past_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, about: wp.vec3)
 
 @wp.func
 def past(half: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, about: wp.vec3, i: wp.vec3i) -> Way:
-    """The way out past the feature of corners c, near the direction `about`. Where their numbers i are the same it has fewer."""
+    """The way out past the feature of corners c, near the direction `about`. Where their numbers i are the same it has
+    fewer."""
     if i[0] == i[1] and i[0] == i[2]:
         return past_corner(half, c0, about)
     if i[0] == i[1]:
@@ -356,7 +365,8 @@ def past(half: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, about: wp.vec3, i
 
 @wp.func
 def lowest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> wp.vec3i:
-    """The numbers of the three corners that are least along d (in the body's frame); the last again where there are but two."""
+    """The numbers of the three corners that are least along d (in the body's frame); the last again where there are but
+    two."""
     i = wp.vec3i(0, 0, 0)
     h = wp.vec3(FAR, FAR, FAR)
     for k in range(corners(b)):
@@ -381,8 +391,8 @@ def rounder(
 ) -> Way:
     """The way out of the round cylinder near that of the prism, whose facets are chords.
 
-    about: the prism's. on: the body's corners that it led past. Tried are the features that these and the body's three lowest
-    corners make, fewest corners first; it is the one than which no other corner is lower along its own way out.
+    about: the prism's. on: the body's corners that it led past. Tried are the features that these and the body's three
+    lowest corners make, fewest corners first; it is the one than which no other corner is lower along its own way out.
     """
     three = lowest(b, vertex, wp.transpose(R) * about)
     most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + GAIN

@@ -1,9 +1,9 @@
 """Depth of two convex cores that overlap: EPA on pairs of corners, from the tetrahedron that GJK ended with.
 
-Van den Bergen, Proximity queries and penetration depth computation on 3D game objects (2001). Cores have corners only, so the
-depth found is the exact one: that of the facet of A - B which is nearest to the origin. Radii and margins add to it, because a
-ball widens A - B by as much in every direction. When GJK was warm-started with the facet of the step before, its tetrahedron
-stands on that facet, and one look confirms it.
+Van den Bergen, Proximity queries and penetration depth computation on 3D game objects (2001). Cores have corners only,
+so the depth found is the exact one: that of the facet of A - B which is nearest to the origin. Radii and margins add to
+it, because a ball widens A - B by as much in every direction. When GJK was warm-started with the facet of the step
+before, its tetrahedron stands on that facet, and one look confirms it.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ FAR = wp.constant(1.0e10)
 ATTEMPTS = wp.constant(3)
 """Searches at most: one is enough in all but one of some ten thousand overlapping poses."""
 PARALLEL = wp.constant(0.999)
-"""Cosine above which two triangles may be of one facet: one that rounding has turned round can lie as deep as the nearest."""
+"""Cosine above which two triangles may be of one facet: one that rounding has turned round can lie as deep as the
+nearest."""
 SURE = wp.constant(1.0e-7)
 """A facet beyond which A - B goes on by more than this [m] is not one of its facets."""
 LEVEL = wp.constant(2.0e-8)
-"""How far [m] a corner must lie above a face to see it, more in each attempt: faces of one plane are seen together or not at
-all, whatever rounding says of each."""
+"""How far [m] a corner must lie above a face to see it, more in each attempt: faces of one plane are seen together or
+not at all, whatever rounding says of each."""
 
 
 @wp.struct
 class Facet:
-    """The facet of A - B nearest to the origin. found: 0 if there is none (the four corners were flat). sure: 0 if A - B does
-    not end where the facet is: then `depth` is how far A - B reaches along `normal`, a way out of the overlap, if not the
-    shortest. normal: outward, which is from A to B, in B's frame. depth [m]: its distance from the origin. i, l: names of its
-    corners, and weights of the nearest point."""
+    """The facet of A - B nearest to the origin. found: 0 if there is none (the four corners were flat). sure: 0 if A -
+    B does not end where the facet is: then `depth` is how far A - B reaches along `normal`, a way out of the overlap,
+    if not the shortest. normal: outward, which is from A to B, in B's frame. depth [m]: its distance from the origin.
+    i, l: names of its corners, and weights of the nearest point."""
 
     found: int
     sure: int
@@ -52,7 +53,8 @@ class Facet:
 
 @wp.func
 def plane(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
-    """Unit normal of the triangle (counter-clockwise seen from outside) and the origin's depth below it; FAR if it has no area."""
+    """Unit normal of the triangle (counter-clockwise seen from outside) and the origin's depth below it; FAR if it has
+    no area."""
     n = wp.cross(b - a, c - a)
     area = wp.length(n)
     if area <= 1.0e-14:
@@ -178,7 +180,8 @@ def grown(
             v = edge[h] >> 8
             face[faces] = u | (v << 8) | (points << 16)
             at[faces] = plane(pos[u], pos[v], w)
-            # Inside out: what grows comes nowhere nearer to the origin, unless that lies just outside, of cores that touch.
+            # Inside out: what grows comes nowhere nearer to the origin, unless that lies just outside, of cores that
+            # touch.
             if at[faces][3] < wp.where(level > OVERLAP, level - SURE, -2.0 * OVERLAP):
                 lost = int(1)
             faces += 1
@@ -214,12 +217,12 @@ def grown(
 
 @wp.func
 def penetration(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, names: wp.vec4i) -> Facet:
-    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose it,
-    or have it on a face.
+    """The nearest facet of A - B, which contains the origin. R, p: A's frame in B's. names: four corners that enclose
+    it, or have it on a face.
 
-    Parallel faces and edges of the two cores make facets of many corners, and rounding may call some triangles of one facet seen
-    and others not, until one is inside out. That shows: it is nearer than any was before, or A - B goes on beyond it. Then the
-    search is repeated, and what it must be above a face to see it is raised.
+    Parallel faces and edges of the two cores make facets of many corners, and rounding may call some triangles of one
+    facet seen and others not, until one is inside out. That shows: it is nearer than any was before, or A - B goes on
+    beyond it. Then the search is repeated, and what it must be above a face to see it is raised.
     """
     best = Facet()
     attempt = int(0)

@@ -1,9 +1,9 @@
 """Distance of two convex cores that do not overlap: GJK on pairs of corners, warm-started.
 
-Gilbert, Johnson and Keerthi 1988; the nearest point of a triangle by Ericson, Real-Time Collision Detection (2005), section
-5.1.5. The simplex is at most three pairs of corners, kept by name in registers. A search that begins at the simplex of the
-step before is over after one look for a nearer corner, because bodies hardly move in one step. float32 throughout; what
-follows from that:
+Gilbert, Johnson and Keerthi 1988; the nearest point of a triangle by Ericson, Real-Time Collision Detection (2005),
+section 5.1.5. The simplex is at most three pairs of corners, kept by name in registers. A search that begins at the
+simplex of the step before is over after one look for a nearer corner, because bodies hardly move in one step. float32
+throughout; what follows from that:
 
 - directions are taken from the simplex's edges or face, not from the small difference of two large positions;
 - a search ends when the corner found is no news, or promises less than `GAIN`, or does not bring the bodies
@@ -31,7 +31,8 @@ LOOKS = 24
 @wp.struct
 class Simplex:
     """n: pairs of corners (0: none yet). p: their differences A - B in B's frame [m]. i: A's corner | B's corner << 16.
-    l: weights of the point v of the simplex that is nearest to the origin. inside: 1 if these and the corner i3 enclose it."""
+    l: weights of the point v of the simplex that is nearest to the origin. inside: 1 if these and the corner i3 enclose
+    it."""
 
     n: int
     p0: wp.vec3
@@ -92,8 +93,8 @@ def nearer(s: Simplex, t: Simplex) -> Simplex:
 
 @wp.func
 def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> Simplex:
-    """What of the triangle a, b, c is nearest to the origin: a point within, or of an edge. Rounding may choose the wrong one,
-    in a sliver, but never a point outside of the triangle."""
+    """What of the triangle a, b, c is nearest to the origin: a point within, or of an edge. Rounding may choose the
+    wrong one, in a sliver, but never a point outside of the triangle."""
     ab = b - a
     ac = c - a
     n = wp.cross(ab, ac)
@@ -176,7 +177,9 @@ def begin(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.v
 
 
 @wp.func
-def outermost(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3) -> int:
+def outermost(
+    a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, u: wp.vec3, beside: wp.vec3
+) -> int:
     """The corner of A - B furthest from the plane through `beside` across u, on the side where that is further."""
     up = support(a, vertex, wp.transpose(R) * u) | (support(b, vertex, -u) << 16)
     down = support(a, vertex, -(wp.transpose(R) * u)) | (support(b, vertex, u) << 16)
@@ -187,7 +190,8 @@ def outermost(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: 
 
 @wp.func
 def enclose(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, simplex: Simplex) -> Simplex:
-    """A simplex that goes through the origin, with corners added until it has four. One corner alone stays what it is."""
+    """A simplex that goes through the origin, with corners added until it has four. One corner alone stays what it
+    is."""
     s = simplex
     if s.n == 2:
         e = s.p1 - s.p0
@@ -210,8 +214,8 @@ def distance(
 ) -> Simplex:
     """The simplex of the nearest points of A and B (`v` from B to A, in B's frame).
 
-    R, p: A's frame in B's. first: names of the corners to begin with. cutoff [m]: bodies that are shown to be further apart
-    need no exact answer; then |v| is at least the cutoff.
+    R, p: A's frame in B's. first: names of the corners to begin with. cutoff [m]: bodies that are shown to be further
+    apart need no exact answer; then |v| is at least the cutoff.
     """
     s = begin(a, b, vertex, R, p, first)
     kept = s
@@ -230,8 +234,8 @@ def distance(
         if vv - vw <= GAIN * norm or (vw > 0.0 and vw >= cutoff * norm):
             break
         t = with_corner(s, w, i)
-        # No nearer, as far as |v| tells: a place 1e-5 m further on a facet brings a centre 1e-2 m away nearer by 5e-9 m. What
-        # the next corner promises tells better. Unless that gets less, it is over.
+        # No nearer, as far as |v| tells: a place 1e-5 m further on a facet brings a centre 1e-2 m away nearer by 5e-9
+        # m. What the next corner promises tells better. Unless that gets less, it is over.
         if t.inside == 0 and wp.dot(t.v, t.v) >= vv and vv - vw <= DOUBT * norm:
             if vv - vw >= least * norm:
                 s = kept
@@ -246,10 +250,11 @@ def distance(
 
 @wp.func
 def touching(a: Any, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3) -> wp.vec4:
-    """Normal (from A to B, in B's frame) and distance [m] of cores that touch with a corner, or whose enclosing corners are flat.
+    """Normal (from A to B, in B's frame) and distance [m] of cores that touch with a corner, or whose enclosing corners
+    are flat.
 
-    There the difference of positions has no direction. So A is moved away by a little, along the line of centres, and the
-    distance found is corrected by what that move must have added to it.
+    There the difference of positions has no direction. So A is moved away by a little, along the line of centres, and
+    the distance found is corrected by what that move must have added to it.
     """
     away = wp.vec3(0.0, 0.0, 1.0)
     if wp.dot(p, p) > 0.0:

@@ -1,7 +1,7 @@
 """The kernels of the narrow phase: for cores that are apart, for cores that overlap, and for cylinders.
 
-Both take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed materials,
-friction, explicit pairs and what a contact is are decided where they always were.
+Both take the pairs that MuJoCo-Warp's broad phase found and write with its own functions, so that margins, mixed
+materials, friction, explicit pairs and what a contact is are decided where they always were.
 """
 
 from __future__ import annotations
@@ -14,11 +14,23 @@ from mujoco_warp._src.types import vec5
 from dexsim.sim.collision.cylinder import from_cylinder, rounder
 from dexsim.sim.collision.epa import Facet, penetration
 from dexsim.sim.collision.gjk import OVERLAP, distance, touching
-from dexsim.sim.collision.shapes import BOX, CAPSULE, CYLINDER, HULL, SPHERE, Core, Prism, corner, corners, radius_of, support
+from dexsim.sim.collision.shapes import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    HULL,
+    SPHERE,
+    Core,
+    Prism,
+    corner,
+    corners,
+    radius_of,
+    support,
+)
 
-
-# Each product and sum rounded by itself, as on a CPU. Fused, a cross product of parallel edges is no longer zero but what one of
-# its two products lost by rounding: a direction out of nothing, by which flat simplices were taken to enclose the origin.
+# Each product and sum rounded by itself, as on a CPU. Fused, a cross product of parallel edges is no longer zero but
+# what one of its two products lost by rounding: a direction out of nothing, by which flat simplices were taken to
+# enclose the origin.
 _ROUNDED = {"fuse_fp": False}
 
 
@@ -69,20 +81,70 @@ class Contacts:
 
 @wp.func
 def write(
-    mat: Materials, out: Contacts, room: int, geoms: wp.vec2i, pairid: wp.vec2i, world: int, margin: float, gap: float,
-    dist: float, pos: wp.vec3, normal: wp.vec3,
+    mat: Materials,
+    out: Contacts,
+    room: int,
+    geoms: wp.vec2i,
+    pairid: wp.vec2i,
+    world: int,
+    margin: float,
+    gap: float,
+    dist: float,
+    pos: wp.vec3,
+    normal: wp.vec3,
 ):
     """One contact. dist [m]: of the surfaces, without margin; normal: from geoms[0] to geoms[1], world frame."""
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        mat.geom_condim, mat.geom_priority, mat.geom_solmix, mat.geom_solref, mat.geom_solimp, mat.geom_friction, mat.geom_adhesion,
-        mat.pair_dim, mat.pair_solref, mat.pair_solreffriction, mat.pair_solimp, mat.pair_adhesion, mat.pair_friction,
-        geoms, pairid[0], world,
+        mat.geom_condim,
+        mat.geom_priority,
+        mat.geom_solmix,
+        mat.geom_solref,
+        mat.geom_solimp,
+        mat.geom_friction,
+        mat.geom_adhesion,
+        mat.pair_dim,
+        mat.pair_solref,
+        mat.pair_solreffriction,
+        mat.pair_solimp,
+        mat.pair_adhesion,
+        mat.pair_friction,
+        geoms,
+        pairid[0],
+        world,
     )
     write_contact(
-        room, 0, dist, pos, make_frame(normal), margin, gap, condim, friction, solref, solreffriction, solimp, adhesion,
-        geoms, pairid, world,
-        out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
-        out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, out.nacon,
+        room,
+        0,
+        dist,
+        pos,
+        make_frame(normal),
+        margin,
+        gap,
+        condim,
+        friction,
+        solref,
+        solreffriction,
+        solimp,
+        adhesion,
+        geoms,
+        pairid,
+        world,
+        out.dist,
+        out.pos,
+        out.frame,
+        out.includemargin,
+        out.friction,
+        out.solref,
+        out.solreffriction,
+        out.solimp,
+        out.dim,
+        out.geom,
+        out.efc_address,
+        out.worldid,
+        out.type,
+        out.geomcollisionid,
+        out.adhesion,
+        out.nacon,
     )
 
 
@@ -109,9 +171,9 @@ def known(name: int, a: Core, b: Core) -> bool:
 class Pairs:
     """What the broad phase found, MuJoCo-Warp's shapes, and what is kept of each pair between steps.
 
-    geom_size, geom_dataid, geom_xpos, geom_xmat: as in MuJoCo-Warp. room: most pairs. number: pairs found. geom, id, world: of
-    each. hull_first, hull_count [nmesh], hull [n]: corners of each mesh's convex hull. slot [ngeom, ngeom]: column of
-    `simplex`. simplex [N, P]: names of the corners that were nearest, or -1.
+    geom_size, geom_dataid, geom_xpos, geom_xmat: as in MuJoCo-Warp. room: most pairs. number: pairs found. geom, id,
+    world: of each. hull_first, hull_count [nmesh], hull [n]: corners of each mesh's convex hull. slot [ngeom, ngeom]:
+    column of `simplex`. simplex [N, P]: names of the corners that were nearest, or -1.
     """
 
     geom_type: wp.array(dtype=int)
@@ -149,7 +211,9 @@ def two(pairs: Pairs, mat: Materials, k: int) -> Two:
     geoms = pairs.geom[k]
     world = pairs.world[k]
     t = Two()
-    margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world)
+    margin, gap = contact_margin_gap(
+        mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world
+    )
     size = pairs.geom_size[world % pairs.geom_size.shape[0], geoms[0]]
     kind = pairs.geom_type[geoms[0]]
     meshes = world % pairs.geom_dataid.shape[0]
@@ -176,9 +240,12 @@ def nearest_of_b(pairs: Pairs, b: Core, i: wp.vec3i, l: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def add(pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3, v: wp.vec3, normal: wp.vec3, dist: float):
-    """The contact of pair k. q: B's nearest point; v: from there to A's core; normal: from A to B; all in B's frame. dist [m]:
-    of the cores, negative if they overlap. A contact lies halfway between the surfaces, and margins move both alike."""
+def add(
+    pairs: Pairs, mat: Materials, out: Contacts, k: int, t: Two, q: wp.vec3, v: wp.vec3, normal: wp.vec3, dist: float
+):
+    """The contact of pair k. q: B's nearest point; v: from there to A's core; normal: from A to B; all in B's frame.
+    dist [m]: of the cores, negative if they overlap. A contact lies halfway between the surfaces, and margins move both
+    alike."""
     geoms = pairs.geom[k]
     world = pairs.world[k]
     b_mat = pairs.geom_xmat[world, geoms[1]]
@@ -197,8 +264,8 @@ def apart(
     enclosing: wp.array(dtype=wp.vec4i),
     deep_number: wp.array(dtype=int),
 ):
-    """Each pair of a point, segment, box or hull with a hull: its contact, if cores are apart. Pairs that overlap are listed in
-    `deep`, with four corners that enclose the origin of A - B, or -1 where they only touch."""
+    """Each pair of a point, segment, box or hull with a hull: its contact, if cores are apart. Pairs that overlap are
+    listed in `deep`, with four corners that enclose the origin of A - B, or -1 where they only touch."""
     k = wp.tid()
     if k >= wp.min(pairs.number[0], pairs.room):
         return
@@ -268,7 +335,8 @@ def beside_cylinder(
     # out
     out: Contacts,
 ):
-    """Each pair of a cylinder with a segment, box or hull: its contact. In the cylinder's frame; normals from it to the other."""
+    """Each pair of a cylinder with a segment, box or hull: its contact. In the cylinder's frame; normals from it to the
+    other."""
     k = wp.tid()
     if k >= wp.min(pairs.number[0], pairs.room):
         return
@@ -281,11 +349,15 @@ def beside_cylinder(
     world = pairs.world[k]
     geom = wp.where(first_is, geoms[0], geoms[1])
     other = wp.where(first_is, geoms[1], geoms[0])
-    margin, gap = contact_margin_gap(mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world)
+    margin, gap = contact_margin_gap(
+        mat.geom_margin, mat.geom_gap, mat.pair_margin, mat.pair_gap, geoms, pairs.id[k][0], world
+    )
     half = pairs.geom_size[world % pairs.geom_size.shape[0], geom]
     size = pairs.geom_size[world % pairs.geom_size.shape[0], other]
     kind = pairs.geom_type[other]
-    b = core_of(kind, size, pairs.geom_dataid[world % pairs.geom_dataid.shape[0], other], pairs.hull_first, pairs.hull_count)
+    b = core_of(
+        kind, size, pairs.geom_dataid[world % pairs.geom_dataid.shape[0], other], pairs.hull_first, pairs.hull_count
+    )
     if kind == HULL and b.count == 0:
         return
     radius = radius_of(kind, size)

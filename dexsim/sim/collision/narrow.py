@@ -77,7 +77,11 @@ class NarrowPhase:
         self._pairs = _filled(kernels.Pairs, m)
         p = self._pairs
         p.geom_xpos, p.geom_xmat, p.room, p.number = d.geom_xpos, d.geom_xmat, d.naconmax, d.ncollision
-        p.hull_first, p.hull_count, p.hull = wp.array(first, dtype=int), wp.array(count, dtype=int), wp.array(corners, dtype=wp.vec3)
+        p.hull_first, p.hull_count, p.hull = (
+            wp.array(first, dtype=int),
+            wp.array(count, dtype=int),
+            wp.array(corners, dtype=wp.vec3),
+        )
         p.slot, p.simplex = wp.array(slot, dtype=int), self.simplex
         self._mat = _filled(kernels.Materials, m)
         self._out = _filled(kernels.Contacts, d.contact)
@@ -87,6 +91,7 @@ class NarrowPhase:
     def in_place(self) -> Iterator[None]:
         """Within this, `mujoco_warp.step` finds the contacts of hulls here."""
         theirs = collision_driver.convex_narrowphase
+
         def convex(m: mjw.Model, d: mjw.Data, ctx: Any, table: list[tuple[GeomType, GeomType]]) -> None:
             theirs(m, d, ctx, [pair for pair in table if pair not in KINDS])
             self.launch(ctx)
@@ -104,13 +109,24 @@ class NarrowPhase:
 
 @event_scope
 def hull_narrowphase(n: NarrowPhase, ctx: collision_driver.CollisionContext) -> None:
-    m, d, pairs = n.m, n.d, n._pairs
+    d, pairs = n.d, n._pairs
     pairs.geom, pairs.id, pairs.world = ctx.collision_pair, ctx.collision_pairid, ctx.collision_worldid
     n.deep_number.zero_()
-    wp.launch(kernels.apart, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out, n._deep, n._enclosing, n.deep_number], block_dim=n.block_dim)
+    wp.launch(
+        kernels.apart,
+        dim=d.naconmax,
+        inputs=[pairs, n._mat],
+        outputs=[n._out, n._deep, n._enclosing, n.deep_number],
+        block_dim=n.block_dim,
+    )
     threads = min(d.naconmax, 1 << 15)
-    wp.launch(kernels.overlapping, dim=threads, inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads], outputs=[n._out],
-              block_dim=32)
+    wp.launch(
+        kernels.overlapping,
+        dim=threads,
+        inputs=[pairs, n._mat, n._deep, n._enclosing, n.deep_number, threads],
+        outputs=[n._out],
+        block_dim=32,
+    )
     if n.cylinders:
         wp.launch(kernels.beside_cylinder, dim=d.naconmax, inputs=[pairs, n._mat], outputs=[n._out], block_dim=32)
 

@@ -1,8 +1,8 @@
 """Convex cores: what is left of a geom when its radius is taken away, and their corners and supports.
 
-A sphere is a point, a capsule a segment, a box and a hull are themselves; the radius is added again to the distance of the
-cores, exactly. Every core is the hull of a few numbered corners, so a search of the nearest points is over pairs of numbers.
-A cylinder is the prism of very many sides.
+A sphere is a point, a capsule a segment, a box and a hull are themselves; the radius is added again to the distance of
+the cores, exactly. Every core is the hull of a few numbered corners, so a search of the nearest points is over pairs of
+numbers. A cylinder is the prism of very many sides.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ import mujoco
 import numpy as np
 import warp as wp
 
-SPHERE, CAPSULE, CYLINDER, BOX, HULL = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH"))
+SPHERE, CAPSULE, CYLINDER, BOX, HULL = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
+)
 SIDES = wp.constant(1 << 14)
 """Of the prism that stands for a cylinder: one of 30 mm radius lacks 0.6 nm of its roundness."""
 
 
 @wp.struct
 class Core:
-    """kind: SPHERE (a point), CAPSULE (a segment along z), BOX or HULL. half [m]: size of the geom. first, count: its corners
-    in the table of hull corners."""
+    """kind: SPHERE (a point), CAPSULE (a segment along z), BOX or HULL. half [m]: size of the geom. first, count: its
+    corners in the table of hull corners."""
 
     kind: int
     half: wp.vec3
@@ -29,8 +31,8 @@ class Core:
 
 @wp.struct
 class Prism:
-    """A cylinder along z. half [m]: radius, half length. Its own type, so that kernels without cylinders are compiled without
-    them."""
+    """A cylinder along z. half [m]: radius, half length. Its own type, so that kernels without cylinders are compiled
+    without them."""
 
     half: wp.vec3
 
@@ -62,7 +64,9 @@ def corner(core: Core, vertex: wp.array(dtype=wp.vec3), i: int) -> wp.vec3:
     if core.kind == BOX:
         h = core.half
         return wp.vec3(
-            wp.where((i & 1) != 0, h[0], -h[0]), wp.where((i & 2) != 0, h[1], -h[1]), wp.where((i & 4) != 0, h[2], -h[2])
+            wp.where((i & 1) != 0, h[0], -h[0]),
+            wp.where((i & 2) != 0, h[1], -h[1]),
+            wp.where((i & 4) != 0, h[2], -h[2]),
         )
     if core.kind == CAPSULE:
         return wp.vec3(0.0, 0.0, wp.where(i != 0, core.half[1], -core.half[1]))
@@ -106,9 +110,13 @@ def support(core: Prism, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> int:  #
 
 
 def hull_corners(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners of each mesh's convex hull: (first [nmesh], count [nmesh], corners [n, 3] in m). A mesh without a hull, which no
-    geom that collides has, gets none."""
-    first, count, found = np.zeros(model.nmesh, np.int32), np.zeros(model.nmesh, np.int32), [np.zeros((0, 3), np.float32)]
+    """Corners of each mesh's convex hull: (first [nmesh], count [nmesh], corners [n, 3] in m). A mesh without a hull,
+    which no geom that collides has, gets none."""
+    first, count, found = (
+        np.zeros(model.nmesh, np.int32),
+        np.zeros(model.nmesh, np.int32),
+        [np.zeros((0, 3), np.float32)],
+    )
     for k in range(model.nmesh):
         vertex = model.mesh_vert[model.mesh_vertadr[k] :][: model.mesh_vertnum[k]]
         adr = model.mesh_graphadr[k]

@@ -14,8 +14,8 @@ from dexsim.sim.solver.source import LANES, text
 def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False) -> wp.Kernel:
     """The kernel for models of `nv` dofs (at most 32); [N * 32] threads, in blocks of whole warps.
 
-    It solves the worlds that have more than `above` and at most `rows` rows beside those of dry friction. registers: CUDA, at
-    most so many a thread (0: as the compiler likes).
+    It solves the worlds that have more than `above` and at most `rows` rows beside those of dry friction. registers:
+    CUDA, at most so many a thread (0: as the compiler likes).
     """
     if not 0 < nv <= LANES or rows % 4:
         raise ValueError(f"solve_kernel: nv {nv} must be 1 to {LANES}, rows {rows} a multiple of 4")
@@ -105,10 +105,10 @@ def solve_kernel(nv: int, rows: int, registers: int = 0, fast_math: bool = False
     ):
         call(
             wp.tid() // wp.static(LANES), above, iterations, ls_iterations, warm, njmax, tolerance_in, ls_tolerance_in,
-            impratio_invsqrt_in, M_rowind, M_colind, M_in, qacc_warmstart_in, qacc_smooth_in, qfrc_smooth_in, dof_frictionadr_in, nf_in,
-            nefc_in, nacon_in, contact_friction, contact_dim, contact_efc_address, type_in, id_in, J_rownnz, J_rowadr, J_colind,
-            J_in, D_in, aref_in, frictionloss_in, qacc_out, Ma_out, qfrc_constraint_out, force_out, state_out, niter_out,
-            overflow_out,
+            impratio_invsqrt_in, M_rowind, M_colind, M_in, qacc_warmstart_in, qacc_smooth_in, qfrc_smooth_in,
+            dof_frictionadr_in, nf_in, nefc_in, nacon_in, contact_friction, contact_dim, contact_efc_address, type_in,
+            id_in, J_rownnz, J_rowadr, J_colind, J_in, D_in, aref_in, frictionloss_in, qacc_out, Ma_out,
+            qfrc_constraint_out, force_out, state_out, niter_out, overflow_out,
         )  # fmt: skip
 
     return wp.kernel(

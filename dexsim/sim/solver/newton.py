@@ -105,8 +105,9 @@ class NewtonSolver:
                 dim=d.nworld * LANES,
                 inputs=[
                     above, m.opt.iterations, m.opt.ls_iterations, warm, d.njmax, m.opt.tolerance, m.opt.ls_tolerance,
-                    m.opt.impratio_invsqrt, m.M_hinit_i, m.M_colind, d.M, d.qacc_warmstart, d.qacc_smooth, d.qfrc_smooth, d.dof_frictionadr,
-                    d.nf, d.nefc, d.nacon, d.contact.friction, d.contact.dim, d.contact.efc_address, d.efc.type, d.efc.id,
+                    m.opt.impratio_invsqrt, m.M_hinit_i, m.M_colind, d.M, d.qacc_warmstart, d.qacc_smooth,
+                    d.qfrc_smooth, d.dof_frictionadr, d.nf, d.nefc, d.nacon, d.contact.friction, d.contact.dim,
+                    d.contact.efc_address, d.efc.type, d.efc.id,
                     d.efc.J_rownnz, d.efc.J_rowadr, d.efc.J_colind, d.efc.J, d.efc.D, d.efc.aref, d.efc.frictionloss,
                 ],
                 outputs=[d.qacc, d.efc.Ma, d.qfrc_constraint, d.efc.force, d.efc.state, d.solver_niter, d.overflow],
