@@ -210,6 +210,51 @@ def test_the_place_on_a_facet_is_right_where_the_distance_no_longer_tells(kind):
     assert np.linalg.norm(worlds.found()[2] - bench.reference(model, poses)[2]) < 5e-8
 
 
+# a way out over the rim, of which the prism's was 0.03 rad off: once 4 um too deep. Mesh of A, places, rotations,
+# sizes.
+OVER_RIM = {
+    "fingertip-cylinder": (
+        "tip_finger",
+        [[0.024709098041057587, 0.007857004180550575, -0.009864677675068378],
+         [0.020519662648439407, 0.03822968527674675, -0.014289066195487976]],
+        [[[0.872961163520813, -0.26739439368247986, 0.4079693853855133],
+          [-0.4820147454738617, -0.6011857986450195, 0.6373675465583801],
+          [0.07483690977096558, -0.7530443668365479, -0.6536999344825745]],
+         [[0.3845754861831665, 0.376815527677536, -0.8426812887191772],
+          [-0.346643328666687, 0.9050290584564209, 0.24649707973003387],
+          [0.8555349707603455, 0.1973131000995636, 0.478672593832016]]],
+        [[0.0, 0.0, 0.0], [0.016337860375642776, 0.011509537696838379, 0.0]],
+    ),
+    "box-cylinder": (
+        None,
+        [[0.01997954584658146, 0.03923625126481056, 0.031940359622240067],
+         [0.01101347990334034, 0.07872407138347626, 0.020061036571860313]],
+        [[[-0.036717094480991364, -0.9960775971412659, -0.08050656318664551],
+          [0.6329566240310669, -0.08552148938179016, 0.7694491147994995],
+          [-0.7733160853385925, -0.022705230861902237, 0.6336140036582947]],
+         [[0.7199376821517944, -0.15072733163833618, -0.6774739623069763],
+          [-0.23765932023525238, 0.8635798096656799, -0.4446886479854584],
+          [0.6520795822143555, 0.4811561107635498, 0.5859018564224243]]],
+        [[0.012696358375251293, 0.020218543708324432, 0.018430793657898903],
+         [0.009981504641473293, 0.02531452663242817, 0.0]],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", OVER_RIM)
+def test_the_way_out_over_a_rim_is_the_round_one(kind):
+    model, _, _ = bench.scene(kind)
+    name, *numbers = OVER_RIM[kind]
+    pos, rot, size = (np.array([x]) for x in numbers)
+    poses = bench.Poses(pos, rot, np.array([[model.mesh(name).id if name else -1, -1]]), size)
+    worlds = bench.Worlds(model, 1, "cpu", "hand")
+    worlds.put(poses)
+    worlds.collide()
+    dist, normal, _ = worlds.found()
+    want = bench.exact(model, poses, 0)
+    assert abs(dist[0] - want[0]) < 1e-8 and np.linalg.norm(normal[0] - want[1]) < 1e-6
+
+
 def test_the_exact_reference_of_cylinders():
     """In closed form: a box whose corner is nearest to the rim, one with an edge ahead of the side, and one above a
     cap; the last two apart and overlapping."""

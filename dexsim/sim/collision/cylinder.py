@@ -18,7 +18,7 @@ STEPS = 50
 """Most steps to the root on an edge; every other one halves the bracket, so that the last is less than float32
 resolves."""
 FAR = wp.constant(1.0e10)
-NEAR = wp.constant(0.02)
+NEAR = wp.constant(0.2)
 """How far [rad] a way out past an edge may be from where the prism had it."""
 LOWER = wp.constant(1.0e-8)
 """What rounding makes of the heights [m] of the corners of one feature."""
@@ -392,13 +392,13 @@ def rounder(
     """The way out of the round cylinder near that of the prism, whose facets are chords.
 
     about: the prism's. on: the body's corners that it led past. Tried are the features that these and the body's three
-    lowest corners make, fewest corners first; it is the one than which no other corner is lower along its own way out.
+    lowest corners make, fewest corners first: the shortest along which no other corner is lower.
     """
     three = lowest(b, vertex, wp.transpose(R) * about)
     most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + GAIN
     best = Way()
     k = int(0)
-    while k < 8 and best.found == 0:
+    while k < 8:
         i = on
         if k < 3:
             i = wp.vec3i(three[k], three[k], three[k])
@@ -412,5 +412,6 @@ def rounder(
             other = R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * w.u))) + p
             if wp.dot(w.u, c0 - other) <= LOWER:
                 best = w
+                most = w.depth - LOWER
         k += 1
     return best
