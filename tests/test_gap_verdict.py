@@ -1,10 +1,13 @@
 """The verdict follows the error on what was kept out; what is kept out leaves every regime to be fitted; limits of
 time."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from dexsim.gap.compute import TimeLimit
+from dexsim.gap.diagnosis import Drives
 from dexsim.gap.inquiry import TouchResult
 from dexsim.gap.judge import kept_out
 from dexsim.gap.rules import JUDGE
@@ -132,6 +135,40 @@ def test_a_limit_ends_searches_and_says_which():
     limit.stop()
     assert second.over() and limit.cut == {"b"} and limit.left() == 0.0
     assert TimeLimit(1e-9).share("c", 1.0).over()
+
+
+@pytest.mark.parametrize("spent, again", [(10.0, ["b"]), (700.0, [])])
+def test_a_joint_whose_share_was_too_short_gets_what_the_others_left(spent, again, monkeypatch):
+    """Of 1,000 s, 800 for searches, each of eight joints has its share; b needed more. Where the others hardly used
+    theirs b is searched again, in half of what is left; where they did, a search anew would end where it did."""
+    clock = [0.0]
+    monkeypatch.setattr("dexsim.gap.compute.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("dexsim.gap.diagnosis.workers", lambda device, jobs: 1)
+    drives = object.__new__(Drives)
+    limit = TimeLimit(1000.0)
+    drives.w = SimpleNamespace(limit=limit, settings=SimpleNamespace(device="cpu"), progress=None)
+    drives.cases, drives._left = [SimpleNamespace(joint=j) for j in "abcdefgh"], 8
+    ends = {}
+
+    def search_of(k, tell):
+        case = drives.cases[k]
+        deadline = limit.share(case.joint, min(1.0, 1 / drives._left))
+        ends[case.joint] = deadline.seconds
+        drives._left -= 1
+        return SimpleNamespace(case=case, deadline=deadline), case.joint
+
+    drives._search_of = search_of
+    answers = [search_of(k, None) for k in range(8)]
+    first = answers[1]
+    clock[0] = first[0].deadline.until
+    assert first[0].deadline.over() and limit.cut == {"b"} and first[0].deadline.seconds == pytest.approx(800 / 7)
+    clock[0], before = spent, dict(ends)
+    drives._search_longer(answers)
+    assert (answers[1] is first) == (not again)
+    assert limit.cut == (set() if again else {"b"})
+    assert {j for j in ends if ends[j] != before[j]} == set(again)
+    if again:
+        assert ends["b"] == pytest.approx(0.5 * (800 - spent))
 
 
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():

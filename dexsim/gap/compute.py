@@ -132,6 +132,7 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None
 # A limit of time, and a wish to end, that every search asks between its steps: what is best by then is the answer.
 
 JUDGING = 0.2  # of the limit: what is left for judging, the replay and the page
+LONGER = 2.0  # times what it had: what a search that ended early must have more for it to begin anew
 
 
 class TimeLimit:
@@ -163,10 +164,10 @@ class TimeLimit:
 
 
 class Deadline:
-    """When one joint's search is to end."""
+    """When one joint's search is to end; `seconds`: how long it has from its beginning."""
 
     def __init__(self, limit: TimeLimit | None = None, joint: str = "", until: float = float("inf")):
-        self.limit, self.joint, self.until = limit, joint, until
+        self.limit, self.joint, self.until, self.seconds = limit, joint, until, until - time.monotonic()
 
     def over(self) -> bool:
         """Whether it is time to end with what there is; noted for the page."""

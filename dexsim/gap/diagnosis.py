@@ -13,7 +13,7 @@ import numpy as np
 
 from dexsim.errors import UserError
 from dexsim.gap import compute
-from dexsim.gap.compute import TimeLimit, map_joints, workers
+from dexsim.gap.compute import LONGER, TimeLimit, map_joints, workers
 from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, modelled
 from dexsim.gap.inquiry import (
     Diagnosis,
@@ -210,7 +210,7 @@ class Drives(Steps):
         """Which effects each joint has; again where what was found in one moves the others otherwise than was
         thought."""
         w = self.w
-        self._left = len(self.cases)  # joints that are still to be searched: they share the time
+        self._left: float = len(self.cases)  # joints that are still to be searched: they share the time
         linked = len(self.cases) > 1 and w.settings.joints is None and coupled(self.cases)
         if linked:
             first = map_joints([c.joint for c in self.cases], self._start, w.settings.device)
@@ -220,6 +220,7 @@ class Drives(Steps):
             w.clock.lap("model along the motion")
         self._test_stages()
         answers = map_joints([c.joint for c in self.cases], self._search_of, w.settings.device, w.progress)
+        self._search_longer(answers)
         if linked:
             self._search_again(answers)
         self._dragged_from_afar(answers)
@@ -270,6 +271,24 @@ class Drives(Steps):
         search.settle(found)
         self._left -= 1
         return search, found
+
+    def _search_longer(self, answers: Answers) -> None:
+        """Joints whose share of the limit was too short, searched once more in what the others did not need of theirs:
+        a joint with something hidden takes longest. `answers` is changed. Half of what is left at most: what follows
+        needs time too."""
+        w = self.w
+        cut = [k for k, (search, _) in enumerate(answers) if search.case.joint in w.limit.cut]
+        if not cut or w.limit.stopped:
+            return
+        share = 0.5 * min(1.0, workers(w.settings.device, len(cut)) / len(cut))
+        if share * w.limit.left() < LONGER * max(answers[k][0].deadline.seconds for k in cut):
+            return  # a search begins anew, and would end where it did
+        w.limit.cut -= {answers[k][0].case.joint for k in cut}
+        self._left = workers(w.settings.device, len(self.cases)) / share
+        joints = [self.cases[k].joint for k in cut]
+        renewed = map_joints(joints, lambda i, tell: self._search_of(cut[i], tell), w.settings.device, w.progress)
+        for k, answer in zip(cut, renewed, strict=True):
+            answers[k] = answer
 
     def _coupled_by(self, trials: Sequence[Trial]) -> None:
         """The cases once more, with the others' motion as these trials have it."""
