@@ -150,12 +150,11 @@ def override(cfg: DictConfig, items: list[Override]) -> DictConfig:
         except (ValueError, TypeError):  # a name where a list has numbers
             parts = key.split(".")
             owners = (".".join(parts[:n]) for n in range(1, len(parts)))
-            lists = [o for o in owners if isinstance(OmegaConf.select(cfg, o), ListConfig)]
-            if not lists:
+            # the outermost list: nothing below it can be asked for by a name
+            a_list = next((o for o in owners if isinstance(OmegaConf.select(cfg, o), ListConfig)), None)
+            if a_list is None:
                 raise
-            raise UserError(
-                f"{key}: {lists[0]} is a list, whose values are numbered: {lists[0]}.0=..., or [..]"
-            ) from None
+            raise UserError(f"{key}: {a_list} is a list, whose values are numbered: {a_list}.0=..., or [..]") from None
     return cfg
 
 
