@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
+import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,11 +28,27 @@ def read(path: Path, where: str) -> mujoco.MjSpec:
     """The model of an MJCF or URDF file, which compiles. where: what the file is, for messages. Raises UserError."""
     check(path, where)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.copy().compile()
+        with warned() as said:
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.copy().compile()
     except (ValueError, RuntimeError) as error:
         raise UserError(f"{where}: {' '.join(str(error).split())}") from None
+    for text in dict.fromkeys(said):
+        print(f"warning: {where}: {text}", file=sys.stderr)
     return spec
+
+
+@contextlib.contextmanager
+def warned() -> Iterator[list[str]]:
+    """What MuJoCo warns of meanwhile, a line each: else it says so on stderr without naming the file, and writes it to
+    MUJOCO_LOG.TXT in whatever folder the user is in."""
+    said: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: said.append(" ".join(str(text).split())))
+    try:
+        yield said
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def check(path: Path, where: str) -> None:

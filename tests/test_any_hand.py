@@ -5,6 +5,7 @@ simulated deployment."""
 from __future__ import annotations
 
 import json
+import socket
 
 import numpy as np
 import pytest
@@ -115,6 +116,53 @@ def test_a_finger_that_closes_with_negative_angles_is_paid_alike(hands):
     assert env.rewards()["diff"].abs().max() < 1e-9
     env.q[:, b] = 0.7
     assert (env.rewards()["diff"] < -1e-3).all()
+
+
+def test_the_finger_that_presses_against_the_others_is_paid_for_a_band_wherever_it_stands(hands):
+    """The made hand's thumb is its last finger; the first is told a force as any other is."""
+    env = make_env(config(hands[False], "grasp"), 4, "cpu", 1, "mujoco")
+    assert env.hand.opposing == (2,)
+
+    def paid(finger: int, command: float, own: float = -1.0, term: str = "force") -> float:
+        env.tip_force.zero_()
+        env.tip_force[:, finger] = 0.5 * env.f_max
+        env.command.fill_(command), env.thumb_command.fill_(own)
+        return float(env.rewards()[term][0])
+
+    whole = paid(0, 0.5)
+    assert whole > 0 and paid(0, 0.1) < 0.5 * whole  # told, and far off
+    assert paid(2, 0.5) == paid(2, 0.1) == pytest.approx(whole)  # not told
+    assert paid(2, 0.1, own=0.5) == pytest.approx(whole) and paid(2, 0.5, own=0.1) < 0.5 * whole
+    assert paid(2, 0.1, 0.5, "thumb_near") > paid(0, 0.1, 0.5, "thumb_near")
+    env.tip_force.fill_(0.5 * env.f_max)
+    env.torque.zero_()
+    env.torque[:, env.roots[2]] = 0.5 * (env.tau_max * env.root_closes)[2]
+    pays = []
+    for command in (0.1, 0.5):
+        env.command.fill_(command)
+        pays.append(float(env.rewards()["torque"][0]))
+    assert pays[0] == pytest.approx(pays[1])  # its torque, alike
+
+
+@pytest.mark.parametrize("pads", [True, False])
+def test_the_live_view_shows_any_hand(hands, pads):
+    pytest.importorskip("viser")
+    from dexsim.view.live import LiveView
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    env = make_env(config(hands[pads], "grasp", "tactile=raw"), 4, "cpu", 1, "mujoco")
+    env.reset_all()
+    still = lambda obs: torch.zeros(4, 9)  # noqa: E731
+    view = LiveView(env, still, "still", ["still"], lambda name: still, "127.0.0.1", port)
+    try:
+        view.wishes.pause, view.wishes.steps = True, 2
+        view.run(seconds=0.5)
+        command = view._commanded(0)
+        assert np.isnan(command).tolist() == [False, False, True] and view.steps == 2
+    finally:
+        view.stop()
 
 
 def test_held_poses_hold(hands):

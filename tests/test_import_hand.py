@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 from functools import partial
 from pathlib import Path
@@ -265,7 +266,41 @@ BAD = {
     ),
     "zero limits": (
         lambda t: t.replace('lower="-0.2" upper="1.7"', 'lower="0" upper="0"', 1),
-        r"joint 'index_1' has .*limits.*low < high",
+        r"joint 'index_1' has limits 0 to 0 rad; give it two, low < high",
+    ),
+    "limits the wrong way round": (
+        lambda t: t.replace('lower="-0.2" upper="1.7"', 'lower="1.7" upper="-0.2"', 1),
+        r"joint 'index_1' has limits 1.7 to -0.2 rad; give it two, low < high",
+    ),
+    "an effort below zero": (
+        lambda t: t.replace('effort="0.6"', 'effort="-0.6"', 1),
+        r"joint 'index_1': <limit effort=\"-0.6\">: must be a number above 0",
+    ),
+    "an effort that is no number": (
+        lambda t: t.replace('effort="0.6"', 'effort="nan"', 1),
+        r"joint 'index_1': <limit effort=\"nan\">: must be a number above 0",
+    ),
+    "an endless speed": (
+        lambda t: t.replace('velocity="7"', 'velocity="inf"', 1),
+        r"joint 'index_1': <limit velocity=\"inf\">: must be a number above 0.*rad/s",
+    ),
+    "a mass below zero": (
+        lambda t: t.replace('mass value="0.3"', 'mass value="-0.3"', 1),
+        r"link 'base': <mass value=\"-0.3\">: must be a number of kg",
+    ),
+    "an inertia of nothing": (
+        lambda t: re.sub('ixx="[^"]*"', 'ixx="0"', t, count=1), r"positive eigenvalues.*'base'.*kg m2 above 0",
+    ),
+    "an axis of nothing": (
+        lambda t: t.replace('axis xyz="0 -1 0"', 'axis xyz="0 0 0"', 1),
+        r"axis too small.*'index_1'.*must not be 0 0 0",
+    ),
+    "a parent that is not there": (
+        lambda t: t.replace('<parent link="base"/>', '<parent link="bass"/>', 1), r"must name links of the file",
+    ),
+    "links in a ring": (
+        lambda t: t.replace('<parent link="base"/><child link="index_near"/>',
+                            '<parent link="index_far"/><child link="index_near"/>', 1), r"must be one tree",
     ),
     "degrees": (lambda t: t.replace('upper="1.7"', 'upper="97"', 1), r"joint 'index_1'.*in degrees"),
     "endless": (
@@ -308,7 +343,6 @@ BAD = {
 
 def _scaled(text: str) -> str:
     """A hand drawn in millimetres, read as metres."""
-    import re
 
     def times(match: re.Match[str]) -> str:
         return f'{match[1]}="{" ".join(str(1000 * float(x)) for x in match[2].split())}"'
@@ -319,13 +353,17 @@ def _scaled(text: str) -> str:
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_files_get_one_line_and_nothing_is_written(case, tmp_path):
+def test_bad_files_get_one_line_and_nothing_is_written(case, tmp_path, monkeypatch, capfd):
     change, said = BAD[case]
     path = _broken(tmp_path, change)
+    assert path.read_text() != hands.urdf(), "nothing was broken"
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")  # MuJoCo writes its warnings where the user is
     with pytest.raises(UserError, match=said) as error:
         import_hand(path, tmp_path / "hand", picture=False)
     assert "\n" not in str(error.value) and (str(path) in str(error.value) or "mesh" in str(error.value))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["robot"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["here", "robot"] and not any(Path().iterdir())
+    assert capfd.readouterr() == ("", "")  # the line is the error's; no library adds one
 
 
 def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(tmp_path):

@@ -316,6 +316,18 @@ def test_a_recording_with_positions_only_is_told_at_once(tmp_path, capsys):
     assert found(read(tmp_path / "d.csv"), "missing_topic") == []
 
 
+def test_touch_without_commands_is_no_error(tmp_path, capsys):
+    """`calibrate touch` reads it: the audit says what it can not be used for, and ends with status 0."""
+    made = recordings.signal(6.0, tactile=True)
+    made.commands = Series.empty(COMMANDS, 2)
+    write(tmp_path / "touch.mcap", made)
+    assert main([str(tmp_path / "touch.mcap")]) == 0
+    out = capsys.readouterr().out
+    assert "no commands: calibrate touch can use this recording, diagnose and replay cannot" in out
+    assert "a column command.JOINT" in out and [f.severity for f in read(tmp_path / "touch.mcap").findings
+                                                if f.kind == "missing_topic"] == ["warning"]  # fmt: skip
+
+
 def test_without_commands_diagnosis_and_replay_say_what_to_log(tmp_path):
     made = recordings.signal(6.0, joints=("knuckle",))
     made.commands = Series.empty(COMMANDS, 1)

@@ -50,7 +50,7 @@ def check(
     m, where = source.model, f"model {source.path}"
     _size(motions, where)
     for j in tree.joints:
-        _limits(m, j, where)
+        _limits(m, j, where, source.limits.get(m.joint(j).name))
     out = Figures({}, {}, {}, {})
     for x in motions:
         for j in x.finger.joints:
@@ -96,10 +96,12 @@ def _size(motions: list[Motion], where: str) -> None:
     raise UserError(f"{where}: its longest finger is {reach:.3g} m, allowed {REACH[0]:g} to {REACH[1]:g} m; {fix}")
 
 
-def _limits(m: mujoco.MjModel, j: int, where: str) -> None:
+def _limits(m: mujoco.MjModel, j: int, where: str, stated: tuple[float, float] | None) -> None:
     name, (low, high) = m.joint(j).name, m.jnt_range[j]
     if not m.jnt_limited[j] or not low < high:
-        state = f"limits {low:g} to {high:g} rad" if m.jnt_limited[j] else "no limits"
+        unit = "rad" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else "m"
+        low, high = stated or (low, high)
+        state = f"limits {low:g} to {high:g} {unit}" if stated or m.jnt_limited[j] else "no limits"
         raise UserError(
             f"{where}: joint '{name}' has {state}; give it two, low < high"
             " (URDF: <limit lower= upper=>, MJCF: range=), or make it fixed"

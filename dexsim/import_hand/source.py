@@ -21,7 +21,8 @@ ONE_DOF = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 @dataclass
 class Source:
     """model: of the hand alone. efforts, speeds: by joint, where the file says them (N m, rad/s). bare: moving bodies
-    whose inertia the file does not give. notes: what was left out, a line each. coupled: what was taken apart."""
+    whose inertia the file does not give. notes: what was left out, a line each. coupled: what was taken apart. limits:
+    [rad, m] by joint, as a URDF says them: MuJoCo leaves out what is none."""
 
     path: Path
     model: mujoco.MjModel
@@ -30,6 +31,7 @@ class Source:
     bare: list[str]
     notes: list[str] = field(default_factory=list)
     coupled: list[str] = field(default_factory=list)
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -44,41 +46,45 @@ def read(path: Path, packages: Sequence[Path] = (), coupled: str = "refuse", den
     links without inertia, limits that are none.
     """
     files.check(path, urdf.MAX_MODEL, "model")
-    scratch = tempfile.TemporaryDirectory(prefix="dexsim_import_")
-    try:
-        speeds: dict[str, float] = {}
-        bare: list[str] = []
-        if urdf.is_urdf(path):
-            text = urdf.read(path, packages, scratch)
-            speeds, bare = text.speeds, text.bare
-            spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
-        else:
-            model_file.check(path, f"model {path}")
-            spec = _parsed(path, lambda: mujoco.MjSpec.from_file(str(path)))
-            _meshes_there(spec, path)
-        notes: list[str] = []
-        _one_tree(spec, path, notes)
-        taken = _coupled(spec, path, coupled)
-        efforts = _strip(spec, path, notes)
-        if bare and density is None:
-            first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
-            raise UserError(
-                f"model {path}: link{'s' if len(bare) > 1 else ''} {first}"
-                " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
-            )
-        for body in spec.bodies:
-            if body.name in bare:
-                geoms = [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
-                for geom in body.geoms:  # what is drawn and what collides is one body, not two
-                    geom.density = density if geom in geoms else 0.0
-        model = _compiled(spec, path, notes)
-    finally:
-        scratch.cleanup()
+    with model_file.warned() as said, tempfile.TemporaryDirectory(prefix="dexsim_import_") as scratch:
+        out = _read(path, packages, coupled, density, Path(scratch))
+    out.notes += [f"MuJoCo warns: {text}" for text in dict.fromkeys(said)]
+    return out
+
+
+def _read(path: Path, packages: Sequence[Path], coupled: str, density: float | None, scratch: Path) -> Source:
+    speeds: dict[str, float] = {}
+    bare: list[str] = []
+    limits: dict[str, tuple[float, float]] = {}
+    if urdf.is_urdf(path):
+        text = urdf.read(path, packages, scratch)
+        speeds, bare, limits = text.speeds, text.bare, text.limits
+        spec = _parsed(path, lambda: mujoco.MjSpec.from_string(text.text))
+    else:
+        model_file.check(path, f"model {path}")
+        spec = _parsed(path, lambda: mujoco.MjSpec.from_file(str(path)))
+        _meshes_there(spec, path)
+    notes: list[str] = []
+    _one_tree(spec, path, notes)
+    taken = _coupled(spec, path, coupled)
+    efforts = _strip(spec, path, notes)
+    if bare and density is None:
+        first = ", ".join(bare[:5]) + (" ..." if len(bare) > 5 else "")
+        raise UserError(
+            f"model {path}: link{'s' if len(bare) > 1 else ''} {first}"
+            " without <inertial>: give mass and inertia, or density=1000 (kg/m3) to take those of the shapes"
+        )
+    for body in spec.bodies:
+        if body.name in bare:
+            geoms = [g for g in body.geoms if g.contype or g.conaffinity] or list(body.geoms)
+            for geom in body.geoms:  # what is drawn and what collides is one body, not two
+                geom.density = density if geom in geoms else 0.0
+    model = _compiled(spec, path, notes)
     _finite(model, path)
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j] and model.jnt_actfrcrange[j].max() > 0:
             efforts.setdefault(model.joint(j).name, float(np.abs(model.jnt_actfrcrange[j]).max()))
-    return Source(path, model, efforts, speeds, bare, notes, taken)
+    return Source(path, model, efforts, speeds, bare, notes, taken, limits)
 
 
 def _finite(m: mujoco.MjModel, path: Path) -> None:
@@ -101,11 +107,21 @@ def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
         raise UserError(f"model {path}: {_said(error)}") from None
 
 
+FIXES = (
+    ("repeated name", "every link and joint needs a name of its own"),
+    ("positive eigenvalues", "ixx, iyy and izz are kg m2 above 0, and ixy, ixz, iyz smaller than they"),
+    ("A + B >= C", "no body's inertia about one axis is above the sum of those about the other two: check its figures"),
+    ("axis too small", "<axis> must not be 0 0 0"),
+    ("URDF body not found", "the links must be one tree: the chain of parents of one of them comes back to it"),
+    ("parent or child missing", "<parent link=> and <child link=> must name links of the file"),
+    ("bad format in attribute", "must be a number, or as many as the attribute has"),
+)
+"""What MuJoCo says of a file, and what to do about it."""
+
+
 def _said(error: BaseException) -> str:
     text = " ".join(str(error).split())
-    if "repeated name" in text:
-        text += "; every link and joint needs a name of its own"
-    return text
+    return "; ".join([text, *(fix for words, fix in FIXES if words in text)])
 
 
 def _meshes_there(spec: mujoco.MjSpec, path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,11 +20,12 @@ READS = (".stl", ".obj", ".msh")
 
 @dataclass
 class Urdf:
-    """text: for MuJoCo, mesh files as absolute paths; speeds: rad/s by joint, of its limits; bare: moving links without
-    an inertia."""
+    """text: for MuJoCo, mesh files as absolute paths; speeds: rad/s by joint, of its limits; limits: rad or m by joint,
+    as they stand there; bare: moving links without an inertia."""
 
     text: str
     speeds: dict[str, float] = field(default_factory=dict)
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     bare: list[str] = field(default_factory=list)
 
 
@@ -49,9 +50,10 @@ def _root(path: Path) -> ET.Element:
     return root
 
 
-def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirectory) -> Urdf:
+def read(path: Path, packages: Sequence[Path], scratch: Path) -> Urdf:
     """The URDF at `path`. packages: folders in which package://NAME/ is looked for, beside those above the file;
-    scratch: where meshes go that MuJoCo does not read. Raises UserError for missing meshes."""
+    scratch: where meshes go that MuJoCo does not read. Raises UserError for missing meshes, and for masses, limits,
+    efforts and speeds that are none."""
     root = _root(path)
     out = Urdf("")
     if any(e.tag.startswith("{") and "xacro" in e.tag for e in root.iter()):
@@ -67,7 +69,7 @@ def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirect
         found = _find(path, name, packages)
         if found.suffix.lower() not in READS or _ascii_stl(found):
             if found not in converted:
-                converted[found] = _convert(found, Path(scratch.name) / f"{found.stem}_{len(converted)}.obj")
+                converted[found] = _convert(found, scratch / f"{found.stem}_{len(converted)}.obj")
             found = converted[found]
         mesh.set("filename", str(found))
     for element in root.findall("mujoco"):
@@ -89,8 +91,20 @@ def read(path: Path, packages: Sequence[Path], scratch: tempfile.TemporaryDirect
                 f"model {path}: joint '{name}' is continuous: it turns without end; a hand's joints have limits:"
                 ' type="revolute" and <limit lower= upper=>'
             )
-        if limit is not None and _number(limit.get("velocity")) > 0:
-            out.speeds[name] = _number(limit.get("velocity"))
+        if limit is not None:
+            where = f"model {path}: joint '{name}': <limit"
+            most = "a number above 0; 0, or nothing, where it is not known"
+            low, high = (_number(f"{where} {k}=", limit.get(k)) for k in ("lower", "upper"))
+            out.limits[name] = low, high
+            _number(f"{where} effort=", limit.get("effort"), f"{most} (N m, of a slide N)", 0.0)
+            speed = _number(f"{where} velocity=", limit.get("velocity"), f"{most} (rad/s, of a slide m/s)", 0.0)
+            if speed > 0:
+                out.speeds[name] = speed
+    for link in root.findall("link"):
+        mass = link.find("inertial/mass")
+        if mass is not None:
+            where = f"model {path}: link '{link.get('name', '')}': <mass value="
+            _number(where, mass.get("value"), "a number of kg, above 0 of a link that moves", 0.0)
     out.bare = [
         link.get("name", "")
         for link in root.findall("link")
@@ -145,8 +159,12 @@ def _convert(path: Path, to: Path) -> Path:
     return to
 
 
-def _number(text: str | None) -> float:
+def _number(what: str, text: str | None, allowed: str = "a finite number", low: float = -math.inf) -> float:
+    """A finite number, not below low; 0 where there is none. what: the file, the element and "<tag key="."""
     try:
-        return float(text or 0.0)
+        value = float(text or 0.0)
     except ValueError:
-        return 0.0
+        value = math.nan
+    if not math.isfinite(value) or value < low:
+        raise UserError(f'{what}"{text}">: must be {allowed}')
+    return value

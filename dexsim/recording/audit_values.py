@@ -60,10 +60,14 @@ def channels(r: Recording) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarr
 
 
 def commanded(r: Recording) -> Iterator[Finding]:
-    """That nothing says what the joints were asked for."""
+    """That nothing says what the joints were asked for: an error, but where touch was recorded, which `calibrate touch`
+    reads by itself."""
     if not np.isfinite(r.commands.value).any():
-        text = f"no commands: diagnose and replay cannot use this recording; {COMMANDS_FIX}"
-        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "error")
+        felt = r.tactile is not None and len(r.tactile) > 0
+        use = "calibrate touch can use this recording, diagnose and replay cannot" if felt else (
+            "diagnose and replay cannot use this recording")  # fmt: skip
+        text = f"no commands: {use}; {COMMANDS_FIX}"
+        yield Finding("missing_topic", COMMANDS, NAN, len(r.commands), text, "warning" if felt else "error")
 
 
 def finite(r: Recording) -> Iterator[Finding]:

@@ -271,7 +271,7 @@ def _metrics(r: dict, k: dict, env: GraspEnv) -> dict:
     for i, name in enumerate(env.hand.finger_names):
         out[f"force_command_correlation_{name}"] = _corr(r["command"][held], r["force"][held, i])
     if env.thumb_range is not None and held.any():
-        own, pressed = r["thumb_command"][held], r["force"][held, 0]
+        own, pressed = r["thumb_command"][held], r["force"][held][:, list(env.hand.opposing)].mean(1)
         out["thumb_own_command_correlation"] = _corr(own, pressed)
         out["thumb_own_command_error_N"] = float(np.abs(pressed - own * f_max).mean())
     if held.sum() > 2:

@@ -101,6 +101,16 @@ def touches(f: int, w: int, s: State, shape: Shape):
 
 
 @wp.func
+def opposes(f: int, shape: Shape):
+    """Whether a finger presses against the others, wherever it stands in the hand's order."""
+    found = bool(False)
+    for i in range(shape.opposing.shape[0]):
+        if shape.opposing[i] == f:
+            found = True
+    return found
+
+
+@wp.func
 def tracking(x: float, command: float, x_max: float, sigma: float, low: float, high: float):
     """R_i of a finger that touches (R_force, R_torque): exp(-(x - command x_max)^2 / (2 (sigma x_max)^2)) within [low
     x_max, high x_max]; for a command below 0, as the thumb's is unless it has its own, the band alone. The paper prints
@@ -119,7 +129,7 @@ def force(w: int, s: State, shape: Shape):
     total = float(0.0)
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
-            command = wp.where(f == 0, s.thumb_command[w], s.command[w])
+            command = wp.where(opposes(f, shape), s.thumb_command[w], s.command[w])
             total += tracking(s.tip_force[w, f], command, shape.f_max, shape.force_sigma, shape.force_low,
                               shape.force_high)  # fmt: skip
     return total
@@ -132,7 +142,7 @@ def torque(w: int, s: State, shape: Shape):
     for f in range(s.tip_force.shape[1]):
         if touches(f, w, s, shape):
             x = s.torque[w, shape.roots[f]] * shape.root_closes[f] / shape.tau_max[f]
-            command = wp.where(f == 0, float(-1.0), s.command[w])
+            command = wp.where(opposes(f, shape), float(-1.0), s.command[w])
             total += tracking(x, command, 1.0, shape.torque_sigma, shape.torque_low, shape.torque_high)
     return total
 
@@ -243,10 +253,15 @@ def worst(by_torque: bool, w: int, s: State, shape: Shape):
 
 @wp.func
 def thumb_near(w: int, s: State, shape: Shape):
-    """Ours: 1 - |F_thumb / F_max - its own command|, not below 0; 0 where it has none."""
+    """Ours: 1 - |F_thumb / F_max - its own command|, not below 0, mean of the opposing fingers; 0 where they have
+    none."""
     if s.thumb_command[w] < 0.0:
         return float(0.0)
-    return at_least(1.0 - wp.abs(s.tip_force[w, 0] / shape.f_max - s.thumb_command[w]), 0.0)
+    total = float(0.0)
+    for i in range(shape.opposing.shape[0]):
+        off = wp.abs(s.tip_force[w, shape.opposing[i]] / shape.f_max - s.thumb_command[w])
+        total += at_least(1.0 - off, 0.0)
+    return total / float(shape.opposing.shape[0])
 
 
 @wp.func

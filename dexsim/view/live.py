@@ -154,8 +154,11 @@ class LiveView:
             )
         self._facts = gui.add_html("")
         with gui.add_folder("Touch"):
-            self._labels = gui.add_html(panels.pad_labels(self.fingers))
-            self._image = gui.add_image(self._map.image(np.zeros(self.env.touch.layout.area.shape), 1.0), format="png")
+            feels = bool(self.env.pads)
+            self._labels = gui.add_html(panels.pad_labels(self.fingers), visible=feels)
+            self._image = gui.add_image(
+                self._map.image(np.zeros(self.env.touch.layout.area.shape), 1.0), format="png", visible=feels
+            )
             self._forces = gui.add_html("")
         with gui.add_folder("Rewards"):
             self._reward_html = gui.add_html("")
@@ -233,7 +236,7 @@ class LiveView:
                     )
             layout = self.env.touch.layout
             self._points = []
-            for f, name in enumerate(layout.bodies):
+            for f, name in enumerate(layout.bodies if self.env.pads else ()):
                 count = int(layout.count[f])
                 self._points.append(
                     scene.add_point_cloud(
@@ -296,11 +299,14 @@ class LiveView:
         self._facts.content = panels.facts(self._about(w))
 
     def _commanded(self, world: int) -> np.ndarray | None:
-        """Commanded force of each finger (N), NaN for the thumb, which is not told one; None without commands."""
+        """Commanded force of each finger (N), NaN for those that press against the others, which are not told one; None
+        without commands."""
         command, full = getattr(self.env, "command", None), getattr(self.env, "f_max", None)
         if command is None or full is None or command.dim() != 1:
             return None
-        return np.array([np.nan, *[float(command[world]) * full] * 4])
+        told = np.full(len(self.fingers), float(command[world]) * full)
+        told[list(self.env.hand.opposing)] = np.nan
+        return told
 
     def _about(self, world: int) -> dict[str, object]:
         env = self.env

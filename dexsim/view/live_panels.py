@@ -39,6 +39,10 @@ class TaxelMap:
         self._nearest, self._inside = [], []
         for f in range(layout.pads):
             k = int(layout.count[f])
+            if k < 2:  # the one that stands for a finger without a pad
+                self._nearest.append(np.zeros((PAD_HEIGHT, PAD_WIDTH), int))
+                self._inside.append(np.zeros((PAD_HEIGHT, PAD_WIDTH), bool))
+                continue
             points, normal = layout.point[f, :k], layout.normal[f, :k].mean(0)
             up = layout.ty[f, :k].mean(0)
             normal /= np.linalg.norm(normal)
