@@ -14,7 +14,7 @@ import warp as wp
 @wp.func
 def eccentricity(q: Any, sine: Any, cosine: Any):
     """Error [rad] at position q [rad] of an encoder whose disk is off its axis: sine * sin q + cosine * (cos q - 1),
-    zero at q = 0."""
+    zero at q = 0. Geometry, to first order in the offset over the disk's radius."""
     return sine * wp.sin(q) + cosine * (wp.cos(q) - type(q)(1.0))
 
 
@@ -30,7 +30,7 @@ def eccentricity_slope(q: Any, sine: Any, cosine: Any):
 @wp.func
 def arrived(end: Any, stamp: Any, dt: Any):
     """Share of the step of dt [s] that ends at `end` [s], less the delay, in which a target stamped `stamp` is in
-    force: a delay that ends inside a step acts for the rest of it."""
+    force, (end - stamp) / dt within 0 .. 1: a delay that ends inside a step acts for the rest of it."""
     return wp.clamp((end - stamp) / dt, type(dt)(0.0), type(dt)(1.0))
 
 
@@ -49,21 +49,22 @@ def warmed(per_degree: Any, warmth: Any):
     """Factor on a torque constant, a friction or a resistance, linear in the temperature: 1 + per_degree [1/degC] *
     warmth [degC].
 
-    Copper has +0.0039, the magnets' flux about -0.001 (NdFeB) per degree; grease gets thinner."""
+    Copper's resistance has +0.0039 (IEC 60028), the magnets' flux about -0.001 (NdFeB) per degree; grease gets
+    thinner."""
     return type(warmth)(1.0) + per_degree * warmth
 
 
 @wp.func
 def sagging(supply: Any, per_torque: Any, others: Any):
     """Supply over nominal where the other motors load it: supply * max(0.05, 1 - sag [1/N.m] * sum of their |torque|
-    [N.m])."""
+    [N.m]). A source with an internal resistance, currents in proportion to torques."""
     return supply * wp.max(type(supply)(1.0) - per_torque * others, type(supply)(0.05))
 
 
 @wp.func
 def voltage_torque(duty: Any, tau0: Any, supply: Any, line: Any, v: Any):
     """Torque [N.m] of a DC motor at a duty (clipped to -1 .. 1) of its supply: tau0 * supply * duty - line * v, line =
-    stall torque over no-load speed [N.m.s/rad] (R i = u - k v, torque = k i)."""
+    stall torque over no-load speed [N.m.s/rad]. The circuit R i = u - k v with torque = k i, without an inductance."""
     return tau0 * supply * wp.clamp(duty, -type(duty)(1.0), type(duty)(1.0)) - line * v
 
 
@@ -101,8 +102,9 @@ def torque_limits(tau0: Any, x: Any, v: Any, slope: Any):
 @wp.func
 def transmission(turn: Any, stiff: Any, hardening: Any):
     """(torque [N.m], stiffness [N.m/rad]) of a transmission wound up by `turn` [rad]: tau = t (1 + hardening t^2), t =
-    stiff * turn; its stiffness is 1 + 3 hardening t^2 times as large (a cubic hardening spring, as harmonic drives
-    show)."""
+    stiff * turn; its stiffness is 1 + 3 hardening t^2 times as large. A cubic hardening spring, as harmonic drives show
+    (T. Tuttle, W. Seering, A nonlinear model of a harmonic drive gear transmission, IEEE Trans. Robotics and Automation
+    12, 1996)."""
     stretch = stiff * turn
     harder = type(turn)(1.0) + hardening * stretch * stretch
     return wp.vector(stretch * harder, (type(turn)(3.0) * harder - type(turn)(2.0)) * stiff)
@@ -111,7 +113,7 @@ def transmission(turn: Any, stiff: Any, hardening: Any):
 @wp.func
 def transmission_damping(rebound: Any, stiff: Any, rotor: Any, link: Any, both: Any):
     """Damping [N.m.s/rad] of a spring [N.m/rad] between two inertias [kg.m2] at the damping ratio `rebound`:
-    2 rebound sqrt(stiff * rotor * link / both), both = rotor + link."""
+    2 rebound sqrt(stiff * rotor * link / both), both = rotor + link: of one mass on a spring, at their reduced one."""
     return type(stiff)(2.0) * rebound * wp.sqrt(stiff * rotor * link / both)
 
 
@@ -135,7 +137,9 @@ def stribeck_power(ratio: Any, exponent: Any):
 @wp.func
 def load_share(torque: Any, v: Any, driving: Any, backdriven: Any):
     """Dry friction per motor torque of a gear: `driving` where the motor drives the load (torque and speed agree),
-    `backdriven` where the load drives the motor (they do not). The friction is this share of |torque|."""
+    `backdriven` where the load drives the motor (they do not). The friction is this share of |torque| (P. Hamon, M.
+    Gautier, P. Garrec, Dynamic identification of robots with a dry friction model depending on load and velocity, IROS
+    2010)."""
     share = driving
     if torque * v < type(v)(0.0):
         share = backdriven
@@ -216,7 +220,7 @@ def preslide_speed(free: Any, a: Any, level: Any, taken: Any, w: Any):
 def ripple_wave(angle: Any, shape: Any):
     """(value, slope per rad) at an angle [rad] of a wave of amplitude 1 whose fundamental is +sin: shape 0 sin(angle),
     1 a sawtooth that rises through 0 at angle 0 and drops at pi, -1 one that falls through 0 at pi and jumps up at 0;
-    mixtures between."""
+    mixtures between. Ours, for a wave that is no sine: a sawtooth's Fourier series has all harmonics."""
     value = wp.sin(angle)
     slope = wp.cos(angle)
     if shape != type(angle)(0.0):

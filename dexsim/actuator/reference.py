@@ -1,4 +1,6 @@
-"""The servo law in NumPy float64, line for line what `kernel.py` does, for arrays of any shape: its oracle."""
+"""The servo's laws, and how a step integrates them, in NumPy float64 for arrays of any shape: what the kernels are
+checked against. Written apart from `laws.py` and `kernel.py`; all that it takes from them are the limits of the
+numerics, as how stiff the end of a play is."""
 
 from __future__ import annotations
 
