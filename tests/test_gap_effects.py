@@ -36,11 +36,14 @@ COLUMNS = {*NAMES, *SERIES}  # some effects are called as the column that they w
 
 def asked_by_name(source: str) -> list[str]:
     """Ids of effects that a source names: any that is no column's name, and those in comparisons with a finding's or a
-    member's effect."""
+    member's effect, by a constant that stands for one too."""
     out = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in IDS - COLUMNS:
             out.append(f"{node.lineno}: {node.value}")
+        if isinstance(node, ast.Compare) and re.search(r"\.effects?\b", ast.unparse(node)):
+            # by a name that stands for one
+            out += [f"{node.lineno}: {x}" for x in re.findall(r"\b(?:[A-Z]\w+\.id|[A-Z][A-Z_]+)\b", ast.unparse(node))]
         if isinstance(node, ast.Compare) and re.search(r"\.ids?\b|\beffects?\b", ast.unparse(node)):
             named = (
                 {x.value for x in ast.walk(node) if isinstance(x, ast.Constant) and isinstance(x.value, str)}
@@ -55,7 +58,8 @@ def asked_by_name(source: str) -> list[str]:
     ('f["effect"] == '
      '"supply_sag"', 1), ('m.id in ("payload", '
                           '"lag")', 2), ('FAST = ("command_delay", "lag")', 1), ('row[INDEX["payload"]]', 0),
-    ('name in ("kp", "torque_limit")', 0)])  # fmt: skip
+    ('name in ("kp", "torque_limit")', 0), ('n.effect == LAG', 1),
+    ('n.effect in (STRIBECK, LoadFriction.id)', 2)])  # fmt: skip
 def test_the_search_for_names_finds_them(source, found):
     assert len(asked_by_name(source)) == found
 

@@ -277,7 +277,7 @@ def told(after: float) -> float:
                            regimes={"_load": np.ones(50), "speed": np.ones(50)})  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kept_out, "intervals_of", lambda *_: [])
-        (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n]), ["a"])], ["j"], [], [])
+        (finding,) = logged_torque.findings([(case, SimpleNamespace(named=[n], full={}), ["a"])], ["j"], [], [])
     return finding["confidence"]
 
 

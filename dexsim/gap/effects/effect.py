@@ -135,6 +135,25 @@ class FittedEffect:
         return entry(value, low, high, unit)
 
 
+@dataclass(frozen=True)
+class ByTorque:
+    """What inverse dynamics say of one effect on one joint: its coefficient with a 90 % interval, the speed that its
+    law has beside it (0: none), figures of the joint that were fitted with it, by `inverse_dynamics.NAMES`; units of
+    a torque and of the joint's position."""
+
+    value: float
+    low: float
+    high: float
+    speed: float
+    joint: dict[str, float]
+    force: str
+    length: str
+
+    def entry(self, unit: str, times: float = 1.0, over: float = 1.0) -> dict[str, Any]:
+        """The coefficient as `diagnosis.json` has it, times x / over."""
+        return entry(times * self.value / over, times * self.low / over, times * self.high / over, unit)
+
+
 def entry(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
     """A number with its interval as `diagnosis.json` has it."""
     low, high = min(low, high), max(low, high)
@@ -188,6 +207,7 @@ class Effect:
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
     jitters: ClassVar[bool] = False  # its size may vary from command to command
+    alike_by_torque: ClassVar[tuple[str, ...]] = ()  # ids that logged torque does not tell apart, its own among them
 
     def variants(self, s: Scales) -> list[Variant]:
         """The ways in which it may be there on a joint of these scales; none where its motion cannot show it."""
@@ -204,6 +224,14 @@ class Effect:
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         """Parameters by the keys of `diagnosis.json`, with 90 % intervals."""
         raise NotImplementedError
+
+    def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
+        """The same where logged torque showed it and not the motion: for those of `search.inverse_dynamics`."""
+        raise NotImplementedError
+
+    def size_by_torque(self, found: ByTorque) -> str:
+        """Its size for the line about logged torque, with its unit; empty where the coefficient says it."""
+        return ""
 
     def said(self, finding: dict[str, Any], believed: dict[str, float]) -> str:
         """What it does, in words, with its direction where its size tells that. believed: columns of the joint,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param
+from dexsim.gap.effects.effect import SLOW, ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
 from dexsim.gap.rules import BELIEF
 
@@ -78,6 +78,11 @@ class ViscousFriction(Effect):
         unit = f"{fit.force}.s/{fit.length}"
         return {"coefficient": fit.entry("coefficient", unit, add=fit.case.scales.base_damping)}
 
+    def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of what differs by direction
+        own = found.joint["viscous_friction"]
+        unit = f"{found.force}.s/{found.length}"
+        return {"coefficient": entry(own, own * 0.95, own * 1.05, unit), "asymmetry": found.entry("1", 2, own)}
+
 
 class StribeckFriction(Effect):
     """Breakaway friction above the sliding level: peak exp(-|v / v_s|^n) sign(v), n 2 or 1."""
@@ -104,6 +109,10 @@ class StribeckFriction(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"peak": fit.entry("peak", fit.force), "v_s": fit.entry("v_s", f"{fit.length}/s")}
+
+    def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
+        v_s = found.speed
+        return {"peak": found.entry(found.force), "v_s": entry(v_s, 0.5 * v_s, 2 * v_s, f"{found.length}/s")}
 
 
 class LoadFriction(Effect):
@@ -144,6 +153,9 @@ class LoadFriction(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}
+
+    def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:
+        return {"fraction": found.entry("1")}
 
 
 def give(s: Scales) -> float:

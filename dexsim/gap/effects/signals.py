@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.effects.effect import ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Lag(Effect):
 
     id = "lag"
     words = "builds its torque up with a lag"
+    alike_by_torque = ("lag", "command_delay")
     shows = "at high acceleration"
     experiment = "steps and a fast chirp"
     classes = ("late",)
@@ -74,6 +75,12 @@ class Lag(Effect):
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"time_constant": fit.entry("time_constant", "s")}
+
+    def parameters_by_torque(self, found: ByTorque) -> dict[str, Any]:  # the coefficient: of the rate of acceleration
+        return {"time_constant": found.entry("s", over=found.joint["inertia"])}
+
+    def size_by_torque(self, found: ByTorque) -> str:
+        return f"{1e3 * found.value / found.joint['inertia']:.2g} ms"
 
 
 class PositionOffset(Effect):

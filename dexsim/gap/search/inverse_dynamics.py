@@ -313,8 +313,8 @@ class Named:
 
     @property
     def speed(self) -> float:
-        """v_s of a Stribeck excess."""
-        return float(self.text.split()[-1].rstrip(")")) if self.effect == STRIBECK else 0.0
+        """v_s of a law that has one, as its text says; else 0."""
+        return float(self.text.split()[-1].rstrip(")")) if "(v_s " in self.text else 0.0
 
 
 @dataclass

@@ -11,17 +11,15 @@ import mujoco
 import numpy as np
 
 from dexsim.gap.effects.body import ExternalForce
-from dexsim.gap.effects.signals import CommandDelay
+from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.effects.effect import ByTorque
 from dexsim.gap.read.runs import Run
 from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
     BY_DIRECTION,
-    LAG,
-    LOAD,
     NAMES,
     PER_CUTOFF,
-    STRIBECK,
     Body,
     Columns,
     Motion,
@@ -93,6 +91,12 @@ def identify_joints(
     return out
 
 
+def _by_torque(case: Case, x: inverse_dynamics.Inverse, n: inverse_dynamics.Named) -> ByTorque:
+    """A further effect of a joint's torque as its entry of the catalogue takes it."""
+    force, length = ("N", "m") if case.scales.slide else ("N.m", "rad")
+    return ByTorque(n.value, n.low, n.high, n.speed, x.full, force, length)
+
+
 def torque_texts(given: Sequence[tuple]) -> list[str]:
     """What `found` gave, in words."""
     out = []
@@ -104,7 +108,8 @@ def torque_texts(given: Sequence[tuple]) -> list[str]:
         text += "".join(f"; {n.replace('_', ' ')}: {why}" for n, why in x.refused.items())
         where = " in the recording kept out" if judged else ""
         for k, n in enumerate(x.named):
-            size = f" ({1e3 * n.value / x.full['inertia']:.2g} ms)" if n.effect == LAG else ""
+            told = EFFECTS[n.effect].size_by_torque(_by_torque(case, x, n)) if n.effect else ""
+            size = f" ({told})" if told else ""
             text += (
                 f"; {'then ' if k else ''}{n.text}{size} takes {100 * (1 - n.after / n.before):.0f} % of that "
                 f"away{where}"
@@ -255,32 +260,16 @@ def _alike(
 def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], train: list[int]) -> list[dict]:
     """The further effects as findings of `diagnosis.json`, for joints of which nothing of the friction was believed
     (`unknown`)."""
-    from dexsim.gap.effects.catalogue import EFFECTS
     from dexsim.gap.judge.kept_out import intervals_of
 
     out = []
     for case, x, judged in given:
-        force, length = ("N", "m") if case.scales.slide else ("N.m", "rad")
         for n in x.named if case.joint in unknown and judged else ():
             if not n.effect:
                 continue
-            entry = lambda v, lo, hi, unit: {"value": v, "low": min(lo, hi), "high": max(lo, hi), "unit": unit}  # noqa: E731
-            if n.effect == LAG:
-                m = x.full["inertia"]
-                parameters = {"time_constant": entry(n.value / m, n.low / m, n.high / m, "s")}
-            elif n.effect == STRIBECK:
-                parameters = {
-                    "peak": entry(n.value, n.low, n.high, force),
-                    "v_s": entry(n.speed, 0.5 * n.speed, 2 * n.speed, f"{length}/s"),
-                }
-            elif n.effect == LOAD:
-                parameters = {"fraction": entry(n.value, n.low, n.high, "1")}
-            else:
-                f = x.full["viscous_friction"]
-                parameters = {"coefficient": entry(f, f * 0.95, f * 1.05, f"{force}.s/{length}"),
-                              "asymmetry": entry(2 * n.value / f, 2 * n.low / f, 2 * n.high / f, "1")}  # fmt: skip
-            same = [LAG, CommandDelay.id] if n.effect == LAG else []
-            signal = EFFECTS[n.effect].signal(case, {k: v["value"] for k, v in parameters.items()}, {})
+            effect = EFFECTS[n.effect]
+            parameters = effect.parameters_by_torque(_by_torque(case, x, n))
+            signal = effect.signal(case, {k: v["value"] for k, v in parameters.items()}, {})
             active = signal > JUDGE.acts * max(float(np.percentile(signal, 99.9)), 1e-12)
             helped = 1 - (n.after / n.before) ** 2
             confidence = min(n.share, TORQUE.surest) * (1.0 if helped > TORQUE.further else TORQUE.unhelped)
@@ -291,16 +280,16 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
                     "alternatives": [{"effect": n.rival, "confidence": round(1 - n.share, 3)}]
                     if n.rival and n.share < 1
                     else [],
-                    "indistinguishable": same,
-                    "separating_experiment": EFFECTS[n.effect].experiment if same else None,
+                    "indistinguishable": list(effect.alike_by_torque),
+                    "separating_experiment": effect.experiment if effect.alike_by_torque else None,
                     "where": {"joints": [case.joint], "taxels": [], "topics": []},
-                    "regime": EFFECTS[n.effect].shows + ("; differs by direction" if n.text == BY_DIRECTION else ""),
+                    "regime": effect.shows + ("; differs by direction" if n.text == BY_DIRECTION else ""),
                     "when": intervals_of(active, case, runs, train),
                     "parameters": parameters,
                     "held_out": {
                         "before": n.before,
                         "after": n.after,
-                        "error": f"effort_rmse_{force.replace('.', '')}",
+                        "error": f"effort_rmse_{'N' if case.scales.slide else 'Nm'}",
                     },
                 }
             )
@@ -537,7 +526,6 @@ def claim_push(d: Diagnosis, pushes: Sequence[Push]) -> None:
     motion had another cause."""
     if not pushes:
         return
-    from dexsim.gap.effects.catalogue import EFFECTS
     from dexsim.gap.report.sentence import sentence
 
     joints = {p.joint for p in pushes if not p.cut}
