@@ -6,8 +6,9 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
@@ -84,6 +85,66 @@ def workers(device: str, jobs: int) -> int:
     return max(1, min(jobs, MOST_GPU if device != "cpu" else min(MOST_CPU, cores())))
 
 
+# searches that compute in Python at a time. One more would hide what numpy does without the interpreter, and each more
+# makes the others wait for it: a search hands the interpreter over thousands of times a second
+TURNS = 2
+_TURNS = threading.Semaphore(TURNS)
+_MINE = threading.local()
+
+
+@contextmanager
+def turn() -> Iterator[None]:
+    """A search's turn at the interpreter: what runs inside waits until it is one of the few."""
+    with _TURNS:
+        _MINE.held = True
+        try:
+            yield
+        finally:
+            _MINE.held = False
+
+
+@contextmanager
+def away() -> Iterator[None]:
+    """What a search waits for without the interpreter (a launch): another has its turn meanwhile."""
+    if not getattr(_MINE, "held", False):
+        yield
+        return
+    _MINE.held = False
+    _TURNS.release()
+    try:
+        yield
+    finally:
+        _TURNS.acquire()
+        _MINE.held = True
+
+
+def side_by_side(work: Sequence[Callable[[], T]], device: str) -> Iterator[T]:
+    """What each of `work` returns, in order. On a GPU all are begun at once: a launch of few guesses takes as long as
+    one of many there, so they wait together. On a CPU, whose cores share each launch already, one after the other, each
+    when it is asked for."""
+    if device == "cpu" or len(work) < 2:
+        yield from (one() for one in work)
+        return
+
+    def begun(one: Callable[[], T]) -> T:
+        with turn():
+            return one()
+
+    waiting = [_hands().submit(begun, one) for one in work]
+    for done in waiting:
+        with away():
+            wait([done])
+        yield done.result()
+
+
+@cache
+def _hands() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(MOST_GPU, thread_name_prefix="hypothesis")
+
+
+os.register_at_fork(after_in_child=_hands.cache_clear)
+
+
 def each(count: int, work: Callable[[int], T]) -> list[T]:
     """work(k) for k below `count`, in order: side by side on the cores, for what numpy does without the interpreter."""
     at_once = min(MOST_CPU, cores(), count)
@@ -108,7 +169,8 @@ def map_joints(names: Sequence[str], work: Callable[[int, Callable[[float], None
                     progress(sum(parts), len(names), names[k])
 
         tell(0.0)
-        out = work(k, tell)
+        with turn():
+            out = work(k, tell)
         tell(1.0)
         return out
 

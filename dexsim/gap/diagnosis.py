@@ -119,6 +119,8 @@ class Drives(Steps):
         self.by_torque: Sequence[tuple] = ()
         self.unknown_controllers: set[str] = set()
         self.outcomes: list[tuple[Case, JointSearch, Outcome]] = []
+        # what of the judgement needs no other joint, by the search that it is of (`_judged_ahead`)
+        self.ahead: dict[int, tuple[JointAnswer, baseline.Baseline | None]] = {}
         # locate and judge
         self.answers: list[JointAnswer] = []
         self.plains: list[baseline.Baseline] = []
@@ -270,7 +272,27 @@ class Drives(Steps):
         found = search.run() if case.moved and case.joint not in self.unknown_controllers else search.without_search()
         search.settle(found)
         self._left -= 1
+        self._judged_ahead(search, found)
         return search, found
+
+    def _judged_ahead(self, search: JointSearch, found: Outcome) -> None:
+        """What `locate` and `judge` need of a joint that is not searched again, while others still are: the one with
+        something hidden takes longest, and leaves cores free. Not where time is limited: searches have it first."""
+        limit = self.w.limit
+        if limit.seconds is None and not limit.stopped and not _unsettled(found):
+            self.ahead[id(search)] = self._answer(search, found), self._plain(search)
+
+    def _answer(self, search: JointSearch, found: Outcome) -> JointAnswer:
+        """A joint on what was kept out."""
+        known = self.ahead.get(id(search))
+        return known[0] if known else JointAnswer(search.case, search, found, self.kept)
+
+    def _plain(self, search: JointSearch) -> baseline.Baseline | None:
+        """What a plain model of a joint leaves of what was kept out."""
+        case, p, known = search.case, self.parts, self.ahead.get(id(search))
+        if known or not case.moved:
+            return known[1] if known else None
+        return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
 
     def _search_longer(self, answers: Answers) -> None:
         """Joints whose share of the limit was too short, searched once more in what the others did not need of theirs:
@@ -390,24 +412,17 @@ class Drives(Steps):
     # -------------------------------------------------------------------------------------------------
     def locate(self) -> None:
         """Where each joint's residual lives: speed, load, time since reversal, ..."""
-        seed, kept = self.w.settings.seed, self.kept
+        seed = self.w.settings.seed
         rng = np.random.default_rng(seed)
-        self.answers = compute.each(len(self.outcomes), lambda k: JointAnswer(*self.outcomes[k], kept))
+        self.answers = compute.each(len(self.outcomes), lambda k: self._answer(*self.outcomes[k][1:]))
         for a in self.answers:
             a.locate(rng, seed)
 
     def judge(self) -> None:
         """The answers on what was kept out, and what a plain model of each joint leaves of it."""
-        p = self.parts
         for a in self.answers:
             a.judge(self.w.m)
-        moved = [(case, search) for case, search, _ in self.outcomes if case.moved]
-
-        def judged(k: int) -> baseline.Baseline | None:
-            case, search = moved[k]
-            return baseline.judged(case, search.plain(), p.test, p.span_test, search.whole)
-
-        self.plains = [b for b in compute.each(len(moved), judged) if b]
+        self.plains = [b for b in compute.each(len(self.outcomes), lambda k: self._plain(self.outcomes[k][1])) if b]
         self.w.clock.lap("plain model")
 
     def report(self, d: Diagnosis) -> None:

@@ -87,6 +87,7 @@ class Known:
 
     def __init__(self, room: int = KNOWN):
         self._room, self._rows = room, OrderedDict[bytes, tuple[np.ndarray, np.ndarray]]()
+        self._lock = threading.Lock()  # hypotheses are fitted side by side on the same windows
 
     def clear(self) -> None:
         """Forgets all."""
@@ -97,22 +98,24 @@ class Known:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions and torques [H, n] of the keys. simulate(which [h]) makes those [h, n] of the keys with these
         numbers; it is asked for each that is not known, once."""
-        new = {key: k for k, key in reversed(list(enumerate(keys))) if key not in self._rows}
+        with self._lock:
+            rows = {key: self._rows[key] for key in keys if key in self._rows}
+        new = {key: k for k, key in reversed(list(enumerate(keys))) if key not in rows}
         made = simulate(np.array(sorted(new.values()))) if new else None
         if made is not None and len(new) == len(keys):
             q, torque = made
         else:
-            rows = dict(self._rows)
             if made is not None:
                 rows |= {keys[k]: row for k, row in zip(sorted(new.values()), zip(*made, strict=True), strict=True)}
             q, torque = (np.stack([rows[key][i] for key in keys]) for i in (0, 1))
         most = self._room // max(16 * q.shape[1], 1)
-        for k in range(max(len(keys) - most, 0), len(keys)):
-            if keys[k] not in self._rows:
-                self._rows[keys[k]] = q[k].copy(), torque[k].copy()
-            self._rows.move_to_end(keys[k])
-        while len(self._rows) > most:
-            self._rows.popitem(last=False)
+        with self._lock:
+            for k in range(max(len(keys) - most, 0), len(keys)):
+                if keys[k] not in self._rows:
+                    self._rows[keys[k]] = q[k].copy(), torque[k].copy()
+                self._rows.move_to_end(keys[k])
+            while len(self._rows) > most:
+                self._rows.popitem(last=False)
         return q, torque
 
 
@@ -375,7 +378,8 @@ class JointPlant:
                     parts.append((keep, at, size))
                     at += 2 * size
                 wp.copy(host, out, count=at)
-        wp.synchronize_stream(mine.stream)
+        with compute.away():
+            wp.synchronize_stream(mine.stream)
         numbers = host.numpy()
         for keep, at, size in parts:
             q[:, keep] = numbers[at : at + size].reshape(H, -1)
@@ -428,7 +432,8 @@ class JointPlant:
                 device="cpu",
             )
 
-        compute.run(launch, compute.parts(steps, H))
+        with compute.away():
+            compute.run(launch, compute.parts(steps, H))
 
     def base(self) -> np.ndarray:
         """[R, C] nominal parameters by run."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Self
 
 import numpy as np
 
@@ -364,6 +366,15 @@ class JointHypotheses:
     def _fix(self, members: tuple[Member, ...], plant: JointPlant | None = None) -> Fixed:
         """Constants of the variants, written to the plant's nominal for the time of a fit."""
         return Fixed(plant or self.case.plant, [f for m in members for f in m.variant.fixed])
+
+    def _apart(self) -> Self:
+        """This search on a plant of its own, for a thread beside others: the constants that a hypothesis writes to it
+        (`_fix`) are no other's."""
+        twin, plant = copy.copy(self), copy.copy(self.case.plant)
+        twin.case = replace(self.case, plant=plant)
+        twin.scan_fitter, twin.fitter = copy.copy(self.scan_fitter), copy.copy(self.fitter)
+        twin.scan_fitter.plant = twin.fitter.plant = plant
+        return twin
 
     def start(self) -> Trial:
         """No effect: the nuisances alone. Those without a trace are left out from here on."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 
 from dexsim import intervals
+from dexsim.gap import compute
 from dexsim.gap.effects.catalogue import CATALOGUE, confusable
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
@@ -108,16 +110,25 @@ class JointSelection(JointScan):
         drafts: list[tuple[tuple[Member, ...], np.ndarray, Fitted]] = []
         followed: dict[str, float] = {}
         begin = lambda x: np.concatenate([self._values(current), x])  # noqa: E731
-        for _, p, member, start in listed:
-            if drafts and self.deadline.over():
+
+        def drafted(k: int) -> tuple[tuple[Member, ...], np.ndarray, Fitted] | None:
+            _, _, member, start = listed[k]
+            if k and self.deadline.over():
+                return None
+            mine = self._apart()
+            tries = [mine.draft((*current.members, member), begin(start), current)]
+            if k < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
+                tries.append(mine.draft((*current.members, member), begin(self.other_start[member.id]), current))
+            return min(tries, key=lambda d: d[2].loss)
+
+        each = compute.side_by_side([partial(drafted, k) for k in range(len(listed))], self.case.plant.device)
+        for (_, p, member, start), draft in zip(listed, each, strict=True):
+            if draft is None:
                 break
             if member.id not in pool or price.get(member.id, 1.0) > p:
                 pool[member.id] = (member, start)
             price[member.id] = p
-            tries = [self.draft((*current.members, member), begin(start), current)]
-            if len(drafts) < 4 and member.id in self.other_start and len(start) == len(self.other_start[member.id]):
-                tries.append(self.draft((*current.members, member), begin(self.other_start[member.id]), current))
-            drafts.append(min(tries, key=lambda d: d[2].loss))
+            drafts.append(draft)
             if drafts[-1][2].loss < followed.get(member.id, np.inf):  # of its kinds the one that follows best
                 if member.id in followed:
                     pool[member.id] = (member, start)
@@ -130,10 +141,12 @@ class JointSelection(JointScan):
         self, drafts: Sequence[tuple[tuple[Member, ...], np.ndarray, Fitted]], current: Trial
     ) -> list[Trial]:
         """The drafts fitted on long windows, and judged on what was left out."""
-        trials = sorted(
-            (self.finish(*d, current) for k, d in enumerate(drafts) if k == 0 or not self.deadline.over()),
-            key=lambda t: t.fit.loss,
-        )
+
+        def finished(k: int) -> Trial | None:
+            return self._apart().finish(*drafts[k], current) if k == 0 or not self.deadline.over() else None
+
+        each = compute.side_by_side([partial(finished, k) for k in range(len(drafts))], self.case.plant.device)
+        trials = sorted((t for t in each if t is not None), key=lambda t: t.fit.loss)
         least = trials[0].fit.loss
         # those that may still be the best are looked at closely
         trials = [
