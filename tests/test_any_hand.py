@@ -200,15 +200,16 @@ def test_the_whole_chain(hands, moment, tmp_path, task, pads, capsys):
     out = tmp_path / "run"
     assert train([f"task={task}", f"hand={hands[pads]}", *FEW, "iterations=2", "final_episodes=0", f"out={out}"]) == 0
     policy = out / "policy.pt"
-    evaluation = ["task.evaluation.cap_s=0.5"] if task == "rotate" else moment
+    (tmp_path / "path.csv").write_text("t,x,y,z\n0,0,0,0\n0.1,0,0,0.02\n0.2,0.02,0,0.03\n0.3,0,0,0.03\n")
+    carried = [f"task.evaluation.base={tmp_path}/path.csv"]
+    evaluation = ["task.evaluation.cap_s=0.5"] if task == "rotate" else carried
     played = ["episodes=2", "worlds=2", "device=cpu", "video=false", f"out={tmp_path}/played", *evaluation]
     assert play([f"checkpoint={policy}", *played]) == 0
-    if task == "grasp":  # its hand carried along, as well as turned
-        (tmp_path / "path.csv").write_text("t,x,y,z\n0,0,0,0\n0.3,0,0,0.05\n0.6,0.05,0,0.1\n0.9,0,0,0.1\n")
-        for base, said in (("lift", "hold_rate_shaken"), (f"{tmp_path}/path.csv", "hold_rate_path")):
-            out = tmp_path / said
-            assert play([f"checkpoint={policy}", *played[:4], f"out={out}", f"task.evaluation.base={base}"]) == 0
-            assert json.loads((out / "metrics.json").read_text())[said] is not None, base
+    if task == "grasp":  # its hand carried along, as well as lifted and shaken
+        lifted = [*played[:4], f"out={tmp_path}/lifted", "task.evaluation.base=lift"]
+        assert play([f"checkpoint={policy}", *lifted]) == 0
+        for folder, said in (("played", "hold_rate_path"), ("lifted", "hold_rate_shaken")):
+            assert json.loads((tmp_path / folder / "metrics.json").read_text())[said] is not None, said
     made = export.export(str(policy), tmp_path / "bundle", steps=8)
     assert export.check(made)
     b = bundle.load(made)

@@ -288,7 +288,7 @@ def test_gains_are_found_and_tell_held_out_loads_better():
 def pads():
     """Counts and load of the simulator's own touch, a ball pressed all over each pad: small contacts with sharp
     edges."""
-    return simulate.delivered(simulate.rolled_recording(HAND, 160, seed=3, frames=12), 3)
+    return simulate.delivered(simulate.rolled_recording(HAND, 160, seed=3, frames=9), 3)
 
 
 def of_pad(r, f):
@@ -409,7 +409,7 @@ def test_command_fits_both_halves_and_touch(pressed, tmp_path, capsys):
         for name, x in (("real", realistic(r)), ("sim", r)):
             (tmp_path / name).mkdir(exist_ok=True)
             write(tmp_path / name / f"{joint}.mcap", x)
-    x, load = rolled(n=120, dead=(40,))
+    x, load = rolled(n=60, dead=(40,))
     t = np.arange(len(x)) * 0.01
     touch = np.zeros((len(x), 5, 120, 3))
     touch[:, 1, :, 2] = x

@@ -210,8 +210,8 @@ def quick(monkeypatch):
 def some(tmp_path_factory):
     """One case of several kinds from one seed, with the fast settings of a test."""
     root = tmp_path_factory.mktemp("cases")
-    seconds, generate.SECONDS = generate.SECONDS, 1.2
-    sizes, generate.SIZES = generate.SIZES, 3
+    seconds, generate.SECONDS = generate.SECONDS, 0.6
+    sizes, generate.SIZES = generate.SIZES, 2
     try:
         plan = entries("none", "backlash", "coulomb", "cable_spring", "torque_limit")
         made = [generate.build(e, n, 3, root / "cases", root / "truth") for n, e in enumerate(plan)]

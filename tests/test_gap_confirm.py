@@ -70,7 +70,7 @@ def test_a_freed_joint_swings():
 def answer(tmp_path_factory):
     """A diagnosis of dry friction in a simulated pendulum, and what it wrote."""
     folder = tmp_path_factory.mktemp("confirm")
-    paths, model, servo, _ = demo.make(folder, "coulomb_friction", seconds=5.0)
+    paths, model, servo, _ = demo.make(folder, "coulomb_friction", seconds=4.0)
     allowed = {"coulomb_friction", "stribeck_friction", "viscous_friction"}
     d = diagnose(
         Settings(paths, folder / "out", None, str(model), str(servo), next_recording=False, allowed=allowed),

@@ -28,7 +28,7 @@ OFF = {"*kp": 1.03, "*inertia_scale": 0.97, "*viscous_friction": 0.96}
 def found(changes: dict[str, float], effect: str) -> tuple[dict, str]:
     """(parameters as reported, variant's label) of the search for one effect on recordings with figures a few percent
     off."""
-    runs = [plant_run(f"run{k}", k, 6.0, OFF | changes, seed=k) for k in (0, 1, 3)]
+    runs = [plant_run(f"run{k}", k, 4.0, OFF | changes, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
     case = build(model(), runs)[0]
@@ -223,7 +223,7 @@ def _scales():
 
 def jittered(kind: int, sd: float) -> Run:
     """A run whose commands act 20 ms and a normal time of `sd` s later than they were sent."""
-    run = plant_run(f"run{kind}", kind, 5.0, {"delay": 0.02}, seed=kind, noisy=False)
+    run = plant_run(f"run{kind}", kind, 4.0, {"delay": 0.02}, seed=kind, noisy=False)
     rng = np.random.default_rng(kind + 50)
     acts = np.maximum.accumulate(run.cmd_t + 0.02 + np.maximum(sd * rng.standard_normal(len(run.cmd_t)), -0.02))
     for _ in range(2):
@@ -259,7 +259,7 @@ def test_jitter_of_a_delay_is_found_and_sized(sd):
 
 def test_what_only_looks_like_jitter_is_not_reported():
     """Free play that nobody fitted leaves residuals that the times of commands could take up, too."""
-    runs = [plant_run(f"run{k}", k, 5.0, {"backlash": 0.1}, seed=k) for k in (0, 1, 3)]
+    runs = [plant_run(f"run{k}", k, 4.0, {"backlash": 0.1}, seed=k) for k in (0, 1, 3)]
     for r in runs:
         r.smooth()
     search = JointSearch(build(model(), runs)[0], [0, 1, 2], None, conditions(runs))

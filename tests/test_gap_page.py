@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from browser import CHROMIUM, Page
@@ -51,7 +53,10 @@ def pages(tmp_path_factory):
         allowed={"command_delay", "lag", "coulomb_friction"},  # others are more rows of the same tables
     )
     paths, model, servo = press_rig.record(folder / "touch", 2, 5.0, gains={54: 0.4, 66: 0.0})
-    out["touch"] = Settings(paths, folder / "touch_out", None, str(model), str(servo), next_recording=False)
+    out["touch"] = replace(
+        out["joint"], recordings=paths, out=folder / "touch_out", model=str(model), servo=str(servo),
+        allowed={"tactile_gain", "contact_stiffness"},
+    )  # fmt: skip
     from dexsim.recording import read, write
 
     r = read(paths[0])

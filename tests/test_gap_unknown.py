@@ -28,7 +28,7 @@ def searched(unknown: tuple[str, ...], changes: dict[str, float], **more):
         plant_run(
             f"run{k}",
             k,
-            5.0,
+            4.2,
             changes,
             seed=k,
             servo={"loop_encoder": "motor"} | {n: "unknown" for n in unknown},

@@ -21,7 +21,7 @@ from dexsim.cli import stable_grasps
 from dexsim.errors import UserError
 from dexsim.hand import load_hand
 from dexsim.hand.places import places
-from dexsim.import_hand import command, geometry, moves, shapes, taxels
+from dexsim.import_hand import command, geometry, moves, poses, shapes, taxels
 from dexsim.import_hand.importing import Settings, import_hand
 from dexsim.tactile.layout import hand_layout
 from dexsim.tasks import make_fingertip_grasps
@@ -36,6 +36,12 @@ def claw(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("claw")
     import_hand(hands.write(place / "robot"), place / "hand", picture=False)
     return place / "hand"
+
+
+@pytest.fixture
+def one_start(monkeypatch):
+    """One of the starts of the search for a cupped pose, of which `claw` takes all: for tests of something else."""
+    monkeypatch.setattr(poses, "STARTS", 1)
 
 
 def test_what_the_tree_and_the_axes_say(claw):
@@ -53,7 +59,7 @@ def test_what_the_tree_and_the_axes_say(claw):
     assert (hand.efforts == 0.6).all() and (hand.speeds == 7).all()  # the file's own <limit effort= velocity=>
 
 
-def test_a_gripper_with_slides_looks_along_its_fingers(tmp_path):
+def test_a_gripper_with_slides_looks_along_its_fingers(one_start, tmp_path):
     links = ""
     for name, side in (("left", 1), ("right", -1)):
         inertia = hands._inertial(0.05, (0.06, 0.012, 0.02), (0.05, 0, 0))
@@ -73,7 +79,7 @@ def test_a_gripper_with_slides_looks_along_its_fingers(tmp_path):
     assert all(m.closer > 0.002 for m in moves.moves(hand))
 
 
-def test_mirrored_it_is_a_left_hand(tmp_path):
+def test_mirrored_it_is_a_left_hand(one_start, tmp_path):
     result = import_hand(hands.write(tmp_path / "robot", left=True), tmp_path / "hand", picture=False)
     assert result.hand["handedness"] == "left"
 
@@ -209,7 +215,7 @@ def test_a_second_run_changes_nothing(claw, tmp_path):
     assert before == after and result.corrected == [] and result.kept == []
 
 
-def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, tmp_path):
+def test_what_a_person_corrects_stays_and_is_no_guess_any_more(claw, one_start, tmp_path):
     shutil.copytree(claw.parent, tmp_path / "all")
     hand = tmp_path / "all" / "hand"
     text = (hand / "hand.yaml").read_text()
@@ -366,7 +372,7 @@ def test_bad_files_get_one_line_and_nothing_is_written(case, tmp_path, monkeypat
     assert capfd.readouterr() == ("", "")  # the line is the error's; no library adds one
 
 
-def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(tmp_path):
+def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(one_start, tmp_path):
     path = hands.write(tmp_path / "robot")
     hands.tip(tmp_path / "robot" / "meshes" / "tip.stl", hole=True)
     with pytest.raises(UserError, match=r"finger thumb: the mesh of its tip is not closed, \d+ edges.*holes=hull"):
@@ -376,7 +382,7 @@ def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(tmp_path):
     load_hand(tmp_path / "hand")
 
 
-def test_self_collision_at_the_open_pose_is_refused_and_the_old_folder_stays(claw, tmp_path):
+def test_self_collision_at_the_open_pose_is_refused_and_the_old_folder_stays(claw, one_start, tmp_path):
     shutil.copytree(claw.parent, tmp_path / "all")
     hand = tmp_path / "all" / "hand"
     content = yaml.safe_load((hand / "hand.yaml").read_text())
@@ -403,7 +409,7 @@ def test_a_folder_that_is_not_ours_is_not_touched(tmp_path):
         import_hand(path, tmp_path / "hand", picture=False)
 
 
-def test_coupled_joints_are_driven_alone_only_when_asked(tmp_path):
+def test_coupled_joints_are_driven_alone_only_when_asked(one_start, tmp_path):
     change, _ = BAD["mimic"]
     path = _broken(tmp_path, change)
     result = import_hand(path, tmp_path / "hand", Settings(coupled="independent"), picture=False)
@@ -411,7 +417,7 @@ def test_coupled_joints_are_driven_alone_only_when_asked(tmp_path):
     assert "index_2" in load_hand(tmp_path / "hand").joints
 
 
-def test_a_package_path_is_found_beside_and_above_the_file(tmp_path):
+def test_a_package_path_is_found_beside_and_above_the_file(one_start, tmp_path):
     robot = tmp_path / "claw"
     path = hands.write(robot / "urdf", mesh="package://claw/meshes/tip.stl")
     shutil.move(robot / "urdf" / "meshes", robot / "meshes")
@@ -426,7 +432,7 @@ def test_a_package_path_is_found_beside_and_above_the_file(tmp_path):
     import_hand(away, tmp_path / "other", Settings(packages=[tmp_path / "packages"], pads=None), picture=False)
 
 
-def test_missing_inertia_from_a_density(tmp_path):
+def test_missing_inertia_from_a_density(one_start, tmp_path):
     path = _broken(tmp_path, BAD["no inertia"][0])
     import_hand(path, tmp_path / "hand", Settings(density=1000.0, pads=None), picture=False)
     model = load_hand(tmp_path / "hand").spec().compile()
@@ -434,7 +440,7 @@ def test_missing_inertia_from_a_density(tmp_path):
     assert model.body("index_far").mass[0] == pytest.approx(1000 * volume, rel=0.02)
 
 
-def test_absurd_figures_are_named(tmp_path):
+def test_absurd_figures_are_named(one_start, tmp_path):
     path = hands.write(tmp_path / "robot")
     text = path.read_text().replace('effort="0.6" velocity="7"', 'effort="600" velocity="7"', 1)
     at = text.index('<mass value="', text.index("ring_far"))
@@ -446,7 +452,7 @@ def test_absurd_figures_are_named(tmp_path):
     assert "link 'ring_far': inertia" in lines and "too small" in lines
 
 
-def test_taxels_from_a_csv_and_those_inside_the_finger(claw, tmp_path):
+def test_taxels_from_a_csv_and_those_inside_the_finger(claw, one_start, tmp_path):
     path = hands.write(tmp_path / "robot")
     normals = {f.name: np.array(f.normal) for f in load_hand(claw).fingers}
     axis = {"thumb": np.array([0, -1.0, 0])}

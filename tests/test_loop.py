@@ -356,8 +356,8 @@ def test_fast_moves_reach_a_speed_limit_and_stay_clear_of_the_ends():
         believed.joints,
         float(t[-1]),
         home,
-        0.002,
+        0.0035,
     )
     limit = np.array([world["servo"]["joints"][j]["no_load_speed"] for j in believed.joints])
-    assert ((np.abs(run.velocity) > 0.9 * limit).sum(0) * 0.002 > 0.3).sum() >= 10
+    assert ((np.abs(run.velocity) > 0.9 * limit).sum(0) * 0.0035 > 0.3).sum() >= 10
     assert (run.position.max(0) - value.max(0)).max() < 0.1 and (run.position <= believed.limits[:, 1]).all()

@@ -83,13 +83,13 @@ def test_how_far_a_part_is_is_known_while_it_runs(tmp_path):
 
 
 LEAKS = """
-import sys, time
+import runpy, sys, time
 from pathlib import Path
 import numpy as np
-from dexsim.sim.memory import give_back
 from tests.soak import parts
+give_back = runpy.run_path("dexsim/sim/memory.py")["give_back"]  # without the engines, which its package loads
 rng, kept = np.random.default_rng(0), []
-for k in range(250):
+for k in range(100):
     pieces = [bytearray(int(n)) for n in rng.integers(1000, 300_000, 60)]  # an environment, of some 9 MB
     time.sleep(0.01)
     kept.append(bytearray(int(float(sys.argv[2]) * 2**20)))
@@ -99,18 +99,18 @@ for k in range(250):
 """
 
 
-@pytest.mark.parametrize("leak_mib", [0.0, 0.2])
+@pytest.mark.parametrize("leak_mib", [0.0, 0.5])
 def test_a_leak_of_a_piece_of_work_is_found_in_what_the_process_keeps(leak_mib, tmp_path):
-    """0.2 MiB of each of 250 pieces: 38 MiB of what is judged. Without a leak, what comes and goes is none."""
+    """0.5 MiB of each of 100 pieces: 38 MiB of what is judged. Without a leak, what comes and goes is none."""
     watch = Watch(
         subprocess.Popen([sys.executable, "-c", LEAKS, str(tmp_path), str(leak_mib)], cwd=ROOT),
         every=0.01,
-        done=lambda: soak.done(soak.SETTINGS | {"envs": "250"}, tmp_path.parent, tmp_path.name),
+        done=lambda: soak.done(soak.SETTINGS | {"envs": "100"}, tmp_path.parent, tmp_path.name),
     )
     watch.join()
     found = judge(watch.rows)
     assert watch.child.wait() == 0 and ("kept_mib" in grows(found)) == bool(leak_mib), found["kept_mib"]
-    assert abs(found["kept_mib"]["per_unit"] - leak_mib) < 0.04, found["kept_mib"]
+    assert abs(found["kept_mib"]["per_unit"] - leak_mib) < 0.1, found["kept_mib"]
 
 
 def alive(group: int) -> bool:

@@ -18,7 +18,7 @@ from . import __main__ as program
 from . import corpus, mutate, silence, strategies, targets
 
 SHORT = settings(
-    max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
+    max_examples=20, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 WELL = ("fine", "refused")
 
@@ -65,7 +65,7 @@ def test_damaged_trees(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", sorted(targets.TARGETS))
 def test_damaged_files(kind, files, tmp_path):
-    @settings(SHORT, max_examples=30)
+    @settings(SHORT, max_examples=15)
     @given(strategies.seeds)
     def run(seed):
         mutate.clean(tmp_path)
