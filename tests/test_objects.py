@@ -365,7 +365,7 @@ def bad_mesh(kind: str) -> trimesh.Trimesh:
         ("hole", "not watertight, 3 of 18 edges"),
         ("winding", "inconsistent winding at 3 of 18 edges"),
         ("flat", "no volume"),
-        ("millimetres", "probably in millimetres: pass scale=0.001"),
+        ("millimetres", "probably in millimetres: pass object_scale=0.001 "),
         ("tiny", "allowed 5 to 300 mm; pass a scale"),
     ],
 )
@@ -387,7 +387,7 @@ def test_bad_files_and_arguments(tmp_path):
         (tmp_path / "text.xyzzy", 1.0, "cannot be read"),
         (good, 0.0, "must be a positive number"),
         (good, float("nan"), "must be a positive number"),
-        (good, 0.001, "pass scale=1"),
+        (good, 0.001, "pass object_scale=1 "),
         ([good] * 4, 1.0, "4 files given, allowed 1 to 3"),
     ):
         with pytest.raises(UserError, match=said) as caught:

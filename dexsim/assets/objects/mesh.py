@@ -28,10 +28,15 @@ def _scale_hint(extent: float, scale: float) -> str:
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         # Units guess the file as it is, so undo the scale that was passed.
         if SMALLEST <= extent / scale * factor <= LARGEST:
-            return f"the file is probably in {unit}: pass scale={factor:g}"
+            return f"the file is probably in {unit}: pass {_named(factor)}"
     if SMALLEST <= extent / scale <= LARGEST:
-        return "the file is probably in metres already: pass scale=1"
-    return f"pass a scale that brings it there, e.g. scale={scale * 0.06 / extent:.3g} for 60 mm"
+        return f"the file is probably in metres already: pass {_named(1.0)}"
+    return f"pass a scale that brings it there, e.g. {_named(scale * 0.06 / extent)} for 60 mm"
+
+
+def _named(scale: float) -> str:
+    """A scale as the commands take it."""
+    return f"object_scale={scale:.3g} (to import-object: scale={scale:.3g})"
 
 
 def _read(path: Path, scale: float) -> tuple[np.ndarray, list[str]]:
