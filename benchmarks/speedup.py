@@ -140,15 +140,19 @@ class Run:
 
 def main(argv: list[str]) -> dict[str, Any]:
     run = Run(argv)
+    failed = {}
     for part in run.parts:
-        if part in ("grasp", "rotate"):
-            run.task(part)
-        else:
-            getattr(run, part)()
-    run.keep("parts", run.parts)
+        try:
+            run.task(part) if part in ("grasp", "rotate") else getattr(run, part)()
+        except UserError as error:  # one part's trouble must not cost the others' figures
+            failed[part] = str(error)
+            print(f"{part} failed: {error}", flush=True)
+    run.keep("failed", failed)
     if run.found["left_out"]:
         print(f"left out, the {run.limit} s of limit_s= being over: {', '.join(run.found['left_out'])}", flush=True)
-    print(json.dumps({k: run.found[k] for k in ("device", "left_out", "total_s")}), flush=True)
+    print(json.dumps({k: run.found[k] for k in ("device", "left_out", "failed", "total_s")}), flush=True)
+    if failed:
+        raise UserError(f"{', '.join(failed)} failed: see above; {run.out / 'speedup.json'} holds the rest")
     return run.found
 
 

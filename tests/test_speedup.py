@@ -54,3 +54,17 @@ def test_last_line_of_json():
     assert speedup.last_json('a\n{"x": 1}\n{"x": 2}\nend') == {"x": 2}
     with pytest.raises(UserError, match="no JSON line"):
         speedup.last_json("nothing")
+
+
+def test_one_part_that_fails_does_not_cost_the_others(tmp_path, monkeypatch, capsys):
+    def of(self, name, module, *arguments):
+        if module == "collision":
+            raise UserError("no GPU")
+        return {"rows": [{"steps_per_s": 1.0}]}
+
+    monkeypatch.setattr(speedup.tools, "config", lambda settings: {"device": "cpu"})
+    monkeypatch.setattr(speedup.Run, "of", of)
+    with pytest.raises(UserError, match="physics failed: see above"):
+        speedup.main(["parts=physics,learning", "worlds=4", f"out={tmp_path}"])
+    found = json.loads((tmp_path / "speedup.json").read_text())
+    assert found["failed"] == {"physics": "no GPU"} and set(found["learning"]["4"]) == {"hand", "mujoco"}
