@@ -166,6 +166,7 @@ FAST = {"torque_limit": 0.3, "no_load_speed": 14.0, "braking_slope": 1.0}
 BRAKING = ({"braking_slope": 0.0}, FAST, {"braking_limit", "torque_limit", "torque_speed_limit"})
 LEADING = ({"speed_feedforward": 0.04}, None, {"controller_term"})
 CREEPING = ({"integral_gain": 3.0}, None, {"controller_term", "payload"})
+HEAVY = ({"armature": 0.015}, None, {"inertia", "payload"})  # a rotor behind a gear: eight times the model's inertia
 GIVING = (
     {"presliding": 0.02, "coulomb_friction": 0.06},
     {"coulomb_friction": 0.06},
@@ -175,10 +176,11 @@ GIVING = (
 
 @pytest.mark.parametrize(("planted", "effect", "key", "value", "jumps"), [
     (LEADING, "controller_term", "gain", 0.04, False),
+    (HEAVY, "inertia", "armature", 0.015, False),
     pytest.param(BRAKING, "braking_limit", "slope", 0.0, True, marks=pytest.mark.slow),
     pytest.param(CREEPING, "controller_term", "gain", 3.0, False, marks=pytest.mark.slow),
     pytest.param(GIVING, "presliding", "distance", 0.02, False, marks=pytest.mark.slow)],
-    ids=["feed-forward", "braking", "integral", "presliding"])  # fmt: skip
+    ids=["feed-forward", "heavy", "braking", "integral", "presliding"])  # fmt: skip
 def test_a_law_that_is_not_believed_is_named_and_sized(monkeypatch, planted, effect, key, value, jumps):
     monkeypatch.setattr(test_gap, "motion", steps if jumps else test_gap.motion)
     best = found(*planted).best

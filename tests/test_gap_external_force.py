@@ -80,7 +80,7 @@ def test_a_torque_that_is_not_the_joints_own_claims_nothing_of_it():
         "held_out": held | {"error": "position_rmse_rad"},
         "unexplained": {"depends_on": []},
     }
-    d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={})
+    d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints={}, outcomes=[])
     logged_torque.claim_push(d, [push])
     assert [f["effect"] for f in d.data["findings"]] == ["external_force", "coulomb_friction"]
     assert d.sentence.startswith("Joint elbow is pushed by something outside")

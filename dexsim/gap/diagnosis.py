@@ -36,7 +36,7 @@ from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.report.files import plain, save
 from dexsim.gap.report.next_recording import plan_next, rival_of
 from dexsim.gap.rules import JUDGE, SEARCH
-from dexsim.gap.search import baseline, logged_torque
+from dexsim.gap.search import baseline, logged_torque, shaking
 from dexsim.gap.search.search import JointSearch, Outcome, Trial
 from dexsim.gap.touch.diagnosis import Touch
 
@@ -269,7 +269,10 @@ class Drives(Steps):
         search, case = self._begun(k, tell), self.cases[k]
         if len(search.long.window) == 0:
             return search, None
-        found = search.run() if case.moved and case.joint not in self.unknown_controllers else search.without_search()
+        if case.moved and case.joint not in self.unknown_controllers:
+            found = shaking.answered(search, search.run())
+        else:
+            found = search.without_search()
         search.settle(found)
         self._left -= 1
         self._judged_ahead(search, found)

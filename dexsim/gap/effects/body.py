@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
 
 
+MOST_INERTIA = 30.0  # x the model's about the joint: the most that is looked for beyond it
+
+
 class Inertia(Effect):
     """Another inertia of the rotor or the link than the model's."""
 
@@ -29,8 +32,11 @@ class Inertia(Effect):
     model_columns = ("armature",)
 
     def variants(self, s: Scales) -> list[Variant]:
-        p = param("armature", "armature", "add", -0.7 * s.inertia, 6.0 * s.inertia, 0.0, "kg" if s.slide else "kg.m2")
-        return [Variant((p,), tuple((f * s.inertia,) for f in (0.08, 0.2, 0.5, 1.2, 3.0, -0.1, -0.3)))]
+        # a rotor's inertia counts with the square of its gear's ratio: beside a model that has none of it, it may be
+        # many times a light link's
+        top = MOST_INERTIA * s.inertia
+        p = param("armature", "armature", "add", -0.7 * s.inertia, top, 0.0, "kg" if s.slide else "kg.m2")
+        return [Variant((p,), tuple((f * s.inertia,) for f in (0.08, 0.2, 0.5, 1.2, 3.0, 8.0, 20.0, -0.1, -0.3)))]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         return case.regimes["acceleration"]

@@ -201,6 +201,7 @@ class Effect:
     plain: ClassVar[tuple[str, ...]] = ()  # servo columns of it that the plain model (`search.baseline`) fits
     misreads: ClassVar[bool] = False  # the encoder does not show where the joint is
     parts_motor: ClassVar[bool] = False  # the motor's speed is not what the loop reads
+    rings: ClassVar[bool] = False  # may make a loop ring by itself
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
     slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
     simulated: ClassVar[bool] = True  # the plant has a law of it

@@ -49,6 +49,7 @@ class Lag(Effect):
     classes = ("late",)
     motions = ("steps", "chirp")
     slows = True
+    rings = True
 
     def variants(self, s: Scales) -> list[Variant]:
         out = [

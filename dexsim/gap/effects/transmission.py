@@ -26,6 +26,7 @@ class Backlash(Effect):
     classes = ("friction or play", "about a reversal")
     motions = ("triangles", "chirp")
     parts_motor = True
+    rings = True
     demo = {"backlash": 0.06}
     demo_on_motor = True
 
@@ -73,6 +74,7 @@ class Compliance(Effect):
     shows = "at high load and at 5-30 Hz"
     experiment = "a chirp of 1-30 Hz"
     parts_motor = True
+    rings = True
     demo = {"softness": 0.5}
     demo_on_motor = True
 

@@ -19,7 +19,7 @@ from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.rules import JUDGE, SEARCH, TORQUE
-from dexsim.gap.search import baseline
+from dexsim.gap.search import baseline, shaking
 from dexsim.gap.search.hypotheses import unknown
 from dexsim.gap.search.search import JointSearch, Outcome
 from dexsim.recording.mechanism import Mechanism
@@ -257,6 +257,8 @@ def _not_refuted(search: JointSearch, outcome: Outcome, ratio: float, test: Sequ
     before, after = (search.in_windows(search.polish(t), test, span) for t in (outcome.none, outcome.best))
     if before > SEARCH.enough**2 and after < (1 - JUDGE.sides) * before:
         return "what was kept out is followed better from moment to moment, but not by a free run"
+    if shaking.shown(search, outcome, test, span):
+        return "it makes the joint ring by itself as it does in what was kept out, but no free run keeps step with that"
     sides_with_neither = ratio < JUDGE.neutral and after < JUDGE.neutral**2 * before
     plain = outcome.none.fit.loss > SEARCH.enough**2 and search.gain(outcome.best, outcome.none) >= JUDGE.sides
     return "what was kept out does not show it" if sides_with_neither and plain else ""

@@ -65,7 +65,7 @@ class Motion:
 
     def smooth(self, x: np.ndarray) -> np.ndarray:
         """x [n] through the filter that the torque passed: what jumps with the sign of a speed must pass it as well."""
-        return _pass(x, self.cutoff, self.step)
+        return low_pass(x, self.cutoff, self.step)
 
 
 @dataclass
@@ -89,13 +89,14 @@ def motion(t: np.ndarray, q: np.ndarray, torque: np.ndarray, cutoff: float) -> M
     """From times [S], positions and torques [S, J] as recorded."""
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1], step)
-    through = lambda x: np.stack([_pass(np.interp(even, t, c), cutoff, step) for c in x.T], 1)  # noqa: E731
+    through = lambda x: np.stack([low_pass(np.interp(even, t, c), cutoff, step) for c in x.T], 1)  # noqa: E731
     q, u = through(q), through(torque)
     v = np.gradient(q, step, axis=0)
     return Motion(even, q, v, np.gradient(v, step, axis=0), u, step, cutoff)
 
 
-def _pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
+def low_pass(x: np.ndarray, cutoff: float, step: float) -> np.ndarray:
+    """x [n], every `step` s, without what is faster than the cutoff [Hz]: forth and back, so that it is not late."""
     b, a = butter(4, cutoff * 2 * step)
     return filtfilt(b, a, x)
 

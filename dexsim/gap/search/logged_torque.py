@@ -307,6 +307,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
 
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
 MOVING = 0.1  # of the joint's large speed
+RINGS, SHAKES, LOUD = 0.2, 3.0, 5.0  # s; x what the slow motion shakes, and x what the quietest quarter does
 
 
 @dataclass
@@ -380,10 +381,36 @@ def find_pushes(model: mujoco.MjModel, runs: Sequence[Run], fitted: Sequence[int
                 _spans(push[0], [runs[r] for r in use]),
                 int(model.jnt_type[model.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE),
             )
-            if push[4] and not spans:
+            if (push[4] and not spans) or _by_ringing(push[0], [runs[r] for r in use], j, cutoff):
                 continue
             out.append(Push(joint, push[1], push[2], push[3], push[4], slide, spans))
     return out
+
+
+def _by_ringing(
+    given: Sequence[tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], j: int, cutoff: float
+) -> bool:
+    """Whether a joint rings in most of the samples in which something seems to push it, (times [S] s, pushed [S]) by
+    run: it shakes by far more than it does elsewhere, and by more than its motion below the cutoff [Hz] asks for.
+    Inverse dynamics know no acceleration of what is faster than the readings, and a loop that rings by itself is
+    pushed by nobody."""
+    pushed, rings = [], []
+    for (t, on), run in zip(given, runs, strict=True):
+        step = float(np.median(np.diff(run.t)))
+        even = np.arange(run.t[0], run.t[-1], step)
+        raw = np.interp(even, run.t, run.q[:, j])
+        all_, slow = (_swing(x, step) for x in (raw, inverse_dynamics.low_pass(raw, cutoff, step)))
+        beyond = (all_ > SHAKES * slow) & (all_ > LOUD * np.quantile(all_, 0.25))
+        pushed.append(on)
+        rings.append(np.interp(t, even - run.t[0], beyond.astype(float)) > 0.5)
+    on = np.concatenate(pushed)
+    return bool(on.any() and np.mean(np.concatenate(rings)[on]) > 0.5)
+
+
+def _swing(x: np.ndarray, step: float) -> np.ndarray:
+    """[n] rms of the second differences of x [n] within `RINGS` about each sample."""
+    count = max(int(RINGS / step), 3)
+    return np.sqrt(np.convolve(np.diff(x, 2, prepend=x[0], append=x[-1]) ** 2, np.ones(count) / count, "same"))
 
 
 def _of_joint(
@@ -521,9 +548,26 @@ def without_pushes(
     return rest, kept
 
 
+def _followed(d: Diagnosis, joint: str) -> bool:
+    """Whether findings of at least a half follow a joint to its noise, where it was fitted and where it was kept
+    out."""
+    named = any(f["confidence"] >= JUDGE.firm and joint in f["where"]["joints"] and f["held_out"]
+                for f in d.data["findings"])  # fmt: skip
+    fitted = any(x.joint == joint and x.best.fit.loss <= JUDGE.within**2 for x in d.outcomes)
+    return named and fitted and d.joints[joint]["after"] <= JUDGE.within * d.joints[joint]["sigma"]
+
+
 def claim_push(d: Diagnosis, pushes: Sequence[Push]) -> None:
     """Puts the findings into the diagnosis, and takes from it what was claimed of these joints beside signals: their
-    motion had another cause."""
+    motion had another cause. Not of a joint that is followed to the noise, in what was fitted and in what was kept out,
+    by what was found of it: nothing is left that could push."""
+    followed = {p.joint for p in pushes if not p.cut and _followed(d, p.joint)}
+    d.notes += [
+        f"{joint}: its torque fits no inertia, gravity or friction, but what was found does: nothing from outside "
+        "pushes it"
+        for joint in sorted(followed)
+    ]
+    pushes = [p for p in pushes if p.joint not in followed]
     if not pushes:
         return
     from dexsim.gap.report.sentence import sentence

@@ -1,0 +1,217 @@
+"""A joint that rings by itself, faster than its recordings resolve: what makes its loop do so, told by how much it
+shakes and when.
+
+Where a transmission gives, a loop that reads the joint and drives the motor may be unstable, and then rings on between
+friction and the limits of its drive, often beyond half the rate of the samples. No simulation keeps step with that for
+longer than a few swings, so that sample by sample all hypotheses miss it alike, the true one too. What lasts is when it
+rings and how strongly. Of windows of a second that begin at the measured motion are compared, measured and simulated:
+the rms by which a reading differs from the line between its neighbours one, two and three samples away (by logarithms:
+of what rings by itself only the order of size is to be trusted), and the mean position. Sizes are tried over their
+whole range and then at random about the best (a loop rings or it does not: there is no slope to follow), beliefs with
+them, which decide by how little it rings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dexsim.gap.effects.catalogue import CATALOGUE
+from dexsim.gap.plant.columns import Param, expand, neutral_of
+from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.hypotheses import SCAN_BUDGET, SHORT, Member, Outcome, Trial, thin
+from dexsim.gap.search.search import JointSearch
+
+APART = (1, 2, 3)  # samples between a reading and those that it is compared with
+SETTLES = 0.25  # s of a window before it is looked at: what was let go at a measured state swings in
+LOUD = 5.0  # x the quietest window, and what is simulated without any effect: it shakes
+FEWEST = 3  # windows that shake
+MOST_LOG, MOST_AWAY = 3.0, 5.0  # log ratio of what shakes, and x the usual miss of the mean: more counts as much
+WEIGHT = 1.0 / 9.0  # of the mean position's squared miss beside the logarithms
+RINGS = (0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little more or less decides
+LIMITS = ({"braking_slope": -1.0, "limit_speed": 1.0}, {"braking_slope": -1.0, "limit_speed": 0.0}, {})  # drive's
+ROUNDS, DRAWN, CLOSER, FIRST = 6, 32, 0.7, 0.35  # about the best: rounds, guesses of each, and how far they are
+CHUNK = 24  # guesses simulated at once
+DRAWS = 300  # of a bootstrap over windows
+
+
+class Shaking:
+    """How much a joint shakes in windows of the recordings `runs`. loud [W] bool: windows that shake."""
+
+    def __init__(
+        self,
+        search: JointSearch,
+        none: Trial,
+        runs: Sequence[int] | None = None,
+        span: dict | None = None,
+        quiet: float = np.inf,
+    ):
+        """runs: None for what is fitted; quiet: level at rest [rad] that other recordings have shown."""
+        self.search, self.plant = search, search.case.plant
+        self.w = (
+            search.short
+            if runs is None
+            else thin(self.plant.windows(SHORT, list(runs), span=span), search.case, SCAN_BUDGET)
+        )
+        self.quiet, self.loud = quiet, np.zeros(len(self.w.window), bool)
+        if not len(self.loud) or self.w.n < 20:
+            return
+        t, window = self.plant.t[self.w.sample_row], self.w.sample_window
+        first = np.full(len(self.loud), np.inf)
+        np.minimum.at(first, window, t)
+        settled = t - first[window] > SETTLES
+        self.near = []
+        for g in APART:
+            mid = np.flatnonzero((window[2 * g :] == window[: -2 * g]) & settled[g:-g]) + g
+            part = (t[mid] - t[mid - g]) / np.maximum(t[mid + g] - t[mid - g], 1e-9)
+            self.near.append((mid, g, part, window[mid]))
+        self.kept = np.flatnonzero(settled)
+        self.levels, self.means = (x[0] for x in self._of(self.plant.q[self.w.sample_row][None]))
+        least = max(search.case.quantum / np.sqrt(12), 1e-12)  # readings of a joint at rest do not differ at all
+        self.quiet = max(min(float(self.levels[0].min()), quiet), least)
+        self.loud = self.levels[0] > LOUD * self.quiet
+        if not self.loud.any():
+            return
+        levels, means = self._simulated(none.members, none.fit.params, none.fit.x[None])
+        self.loud &= self.levels[0] > LOUD * levels[0, 0]
+        self.usual = max(1.5 * float(np.median(np.abs(means[0] - self.means))), self.quiet / 3)
+
+    def _of(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """([H, gaps, W] rms by which readings q [H, n] differ from the line between their neighbours, [H, W] their
+        mean)."""
+        W = len(self.w.window)
+        by = lambda x, of: np.bincount(of, x, W) / np.maximum(np.bincount(of, None, W), 1)  # noqa: E731
+        levels = []
+        for mid, g, part, of in self.near:
+            off = q[:, mid] - (q[:, mid - g] * (1 - part) + q[:, mid + g] * part)
+            levels.append(np.sqrt(np.stack([by(x * x, of) for x in off])))
+        means = np.stack([by(x[self.kept], self.w.sample_window[self.kept]) for x in q])
+        return np.stack(levels, 1), means
+
+    def _simulated(
+        self, members: tuple[Member, ...], params: list[Param], x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        parts = []
+        with self.search._fix(members):
+            for i in range(0, len(x), CHUNK):
+                q, _ = self.plant.simulate(expand(self.plant, params, x[i : i + CHUNK]), self.w)
+                parts.append(self._of(np.clip(np.nan_to_num(q, nan=1e4), -1e4, 1e4)))
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+    def missed(self, members: tuple[Member, ...], params: list[Param], x: np.ndarray) -> np.ndarray:
+        """[H, W] by how much each guess x [H, P] misses each window."""
+        levels, means = self._simulated(members, params, x)
+        noise = 1.5 * self.quiet**2
+        ratio = 0.5 * np.log((self.levels**2 + noise) / (levels**2 + 2 * noise))
+        away = (means - self.means) / self.usual
+        return (np.clip(ratio, -MOST_LOG, MOST_LOG) ** 2).sum(1) + WEIGHT * np.minimum(away**2, MOST_AWAY**2)
+
+    def of(self, trial: Trial) -> np.ndarray:
+        """[W] by how much a fitted hypothesis misses each window."""
+        return self.missed(trial.members, trial.fit.params, trial.fit.x[None])[0]
+
+    def best(self, member: Member, rng: np.random.Generator) -> tuple[float, list[Param], np.ndarray]:
+        """(what is missed in all, params, sizes [P]) of one effect, looked for over its range and then about the
+        best."""
+        search, case = self.search, self.search.case
+        own = len(member.variant.params)
+        taken = {c for p in member.variant.params for c in p.columns}
+        # as in a fit: keys of the effect's own parameters are unique in the hypothesis
+        params = [p for p in search._params((member,)) if not p.nuisance]
+        params += [p for p in search.all_nuisances if not taken & set(p.columns)]
+        low, high = (np.array([getattr(p, k) for p in params]) for k in ("low", "high"))
+        keys = [p.key for p in params]
+        guesses = []
+        for start in _starts(member):
+            for limits in LIMITS:
+                x = np.array([p.start for p in params], float)
+                x[:own] = start
+                for key, value in limits.items():
+                    if key in keys:
+                        x[keys.index(key)] = value
+                guesses.append(x)
+        tried = np.unique(np.clip(np.array(guesses), low, high), axis=0)
+        lost = self.missed((member,), params, tried).sum(1)
+        least, x = float(lost.min()), tried[int(np.argmin(lost))]
+        zero = np.array([neutral_of(p, case) for p in member.variant.params])
+        zero = np.where(np.abs(zero) < 1e6, zero, 0.0)
+        spread = np.array([p.sd if p.sd > 0 else 0.25 * p.span for p in params[own:]])
+        for k in range(ROUNDS):
+            size = CLOSER**k
+            tried = np.repeat(x[None], DRAWN, 0)
+            tried[:, :own] = zero + (x[:own] - zero) * np.exp(FIRST * size * rng.standard_normal((DRAWN, own)))
+            moved = rng.random((DRAWN, len(spread))) < 0.3
+            tried[:, own:] += moved * size * spread * rng.standard_normal(moved.shape)
+            tried = np.clip(tried, low, high)
+            lost = self.missed((member,), params, tried).sum(1)
+            if lost.min() < least:
+                least, x = float(lost.min()), tried[int(np.argmin(lost))]
+        return least, params, x
+
+
+def _starts(member: Member) -> list[tuple[float, ...]]:
+    """Sizes from which an effect's are looked for, its damping finer than where a slope is followed."""
+    keys, starts = [p.key for p in member.variant.params], member.variant.starts
+    if "rebound" not in keys:
+        return list(starts)
+    i = keys.index("rebound")
+    return list(dict.fromkeys((*s[:i], ring, *s[i + 1 :]) for s in starts for ring in RINGS))
+
+
+def answered(search: JointSearch, found: Outcome) -> Outcome:
+    """What the search of a joint found; where it rings by itself and that is hardly followed, the effect that makes it
+    ring as measured in the place of what was found, if any does by at least `SEARCH.least` more."""
+    followed = bool(found.best.members) and found.best.fit.loss < SEARCH.unsettled
+    if followed or search.deadline.over():
+        return found  # without an effect even ringing may be within the noise: it is what the noise was told by
+    shaking = Shaking(search, found.none)
+    if shaking.loud.sum() < FEWEST:
+        return found
+    before = shaking.of(found.best)
+    asked = [e for e in CATALOGUE if e.rings and (search.allowed is None or e.id in search.allowed)]
+    tries: dict[str, tuple[float, Trial]] = {}
+    for effect in asked:
+        if effect.id in found.best.ids:
+            return found  # it is what was found by the motion itself
+        for whole in effect.variants(search.case.scales):
+            variant = None if whole.refines or whole.instead else search._narrow(whole)
+            if variant is None or search.deadline.over():
+                continue
+            member = Member(effect, variant)
+            lost, params, x = shaking.best(member, search.rng)
+            if effect.id not in tries or lost < tries[effect.id][0]:
+                with search._fix((member,)):
+                    fit = search.fitter.fit(params, x0=x, iterations=0)
+                tries[effect.id] = lost, Trial((member,), fit)
+    if not tries:
+        return found
+    lost = {e: shaking.of(t) for e, (_, t) in tries.items()}
+    name = min(lost, key=lambda e: lost[e].sum())
+    gain = 1 - lost[name].sum() / before.sum()
+    draws = search.rng.integers(0, len(before), (DRAWS, len(before)))
+    sums = {e: x[draws].sum(1) for e, x in lost.items()}
+    if gain < 2 * SEARCH.least or np.mean(sums[name] < before[draws].sum(1)) < 1 - SEARCH.chance:
+        return found
+    won = np.argmin(np.stack(list(sums.values())), 0)
+    share = {e: float(np.mean(won == k)) for k, e in enumerate(sums)}
+    rivals = sorted(((e, s) for e, s in share.items() if e != name), key=lambda o: -o[1])
+    return Outcome(
+        found.joint, found.none, tries[name][1], {name: rivals}, {name: share[name]}, {name: float(gain)},
+        {name: 0.0}, found.scanned,
+    )  # fmt: skip
+
+
+def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict | None) -> bool:
+    """Whether a joint rings by itself in `runs`, which were kept out, rather as what was found makes it than as it is
+    without."""
+    if not any(m.effect.rings for m in outcome.best.members):
+        return False
+    fitted = Shaking(search, outcome.none)
+    if not fitted.loud.any():
+        return False
+    shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
+    if shaking.loud.sum() < FEWEST:
+        return False
+    before, after = (shaking.of(t).sum() for t in (outcome.none, outcome.best))
+    return bool(after < (1 - SEARCH.least) * before)

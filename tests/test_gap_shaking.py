@@ -1,0 +1,119 @@
+"""A loop that rings by itself, faster than its recordings resolve: what makes it ring is named by how much it shakes,
+nobody is said to push it, and its readings are not called stale."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_gap import model, plant_run
+from test_gap_torque_route import arm, run
+
+from dexsim.gap.judge import conclude
+from dexsim.gap.plant.case import build
+from dexsim.gap.read.runs import conditions
+from dexsim.gap.search import logged_torque, shaking
+from dexsim.gap.search.search import JointSearch
+from dexsim.recording.audit_values import repeats
+
+SERVO = {"kp": 4.0, "kd": 0.2, "torque_limit": 2.0}
+SOFT = {"softness": 0.1, "rebound": 0.16}
+
+
+@pytest.fixture(scope="module")
+def soft() -> JointSearch:
+    """Three recordings of a drive whose transmission gives, so that its loop rings once a step has begun it; the last
+    is kept out."""
+    runs = [plant_run(f"run{k}", k, 4.0, SOFT, seed=k, servo=SERVO) for k in (1, 3, 2)]
+    for r in runs:
+        r.smooth()
+    return JointSearch(
+        build(model(), runs)[0], [0, 1], None, conditions(runs), allowed={"compliance", "coulomb_friction"}
+    )
+
+
+def test_what_makes_a_loop_ring_is_named_by_how_much_it_shakes(soft):
+    nothing = soft.without_search()
+    ringing = shaking.Shaking(soft, nothing.none)
+    assert 0.2 < ringing.loud.mean() < 0.9  # before the step that begins it the loop is quiet
+    found = shaking.answered(soft, nothing)
+    assert found.best.ids == ("compliance",) and found.none is nothing.none
+    at = {p.key: x for p, x in zip(found.best.fit.params, found.best.fit.x, strict=True)}
+    assert at["compliance.softness"] == pytest.approx(SOFT["softness"], rel=0.3)
+    assert ringing.of(found.best).sum() < 0.5 * ringing.of(nothing.none).sum()
+    assert shaking.shown(soft, found, [2], None) and not shaking.shown(soft, nothing, [2], None)
+    assert "ring by itself" in conclude._not_refuted(soft, found, 1.2, [2], None)
+
+
+def test_a_joint_that_does_not_ring_is_left_as_it_was_found():
+    runs = [plant_run(f"run{k}", 1, 3.0, {"coulomb_friction": 0.06}, seed=k, servo=SERVO) for k in (0, 1)]
+    for r in runs:
+        r.smooth()
+    search = JointSearch(build(model(), runs)[0], [0], None, conditions(runs), allowed={"compliance"})
+    nothing = search.without_search()
+    assert nothing.none.fit.loss > 2 and not shaking.Shaking(search, nothing.none).loud.any()
+    assert shaking.answered(search, nothing) is nothing
+    assert not shaking.shown(search, nothing, [1], None)
+
+
+def ringing(t: np.ndarray) -> np.ndarray:
+    """rad: swings of 83 Hz in two stretches."""
+    on = ((t > 3.0) & (t < 6.0)) | ((t > 11.0) & (t < 15.0))
+    return np.where(on, 0.02 * np.sin(2 * np.pi * 83.0 * t), 0.0)
+
+
+def test_nobody_pushes_a_joint_that_rings():
+    """A loop that rings answers with torque that no motion below the samples' rate explains."""
+    model, runs = arm(), []
+    for seed, rings in ((0, True), (1, False)):
+        r = run(model, seed)
+        if rings:
+            swing = ringing(r.t)
+            r.q[:, 1] += swing
+            r.torque[:, 1] -= np.where(swing != 0, 5.0 * np.sign(np.sin(2 * np.pi * 0.7 * r.t)), 0.0)
+        runs.append(r)
+    assert logged_torque.find_pushes(model, runs, [0, 1]) == []
+    runs[0].q[:, 1] -= ringing(runs[0].t)  # the same torque where it does not ring
+    assert [p.joint for p in logged_torque.find_pushes(model, runs, [0, 1])] == ["elbow"]
+
+
+def test_what_is_followed_to_the_noise_is_not_pushed():
+    push = logged_torque.Push("elbow", 1.0, 0.1, 0.5, False, False)
+    finding = {
+        "effect": "torque_ripple",
+        "where": {"joints": ["elbow"]},
+        "confidence": 0.9,
+        "held_out": {"before": 0.02, "after": 0.001},
+        "parameters": {"amplitude": {"value": 0.5, "low": 0.4, "high": 0.6, "unit": "N.m"}},
+        "indistinguishable": [],
+    }
+
+    def claimed(after: float, loss: float) -> list[str]:
+        data = {
+            "findings": [finding],
+            "verdict": "explained",
+            "noise_floor": {"position_rad": 0.001},
+            "held_out": {"before": 0.02, "after": after, "error": "position_rmse_rad"},
+            "unexplained": {"depends_on": []},
+        }
+        outcome = SimpleNamespace(joint="elbow", best=SimpleNamespace(fit=SimpleNamespace(loss=loss)))
+        joints = {"elbow": {"after": after, "sigma": 0.001}}
+        d = SimpleNamespace(data=data, notes=[], sentence="", mechanism=None, joints=joints, outcomes=[outcome])
+        logged_torque.claim_push(d, [push])
+        assert len(d.notes) == 1
+        return [f["effect"] for f in d.data["findings"]]
+
+    assert claimed(0.0011, 1.1) == ["torque_ripple"]
+    assert claimed(0.005, 1.1) == ["external_force"]  # what was kept out is not followed
+    assert claimed(0.0011, 9.0) == ["external_force"]  # nor what was fitted
+
+
+def test_a_reading_that_shakes_and_stands_by_chance_is_not_repeated():
+    t, quantum, rng = np.arange(0.0, 20.0, 0.01), 1.5e-3, np.random.default_rng(0)
+    slow = 0.3 * np.sin(0.7 * t)
+    read = lambda x: np.round((x + 5e-4 * rng.standard_normal(len(t))) / quantum) * quantum  # noqa: E731
+    assert not repeats(t, read(slow + 0.02 * np.sin(2 * np.pi * 71.3 * t))).any()
+    steady = read(1.5 * np.sin(0.7 * t))
+    steady[50::40] = steady[49:-1:40]  # old readings, sent again
+    assert repeats(t, steady).sum() > 20
