@@ -267,8 +267,7 @@ def repeats(t: np.ndarray, x: np.ndarray) -> np.ndarray:
         before = (x[a] - x[a - 2]) / max(t[a] - t[a - 2], 1e-9)
         after = (x[b + 3] - x[b + 1]) / max(t[b + 3] - t[b + 1], 1e-9)
         # what shakes faster than it is read turns back between two readings, and stands now and then by chance
-        steady = np.sign([dx[a - 2], dx[a - 1], dx[b], dx[b + 1], dx[b + 2]])
-        if abs(steady.sum()) < len(steady):
+        if np.any(np.array([dx[a - 2], dx[a - 1], dx[b + 1], dx[b + 2]]) * dx[b] < 0):
             continue
         slow = min(abs(before), abs(after))
         # of neighbours equally fast: the missed way shows as a jump of its size, in one sample

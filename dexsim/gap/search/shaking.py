@@ -30,7 +30,11 @@ FEWEST = 3  # windows that shake
 MOST_LOG, MOST_AWAY = 3.0, 5.0  # log ratio of what shakes, and x the usual miss of the mean: more counts as much
 WEIGHT = 1.0 / 9.0  # of the mean position's squared miss beside the logarithms
 RINGS = (0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little more or less decides
-LIMITS = ({"braking_slope": -1.0, "limit_speed": 1.0}, {"braking_slope": -1.0, "limit_speed": 0.0}, {})  # drive's
+LIMITS: tuple[dict[str, float], ...] = (  # laws of the drive's limits, which end how far it swings
+    {"braking_slope": -1.0, "limit_speed": 1.0},
+    {"braking_slope": -1.0, "limit_speed": 0.0},
+    {},
+)
 ROUNDS, DRAWN, CLOSER, FIRST = 6, 32, 0.7, 0.35  # about the best: rounds, guesses of each, and how far they are
 CHUNK = 24  # guesses simulated at once
 DRAWS = 300  # of a bootstrap over windows
@@ -186,11 +190,11 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
                 tries[effect.id] = lost, Trial((member,), fit)
     if not tries:
         return found
-    lost = {e: shaking.of(t) for e, (_, t) in tries.items()}
-    name = min(lost, key=lambda e: lost[e].sum())
-    gain = 1 - lost[name].sum() / before.sum()
+    left = {e: shaking.of(t) for e, (_, t) in tries.items()}
+    name = min(left, key=lambda e: float(left[e].sum()))
+    gain = 1 - left[name].sum() / before.sum()
     draws = search.rng.integers(0, len(before), (DRAWS, len(before)))
-    sums = {e: x[draws].sum(1) for e, x in lost.items()}
+    sums = {e: x[draws].sum(1) for e, x in left.items()}
     if gain < 2 * SEARCH.least or np.mean(sums[name] < before[draws].sum(1)) < 1 - SEARCH.chance:
         return found
     won = np.argmin(np.stack(list(sums.values())), 0)
