@@ -77,7 +77,7 @@ def test_a_finding_that_a_free_run_does_not_confirm_is_dropped_or_doubted():
     conditions left out."""
 
     def reason(before: float, after: float, ratio: float, gain: float, loss: float, told: bool = False) -> str:
-        none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace()
+        none, best = SimpleNamespace(fit=SimpleNamespace(loss=loss)), SimpleNamespace(members=())
         search = SimpleNamespace(
             case=SimpleNamespace(told=told),
             polish=lambda t: t,
