@@ -11,9 +11,12 @@ out, so that none can be too small, and the least is the answer.
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
 HALVINGS = 52
+LEVEL = 1e-9
+"""Points of one feature are as high as each other, to this [m]."""
 SAMPLES = 96
 """Directions across an edge between which a root is looked for."""
 
@@ -27,14 +30,31 @@ def features(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(edges, axis=0), triangles
 
 
-def answer(radius: float, half: float, corners: np.ndarray) -> tuple[float, np.ndarray]:
-    """(distance in m, negative if they overlap; unit direction from the cylinder to the polytope), in the cylinder's
-    frame: axis z, radius and half length in m, corners [n, 3] of the polytope."""
+def answer(radius: float, half: float, corners: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """(distance in m, negative if they overlap; unit direction from the cylinder to the polytope; the place halfway
+    between their nearest points in m), in the cylinder's frame: axis z, radius and half length in m, corners [n, 3] of
+    the polytope."""
     edges, triangles = features(corners)
-    gap = _apart(radius, half, corners, edges, triangles)
-    if gap[0] > 1e-12 and not _crosses(radius, half, gap[1], corners):
-        return gap
-    return _overlapping(radius, half, corners, edges, triangles)
+    dist, u, x = _apart(radius, half, corners, edges, triangles)
+    if dist > 1e-12 and not _crosses(radius, half, u, corners):
+        return dist, u, x - 0.5 * dist * u
+    dist, u = _overlapping(radius, half, corners, edges, triangles)
+    return dist, u, _between(radius, half, corners, dist, u)
+
+
+def _between(radius: float, half: float, corners: np.ndarray, dist: float, u: np.ndarray) -> np.ndarray:
+    """The place halfway between the furthest points along u of the cylinder and against it of the polytope: one point
+    of the rim, or the polytope's one corner, or where its lowest edge crosses a line of the side."""
+    flat = float(np.hypot(u[0], u[1]))
+    if min(2 * half * abs(u[2]), 2 * radius * flat) > LEVEL:
+        return _furthest(radius, half, u) + 0.5 * dist * u
+    low = corners[(h := corners @ u) < h.min() + LEVEL]
+    if len(low) == 1 or 2 * radius * flat <= LEVEL:  # on a cap: of an edge or face its middle
+        return low.mean(0) - 0.5 * dist * u
+    line = _furthest(radius, half, u) * [1, 1, 0] + np.outer([-half, half], [0, 0, 1.0])
+    pairs = (low[:, None] - line[None]).reshape(-1, 3) - dist * u
+    weight, _ = nnls(np.vstack([pairs.T / np.abs(pairs).max(), np.ones(len(pairs))]), np.array([0.0, 0.0, 0.0, 1.0]))
+    return (weight.reshape(-1, 2).sum(1) / weight.sum()) @ low - 0.5 * dist * u
 
 
 def _off(radius: float, half: float, x: np.ndarray) -> np.ndarray:
@@ -55,7 +75,8 @@ def _crosses(radius: float, half: float, u: np.ndarray, corners: np.ndarray) -> 
     return bool((corners @ u).min() < (_furthest(radius, half, u) @ u) - 1e-9)
 
 
-def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray]:
+def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray, np.ndarray]:
+    """Distance, direction, and the polytope's nearest point."""
     found = [corners]
     if len(edges):
         a, e = corners[edges[:, 0]], corners[edges[:, 1]] - corners[edges[:, 0]]
@@ -65,10 +86,11 @@ def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray]:
             grows = (e * _off(radius, half, a + t[:, None] * e)).sum(1) > 0
             low, high = np.where(grows, low, t), np.where(grows, t, high)
         found.append(a + (0.5 * (low + high))[:, None] * e)
-    off = _off(radius, half, np.concatenate(found))
+    points = np.concatenate(found)
+    off = _off(radius, half, points)
     dist = np.linalg.norm(off, axis=1)
     k = dist.argmin()
-    best = (float(dist[k]), off[k] / max(float(dist[k]), 1e-300))
+    best = (float(dist[k]), off[k] / max(float(dist[k]), 1e-300), points[k])
     if len(triangles):
         p = corners[triangles]
         n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
@@ -81,7 +103,7 @@ def _apart(radius, half, corners, edges, triangles) -> tuple[float, np.ndarray]:
         gap = np.where(within & (gap >= 0), gap, np.inf)
         k = gap.argmin()
         if gap[k] < best[0]:
-            best = (float(gap[k]), n[k])
+            best = (float(gap[k]), n[k], x[k])
     return best
 
 

@@ -11,14 +11,14 @@ against cylinders are left to MuJoCo-Warp's closed forms, and are measured too (
 exact answer in float64: of overlapping bodies the nearest facet of the hull of all differences of corners (Qhull), of
 others the nearest point of that hull (Lawson and Hanson's least distance programming), of cylinders the best of all
 features (`cylinder_exact.py`). How often C MuJoCo was wrong is printed. Printed for each pair of types and both
-settings: percentiles of the error of the distance, of the angle of the normal and of the contact's place, how many
-places are off by more than 1e-6 m, and microseconds a pair of the narrow phase alone (of all worlds at once, cold: no
-pair has been there before).
- No pose is left out of the distances. Normals and places are compared where they are well-posed: not where overlapping
-bodies have two ways out of equal length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two
-roundings; places also only where a corner of one body is nearest, since parallel edges and faces (`degenerate`, within
-1e-3 rad or 10 um) have no single nearest point. The number compared is printed, and the worst distance among the
-degenerate ones by itself.
+settings: percentiles of the error of the distance, of the angle of the normal and of the contact's place, and
+microseconds a pair of the narrow phase alone (of all worlds at once, cold: no pair has been there before).
+ No pose is left out of the distances, and none out of the count of places that are off: each that is more than 1e-6 m
+from C MuJoCo's is held to all exact nearest points in float64 (`places.py`), of dexsim's kernels where they serve.
+ Percentiles of normals and places are of poses where they are well-posed: not where overlapping bodies have two ways
+out of equal length (to 1 um), nor at gaps below 10 um, where a normal is a quotient of two roundings; of places also
+only where a corner of one body is nearest, since parallel edges and faces (`degenerate`, within 1e-3 rad or 10 um) have
+no single nearest point. The number compared is printed, and the worst distance among the degenerate ones by itself.
 """
 
 from __future__ import annotations
@@ -33,10 +33,9 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from scipy.optimize import nnls
-from scipy.spatial import ConvexHull
 
-from benchmarks import cylinder_exact, tools
+from benchmarks import tools
+from benchmarks.places import exact, judge
 from dexsim.assets import xhand
 from dexsim.assets.objects import library
 from dexsim.errors import UserError
@@ -301,58 +300,12 @@ def confirmed(model: mujoco.MjModel, poses: Poses, normal: np.ndarray) -> np.nda
     return reach - ((poses.pos[:, 1] - poses.pos[:, 0]) * normal).sum(1)
 
 
-def _core(model: mujoco.MjModel, poses: Poses, k: int, i: int) -> np.ndarray:
-    """Corners of geom k in pose i, in the world [m]."""
-    kind, size = model.geom_type[k], poses.size[i, k]
-    if kind == GEOM["sphere"]:
-        corners = np.zeros((1, 3))
-    elif kind == GEOM["capsule"]:
-        corners = np.array([[0, 0, -size[1]], [0, 0, size[1]]])
-    elif kind == GEOM["box"]:
-        corners = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    else:
-        first, count, table = hull_corners(model)
-        m = poses.mesh[i, k]
-        corners = table[first[m] :][: count[m]].astype(float)
-    return corners @ poses.rot[i, k].T + poses.pos[i, k]
-
-
-def exact(model: mujoco.MjModel, poses: Poses, i: int) -> tuple[float, np.ndarray]:
-    """(distance in m, normal from A to B) of pose i in float64, of two cores of which one is a solid."""
-    radius = float(_radius(model, poses[i : i + 1])[0])
-    for k in np.flatnonzero(np.isin(model.geom_type, int(GEOM["cylinder"]))):
-        turn = poses.rot[i, k]
-        corners = (_core(model, poses, 1 - k, i) - poses.pos[i, k]) @ turn
-        dist, normal = cylinder_exact.answer(*poses.size[i, k, :2], corners)
-        return dist - radius, turn @ normal * (1 - 2 * k)
-    points = (_core(model, poses, 0, i)[:, None] - _core(model, poses, 1, i)[None]).reshape(-1, 3)
-    faces = ConvexHull(points).equations  # unit normals outward, and minus the distance of the plane from the origin
-    if faces[:, 3].max() <= 0.0:
-        f = faces[faces[:, 3].argmax()]
-        return f[3] - radius, f[:3]
-    scale = np.abs(points).max()
-    weight, _ = nnls(np.vstack([points.T / scale, np.ones(len(points))]), np.array([0.0, 0.0, 0.0, 1.0]))
-    v = points.T @ (weight / weight.sum())
-    return float(np.linalg.norm(v)) - radius, -v / np.linalg.norm(v)
-
-
-def _on_rim(poses: Poses, k: int, i: int, dist: float, normal: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """The place of contact in pose i where one point of the rim of geom k, a cylinder, is furthest along the normal."""
-    u = poses.rot[i, k].T @ normal * (1 - 2 * k)  # from the cylinder
-    if min(abs(u[2]), np.hypot(u[0], u[1])) < 1e-3:
-        return otherwise
-    radius, half = poses.size[i, k, :2]
-    y = np.array([*(radius * u[:2] / np.hypot(u[0], u[1])), np.copysign(half, u[2])])
-    return poses.rot[i, k] @ (y + 0.5 * dist * u) + poses.pos[i, k]
-
-
 def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """(what is compared with, where C MuJoCo itself was wrong by more than 1e-7 m [n]). answers: its own first.
 
     Each answer of C MuJoCo is looked at by itself: along its normal the bodies must reach just as far as it says. Where
     that fails, or another answer differs by more than 1e-7 m (MuJoCo-Warp's own: 1e-6, its tolerance), the exact one
-    counts; of a cylinder also where the next answer's single place differs by more than 1e-6 m, and then the exact
-    place on its rim (C MuJoCo's lies on a chord of that).
+    counts.
     """
     dist, normal, pos = (x.copy() for x in answers[0])
     near = dist < MARGIN + 1e-4
@@ -366,16 +319,10 @@ def truth(model: mujoco.MjModel, poses: Poses, answers: list) -> tuple[tuple[np.
     solid = (int(mujoco.mjtGeom.mjGEOM_MESH), int(GEOM["box"]), int(GEOM["cylinder"]))
     if not np.isin(model.geom_type, solid).any():
         return (dist, normal, pos), wrong
-    cylinders = np.flatnonzero(model.geom_type == GEOM["cylinder"])
-    if len(cylinders):
-        off = np.linalg.norm(answers[1][2] - pos, axis=1) > 1e-6
-        doubt |= near & np.isfinite(answers[1][0]) & off & well_posed(model, poses, answers[0])[1]
     for i in np.flatnonzero(doubt):
-        d, n = exact(model, poses, i)
+        d, normal[i], pos[i] = exact(model, poses, i)
         wrong[i] = abs(d - dist[i]) > 1e-7
-        dist[i], normal[i] = d, n
-        for k in cylinders:
-            pos[i] = _on_rim(poses, k, i, d, n, pos[i])
+        dist[i] = d
     return (dist, normal, pos), wrong
 
 
@@ -387,7 +334,7 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
     both = {s: Worlds(model, worlds, device, s) for s in (SETTINGS if kind in OURS else SETTINGS[1:])}
     errors: dict[str, list] = {s: [] for s in both}
     times: dict[str, list[float]] = {s: [] for s in both}
-    wrong = 0
+    wrong, judged = 0, []
     for _ in range(-(-n // worlds)):
         poses = draw(model, kind, a, b, worlds, rng)
         answers = [reference(model, poses)]
@@ -403,12 +350,15 @@ def kind_of_pair(kind: str, n: int, device: str, worlds: int, seed: int = 1) -> 
             answers.append(w.found())
         want, mistaken = truth(model, poses, answers)
         wrong += int(mistaken.sum())
+        judged.append(judge(model, poses, want, answers[1], confirmed(model, poses, answers[1][1])))
+        for i, at in judged[-1]["exact"].items():
+            want[2][i] = at
         for setting, got in zip(both, answers[1:], strict=True):
-            r = compare(model, poses, want, got)
-            r["pos"][mistaken] = np.nan
-            errors[setting].append(r)
+            errors[setting].append(compare(model, poses, want, got))
     out: dict = {"poses": worlds * len(errors["mujoco"]), "reference_wrong": wrong,
                  "whose": "dexsim's kernels" if kind in OURS else "MuJoCo-Warp's closed form or search"}  # fmt: skip
+    count = {k: sum(j[k] for j in judged) for k in ("off", "ill", "equal", "reference_off")}
+    out["places"] = count | {"worst_m": max(j["worst"] for j in judged)}
     for setting, parts in errors.items():
         r = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
         out[setting] = {"contacts": int(np.isfinite(r["dist"]).sum()), "missed": int(r["missed"].sum()),
@@ -445,6 +395,12 @@ def main(argv: list[str]) -> dict:
         print(
             f"{kind} ({r['whose']}): {r['poses']} poses, in {r['reference_wrong']} of them C MuJoCo is wrong by more"
             " than 1e-7 m"
+        )
+        held = r["places"]
+        print(
+            f"  places of all contacts, {SETTINGS[kind not in OURS]}: {held['off']} off by more than 1e-6 m,"
+            f" {held['ill']} by less than the pose leaves open, at worst {held['worst_m']:.3g} m; {held['equal']} of"
+            f" several nearest points another than C MuJoCo's; C MuJoCo's off: {held['reference_off']}"
         )
         for setting in (s for s in SETTINGS if s in r):
             s = r[setting]

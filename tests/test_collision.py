@@ -23,8 +23,10 @@ POSES = 768
 @pytest.mark.parametrize("kind", bench.OURS)
 def test_contacts_of_random_poses_are_those_of_c_mujoco(kind):
     """Surfaces from 2 mm deep to the margin apart, a tenth with faces parallel: all contacts, none too many, to 1e-7
-    m."""
-    got = bench.kind_of_pair(kind, POSES, "cpu", POSES, seed=3)["hand"]
+    m, each at a nearest point."""
+    out = bench.kind_of_pair(kind, POSES, "cpu", POSES, seed=3)
+    assert out["places"]["off"] == out["places"]["ill"] == 0 and out["places"]["worst_m"] < 1e-6, out["places"]
+    got = out["hand"]
     assert got["contacts"] > POSES / 6 and got["missed"] == got["extra"] == 0
     assert got["dist_m"]["median"] < 5e-9 and got["dist_m"]["worst"] < 1e-7, got["dist_m"]
     assert got["normal_rad"]["p99"] < 1e-5, got["normal_rad"]
@@ -259,15 +261,17 @@ def test_the_exact_reference_of_cylinders():
     """In closed form: a box whose corner is nearest to the rim, one with an edge ahead of the side, and one above a
     cap; the last two apart and overlapping."""
     box = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
-    dist, normal = cylinder_exact.answer(0.02, 0.03, box + [0.035, 0.0, 0.045])
+    dist, normal, at = cylinder_exact.answer(0.02, 0.03, box + [0.035, 0.0, 0.045])
+    np.testing.assert_allclose(at[[0, 2]], [0.0225, 0.0325], atol=1e-12)
     assert abs(dist - np.hypot(0.005, 0.005)) < 1e-12
     np.testing.assert_allclose(normal, [np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
     turn = np.array([[np.sqrt(0.5), -np.sqrt(0.5), 0], [np.sqrt(0.5), np.sqrt(0.5), 0], [0, 0, 1]])  # an edge ahead
     reach = 0.01 * np.sqrt(2)
     for gap in (1e-3, -1e-3):
-        dist, normal = cylinder_exact.answer(0.02, 0.03, box @ turn.T + [0.02 + gap + reach, 0.0, 0.0])
+        dist, normal, at = cylinder_exact.answer(0.02, 0.03, box @ turn.T + [0.02 + gap + reach, 0.0, 0.0])
         assert abs(dist - gap) < 1e-12 and abs(normal[0] - 1) < 1e-12
-        dist, normal = cylinder_exact.answer(0.02, 0.03, box @ turn.T + [0.003, 0.0, 0.04 + gap])
+        np.testing.assert_allclose(at[:2], [0.02 + gap / 2, 0.0], atol=1e-9)
+        dist, normal, _ = cylinder_exact.answer(0.02, 0.03, box @ turn.T + [0.003, 0.0, 0.04 + gap])
         assert abs(dist - gap) < 1e-12 and abs(normal[2] - 1) < 1e-12
 
 

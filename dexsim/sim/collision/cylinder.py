@@ -21,7 +21,9 @@ FAR = wp.constant(1.0e10)
 NEAR = wp.constant(0.2)
 """How far [rad] a way out past an edge may be from where the prism had it."""
 LOWER = wp.constant(1.0e-8)
-"""What rounding makes of the heights [m] of the corners of one feature."""
+"""What rounding makes of the heights [m] of the ends of one edge."""
+FLAT = wp.constant(1.0e-7)
+"""And of the corners of one face: of a sliver's normal more is not known."""
 LEVEL = wp.constant(1.0e-5)
 """A direction [rad] as near to square with the axis leads out through the side."""
 
@@ -145,6 +147,17 @@ def on_edge(half: wp.vec3, a: wp.vec3, b: wp.vec3, ia: int, ib: int) -> Nearest:
 
 
 @wp.func
+def beside(y: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """The corner nearest to y: from there a height above the face suffers least from what its normal is off."""
+    p = a
+    if wp.length_sq(b - y) < wp.length_sq(p - y):
+        p = b
+    if wp.length_sq(c - y) < wp.length_sq(p - y):
+        p = c
+    return p
+
+
+@wp.func
 def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int, ic: int) -> Nearest:
     """The triangle's nearest point if that is within, else `none`: then an edge has it, or one as near."""
     n = wp.cross(b - a, c - a)
@@ -154,15 +167,14 @@ def on_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, ia: int, ib: int,
     n = n / area
     if wp.dot(n, a) < 0.0:
         n = -n
-    height = wp.dot(n, a)
     y = furthest(half, n)
-    reach = wp.dot(n, y)
-    gap = height - reach
+    p = beside(y, a, b, c)
+    gap = wp.dot(n, p - y)
     x = y + gap * n
     if gap <= 0.0:
         # the cylinder goes through the plane, here at least
         gap = 0.0
-        x = (height / reach) * y
+        x = (wp.dot(n, p) / wp.dot(n, y)) * y
     m = wp.cross(b - a, c - a)
     if (
         wp.dot(m, wp.cross(b - x, c - x)) <= 0.0
@@ -197,13 +209,17 @@ def number(s: Nearest, k: int) -> int:
 def with_corner(half: wp.vec3, s: Nearest, w: wp.vec3, i: int) -> Nearest:
     """What of the feature and one more corner is nearest to the cylinder; the corner has a part in it."""
     best = none()
+    face = none()
     for k in range(s.n):  # not known in advance: a loop that is not unrolled compiles in a third of the time
         a = place(s, k)
         ia = number(s, k)
         best = nearer(best, on_edge(half, a, w, ia, i))
         if s.n == 3 or s.n - k == 2:
             next = (k + 1) % s.n
-            best = nearer(best, on_face(half, a, place(s, next), w, ia, number(s, next), i))
+            face = nearer(face, on_face(half, a, place(s, next), w, ia, number(s, next), i))
+    # a point within a face is nearer than its edges, but near a corner by less than float32 tells
+    if face.n != 0 and wp.length(face.g) <= wp.length(best.g) + GAIN:
+        return face
     return best
 
 
@@ -346,7 +362,8 @@ def past_face(half: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, about: wp.vec3)
     w = Way()
     n = wp.cross(b - a, c - a)
     if wp.dot(n, n) > 0.0:
-        w = way(half, wp.normalize(wp.where(wp.dot(n, about) > 0.0, n, -n)), a)
+        u = wp.normalize(wp.where(wp.dot(n, about) > 0.0, n, -n))
+        w = way(half, u, beside(furthest(half, u), a, b, c))
     return w
 
 
@@ -386,6 +403,71 @@ def lowest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3) -> wp.vec3i:
 
 
 @wp.func
+def widest(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, first: wp.vec3i) -> wp.vec3i:
+    """Three corners far apart of the face that is lowest along d (in the body's frame), which tell its normal best;
+    `first`, the three lowest, if no more are as low."""
+    c0 = corner(b, vertex, first[0])
+    level = wp.dot(d, c0) + FLAT
+    out = first
+    most = float(0.0)
+    for k in range(corners(b)):
+        e = corner(b, vertex, k) - c0
+        if wp.dot(d, e + c0) <= level and wp.length_sq(e) > most:
+            most = wp.length_sq(e)
+            out = wp.vec3i(first[0], k, first[2])
+    if most == 0.0:
+        return first
+    c1 = corner(b, vertex, out[1])
+    most = float(0.0)
+    for k in range(corners(b)):
+        e = corner(b, vertex, k) - c0
+        area = wp.length_sq(wp.cross(e, c1 - c0))
+        if wp.dot(d, e + c0) <= level and area > most:
+            most = area
+            out = wp.vec3i(out[0], out[1], k)
+    if most == 0.0:
+        return first
+    return out
+
+
+@wp.func
+def on_line(u: wp.vec3, x: wp.vec3) -> wp.vec3:
+    """x moved to above the line of the side that is furthest along u; not where u is not square with the axis."""
+    flat = wp.sqrt(u[0] * u[0] + u[1] * u[1])
+    if wp.abs(u[2]) > LEVEL or flat == 0.0:
+        return x
+    beside = wp.vec3(-u[1] / flat, u[0] / flat, 0.0)
+    return x - wp.dot(x, beside) * beside
+
+
+@wp.func
+def side(b: Core, vertex: wp.array(dtype=wp.vec3), d: wp.vec3, y: wp.vec3, near: wp.vec3i) -> wp.vec2i:
+    """The ends of the edge beyond which y lies, of the face that is lowest along the unit direction d; (-1, -1) if y is
+    within. All in the body's frame; near: three of the face's corners."""
+    level = wp.dot(d, corner(b, vertex, near[0])) + FLAT
+    out = wp.vec2i(-1, -1)
+    furthest_off = float(0.0)
+    for i in range(corners(b)):
+        p = corner(b, vertex, i)
+        if wp.dot(d, p) <= level:
+            for j in range(corners(b)):
+                e = corner(b, vertex, j) - p
+                if i != j and wp.dot(d, e + p) <= level:
+                    inward = wp.normalize(wp.cross(d, e))
+                    off_by = -wp.dot(inward, y - p)
+                    if off_by > furthest_off:
+                        least = float(0.0)
+                        for k in range(corners(b)):
+                            q = corner(b, vertex, k)
+                            if wp.dot(d, q) <= level:
+                                least = wp.min(least, wp.dot(inward, q - p))
+                        if least > -LOWER:
+                            furthest_off = off_by
+                            out = wp.vec2i(i, j)
+    return out
+
+
+@wp.func
 def rounder(
     half: wp.vec3, b: Core, vertex: wp.array(dtype=wp.vec3), R: wp.mat33, p: wp.vec3, about: wp.vec3, on: wp.vec3i
 ) -> Way:
@@ -395,8 +477,9 @@ def rounder(
     lowest corners make, fewest corners first: the shortest along which no other corner is lower.
     """
     three = lowest(b, vertex, wp.transpose(R) * about)
-    most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + GAIN
+    most = wp.dot(about, furthest(half, about) - (R * corner(b, vertex, three[0]) + p)) + 2.0 * LOWER
     best = Way()
+    face = wp.vec3i(-1, -1, -1)
     k = int(0)
     while k < 8:
         i = on
@@ -405,13 +488,23 @@ def rounder(
         elif k < 6:
             i = wp.vec3i(three[(k + 1) % 3], three[(k + 1) % 3], three[(k + 2) % 3])
         elif k == 6:
-            i = three
+            i = widest(b, vertex, wp.transpose(R) * about, three)
         c0 = R * corner(b, vertex, i[0]) + p
         w = past(half, c0, R * corner(b, vertex, i[1]) + p, R * corner(b, vertex, i[2]) + p, about, i)
         if w.found != 0 and w.depth < most:
             other = R * corner(b, vertex, support(b, vertex, -(wp.transpose(R) * w.u))) + p
-            if wp.dot(w.u, c0 - other) <= LOWER:
+            if wp.dot(w.u, c0 - other) <= wp.where(k < 6, LOWER, FLAT):
                 best = w
                 most = w.depth - LOWER
+                face = wp.where(k < 6, wp.vec3i(-1, -1, -1), i)
         k += 1
+    if face[0] >= 0:
+        # The rim may be furthest beyond one of the face's edges, where the way out is hardly shorter: by the tilt
+        # squared. That edge need not be of the three corners'.
+        to_b = wp.transpose(R)
+        ends = side(b, vertex, to_b * best.u, to_b * (furthest(half, best.u) - p), face)
+        if ends[0] >= 0:
+            w = past_edge(half, R * corner(b, vertex, ends[0]) + p, R * corner(b, vertex, ends[1]) + p, best.u)
+            if w.found != 0 and w.depth < best.depth + LOWER:
+                best = w
     return best

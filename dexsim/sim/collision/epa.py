@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from dexsim.sim.collision.gjk import GAIN, OVERLAP, difference
+from dexsim.sim.collision.gjk import OVERLAP, difference
 from dexsim.sim.collision.shapes import Core, support
 
 POINTS = 32
@@ -20,6 +20,8 @@ POINTS = 32
 FACES = 2 * POINTS - 4
 EDGES = 48
 FAR = wp.constant(1.0e10)
+GAIN = wp.constant(6.0e-9)
+"""A corner that lies above a facet by less than this [m] is of it."""
 ATTEMPTS = wp.constant(3)
 """Searches at most: one is enough in all but one of some ten thousand overlapping poses."""
 PARALLEL = wp.constant(0.999)

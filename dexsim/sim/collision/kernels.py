@@ -11,7 +11,7 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from dexsim.sim.collision.cylinder import from_cylinder, rounder
+from dexsim.sim.collision.cylinder import from_cylinder, on_line, rounder
 from dexsim.sim.collision.epa import Facet, penetration
 from dexsim.sim.collision.gjk import OVERLAP, distance, touching
 from dexsim.sim.collision.shapes import (
@@ -392,7 +392,10 @@ def beside_cylinder(
             w = rounder(half, b, pairs.hull, R, p, normal, wp.vec3i(f.i0 >> 16, f.i1 >> 16, f.i2 >> 16))
             if w.found != 0:
                 normal = w.u
-                middle = wp.where(w.placed != 0, w.q, R * q + p + 0.5 * w.depth * w.u)
+                middle = w.q
+                if w.placed == 0:
+                    # on the side or a cap any of the prism's places is right, but that its side is a facet, not a line
+                    middle = on_line(w.u, R * q + p) + 0.5 * w.depth * w.u
                 dist = -w.depth
         elif t.inside == 0 and wp.length(t.v) > OVERLAP:
             names = wp.vec3i(t.i0, wp.where(t.n > 1, t.i1, -1), wp.where(t.n > 2, t.i2, -1))
