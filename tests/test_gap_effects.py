@@ -270,10 +270,20 @@ TRIED = """
 import json, sys
 from pathlib import Path
 import numpy as np
-from dexsim.actuator import reference
+import torch
+from dexsim.actuator import Servo, reference
 from dexsim.actuator.table import ServoTable
 from dexsim.gap import demo
 from dexsim.gap.diagnosis import Settings, diagnose, save
+from dexsim.tasks.randomize import Sampler
+from dexsim.tasks.servos import ServoRandomizer
+
+class Drives:  # of 400 worlds
+    joints, queue, control_period, features = ("joint",), 8, 0.02, frozenset()
+    table = ServoTable.from_dict(demo.BELIEVED)
+    nominal = torch.as_tensor(table.nominal(joints), dtype=torch.float32)
+    params = nominal.expand(400, *nominal.shape).clone()
+    check_simulated = Servo.check_simulated
 
 out = Path(sys.argv[1])
 paths, model, servo, hidden = demo.make(out, "cable_pull", seconds=5.0)
@@ -283,7 +293,10 @@ save(d, out)
 row = ServoTable.from_dict(demo.BELIEVED).nominal(["joint"])[0]
 plain, pulled = (reference.servo(r, 1.0, 1.0, 0.0, dt=1e-9)["qfrc_applied"] for r in (row,
              np.where(np.arange(len(row)) == reference.INDEX["cable"], 0.08, row)))
-print(json.dumps({"hidden": hidden, "torque": float(pulled - plain),
+ranges = {"servo": {"cable": [0.02, 0.06]}}
+ServoRandomizer(Drives(), Sampler(ranges, torch.Generator().manual_seed(0), 400, "cpu")).draw(torch.ones(400).bool())
+drawn = Drives.params[:, 0, reference.INDEX["cable"]]
+print(json.dumps({"hidden": hidden, "torque": float(pulled - plain), "drawn": [float(drawn.min()), float(drawn.max())],
              "row": ServoTable.load(out / "servo.yaml").value("joint", "cable").value}))
 """
 
@@ -291,7 +304,8 @@ print(json.dumps({"hidden": hidden, "torque": float(pulled - plain),
 @pytest.mark.slow
 def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
     """A copy of the package with one effect more, added in the places that CONTRIBUTING names and nowhere else: it is
-    planted by the engine that trains, found, sized, written to servo.yaml and shown on the page."""
+    drawn for training, planted by the engine that trains, found, sized, written to servo.yaml and shown on the
+    page."""
     package = tmp_path / "dexsim"
     shutil.copytree(Path(dexsim.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     for name, before, text in ADDED:
@@ -313,5 +327,6 @@ def test_an_effect_is_added_by_its_column_its_law_and_its_entry(tmp_path):
     first = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))["findings"][0]
     assert said["hidden"] == {"cable": 0.08} and said["torque"] == pytest.approx(-0.08, rel=1e-3)
     assert first["effect"] == "cable_pull" and first["parameters"]["stiffness"]["value"] == pytest.approx(0.08, rel=0.1)
+    assert said["drawn"] == [pytest.approx(0.02, abs=1e-3), pytest.approx(0.06, abs=1e-3)]
     assert said["row"] == pytest.approx(first["parameters"]["stiffness"]["value"], rel=1e-3)
     assert "is pulled home by a cable" in (out / "report.html").read_text(encoding="utf-8")

@@ -1060,20 +1060,26 @@ class BeliefRules:
     )
 
 
-SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = SearchRules(), JudgeRules(), TouchRules(), TorqueRules(), BeliefRules()
-ROOMS: dict[str, SearchRules | JudgeRules | TouchRules | TorqueRules | BeliefRules] = {
-    "search": SEARCH,
-    "judge": JUDGE,
-    "touch": TOUCH,
-    "torque": TORQUE,
-    "belief": BELIEF,
-}
+@dataclass(frozen=True)
+class Rules:
+    """All of them."""
+
+    search: SearchRules = SearchRules()
+    judge: JudgeRules = JudgeRules()
+    touch: TouchRules = TouchRules()
+    torque: TorqueRules = TorqueRules()
+    belief: BeliefRules = BeliefRules()
+
+
+RULES = Rules()
+SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = RULES.search, RULES.judge, RULES.touch, RULES.torque, RULES.belief
 
 
 def described() -> list[tuple[str, float, str, str, str]]:
     """(name such as "search.least", value, meaning, source, test) of every rule."""
     return [
-        (f"{room}.{f.name}", getattr(rules, f.name), *(f.metadata[k] for k in ("means", "source", "test")))
-        for room, rules in ROOMS.items()
+        (f"{room.name}.{f.name}", getattr(rules, f.name), *(f.metadata[k] for k in ("means", "source", "test")))
+        for room in fields(RULES)
+        for rules in (getattr(RULES, room.name),)
         for f in fields(rules)
     ]
