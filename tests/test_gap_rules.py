@@ -163,7 +163,11 @@ class Selecting(Made):
         """offered: the scan's effects; saved: (what else of the scan saves in hindsight, effect)."""
         super().__init__()
         self.losses, self.offered, self.hindsight = losses, offered, saved
-        self.deadline, self.case, self.other_start, self.costs = Deadline(), SimpleNamespace(joint="j"), {}, {}
+        self.deadline, self.other_start, self.costs = Deadline(), {}, {}
+        self.case = SimpleNamespace(joint="j", plant=SimpleNamespace(device="cpu"))
+
+    def _apart(self):
+        return self
 
     def _left(self, trial):
         return trial.left_out
@@ -381,10 +385,11 @@ class Refuted:
     def __init__(self, followed=1.0, gain=0.0, told=False):
         self.case = SimpleNamespace(joint="j", told=told)
         self.kept = SimpleNamespace(test=[], span_test=None)
-        self.outcome = SimpleNamespace(none=SimpleNamespace(fit=SimpleNamespace(loss=4.0)), best="best")
+        best = SimpleNamespace(members=())
+        self.outcome = SimpleNamespace(none=SimpleNamespace(fit=SimpleNamespace(loss=4.0)), best=best)
         self.search = self
         self.gain, self.polish = lambda best, none: gain, lambda trial: trial
-        self.in_windows = lambda trial, test, span: 4.0 * (followed if trial == "best" else 1.0)
+        self.in_windows = lambda trial, test, span: 4.0 * (followed if trial is best else 1.0)
 
 
 def test_findings_that_do_not_help_are_taken_back():
