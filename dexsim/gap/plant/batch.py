@@ -18,10 +18,11 @@ from dexsim.gap.plant import kernel as pk
 from dexsim.gap.plant.columns import INDEX, NAMES, NEUTRAL, SERIES, SERIES_INDEX
 from dexsim.gap.plant.mechanics import JointConstants, on_lines
 
-# threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch has fewer blocks than there
-# are
-BLOCK = 32
+# threads of a GPU in a block: each block sits on a core of the GPU of its own, and a launch of a fit has fewer blocks
+# than there are; one of a scan has more, and takes a quarter longer in blocks of 32
+BLOCK = 64
 KNOWN = 1 << 24  # bytes of answers that one set of windows keeps
+TOGETHER = 16  # of them that are copied in one call, and forgotten when all are
 FEW = 32  # guesses x windows up to which a CPU's core is faster than one thread of a GPU each
 _GPU = threading.Lock()  # Warp's own state is not for several threads; what waits for a GPU does not hold it
 _LANE = threading.local()
@@ -109,10 +110,14 @@ class Known:
                 rows |= {keys[k]: row for k, row in zip(sorted(new.values()), zip(*made, strict=True), strict=True)}
             q, torque = (np.stack([rows[key][i] for key in keys]) for i in (0, 1))
         most = self._room // max(16 * q.shape[1], 1)
+        last = range(max(len(keys) - most, 0), len(keys))
+        kept = [k for k in last if keys[k] not in rows]
+        copies: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        for some in (kept[a : a + TOGETHER] for a in range(0, len(kept), TOGETHER)):
+            copies |= {keys[k]: row for k, row in zip(some, zip(q[some], torque[some], strict=True), strict=True)}
         with self._lock:
-            for k in range(max(len(keys) - most, 0), len(keys)):
-                if keys[k] not in self._rows:
-                    self._rows[keys[k]] = q[k].copy(), torque[k].copy()
+            for k in last:
+                self._rows.setdefault(keys[k], copies.get(keys[k]) or rows[keys[k]])
                 self._rows.move_to_end(keys[k])
             while len(self._rows) > most:
                 self._rows.popitem(last=False)

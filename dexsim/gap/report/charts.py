@@ -291,7 +291,7 @@ def _view(cloud: np.ndarray, facing: np.ndarray | None) -> np.ndarray:
     """Rows right, up, towards the viewer: along the cloud's thinnest direction; up stays up, else the longest side
     stands."""
     centred = cloud - cloud.mean(0)
-    _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=True)
+    _, _, axes = np.linalg.svd(centred[:: max(1, len(centred) // 4000)], full_matrices=False)
     front = axes[2]
     if facing is not None and abs(front @ facing) > 0.2:
         front = front * np.sign(front @ facing)

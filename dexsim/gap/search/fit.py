@@ -14,6 +14,7 @@ from dexsim.gap.rules import BELIEF
 STEP_OF_VALUE = 4.0  # x the relative step of a finite difference
 STEP_OF_BELIEF = 0.03  # of its range: small ones show only how rough the loss is, of sticks that come and go
 PATTERN = (0.5, 0.7, 0.85, 0.95, 1.05, 1.18, 1.4, 2.0)  # sizes of an effect that are tried outright
+SUMMED = 1 << 18  # residuals that are summed in one call: they stay in a core's cache
 AWAY = 0.02  # of a belief's range: one that was moved farther from what is believed is tried there too
 
 EFFORT_GAIN, EFFORT_OFFSET = INDEX["effort_gain"], INDEX["effort_offset"]
@@ -114,14 +115,22 @@ class Fitter:
         """res [H, m] after the best initial state of each window (with its prior) is taken out."""
         if s is None:
             return res
-        W = self.count
-        sums = lambda v: np.stack([np.bincount(self.window, row, W) for row in np.atleast_2d(v)])  # noqa: E731
-        a11, a22, a12 = (sums(v)[0] for v in (s[0] ** 2, s[1] ** 2, s[0] * s[1]))
+        a11, a22, a12 = self._sums(np.stack([s[0] ** 2, s[1] ** 2, s[0] * s[1]]))
         a11, a22 = a11 + 1.0, a22 + 1.0
         det = a11 * a22 - a12**2
-        b1, b2 = sums(res * s[0]), sums(res * s[1])
+        b1, b2 = self._sums(res * s[0]), self._sums(res * s[1])
         c1, c2 = (a22 * b1 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
         return res - c1[:, self.window] * s[0] - c2[:, self.window] * s[1]
+
+    def _sums(self, x: np.ndarray) -> np.ndarray:
+        """[H, W] sums of x [H, m] by window: many rows in one call, for in each call another thread may take the
+        interpreter."""
+        out, some = np.empty((len(x), self.count)), max(SUMMED // max(x.shape[1], 1), 1)
+        for a in range(0, len(x), some):
+            rows = x[a : a + some]
+            at = self.window + self.count * np.arange(len(rows))[:, None]
+            out[a : a + some] = np.bincount(at.ravel(), rows.ravel(), rows.shape[0] * self.count).reshape(len(rows), -1)
+        return out
 
     def loss(self, res: np.ndarray) -> np.ndarray:
         """[H] mean of Huber's square."""

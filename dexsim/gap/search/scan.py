@@ -177,7 +177,7 @@ class JointScan(JointLosses):
     ) -> tuple[list[np.ndarray], list[tuple[Member, np.ndarray]]]:
         """The plant's rows of every effect that `current` has not, at each of its starts, the others as in base [R, C];
         and (effect, start) of each."""
-        case = self.case
+        case, believed = self.case, self.case.plant.base()
         taken = {m.id for m in current.members}
         guesses: list[np.ndarray] = []
         owners: list[tuple[Member, np.ndarray]] = []
@@ -195,7 +195,7 @@ class JointScan(JointLosses):
                         g[:, INDEX[name]] = value
                     for p, value in zip(variant.params, begun, strict=True):
                         value = float(np.clip(value, p.low, p.high))
-                        p.apply(g[None], np.array([value]), case.plant.base())
+                        p.apply(g[None], np.array([value]), believed)
                     guesses.append(legal(g))
                     owners.append((member, np.array(begun)))
         return guesses, owners
@@ -235,8 +235,10 @@ class JointScan(JointLosses):
         for a in range(0, len(guesses), size):
             with self._fix(()):
                 q = self._simulate(fitter, np.stack(guesses[a : a + size]), s)
-            for i, res in enumerate(q):
-                d = project((r0 - res) * sw)
+            changes = r0 - q
+            changes *= sw
+            for i, raw_d in enumerate(changes):
+                d = project(raw_d)
                 dd = float(d @ d)
                 if not np.isfinite(dd) or dd < 1e-6 * total * 1e-3 + 1e-12:
                     continue
@@ -247,7 +249,6 @@ class JointScan(JointLosses):
                 null = np.maximum(null, np.maximum(flips @ part, 0.0) ** 2 / dd / total)
                 member, start = owners[a + i]
                 rows.append((gain, member, start))
-                raw_d = (r0 - res) * sw
                 dots.append(float(raw_d @ rw))
                 squares.append(float(raw_d @ raw_d))
                 cross.append(all_J.T @ raw_d)
