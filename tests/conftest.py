@@ -21,10 +21,16 @@ def pytest_configure(config) -> None:
             signal.signal(number, signal.SIG_DFL)
 
 
+def pytest_collection(session) -> None:
+    """Until all is loaded there is no garbage to look for among it."""
+    gc.disable()
+
+
 def pytest_collection_finish(session) -> None:
     """What is loaded by now (torch, Warp, MuJoCo, some million objects) stays until the end: looking through it for
     garbage again and again took a tenth of all tests' processor time. A deployment's loop thaws what it froze, and
     would thaw this too."""
+    gc.enable()
     gc.collect()
     gc.freeze()
     gc.unfreeze = lambda: None

@@ -257,7 +257,7 @@ def test_an_imu_that_is_not_read_relaxes_the_hand(made, fault, at, monkeypatch):
     monkeypatch.setattr(deploy_loop.gc, "collect", lambda: 0)  # of torch's whole heap, before each run
     hand = FakeHand(VirtualClock(100.0), start=0.05)
     imu = Imu(hand, IMU[fault], at)
-    loop = Loop(bundle.load(made[0]), hand, imu, Calibration.default(), LoopSettings(seconds=1.0, home_speed=3.0,
+    loop = Loop(bundle.load(made[0]), hand, imu, Calibration.default(), LoopSettings(seconds=0.6, home_speed=3.0,
                 wait=0.1, grip=0.1), hand.clock)  # fmt: skip
     report = loop.run()
     if made[2] == "proprioception":

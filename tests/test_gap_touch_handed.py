@@ -34,7 +34,7 @@ def handed(findings, facts):
 
 
 def diagnosed(folder, allowed=None, **planted):
-    paths, model, servo = press_rig.record(folder / "rig", 3, 7.0, seed=5, **planted)
+    paths, model, servo = press_rig.record(folder / "rig", 3, 5.0, seed=5, **planted)
     settings = Settings(paths, folder / "out", [], str(model), str(servo), next_recording=False, allowed=allowed)
     d = diagnose(settings, say=lambda _: None)
     save(d, folder / "out")

@@ -30,9 +30,9 @@ def claw(tmp_path_factory) -> Hand:
     return load_hand(place / "hand")
 
 
-def pressed(folder: Path, hand: Hand, finger: str, **planted):
+def pressed(folder: Path, hand: Hand, finger: str, seconds: float, **planted):
     """(mechanism, recordings) of a press rig of that hand's finger."""
-    paths, model, servo = press_rig.record(folder, 3, 5.0, seed=4, finger=finger, hand=hand, **planted)
+    paths, model, servo = press_rig.record(folder, 3, seconds, seed=4, finger=finger, hand=hand, **planted)
     m = mechanism(model, servo, hand=hand)
     return m, [read(p, joints=m.joints, audit=False) for p in paths]
 
@@ -41,7 +41,7 @@ def pressed(folder: Path, hand: Hand, finger: str, **planted):
 def test_the_plant_reads_what_a_hands_taxels_read(claw, tmp_path, mirror):
     """Imported, and a left xHand: the diagnosis's own contact gives the readings of the kernels that train."""
     hand, finger = (load_hand("xhand", mirror=True), "mid") if mirror else (claw, "middle")
-    m, recordings = pressed(tmp_path, hand, finger)
+    m, recordings = pressed(tmp_path, hand, finger, 3.0)
     data = touch_read.collect(recordings, m, m.sensors)
     assert len(data.runs) == 3 and {r.name for r in data.runs} == {finger} and not data.blind and not data.notes
     for run in data.runs:
@@ -53,7 +53,7 @@ def test_the_plant_reads_what_a_hands_taxels_read(claw, tmp_path, mirror):
 
 def test_a_weak_taxel_is_named_on_the_hands_own_pad(claw, tmp_path):
     k = Sensors(claw).middle(2)
-    m, recordings = pressed(tmp_path, claw, "middle", gains={k: 0.4})
+    m, recordings = pressed(tmp_path, claw, "middle", 5.0, gains={k: 0.4})
     result = diagnosis.diagnose(recordings, m, set(), allowed={"tactile_gain"})
     (f,) = result.findings
     assert f["effect"] == "tactile_gain" and f["where"]["taxels"] == [f"2:{k}"], f["where"]

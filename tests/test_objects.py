@@ -254,7 +254,7 @@ def test_grid_inside_a_convex_shape_is_the_largest_plane_distance(name):
 @pytest.mark.parametrize("name", GRID_SHAPES)
 def test_grid_against_exact_distance_near_the_surface(name):
     shape = library()[name]
-    p = near_surface(shape, 500, 2e-3)
+    p = near_surface(shape, 250, 2e-3)
     exact, sampled = signed_distance(shape.hulls, p), shape.grid.sample(p)
     error = np.abs(sampled - exact)
     # Kinks at edges cost up to a third of a cell there; over faces the distance is linear and the grid exact.

@@ -15,7 +15,7 @@ def test_what_refitted_figures_take_over_is_no_size_and_sizes_grow_to_what_is_wa
     runs = planted._not_the_hardest_last(b, planted._runs(b, rng, "damped"))
     noise = 5e-4
     kind = planted.PLANTS["coulomb_friction"]
-    sizes = np.geomspace(*kind.span, 8)
+    sizes = np.geomspace(*kind.span, 5)
     # inside the beliefs
     hidden = planted._joined(
         b["off"], {"*kp": 0.999 * 1.05 / b["off"]["*kp"], "*gravity_scale": 1.04 / b["off"]["*gravity_scale"]}

@@ -20,7 +20,7 @@ def found(recording, kind):
     return [f for f in audit(recording) if f.kind == kind]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_silent_on_a_clean_recording(seed, tmp_path):
     made = recordings.signal(8.0, seed=seed, tactile=True, joints=recordings.HAND if seed % 2 else ("a", "b"))
     if seed % 2:  # inside the hand's narrowest limits

@@ -158,7 +158,7 @@ def test_the_state_is_read(env):
 
 def test_nothing_is_felt_where_an_episode_begins(env):
     env.reset_all()
-    for _ in range(60):
+    for _ in range(35):
         env.step(torch.full((N, 12), 0.5))
     names = ("force", "force_clean", "force_other", "centre", "centre_clean")
     before = {name: getattr(env.touch, name).clone() for name in names}

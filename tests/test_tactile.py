@@ -599,6 +599,8 @@ def test_shipped_settings_are_valid_for_the_hand(name):
 
 def test_variants_of_a_shape_share_their_samples():
     rock = library()["rock"]
+    both = ShapeSet([rock]), ShapeSet([rock])
+    assert both[0].wp.data.ptr == both[1].wp.data.ptr  # whoever asks has the same
     assert ShapeSet([rock, rock, library()["box"], rock]).cells == np.prod(np.array(rock.grid.data.shape) - 1)
 
 

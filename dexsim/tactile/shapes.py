@@ -37,19 +37,12 @@ class ShapeSet:
         self.kinds = np.array([_kind(s) for s in shapes], dtype=np.int32)
         self.grids: list[Grid | None] = []
         dims, origin, spacing, offset, radius, middle, half = [], [], [], [], [], [], []
-        data: list[np.ndarray] = []
-        at = 0
-        seen: dict[int, tuple[int, Grid, tuple]] = {}  # variants of one shape share its cells
+        seen, self.cells, data = _laid_out([s for s in shapes if s.kind == "grid"], device)
         for s in shapes:
             grid = None
             d, o, h = (2, 2, 2), np.zeros(3), 1.0
             bound = (0.0, np.zeros(3), np.zeros(3))
             if s.kind == "grid":
-                if id(s.grid) not in seen:
-                    grid = _checked(s)
-                    seen[id(s.grid)] = (at, grid, _surface_bound(grid))
-                    data.append(_cells(grid.data))
-                    at += len(data[-1]) // 2
                 start, grid, bound = seen[id(s.grid)]
                 d, o, h = grid.data.shape, grid.origin, grid.spacing
             self.grids.append(grid)
@@ -60,9 +53,6 @@ class ShapeSet:
             middle.append(bound[1])
             half.append(bound[2])
             offset.append(start if grid is not None else 0)
-        if at >= 2**30:
-            raise UserError(f"distance grids hold {at} cells, at most {2**30 - 1} fit: use fewer or coarser ones")
-        self.cells = at
         self.device = device
         out = Shapes()
         with wp.ScopedDevice(device):
@@ -74,7 +64,7 @@ class ShapeSet:
             out.radius = wp.array(np.array(radius, dtype=np.float32), dtype=float)
             out.middle = wp.array(np.array(middle, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3)
             out.half = wp.array(np.array(half, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3)
-            out.data = wp.array(np.concatenate(data) if data else np.zeros((2, 4), np.float32), dtype=wp.vec4)
+            out.data = data
         self.wp = out
 
     def index(self, name: str) -> int:
@@ -82,6 +72,39 @@ class ShapeSet:
         if name not in self.names:
             raise UserError(f"no touch shape '{name}'; there are: {', '.join(self.names)}")
         return self.names.index(name)
+
+
+_LaidOut = tuple[dict[int, tuple[int, Grid, tuple]], int, wp.array]
+_kept: dict[tuple, tuple[list[Grid | None], _LaidOut]] = {}
+"""What was last laid out, with its grids, and for whom: tens of megabytes, which every environment of a process asks
+for again of the same objects and fingertips."""
+KEPT = 2
+
+
+def _laid_out(shapes: list[Felt], device: str) -> _LaidOut:
+    """By the identity of each grid (variants of one shape share it) where its cells begin, the grid and what bounds its
+    surface; the number of cells; all of them on the device, not to be written to."""
+    key = (device, *(id(s.grid) for s in shapes))
+    if key in _kept:
+        return _kept[key][1]
+    seen: dict[int, tuple[int, Grid, tuple]] = {}
+    data: list[np.ndarray] = []
+    at = 0
+    for s in shapes:
+        if id(s.grid) not in seen:
+            grid = _checked(s)
+            seen[id(s.grid)] = (at, grid, _surface_bound(grid))
+            data.append(_cells(grid.data))
+            at += len(data[-1]) // 2
+    if at >= 2**30:
+        raise UserError(f"distance grids hold {at} cells, at most {2**30 - 1} fit: use fewer or coarser ones")
+    flat = np.concatenate(data) if data else np.zeros((2, 4), np.float32)
+    found: _LaidOut = (seen, at, wp.array(flat, dtype=wp.vec4, device=device))
+    if data and not any(s.grid.data.flags.writeable for s in shapes if s.grid is not None):  # others may change
+        while len(_kept) >= KEPT:
+            del _kept[next(iter(_kept))]
+        _kept[key] = [s.grid for s in shapes], found
+    return found
 
 
 def bake_convex(points: np.ndarray, spacing: float = 0.5e-3, margin: float = 2e-3) -> Grid:

@@ -303,7 +303,9 @@ class Tactile:
 
 @lru_cache(maxsize=8)
 def _baked(corners: bytes) -> Grid:
-    return bake_convex(np.frombuffer(corners).reshape(-1, 3))
+    grid = bake_convex(np.frombuffer(corners).reshape(-1, 3))
+    grid.data.flags.writeable = False  # whoever asks has this one
+    return grid
 
 
 def _tip_shapes(layout: TaxelLayout, tips: Sequence[np.ndarray]) -> list[TouchShape]:
