@@ -579,10 +579,7 @@ def _one(job: tuple) -> dict:
 
     quiet_warp("cpu")
     from dexsim.gap.diagnosis import Settings, diagnose, save
-    from dexsim.gap.plant import batch as plant
 
-    if s["workers"] > 1:
-        plant.THREADS = 1
     folder = root / "cases" / str(number)
     truth = make(entry, number, s["seed"], folder)
     start, cpu = time.perf_counter(), time.process_time()

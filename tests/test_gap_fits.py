@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dexsim.gap.effects.catalogue import CATALOGUE
 from dexsim.gap.judge.joint import stretched, traded
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.search import JointSearch, Member, Trial
 from tests.test_gap import model, plant_run
+
+BRAKES = ("torque_limit", "viscous_friction", "braking_limit")
 
 
 @pytest.mark.parametrize("changes", [{"lag": 0.005}, {"torque_limit": 0.25, "no_load_speed": 7.0, "limit_speed": 0.0}])
@@ -47,6 +50,28 @@ def test_no_effect_is_begun_again_from_where_an_effect_ended():
     assert s._begun_again(again, [there]) is again  # what follows as well is left alone
     worse = replace(there, fit=replace(there.fit, loss=2 * short.fit.loss))
     assert s._begun_again(short, [worse]) is short
+
+
+def test_what_left_a_trace_beside_one_effect_begins_there_beside_a_further_one():
+    """How a drive brakes shows only beside a limit: a second effect is fitted from what the first has told of it."""
+    run = plant_run("a", 0, 3.0, {}, 1)
+    s = JointSearch(build(model(), [run])[0], [0], None, [0])
+    s.short_slopes = {}
+    brake = next(p for p in s.all_nuisances if p.key == "braking_slope")
+    s.nuisances = [p for p in s.all_nuisances if p.key in ("kp", "inertia")]
+    of = {effect.id: Member(effect, effect.variants(s.case.scales)[0]) for effect in CATALOGUE if effect.id in BRAKES}
+    params = s._params((of["torque_limit"],)) + [brake]
+    x = np.array([p.start for p in params], float)
+    x[-1] = -0.7
+    like = Trial((of["torque_limit"],), s.fitter.fit(params, x0=x, iterations=0))
+    two = (of["torque_limit"], of["viscous_friction"])
+    starts = np.concatenate([like.fit.x[:1], of["viscous_friction"].variant.starts[0]])
+    _, x0, draft = s.draft(two, starts, like)
+    keys = [p.key for p in draft.params]
+    assert keys.count("braking_slope") == 1 and x0[keys.index("braking_slope")] == pytest.approx(-0.7)
+    _, _, alone = s.draft((of["braking_limit"],), np.array(of["braking_limit"].variant.starts[0]), like)
+    columns = [c for p in alone.params for c in p.columns]
+    assert len(set(columns)) == len(columns)  # what an effect writes is not fitted twice
 
 
 def test_an_interval_holds_what_a_size_trades_with_a_belief():

@@ -436,6 +436,10 @@ class JointHypotheses:
     ) -> tuple[tuple[Member, ...], np.ndarray, Fitted]:
         """(members, where it began, fit on short windows) of a hypothesis, from `starts` of the members' parameters."""
         params = self._params(members)
+        if like is not None:  # what left a trace in that alone starts from there too, not from what was believed
+            taken = {c for p in params for c in p.columns}
+            more = [p for p in like.fit.params if p in self.all_nuisances and not taken & set(p.columns)]
+            params = params + more
         x0 = np.array([p.start for p in params], float)
         if like is not None:
             known = {p.key: v for p, v in zip(like.fit.params, like.fit.x, strict=True)}
