@@ -27,12 +27,13 @@ class Judged(JointAnswer):
             SimpleNamespace(members=(self.member,), fit=None),
             SimpleNamespace(fit=SimpleNamespace(params=[], x=[])),
         )
-        self.case = SimpleNamespace(joint="j")
+        self.case = SimpleNamespace(joint="j", sigma=1.0)
         self.kept = SimpleNamespace(runs=[], train=[], test=[])
         self.outcome = SimpleNamespace(rivals={})
         self.search = self.whole = self.windows = self.bounds = self.widest = None
         self.measured, self.t = np.zeros(ROWS), 0.01 * np.arange(ROWS)
         self.without, self.after = np.full(ROWS, before), np.full(ROWS, after**2)
+        self.before = self.without**2
         self.effort_after, self.raw, self.spans, self.evidence = None, {}, {}, []
 
     def _fitted(self, mm, bounds):
@@ -63,6 +64,27 @@ def test_an_effect_must_remove_a_part_of_what_was_kept_out(share, hint):
     assert (len(reasons) > 0) is hint and all(f"less than {100 * JUDGE.part:.0f} %" in r for r in reasons)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.6])
+def test_half_a_second_that_nothing_follows_does_not_outweigh_the_rest(share):
+    """A moment of what was kept out is missed by a hundred times the noise with the effect and without it; elsewhere it
+    removes a share of the squared error. It is a hint for the moment, as it is for removing little."""
+    answer = Judged(1.0, np.sqrt(1 - share))
+    answer.without[:50], answer.after[:50] = 100.0, 100.0**2
+    answer.before = answer.without**2
+    assert answer.told == pytest.approx((1.0, np.sqrt(1 - share)))
+    f = judged(answer)
+    assert f["confidence"] == JUDGE.hinted and f["held_out"]["after"] > 30
+    reasons = answer.evidence[0].reasons
+    assert reasons[-1] == joint.MUTE and len(reasons) == 1 + (share <= JUDGE.part)
+
+
+def test_what_removes_much_of_all_that_was_kept_out_needs_no_moments_left_out():
+    answer = Judged(100.0, 1.0)
+    answer.without[:50], answer.after[:50] = 1e3, 1e6  # alike there, and hardly more than all the rest
+    answer.without[50:] = 3e3
+    assert judged(answer)["confidence"] == 0.95 and answer.evidence[0].reasons == []
+
+
 def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=False) -> confidence.Evidence:
     """The evidence of a name against which nothing else speaks. fitted, reported: which of the two intervals, the fit's
     and the reported one, holds the size at which nothing is missing; blurred: why the encoder does not resolve it."""
@@ -80,7 +102,7 @@ def weighed(monkeypatch, fitted=False, reported=False, blurred="", borne_out=Fal
     monkeypatch.setattr(confidence, "unresolved", lambda *_: blurred)
     monkeypatch.setattr(joint, "at_bound", lambda *_: "")
     monkeypatch.setattr(confidence, "beyond", lambda *_: "")
-    return JointAnswer._weighed(answer, answer.member, {}, fitted, 1.0, 0.1, False, borne_out)
+    return JointAnswer._weighed(answer, answer.member, {}, fitted, 1.0, 0.1, False, borne_out, 1.0)
 
 
 @pytest.mark.parametrize(

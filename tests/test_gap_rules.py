@@ -395,7 +395,7 @@ class Refuted:
 def test_findings_that_do_not_help_are_taken_back():
     for ratio, kept in ((0.975, True), (0.985, False)):
         d = SimpleNamespace(
-            joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0}},
+            joints={"j": {"before": 1.0, "after": ratio, "mae_before": 1.0, "told_before": 1.0, "told_after": ratio}},
             evidence=[],
             notes=[],
             data={"nuisance": {}},
@@ -403,6 +403,18 @@ def test_findings_that_do_not_help_are_taken_back():
         refuted = Refuted()
         refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
         assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
+
+
+def test_what_most_of_what_was_kept_out_bears_out_is_a_hint():
+    for ratio, kept in ((0.975, True), (0.985, False)):
+        e = doubtful(effect="deadband")
+        joints = {"j": {"before": 1.0, "after": 1.0, "mae_before": 1.0, "told_before": 0.1, "told_after": 0.1 * ratio}}
+        d = SimpleNamespace(joints=joints, evidence=[e], notes=[], data={"nuisance": {}})
+        refuted = Refuted()
+        refuted.none = SimpleNamespace(fit=SimpleNamespace(params=[], x=[]))
+        e.joint = "j"
+        assert (conclude._take_back(d, [refuted], [named()]) == set()) is kept, ratio
+        assert (joint.MUTE in e.reasons and e.confidence <= rules.JUDGE.hinted) is kept
 
 
 def test_what_was_kept_out_may_side_with_neither():
@@ -483,6 +495,23 @@ def test_what_was_kept_out_surely_shows_is_doubted_only():
             patch.setattr(kept_out, "gain_interval", lambda *_, surely=surely: (surely, 0.9))
             sure = judged(answer)["confidence"]
         assert (sure < rules.JUDGE.firm) is hint and sure <= rules.JUDGE.doubted, surely
+
+
+def test_moments_that_nothing_follows_do_not_speak():
+    """Of 20 half seconds some are missed far beyond the noise without an effect, and nearly so with it."""
+
+    def silent(count: int, missed: float, differs: float) -> bool:
+        squares, t = np.ones(200), 0.05 * np.arange(200)
+        squares[: 10 * count] = missed**2
+        with_it = squares.copy()
+        with_it[: 10 * count] *= 1 - differs
+        on = kept_out.telling(squares, with_it, t, 1.0)
+        assert on.all() or not on[: 10 * count].any() and on[10 * count :].all()
+        return not on.all()
+
+    assert silent(1, 5.4, 0.09) and not silent(1, 5.4, 0.11)  # it differs
+    assert silent(1, 5.1, 0.01) and not silent(1, 4.9, 0.01)  # it is followed
+    assert silent(4, 9.0, 0.0) and not silent(5, 9.0, 0.0)  # not a few moments
 
 
 def test_intervals_grow_with_what_is_left():

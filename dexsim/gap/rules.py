@@ -300,6 +300,19 @@ class JudgeRules:
         "by judgement: twice SEARCH.least",
         "test_what_was_kept_out_may_side_with_neither",
     )
+    mute: float = _rule(
+        0.1,
+        "share of the squared error of a half second by which it differs with an effect that it can speak of; less, "
+        "where neither follows, says nothing",
+        "by judgement: half of `part`",
+        "test_moments_that_nothing_follows_do_not_speak",
+    )
+    mutes: float = _rule(
+        0.2,
+        "share of what was kept out that may say nothing of an effect: more of it is not a few moments",
+        "by judgement",
+        "test_moments_that_nothing_follows_do_not_speak",
+    )
     alone: float = _rule(
         2.0,
         "x the error where it was fitted: beyond it what was kept out shows something that the rest does not",

@@ -15,7 +15,7 @@ from dexsim.gap.effects.catalogue import EFFECTS, TOUCH_EFFECTS, entry
 from dexsim.gap.inquiry import Diagnosis, Settings, TouchResult
 from dexsim.gap.judge import confidence, kept_out
 from dexsim.gap.judge.handed_on import earned, model_changes, servo_changes, widen
-from dexsim.gap.judge.joint import JointAnswer, Kept, nuisances, rms
+from dexsim.gap.judge.joint import MUTE, JointAnswer, Kept, nuisances, rms
 from dexsim.gap.read.inputs import SIGN
 from dexsim.gap.report.sentence import sentence
 from dexsim.gap.rules import JUDGE, SEARCH, TORQUE
@@ -142,11 +142,14 @@ def _take_back(d: Diagnosis, answers: Sequence[JointAnswer], findings: list[dict
         if not mine or v["after"] < JUDGE.helps * v["before"]:
             continue
         reason = _not_refuted(a.search, a.outcome, v["after"] / v["before"], a.kept.test, a.kept.span_test)
-        if reason:
+        elsewhere = v["told_after"] < JUDGE.helps * v["told_before"]  # but for moments that nothing follows
+        if reason or elsewhere:
             for e in d.evidence:
                 if e.joint == joint and not EFFECTS[e.effect].effort_only:
-                    e.reasons.append(reason)
-                    e.confidence = min(e.confidence, JUDGE.doubted)
+                    if reason:
+                        e.doubt(reason)
+                    elif MUTE not in e.reasons:
+                        e.hint(MUTE)
             continue
         refuted.add(joint)
         d.notes += [

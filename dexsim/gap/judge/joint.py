@@ -25,6 +25,8 @@ from dexsim.gap.search.search import JointSearch, Member, Outcome, Trial, subset
 from dexsim.intervals import draws
 from dexsim.recording.mechanism import Mechanism
 
+MUTE = "moments of what was kept out are followed neither with it nor without; the others alone speak for it"
+
 
 @dataclass
 class Kept:
@@ -94,10 +96,18 @@ class JointAnswer:
             "sigma": self.case.sigma,
             "fitted": self._followed(),
             "left": 0.0,
+            "told_before": self.told[0],
+            "told_after": self.told[1],
         }
         if self.effort_before is not None and self.effort_after is not None:
             out |= {"effort_before": rms(self.effort_before), "effort_after": rms(self.effort_after)}
         return out
+
+    @property
+    def told(self) -> tuple[float, float]:
+        """Errors before and after (rms) where what was kept out can speak of what was found (`kept_out.telling`)."""
+        on = kept_out.telling(self.before, self.after, self.t, self.case.sigma)
+        return rms(self.before[on]), rms(self.after[on])
 
     def mae(self) -> dict[str, tuple[float, float]]:
         """Mean |error| before and after by recording; one that was cut is several runs."""
@@ -122,26 +132,21 @@ class JointAnswer:
         q, effort = kept_out.free_run(
             self.whole, trial.fit.params, trial.fit.x, self.windows, [f for x in rest for f in x.variant.fixed], True
         )
-        error_without = rms((self.measured - q) ** 2)
+        lost = (self.measured - q) ** 2
         effort_only = mm.effect.effort_only
         of_effort = self.effort_after if effort_only else None
-        was, left = (
-            (rms((self.torque - effort)[self.sensed] ** 2), rms(of_effort))
-            if of_effort is not None
-            else (error_without, rms(self.after))
-        )
-        gain = kept_out.gain_interval((self.measured - q) ** 2, self.after, self.t)
-        borne_out = gain[0] >= JUDGE.borne_out
-        evidence = self._weighed(mm, raw, self._fitted(mm, self.widest)[1], was, left, effort_only, borne_out)
-        if left**2 > (1 - JUDGE.part) * was**2:
-            evidence.hint(
-                f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
-                f"kept out, less than {100 * JUDGE.part:.0f} %"
-            )
-        elif not effort_only and gain[0] < -JUDGE.slack:
-            evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
-        if not effort_only and (harmed := self._harmed(trial)):
-            (evidence.doubt if borne_out else evidence.hint)(harmed)
+        if of_effort is not None:
+            was, left = rms((self.torque - effort)[self.sensed] ** 2), rms(of_effort)
+        else:
+            was, left = rms(lost), rms(self.after)
+        gain = kept_out.gain_interval(lost, self.after, self.t)
+        evidence = self._judged(mm, trial, raw, was, left, gain[0])
+        on = kept_out.telling(lost, self.after, self.t, self.case.sigma)
+        if not effort_only and not on.all():  # what the other moments say of it, as a hint
+            part = kept_out.gain_interval(lost[on], self.after[on], self.t[on])[0]
+            other = self._judged(mm, trial, raw, rms(lost[on]), rms(self.after[on]), part, self.told[0])
+            other.hint(MUTE)
+            evidence = max(other, evidence, key=lambda e: e.confidence)
         self.evidence.append(evidence)
         rivals = self.outcome.rivals.get(mm.id, [])
         same = [r for r in rivals if confusable(r[0], mm.id) and r[1] >= JUDGE.set_share][:2]
@@ -163,7 +168,7 @@ class JointAnswer:
             "held_out": {"before": rms((self.torque - effort)[self.sensed] ** 2), "after": rms(of_effort)}
             if of_effort is not None
             else {
-                "before": error_without,
+                "before": rms(lost),
                 "after": rms(self.after),
                 "removed_low": round(gain[0], 4),
                 "removed_high": round(gain[1], 4),
@@ -173,6 +178,34 @@ class JointAnswer:
         if late is not None:
             finding["parameters"]["jitter"] = late.entry()
         return finding
+
+    def _judged(
+        self,
+        mm: Member,
+        without_it: Trial,
+        raw: dict[str, float],
+        was: float,
+        left: float,
+        surely: float,
+        before: float | None = None,
+    ) -> confidence.Evidence:
+        """The evidence of one effect: was, left: rms error of what was kept out without and with it; surely: share of
+        the squared error that it removes in all but a twentieth of its draws; before: error before anything was named,
+        where that is not of all that was kept out."""
+        effort_only, borne_out = mm.effect.effort_only, surely >= JUDGE.borne_out
+        before = rms(self.before) if before is None else before
+        spread = self._fitted(mm, self.widest)[1]
+        evidence = self._weighed(mm, raw, spread, was, left, effort_only, borne_out, before)
+        if left**2 > (1 - JUDGE.part) * was**2:
+            evidence.hint(
+                f"it removes {100 * max(1 - (left / max(was, 1e-12)) ** 2, 0):.0f} % of the squared error on what was "
+                f"kept out, less than {100 * JUDGE.part:.0f} %"
+            )
+        elif not effort_only and surely < -JUDGE.slack:
+            evidence.hint("the error on what was kept out is not lower with it than without, as far as its blocks tell")
+        if not effort_only and (harmed := self._harmed(without_it)):
+            (evidence.doubt if borne_out else evidence.hint)(harmed)
+        return evidence
 
     def _harmed(self, without_it: Trial) -> str:
         """Why an effect is a hint only: what it gains in some recordings it loses in others, as what differs from run
@@ -210,13 +243,15 @@ class JointAnswer:
         after: float,
         effort_only: bool,
         borne_out: bool,
+        before: float,
     ) -> confidence.Evidence:
         """How sure the name is, and every reason to doubt it. error_without, after: rms error on what was kept out
         without and with it: of the motion, or of the effort where the motion is unaffected (what is left of the motion
-        then tells nothing of it). borne_out: whether what was kept out surely shows it."""
+        then tells nothing of it). borne_out: whether what was kept out surely shows it; before: error of the motion
+        before anything was named."""
         case, outcome = self.case, self.outcome
         # the one effect of the reading: nothing else explains the effort
-        before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (rms(self.before), case.sigma)
+        before, noise = (error_without, self.search.r.sigma_torque) if effort_only else (before, case.sigma)
         earned = (
             1.0
             if effort_only
