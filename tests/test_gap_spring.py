@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
 from dexsim.actuator.table import ServoTable
-from dexsim.gap.effects.catalogue import EFFECTS
+from dexsim.gap.compute import Deadline
+from dexsim.gap.effects.catalogue import EFFECTS, nested
 from dexsim.gap.effects.effect import FittedEffect
 from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read.runs import Run, conditions
-from dexsim.gap.search.search import JointSearch
+from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.search import JointSearch, JointSelection, Member, Trial
 
 MODEL = """<mujoco><compiler angle="{angle}"/><option gravity="0 0 0" timestep="0.0005"/><worldbody>
 <body><joint name="a" axis="0 1 0" damping="2e-4" {spring}/><geom type="sphere" size="1e-3" mass="0.2" pos="0 0 -0.1"/>
 </body></worldbody></mujoco>"""
+OFF = ServoTable.from_dict({"joints": {"*": {"kp": 0.0, "kd": 0.0, "torque_limit": 1.0}}})
 STIFFNESS, PRELOAD = 0.3, -0.06  # N.m/rad, N.m
 MOST = 0.02  # of the swing
 TIMES = np.arange(0.0, 1.5, 0.01)
@@ -30,9 +35,8 @@ def model_text(spring: str = "", angle: str = "degree") -> str:
 
 def case_of(text: str):
     """The joint's case along a motion of its own; its drive is off."""
-    servo = ServoTable.from_dict({"joints": {"*": {"kp": 0.0, "kd": 0.0, "torque_limit": 1.0}}})
     q = 0.5 + 0.3 * np.sin(9 * TIMES)
-    run = Run("x", ("a",), TIMES, np.zeros((len(TIMES), 1)), TIMES, q[:, None], servo, np.zeros(3))
+    run = Run("x", ("a",), TIMES, np.zeros((len(TIMES), 1)), TIMES, q[:, None], OFF, np.zeros(3))
     return build(mujoco.MjModel.from_xml_string(text), [run])[0]
 
 
@@ -70,6 +74,19 @@ def test_without_stiffness_and_preload_there_is_no_spring():
     plain = moved(case)
     assert np.array_equal(plain, moved(case, spring=0.0, spring_preload=0.0))
     assert np.abs(plain - moved(case, spring_preload=0.01)).max() > 1e-3
+
+
+def test_with_a_play_the_spring_pulls_the_motor():
+    """Behind the play it would keep it closed and no play would show: the joint stays until the motor, pulled from the
+    middle of the play, has crossed half of it."""
+    run = Run("x", ("a",), TIMES, np.zeros((len(TIMES), 1)), TIMES, np.full((len(TIMES), 1), 0.5), OFF, np.zeros(3))
+    case = build(mujoco.MjModel.from_xml_string(model_text()), [run])[0]
+    gap, pull, rotor = 0.2, 0.05, 1e-3  # rad, N.m, kg.m2
+    q = moved(case, backlash=gap, rotor=rotor, spring_preload=pull)
+    met = np.sqrt(gap * rotor / pull)  # s: gap / 2 = (pull / rotor) t^2 / 2
+    assert np.abs(q[met - 0.01 > TIMES] - 0.5).max() < 1e-4
+    assert q[np.searchsorted(TIMES, met + 0.1)] < 0.4
+    assert np.abs(moved(case, spring_preload=pull)[TIMES < met] - 0.5).max() > 0.02  # without a play at once
 
 
 @pytest.mark.parametrize("angle", ["radian", "degree"])
@@ -131,6 +148,85 @@ def test_a_spring_is_named_and_sized_where_no_loop_holds_the_joint():
     assert [m.id for m in best.members][:1] == ["joint_spring"]
     assert best.fit.value("joint_spring.stiffness") == pytest.approx(STIFFNESS, rel=0.1)
     assert best.fit.value("joint_spring.preload") == pytest.approx(PRELOAD, rel=0.2)
+
+
+def grown(better: bool, left: float = 9.0) -> tuple:
+    """(what one effect more beside what pulls alike makes of an answer, which of them was asked): with fits by hand."""
+    search, asked = object.__new__(JointSelection), []
+    trial = lambda ids, loss: SimpleNamespace(ids=ids, members=ids, fit=SimpleNamespace(loss=loss))  # noqa: E731
+    current, fork = trial(("coulomb_friction",), 5.0), trial(("joint_spring",), 6.0)
+    more = trial(("joint_spring", "backlash"), 2.0 if better else 5.5)
+    search.blocks, search.deadline = np.zeros(10), Deadline()
+    search.scan = lambda t: asked.append(t.ids) or []
+    search._shortlist = lambda scan, size, loss, members: ["backlash"]
+    search._drafts = lambda listed, t, pool, price: listed
+    search._finished = lambda drafts, t: [more]
+    search._best = lambda trials, t: trials[0]
+    search._earns = lambda new, old: new.fit.loss < old.fit.loss
+    search._score = lambda t: 10 * t.fit.loss
+    search._left = lambda t: np.full(10, left * t.fit.loss / 6.0)
+    return search._beside_alike([fork], current, 6, {}, {}).ids, asked
+
+
+def test_what_pulls_alike_is_asked_for_beside_another_effect():
+    """A friction that differs by direction and a spring's preload are one torque while a joint moves; which it is may
+    show beside a play only."""
+    assert nested("coulomb_friction", "joint_spring") and not nested("coulomb_friction", "coulomb_friction")
+    assert not nested("coulomb_friction", "payload")
+    assert grown(better=True) == (("joint_spring", "backlash"), [("joint_spring",)])
+    assert grown(better=False)[0] == ("coulomb_friction",)
+    assert grown(better=True, left=0.5 * SEARCH.unsettled) == (("coulomb_friction",), [])  # little is left
+
+
+UNEVEN, LEVEL = 0.9, 0.01  # of friction by direction, N.m
+
+
+def test_a_friction_that_differs_by_direction_is_a_spring_without_stiffness():
+    run = driven(0)
+    case = build(mujoco.MjModel.from_xml_string(model_text()), [run])[0]
+    uneven = moved(case, friction_asymmetry=UNEVEN)
+    assert np.abs(uneven - moved(case, spring_preload=0.5 * UNEVEN * LEVEL)).max() < 1e-9
+    assert np.abs(uneven - moved(case)).max() > 1e-2
+
+
+def as_pull(times: float, *, level_known: bool = False, stiff: bool = False) -> tuple:
+    """(what an answer with uneven friction becomes, where a spring was begun from): with fits by hand, the spring's
+    loss being `times` the other's."""
+    case = build(mujoco.MjModel.from_xml_string(model_text()), [driven(0)])[0]
+    if stiff:
+        case = replace(case, scales=replace(case.scales, stiffness=2.0 * case.scales.tau / case.scales.span))
+    whole = EFFECTS["coulomb_friction"].variants(case.scales)[0]
+    variant = whole if level_known else replace(whole, params=whole.params[1:], starts=((0.8,),))
+    member = Member(EFFECTS["coulomb_friction"], variant)
+    names = [f"{member.id}.{p.key}" for p in variant.params] + ["coulomb_friction"] * (not level_known)
+    x = np.array([LEVEL, UNEVEN] if level_known else [UNEVEN, LEVEL])
+    params = [SimpleNamespace(key=n, nuisance="." not in n) for n in names]
+    current = Trial((member,), SimpleNamespace(params=params, x=x, loss=2.0))
+    search, begun = object.__new__(JointSelection), []
+    search.case, search.allowed, search.deadline, search.fitted = case, None, Deadline(), {}
+
+    def fit(params, x0, iterations):
+        assert [p.key for p in params] == ["joint_spring.stiffness", "joint_spring.preload", "coulomb_friction"]
+        begun.append(x0)
+        return SimpleNamespace(params=params, x=x0, loss=2.0 * times)
+
+    search.fitter, search._fix, search.thorough = SimpleNamespace(fit=fit), lambda members: nullcontext(), lambda t: t
+    search._left = lambda t: np.full(4, t.fit.loss)
+    search._dear, search._shrunk = (lambda t: 1.0), lambda t: False
+    return search._more_general(current).ids, begun
+
+
+def test_a_joint_that_no_loop_holds_has_a_spring_rather_than_uneven_friction():
+    """They are one torque where the spring has no stiffness, so that fit begins from there. A friction that removes
+    what an effect must of what the spring leaves, one whose level was found too, and a joint that a loop holds keep
+    their name."""
+    became, begun = as_pull(1.0)
+    assert became == ("joint_spring",)
+    assert begun[0] == pytest.approx([0.0, 0.5 * UNEVEN * LEVEL, LEVEL]) and all(x[0] > 0 for x in begun[1:])
+    assert as_pull(0.98 / (1 - SEARCH.least))[0] == ("joint_spring",)
+    assert as_pull(1.02 / (1 - SEARCH.least))[0] == ("coulomb_friction",)
+    assert as_pull(1.0, level_known=True) == (("coulomb_friction",), [])
+    assert as_pull(1.0, stiff=True) == (("coulomb_friction",), [])
 
 
 def test_it_is_not_looked_for_where_a_loop_holds_the_joint_stiffer():

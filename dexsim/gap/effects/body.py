@@ -230,8 +230,9 @@ class JointSpring(Effect):
     words = "is pulled towards a position by a spring that the model lacks"
     shows = "with the position, also at rest"
     experiment = "static poses over the whole range, and the drive off at each"
-    classes = ("static load",)
+    classes = ("static load", "friction or pull")
     motions = ("holds",)
+    nests = ("coulomb_friction",)  # as it differs by direction: a preload without stiffness
     from_poses = True
     model_columns = ("spring", "spring_preload")
 
@@ -243,6 +244,14 @@ class JointSpring(Effect):
         preload = param("preload", "spring_preload", "set", -2.0 * s.tau, 2.0 * s.tau, 0.0, "N" if s.slide else "N.m")
         starts = ((0.1, 0.0), (0.3, 0.0), (0.3, 0.2), (0.3, -0.2), (0.8, 0.0), (0.8, 0.4), (0.8, -0.4), (1.6, 0.0))
         return [Variant((stiffness, preload), tuple((k * unit, p * s.tau) for k, p in starts))]
+
+    def begun_from(self, columns: dict[str, float], case: Case) -> list[tuple[float, ...]]:
+        if set(columns) != {"coulomb_friction", "friction_asymmetry"} or not self.variants(case.scales):
+            return []
+        # the level counts for half of it more one way and half less the other
+        pull = 0.5 * columns["friction_asymmetry"] * columns["coulomb_friction"]
+        unit, middle = case.scales.tau / case.scales.span, float(np.median(case.plant.q))
+        return [(k, pull - k * middle) for k in (0.0, 0.1 * unit)]
 
     def unseen(self, s: Scales) -> str:
         return "" if self.variants(s) else (

@@ -99,6 +99,8 @@ CLASSES: dict[str, str] = {
     "loop": "constant speeds from slow to fast, steps of several sizes and long holds against a known load",
     "about a reversal": "reversals of increasing size about a pose, without a load and with one that holds the joint "
                         "to a side",
+    "friction or pull": "static poses over the whole range with the drive off at each: friction holds the joint where "
+    "a pull moves it",
     "weight or push": "static poses over the whole range, twice, with nothing in reach",
 }
 TOUCH_CLASSES = ("how hard it is touched", "how touch changes with time")
@@ -135,6 +137,11 @@ def separating(effects: Sequence[str]) -> str:
 def confusable(a: str, b: str) -> bool:
     """Whether two effects of joints are of one class that some recordings cannot separate."""
     return bool({*EFFECTS[a].classes} & {*EFFECTS[b].classes}) if a in EFFECTS and b in EFFECTS else False
+
+
+def nested(a: str, b: str) -> bool:
+    """Whether one of two effects is the other with a size of nothing: one torque while the joint moves."""
+    return a in EFFECTS[b].nests or b in EFFECTS[a].nests
 
 
 def inseparable(effect: str, case: Case, runs: Sequence[int]) -> list[str]:

@@ -204,6 +204,8 @@ class Effect:
     rings: ClassVar[bool] = False  # may make a loop ring by itself
     from_poses: ClassVar[bool] = False  # told from the pose and the motion of other joints
     slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
+    # effects that are this one with a size of nothing, whatever else is like them
+    nests: ClassVar[tuple[str, ...]] = ()
     simulated: ClassVar[bool] = True  # the plant has a law of it
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it
@@ -245,6 +247,11 @@ class Effect:
 
     def doubts(self, case: Case, runs: Sequence[int]) -> list[str]:
         """Reasons of its own to doubt it, from the recordings that were used."""
+        return []
+
+    def begun_from(self, columns: dict[str, float], case: Case) -> list[tuple[float, ...]]:
+        """Where a fit of its first variant begins to be the same torque as these columns' values are; empty where none
+        is."""
         return []
 
     def excludes(self, mine: Variant, other: Effect, theirs: Variant) -> bool:

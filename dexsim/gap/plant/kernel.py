@@ -760,7 +760,8 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
     if not p.slide:
         dq = x.q - n.q  # the model was evaluated at the measured pose
         load = turned(n.gravity_cos, n.gravity_sin, dq)
-    load += n.load + p.preload + p.spring * (x.q + half * dt * x.v)
+    pulled = p.preload + p.spring * (x.q + half * dt * x.v)
+    load += n.load + pulled
     by_gear = p.gear_load > zero or p.gear_back > zero
     if by_gear and (n.held or x.fresh != zero):
         x.borne = load
@@ -843,7 +844,11 @@ def substep(c: Recorded, h: int, x: State, visc: f64, p: Guess, n: Now, b: Pair)
         stop_d = p.stop * f64(0.02)
     was = x.v
     if p.two:
-        x = two_bodies(c, x, t, applied, load, level, stop_d, dt, p, n, b)
+        on_motor = zero
+        if p.gap2 > zero:  # a spring behind the play would keep it closed: one that leaves it open is before it
+            on_motor = p.preload + p.spring * (x.qm + half * dt * x.vm)
+            load -= pulled
+        x = two_bodies(c, x, t, applied - on_motor, load, level, stop_d, dt, p, n, b)
     else:
         x = one_body(x, t, applied, load, level, stop_d, visc, theta, dt, p, n)
     if by_gear and not n.held:

@@ -12,13 +12,13 @@ import numpy as np
 
 from dexsim import intervals
 from dexsim.gap import compute
-from dexsim.gap.effects.catalogue import CATALOGUE, confusable
+from dexsim.gap.effects.catalogue import CATALOGUE, EFFECTS, confusable, nested
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, Param
 from dexsim.gap.rules import BELIEF, SEARCH
 from dexsim.gap.search import baseline
 from dexsim.gap.search.fit import AWAY, Fitted, Fitter, Residuals, slopes_of
-from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, subset
+from dexsim.gap.search.hypotheses import LONG, MAYBE, Member, Outcome, Trial, fits_beside, named, subset
 from dexsim.gap.search.scan import BOOTSTRAPS, STRETCH, JointScan, Scanned, expand_one
 
 CLOSELY = 2  # hypotheses of a level that are looked for nearby and with their beliefs drawn back to their prior
@@ -43,6 +43,7 @@ class JointSelection(JointScan):
         per = len(self.blocks)
         pool: dict[str, tuple[Member, np.ndarray]] = {}
         level: list[Trial] = []
+        forks: list[Trial] = []
         for _ in range(SEARCH.most):
             loss = self._left(current).sum() / per
             enough = loss < SEARCH.enough**2
@@ -85,18 +86,75 @@ class JointSelection(JointScan):
                 best = current if enough or self.deadline.over() else self._pair(current, listed[:3]) or current
                 if best is current:
                     break
+            rest, last = best.members[:-1], best.ids[-1]
+            forks += [t for t in trials if t.members[:-1] == rest and nested(t.ids[-1], last)]
             current, level = best, trials
             if len(current.members) > 1 and not self.deadline.over():
                 current, level = self._swap(current, pool, level)
-        current = self._from_plain(current)
+        current = self._from_plain(self._beside_alike(forks, current, shortlist, pool, price))
         if not self.deadline.over():
-            current = self._by_laws(self._refine(self._instead(self._drop(current))))
+            current = self._more_general(self._by_laws(self._refine(self._instead(self._drop(current)))))
         self._on(0.1)
         current, final = self._settled(current, pool)
         for m in current.members:
             rivals[m.id], confidence[m.id], gains[m.id] = final[m.id]
             price.setdefault(m.id, 0.0)
         return Outcome(self.case.joint, none, current, rivals, confidence, gains, price, scanned, self.costs)
+
+    def _beside_alike(
+        self,
+        forks: Sequence[Trial],
+        current: Trial,
+        shortlist: int,
+        pool: dict[str, tuple[Member, np.ndarray]],
+        price: dict[str, float],
+    ) -> Trial:
+        """What one effect more makes of hypotheses with what is the same torque while the joint moves in the place of
+        what was added (`nested`): which of them it is may show beside another effect only. `current` where none
+        lasts better, or little is left."""
+        best = current
+        for fork in forks:
+            loss = self._left(fork).sum() / len(self.blocks)
+            if loss < SEARCH.unsettled or self.deadline.over():
+                continue
+            listed = self._shortlist(self.scan(fork), shortlist, loss, fork.members)
+            if not listed:
+                continue
+            more = self._best(self._finished(self._drafts(listed, fork, pool, price), fork), fork)
+            if self._earns(more, fork) and self._score(more) < self._score(best) and more.fit.loss < best.fit.loss:
+                best = more
+        return best
+
+    def _more_general(self, current: Trial) -> Trial:
+        """`current` with what is more general in an effect's place (`Effect.nests`): of friction whose level is
+        unknown anyway only that it differs by direction is found, which is a spring without stiffness, and on a joint
+        that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
+        general one leaves."""
+        for member in current.members:
+            fitted = dict(zip([p.key for p in current.fit.params], current.fit.x, strict=True))
+            columns = {p.columns[0]: float(fitted[f"{member.id}.{p.key}"]) for p in member.variant.params}
+            columns |= {c: float(fitted[c]) for c in EFFECTS[member.id].fitted_anyway if c in fitted}
+            rest = tuple(m for m in current.members if m is not member)
+            for effect in (e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids):
+                starts = effect.begun_from(columns, self.case)
+                if not starts or (self.allowed is not None and effect.id not in self.allowed) or self.deadline.over():
+                    continue
+                wider = Member(effect, effect.variants(self.case.scales)[0])
+                if len(columns) == len(member.variant.params) or any(not fits_beside(wider, m) for m in rest):
+                    continue  # its level was found too
+                members = tuple(wider if m is member else m for m in current.members)
+                params = [p for m in members for p in named(m)] + [p for p in current.fit.params if p.nuisance]
+                fits = []
+                for start in starts:  # from what is known to follow, in steps of slopes of its own
+                    fitted |= {p.key: x for p, x in zip(named(wider), start, strict=True)}
+                    with self._fix(members):
+                        fits.append(self.fitter.fit(params, x0=np.array([fitted[p.key] for p in params]), iterations=8))
+                new = self.thorough(Trial(members, min(fits, key=lambda f: f.loss)))
+                mine, theirs = (self._left(t).sum() * self._dear(t) for t in (current, new))
+                if (1 - SEARCH.least) * theirs < mine and not self._shrunk(new):
+                    self.fitted[frozenset(new.ids)] = new
+                    return new
+        return current
 
     def _drafts(
         self,
@@ -400,9 +458,10 @@ class JointSelection(JointScan):
         for k, m in enumerate(current.members):
             others, share, _ = final[m.id]
             if others:
-                rival = others[0][
-                    0
-                ]  # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
+                rival = others[0][0]
+                if rival in EFFECTS[m.id].nests:  # it had its turn (`_more_general`)
+                    continue
+                # draws that its like wins, which the recording cannot tell from it, are not lost to the rival
                 like = (
                     sum(s for e, s in others[1:] if confusable(e, m.id) and not confusable(e, rival))
                     if not confusable(rival, m.id)
