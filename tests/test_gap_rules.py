@@ -39,6 +39,7 @@ class Made(JointSearch):
 
     def __init__(self):
         self.blocks, self.rng, self.none_loss, self.by_law = np.arange(40), np.random.default_rng(0), np.ones(40), {}
+        self.fold_by = "time"
         self.saved, self.fitter = [], SimpleNamespace(perturbed_restarts=lambda params, fit, rng: "restarted")
 
     def _left(self, trial):
@@ -98,6 +99,25 @@ def test_a_further_effect_must_matter_beside_the_first():
     assert search._earns(new, old)
     search.none_loss = np.full(40, 900.0)
     assert not search._earns(new, old)
+
+
+def test_far_from_the_noise_whole_recordings_decide():
+    search = Made()
+    search.fold_by, search.deadline, search._boot = "conditions", Deadline(), lambda x: np.full(100, -1.0)
+    errors = {"old": np.array([10.0, 10.0, 10.0])}
+    search._free_left = lambda t: errors["old" if t.members else "new"]
+    for left, new, earns in (
+        (120.0, (9.0, 9.0, 9.0), True),
+        (80.0, (9.0, 9.0, 9.0), False),  # windows are to be trusted
+        (120.0, (9.5, 9.5, 9.5), False),  # less than a least share of the squared error
+        (120.0, (4.0, 10.1, 10.1), False),  # in one condition only
+    ):
+        errors["new"], old = np.array(new), trial(2 * left, ("another",))
+        search.none_loss = old.loss
+        assert search._earns(trial(left), old) is earns, (left, new)
+    errors["new"] = np.array([9.0, 9.0, 9.0])
+    assert not search._earns(trial(120.0), trial(240.0))  # of a first effect windows decide
+    assert not search._earns(trial(120.0), trial(125.0, ("another",)))  # no better where it was fitted
 
 
 def test_a_size_at_its_bound_must_do_far_better_than_another():

@@ -41,6 +41,18 @@ def test_refold_fits_each_condition_left_out_better_than_one_step_does():
     assert own.left_out.sum() <= 1.25 * step.left_out.sum()  # what is free to fit noise does, a little
 
 
+def test_conditions_left_out_are_run_free_with_fits_of_their_own():
+    s = searched({"torque_limit": 0.12})
+    assert s.fold_by == "conditions"
+    none = s.start()
+    member, start = next((Member(m.effect, m.variant), x) for _, _, m, x in s.scan(none) if m.id == "torque_limit")
+    trial = s.fit((member,), start, none)
+    before, after = s._free_left(none), s._free_left(trial)
+    assert before.shape == after.shape == (3,) and s._free_left(trial) is after
+    # what limits the torque is the same in each condition, whichever is left out
+    assert after.mean() < 0.5 * before.mean() and after.mean() < 3.0
+
+
 def test_the_scan_lets_beliefs_go_back_where_an_effect_takes_over():
     """What a guess saves is the bounded least squares of residuals and beliefs with it and without it."""
     rng = np.random.default_rng(3)

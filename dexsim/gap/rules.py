@@ -93,6 +93,12 @@ class SearchRules:
         "by judgement: a third of what it must remove in the end",
         "test_what_saves_much_in_hindsight_is_tried_whatever_its_price",
     )
+    astray: float = _rule(
+        10.0,
+        "x the noise: where a further effect leaves more, whole recordings run free may speak for it, too",
+        "between 9, the most left beside what was found in 35 cases of another plant, and 60, of a real pendulum",
+        "test_far_from_the_noise_whole_recordings_decide",
+    )
     rough: float = _rule(
         3.0,
         "x the noise squared: above it every effect that helps is tried, whatever its price",

@@ -327,9 +327,18 @@ class JointHypotheses:
             count = len(self.long.window)
             self.fold_of = np.minimum(np.arange(count) * 3 // max(count, 1), 2)
             self.fold_by = "time"
+        # by fold: runs to fit without it, and its own
+        self.folded: list[tuple[list[int], list[int]]] = []
+        if self.fold_by == "conditions":
+            fold = {r: groups.index(conditions[r]) % (4 if len(groups) > 4 else len(groups)) for r in train}
+            self.folded = [
+                ([r for r in train if fold[r] != k], [r for r in train if fold[r] == k])
+                for k in sorted(set(fold.values()))
+            ]
         self.blocks = self._blocks(self.fitter, self.long)
         self.by_law: dict[str, list[Trial]] = {}  # by effect: the hypothesis by every law that the effect may have
         self._polished: dict[int, tuple[Trial, Trial]] = {}  # by the trial's id, which is kept so that it stays its own
+        self._run_free: dict[int, tuple[Trial, np.ndarray]] = {}  # likewise
         self.all_nuisances = refitted(case)
         self.nuisances = self.all_nuisances
         believed = [

@@ -15,11 +15,12 @@ from dexsim.gap.effects.effect import Variant
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX, NOT_NEGATIVE, SHAPES, Param, at_bound, expand
 from dexsim.gap.rules import SEARCH
-from dexsim.gap.search.fit import Fitter, disbelief, prior_weight, slopes_of
+from dexsim.gap.search.fit import Fitter, Residuals, disbelief, prior_weight, slopes_of
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, dear_of, fits_beside, subset
 
 # -- what hypotheses lose on conditions that their fit has not seen, and whether one earns its place by that ----------
 
+FREE_STEPS = 6  # of a fit to whole recordings
 BOOTSTRAPS, STRETCH = 300, 4  # and of how many neighbouring half-second blocks a stretch of theirs is
 
 
@@ -126,6 +127,11 @@ class JointLosses(JointHypotheses):
         return replace(trial, left_out=out, folds=parts, refitted=True)
 
     def _earns(self, new: Trial, old: Trial, further: bool = True) -> bool:
+        """Whether what `new` has beside `old` removes enough of what was left out: of windows or, far from the noise
+        and beside other effects, of whole recordings."""
+        return self._earns_in_windows(new, old, further) or self._earns_run_free(new, old)
+
+    def _earns_in_windows(self, new: Trial, old: Trial, further: bool) -> bool:
         a, b = self._left(old), self._left(new)
         gain = 1 - b.sum() / a.sum()
         # what was left out may be lost by the step to it alone: what is fitted must be followed better too
@@ -142,6 +148,47 @@ class JointLosses(JointHypotheses):
             else (SEARCH.rare if gain < 4 * SEARCH.least else SEARCH.rarer) * SEARCH.chance
         )
         return bool(np.quantile(self._boot(a - b), chance) > 0)
+
+    def _earns_run_free(self, new: Trial, old: Trial) -> bool:
+        """Whether a further effect lasts on whole recordings of conditions left out.
+
+        Where even with it far more than noise is left, a joint that sticks goes another way than the recorded one in a
+        few windows, and their squares decide by which stick came first. Mean errors of free runs hang less on a few
+        moments; they are asked only where what is fitted is followed clearly better."""
+        if (
+            self._here(new) < SEARCH.astray**2
+            or not old.members
+            or self.fold_by != "conditions"
+            or self._here(new) > (1 - SEARCH.least) * self._here(old)
+            or self._shrunk(new)
+            or self.deadline.over()
+        ):
+            return False
+        a, b = self._free_left(old), self._free_left(new)
+        return bool(b.mean() ** 2 < (1 - SEARCH.least) * a.mean() ** 2 and (b < a).mean() > 0.5)
+
+    def _free_left(self, trial: Trial) -> np.ndarray:
+        """Mean |error| [G], in sigmas, of each condition's recordings run free from their first sample with a fit of
+        its own to the other conditions' recordings, from the better of where the trial's fits ended. Made once."""
+        if id(trial) in self._run_free:
+            return self._run_free[id(trial)][1]
+        plant, params, out = self.case.plant, trial.fit.params, []
+        self.cross(trial)
+        parts = dict(zip(np.unique(self.fold_of).tolist(), trial.folds, strict=False))
+        for k, (rest, left) in enumerate(self.folded):
+            r = Residuals(self.r.sigma_q, self.r.sigma_torque)
+            fitter = Fitter(plant, plant.windows(None, rest, span=self.span), r)
+            judge = Fitter(plant, plant.windows(None, left, span=self.span), Residuals(self.r.sigma_q))
+            with self._fix(trial.members):
+                starts = np.stack([trial.fit.x, parts.get(k, trial.fit.x)])
+                tried = np.abs(fitter.residuals(params, starts))
+                best = int(np.argmin(tried.mean(1)))
+                r.huber = max(1.0, float(np.median(tried[best])))
+                x = fitter.fit(params, x0=starts[best], iterations=FREE_STEPS, tolerance=1e-2, exact=False).x
+                error = np.abs(judge.residuals(params, x[None])[0])
+            out.append(float(error.mean()))
+        self._run_free[id(trial)] = trial, np.array(out)
+        return self._run_free[id(trial)][1]
 
     def _boot(self, x: np.ndarray) -> np.ndarray:
         """Sums of a block bootstrap of x [B]: 2-s stretches of neighbouring half-second blocks."""
