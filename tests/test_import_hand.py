@@ -28,6 +28,7 @@ from dexsim.tasks import make_fingertip_grasps
 from dexsim.tasks.reach import Reach
 from dexsim.tasks.stable_grasps import GraspSet
 from tests import hands
+from tests.made_hand import made_hand
 
 
 @pytest.fixture(scope="module")
@@ -370,6 +371,22 @@ def test_bad_files_get_one_line_and_nothing_is_written(case, tmp_path, monkeypat
     assert "\n" not in str(error.value) and (str(path) in str(error.value) or "mesh" in str(error.value))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["here", "robot"] and not any(Path().iterdir())
     assert capfd.readouterr() == ("", "")  # the line is the error's; no library adds one
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ('damping="0.01"', 'damping="-0.01"', "damping of joint 'a_spread' is -0.01: must be 0 or above"),
+    ('armature="4e-4"', 'armature="nan"', "armature of joint 'a_spread' is nan: must be 0 or above"),
+    ('range="0 2.1"', 'range="0 0"', "joint 'a_curl' has no limits; give it two, low < high"),
+    ('mass="0.015"', 'mass="-0.015"', "'a_end'.*a moving link without mass; give its <inertial>")])  # fmt: skip
+def test_bad_figures_in_an_mjcf_get_one_line(old, new, said, tmp_path, monkeypatch, capfd):
+    path = made_hand(tmp_path / "made", pads=False) / "made.xml"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(UserError, match=said):
+        import_hand(path, tmp_path / "hand", picture=False)
+    assert not (tmp_path / "hand").exists() and not any(Path().iterdir()) and capfd.readouterr() == ("", "")
 
 
 def test_a_tip_with_a_hole_is_refused_or_its_hull_taken(one_start, tmp_path):

@@ -88,7 +88,7 @@ def _read(path: Path, packages: Sequence[Path], coupled: str, density: float | N
 
 
 def _finite(m: mujoco.MjModel, path: Path) -> None:
-    """UserError for a figure that is no number: MuJoCo's reader takes "nan"."""
+    """UserError for a figure that is no number, or pushes a joint on: MuJoCo's reader takes "nan" and -0.1."""
     for what, values, name in (
         ("position", m.body_pos, m.body), ("orientation", m.body_quat, m.body), ("mass", m.body_mass, m.body),
         ("inertia", m.body_inertia, m.body), ("centre of mass", m.body_ipos, m.body), ("axis", m.jnt_axis, m.joint),
@@ -98,6 +98,12 @@ def _finite(m: mujoco.MjModel, path: Path) -> None:
         if bad.any():
             k = int(np.argmax(bad))
             raise UserError(f"model {path}: {what} of '{name(k).name or k}' is {values[k]}: must be finite numbers")
+    dofs = {"armature": m.dof_armature, "damping": m.dof_damping, "frictionloss": m.dof_frictionloss}
+    for what, values in dofs.items():
+        bad = ~(np.asarray(values) >= 0) | np.isinf(values)
+        if bad.any():
+            k = int(np.argmax(bad))  # a dof a joint: hinges and slides
+            raise UserError(f"model {path}: {what} of joint '{m.joint(k).name}' is {values[k]:g}: must be 0 or above")
 
 
 def _parsed(path: Path, read: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
