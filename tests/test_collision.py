@@ -298,7 +298,7 @@ def test_what_was_nearest_before_does_not_decide_what_is_nearest_now(two_poses):
     for start in ("none", "before", "others"):
         worlds.put(before)
         worlds.collide()
-        kept = worlds.narrow.simplex.numpy()
+        kept = worlds.narrow.simplex.numpy().copy()  # on a CPU that is no copy by itself
         worlds.put(after)
         if start != "none":
             worlds.narrow.simplex.assign(kept if start == "before" else np.roll(kept, 7, axis=0))
