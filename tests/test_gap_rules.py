@@ -218,7 +218,7 @@ class Selecting(Made):
     _on = cross = lambda *_: None
     thorough = refold = _drop = _refine = _by_laws = lambda self, trial: trial
     _begun_again = lambda self, current, trials: current  # noqa: E731
-    _instead = lambda self, current: current  # noqa: E731
+    _instead = _more_general = lambda self, current: current  # noqa: E731
     _swap = lambda self, current, pool, level: (current, level)  # noqa: E731
     _overtaken = _pair = lambda *_: None
     _dear = lambda self, trial: 1.0  # noqa: E731
