@@ -33,8 +33,8 @@ def handed(findings, facts):
     return diagnosis.handed(findings, facts, xhand.FINGERS)
 
 
-def diagnosed(folder, allowed=None, **planted):
-    paths, model, servo = press_rig.record(folder / "rig", 3, 5.0, seed=5, **planted)
+def diagnosed(folder, allowed=None, seconds=7.0, **planted):
+    paths, model, servo = press_rig.record(folder / "rig", 3, seconds, seed=5, **planted)
     settings = Settings(paths, folder / "out", [], str(model), str(servo), next_recording=False, allowed=allowed)
     d = diagnose(settings, say=lambda _: None)
     save(d, folder / "out")
@@ -45,7 +45,7 @@ def diagnosed(folder, allowed=None, **planted):
 def late(tmp_path_factory):
     """The diagnosis of an index finger whose touch is late, and its tactile.yaml."""
     few = {"tactile_delay", "tactile_hysteresis", "contact_stiffness"}
-    return diagnosed(tmp_path_factory.mktemp("late"), few, sensor={"delay": 0.06})
+    return diagnosed(tmp_path_factory.mktemp("late"), few, 5.0, sensor={"delay": 0.06})
 
 
 def within(drawn: torch.Tensor, p: dict) -> bool:
