@@ -260,7 +260,7 @@ class Plainly(Selecting):
 def test_effects_that_only_a_plain_model_shows_are_tried_together(left, found, monkeypatch):
     def effect(name, column):
         variant = SimpleNamespace(refines=False, instead=False, params=[SimpleNamespace(columns=(column,))])
-        return SimpleNamespace(id=name, plain=(column,), variants=lambda scales: [variant])
+        return SimpleNamespace(id=name, plain=(column,), nests=(), variants=lambda scales: [variant])
 
     fitted = [effect(e.id, e.plain[0]) for e in selecting.CATALOGUE if e.plain]
     assert {e.id for e in fitted} >= {"coulomb_friction", "viscous_friction", "command_delay", "torque_limit"}

@@ -131,11 +131,14 @@ class JointSelection(JointScan):
         that no loop holds the spring is the likelier. `current` where it removes what an effect must of what the more
         general one leaves."""
         for member in current.members:
+            more = [e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids]
+            if not more:
+                continue
             fitted = dict(zip([p.key for p in current.fit.params], current.fit.x, strict=True))
             columns = {p.columns[0]: float(fitted[f"{member.id}.{p.key}"]) for p in member.variant.params}
             columns |= {c: float(fitted[c]) for c in EFFECTS[member.id].fitted_anyway if c in fitted}
             rest = tuple(m for m in current.members if m is not member)
-            for effect in (e for e in CATALOGUE if member.id in e.nests and e.id not in current.ids):
+            for effect in more:
                 starts = effect.begun_from(columns, self.case)
                 if not starts or (self.allowed is not None and effect.id not in self.allowed) or self.deadline.over():
                     continue
