@@ -126,6 +126,14 @@ MUTATIONS = (
     _never_drawn("rotate", "contact.stiffness", "7000.0"),
     _never_drawn("rotate", "imu.tilt", "0.0", ", 3"),
     Mutation(
+        "the first finger is taken for the thumb",
+        "dexsim/tasks/grasp_rewards.py",
+        "if shape.opposing[i] == f:",
+        "if f == 0:",
+        "tests/test_any_hand.py::"
+        "test_the_finger_that_presses_against_the_others_is_paid_for_a_band_wherever_it_stands",
+    ),
+    Mutation(
         "the grasp's actor is told the true force",
         GRASP,
         "touch_force=self.touch.force[:, : self.felt],",
