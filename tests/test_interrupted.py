@@ -22,6 +22,7 @@ from dexsim.console import stop as stops
 from dexsim.console.stop import Stop
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
+from dexsim.view import plots
 
 STARTS = 12
 QUICK = (
@@ -36,6 +37,8 @@ QUICK = (
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
+    """An empty working directory, in which no curves are drawn: that takes longer than such a training."""
+    monkeypatch.setattr(plots, "curves", lambda columns, path, title: path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -28,6 +28,12 @@ def test_rows_differ_from_the_first_in_their_settings_only():
         assert {k for k in own if own[k] != first.get(k)} == {s.partition("=")[0] for s in row.settings}, row.key
 
 
+@pytest.fixture(autouse=True)
+def fewer_draws(monkeypatch):
+    """Of each bootstrap: its percentiles are known well enough for what is told here."""
+    monkeypatch.setattr(analysis, "DRAWS", 500)
+
+
 def seeds(means, rng, spread=1.0):
     return [rng.normal(m, spread, 200) for m in means]
 

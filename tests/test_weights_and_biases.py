@@ -12,6 +12,7 @@ import pytest
 import shell
 
 from dexsim.learning import checkpoint
+from dexsim.view import plots
 
 STAND_IN = """import json, os
 class Error(Exception): pass
@@ -34,6 +35,7 @@ QUICK = ("task=dummy", "device=cpu", "worlds=4", "iterations=2", "final_episodes
 @pytest.fixture
 def configs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plots, "curves", lambda columns, path, title: path)  # takes longer than such a training
     monkeypatch.delenv("WANDB_DIR", raising=False)
     return shell.configs(tmp_path)
 
