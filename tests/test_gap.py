@@ -384,13 +384,13 @@ def check_planted(effect, changes, key, value, seconds=3.0):
     [pytest.param(*p, id=p[0], marks=[pytest.mark.slow] if p[0] == "deadband" else []) for p in PLANTED],
 )
 def test_planted_effect_is_named_and_sized(effect, changes, key, value):
-    check_planted(effect, changes, key, value, 6.0 if effect == "deadband" else 2.0)
+    check_planted(effect, changes, key, value, 4.0 if effect == "deadband" else 2.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("effect", "changes", "key", "value"), MORE, ids=[p[0] for p in MORE])
 def test_more_planted_effects(effect, changes, key, value):
-    check_planted(effect, changes, key, value, 6.0)
+    check_planted(effect, changes, key, value, 4.0)
 
 
 def test_nothing_planted_nothing_found():
