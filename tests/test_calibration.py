@@ -473,7 +473,7 @@ def test_another_hand_is_calibrated_from_its_own_presses(tmp_path, capsys):
     slope = content["joints"][joint]["sim"]["slope"]["value"]
     assert slope == pytest.approx(1 / abs(arms[finger.flexion[-1]]), rel=0.15)
     assert Calibration.load(tmp_path / "o" / "calibration.yaml", hand=hand).hand.robot == hand.robot
-    rolled = simulate.delivered(simulate.rolled_recording(hand, 60, seed=1, frames=12), 1)
+    rolled = simulate.delivered(simulate.rolled_recording(hand, 45, seed=1, frames=9), 1)
     write(tmp_path / "rolled.mcap", rolled)
     assert command.main([*arguments[:2], f"touch={tmp_path / 'rolled.mcap'}", f"out={tmp_path / 't'}"], CONFIGS) == 0
     touch = yaml.safe_load((tmp_path / "t" / "calibration.yaml").read_text())["touch"]

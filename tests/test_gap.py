@@ -407,7 +407,7 @@ def test_nothing_planted_nothing_found():
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rig")
-    paths, model_path, servo, _ = demo.make(folder, "command_delay", seconds=5.0)
+    paths, model_path, servo, _ = demo.make(folder, "command_delay", seconds=4.0)
     return folder, paths, model_path, servo
 
 
