@@ -13,7 +13,7 @@ from mujoco_warp._src.types import vec5
 
 from dexsim.sim.collision.cylinder import from_cylinder, on_line, rounder
 from dexsim.sim.collision.epa import Facet, penetration
-from dexsim.sim.collision.gjk import OVERLAP, distance, touching
+from dexsim.sim.collision.gjk import OVERLAP, crossing, distance, touching
 from dexsim.sim.collision.shapes import (
     BOX,
     CAPSULE,
@@ -292,7 +292,13 @@ def apart(
         enclosing[j] = wp.where(s.inside != 0, wp.vec4i(s.i0, s.i1, s.i2, s.i3), wp.vec4i(-1, -1, -1, -1))
     elif d < cutoff:
         q = nearest_of_b(pairs, t.b, names, wp.vec3(s.l0, s.l1, s.l2))
-        add(pairs, mat, out, k, t, q, s.v, -s.v / d, d)
+        v = s.v
+        c = crossing(t.a, t.b, pairs.hull, t.R, t.p, s)
+        if c.found != 0:
+            q = c.q
+            v = c.v
+            d = wp.length(v)
+        add(pairs, mat, out, k, t, q, v, -v / d, d)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=_ROUNDED)
@@ -387,14 +393,14 @@ def beside_cylinder(
         if f.found != 0:
             q = nearest_of_b(pairs, b, wp.vec3i(f.i0, f.i1, f.i2), wp.vec3(f.l0, f.l1, f.l2))
             normal = R * f.normal
-            middle = R * (q + 0.5 * f.depth * f.normal) + p
+            # the prism's side is a facet, not a line; its other places are as right as any
+            middle = on_line(normal, R * q + p) + 0.5 * f.depth * normal
             dist = -f.depth
             w = rounder(half, b, pairs.hull, R, p, normal, wp.vec3i(f.i0 >> 16, f.i1 >> 16, f.i2 >> 16))
             if w.found != 0:
                 normal = w.u
                 middle = w.q
                 if w.placed == 0:
-                    # on the side or a cap any of the prism's places is right, but that its side is a facet, not a line
                     middle = on_line(w.u, R * q + p) + 0.5 * w.depth * w.u
                 dist = -w.depth
         elif t.inside == 0 and wp.length(t.v) > OVERLAP:
