@@ -1,5 +1,5 @@
-"""What a diagnosis does at the same time: searches that take turns at the interpreter, hypotheses and worlds in threads
-of their own, joints judged before the last is searched. Each gives what one after the other gives, to the last bit."""
+"""What a diagnosis does at the same time: searches that take turns at the interpreter, hypotheses in threads of
+their own, joints judged before the last is searched. Each gives what one after the other gives, to the last bit."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_gap import SERVO, mechanism_of, motion, plant_run
-from test_gap_confirm import world
+from test_gap import plant_run
 from test_gap_search import searched
 
-from dexsim.actuator.table import ServoTable
 from dexsim.gap import compute
 from dexsim.gap.compute import TimeLimit, away, map_joints, side_by_side
 from dexsim.gap.diagnosis import Drives
-from dexsim.gap.judge.full_model import free_runs
 from dexsim.gap.plant.case import build
 from dexsim.gap.read.runs import conditions
 from dexsim.gap.rules import SEARCH
@@ -121,23 +118,6 @@ def test_of_hypotheses_that_are_out_of_time_the_first_is_fitted(monkeypatch):
     drafts = s._drafts(listed, none, {}, {})
     assert len(drafts) == 1 and drafts[0][0][0].id == listed[0][2].id
     assert len(s._finished(drafts * 2, none)) == 1
-
-
-def test_worlds_replayed_on_several_cores_move_as_on_one(monkeypatch):
-    """The servo's kernel is made for all of them, though only one of them is late, and one has a dead zone."""
-    tables = [
-        ServoTable.from_dict({"joints": {"*": SERVO | more}}) for more in ({"delay": 0.033}, {}, {"deadband": 0.01})
-    ]
-    given = [motion(k, 1.5, k) for k in range(3)]
-    worlds = [world(tables[k], *given[k], 1.5 - 0.2 * k, given[k][1][0]) for k in range(3)]
-    spec = mechanism_of(tables[0]).spec
-    expected = None
-    for cores in (1, 2, 3, 8):
-        monkeypatch.setattr(compute, "cores", lambda cores=cores: cores)
-        got = free_runs(spec, ["joint"], worlds, timestep=1e-3, torque=True)
-        expected = expected or got
-        for (q, tau), (q1, tau1) in zip(got, expected, strict=True):
-            assert np.array_equal(q, q1) and np.array_equal(tau, tau1) and np.ptp(q) > 0.1
 
 
 @pytest.mark.parametrize("seconds, stopped, settled, ahead", [

@@ -3,13 +3,10 @@ kernel of a few worlds on a CPU, and a simulation launches the same few kernels 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
-
-_PACKING = threading.Lock()  # the first launch of a kernel loads its module, once for all threads
 
 
 class Launches:
@@ -26,7 +23,6 @@ class Launches:
             wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
             return
         if name not in self._packed:  # kept with its inputs: it points to their memory
-            with _PACKING:
-                command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
+            command = wp.launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
             self._packed[name] = command, inputs
         self._packed[name][0].launch()

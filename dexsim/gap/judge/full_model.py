@@ -12,21 +12,18 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 
 from dexsim.actuator.columns import COLUMNS
 from dexsim.actuator.columns import INDEX as SERVO_INDEX
 from dexsim.actuator.servo import FIELDS, Servo
 from dexsim.actuator.table import ServoTable
 from dexsim.errors import UserError
-from dexsim.gap import compute
 from dexsim.gap.effects.catalogue import model_columns
 from dexsim.gap.judge.handed_on import columns_beside, handed, model_changes, moved_friction, undamped
 from dexsim.gap.judge.kept_out import free_run
@@ -255,45 +252,34 @@ def free_runs(
         groups.setdefault((w.gravity.tobytes(), w.table.drive, w.table.control_rate), []).append(i)
     out: list = [np.zeros((0, len(joints)))] * len(worlds)
     for members in groups.values():
-        mine = [worlds[i] for i in members]
-        # C MuJoCo's worlds on a core each: a step of a few is too short to be shared
-        apart = device == "cpu" and engine != "warp"
-        count = min(len(mine), compute.cores()) if apart else 1
-        parts = [list(x) for x in np.array_split(np.arange(len(mine)), count)]
-        begun = [_begun(spec, joints, mine, part, device, timestep, engine, torque) for part in parts]
-        with wp.ScopedDevice("cpu") if apart else nullcontext():  # each thread sets it, and sets it back
-            found = compute.each(count, lambda k: begun[k]())  # noqa: B023
-        for k, q in zip((i for part in parts for i in part), itertools.chain(*found), strict=True):
-            out[members[k]] = q
+        for i, q in zip(
+            members, _batch(spec, joints, [worlds[i] for i in members], device, timestep, engine, torque), strict=True
+        ):
+            out[i] = q
     return out
 
 
-def _begun(
+def _batch(
     spec: mujoco.MjSpec,
     joints: Sequence[str],
-    every: Sequence[World],
-    part: Sequence[int],
+    worlds: Sequence[World],
     device: str,
     timestep: float,
     kind: str,
     torque: bool,
-) -> Callable[[], list]:
-    """What runs worlds number `part` of `every`, which are of one drive and gravity, by the engine and the servo that
-    all of them together need, and returns their positions as `free_runs` does."""
-    worlds = [every[i] for i in part]
+) -> list:
     spec = spec.copy()
     spec.option.timestep, spec.option.gravity = timestep, worlds[0].gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     N = len(worlds)
     # one thread: a step of some worlds is shorter than the way to another thread and back
     engine = make_engine(spec, N, device, kind, fields=FIELDS, threads=1)
-    rows = np.stack([w.rows for w in every])
+    rows = np.stack([w.rows for w in worlds])
     table = copy.deepcopy(worlds[0].table)
     table.set(joints[0], "delay", float(rows[:, :, SERVO_INDEX["delay"]].max()))  # the queue must hold the longest
-    spacing = np.concatenate([np.diff(w.stamps) for w in every])
+    spacing = np.concatenate([np.diff(w.stamps) for w in worlds])
     spacing = spacing[spacing > 1e-6]
     varied = [c.name for i, c in enumerate(COLUMNS) if (rows[:, :, i] != c.neutral).any()]
-    rows = rows[part]
     servo = Servo(
         engine,
         joints,
@@ -319,18 +305,14 @@ def _begun(
         if worlds[0].table.drive == "voltage":
             held /= rows[:, :, SERVO_INDEX["torque_limit"]] * rows[:, :, SERVO_INDEX["supply"]]
         servo.state[:, :, servo.slots["integral"]] = up(held)
-    steps = int(math.ceil(max(w.duration for w in every) / timestep)) + 2
+    steps = int(math.ceil(max(w.duration for w in worlds) / timestep)) + 2
     seen = torch.zeros(steps, N, len(joints), dtype=real, device=engine.t.qpos.device)
     given = torch.zeros_like(seen) if torque else None
     heated = "warmth" in varied or "rare" in servo.features
     changes = Changes(servo, worlds, now, steps, timestep, up, heated)
-
-    def run() -> list:
-        shown = _stepped(engine, servo, changes, seen, given)
-        q, *tau = (x.cpu().numpy().astype(float) for x in (shown, given) if x is not None)
-        return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
-
-    return run
+    seen = _stepped(engine, servo, changes, seen, given)
+    q, *tau = (x.cpu().numpy().astype(float) for x in (seen, given) if x is not None)
+    return [(q[:, i], tau[0][:, i]) if tau else q[:, i] for i in range(N)]
 
 
 def _stepped(
