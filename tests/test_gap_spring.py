@@ -18,6 +18,7 @@ from dexsim.gap.plant.case import build
 from dexsim.gap.plant.columns import INDEX, SERIES_INDEX
 from dexsim.gap.read.runs import Run, conditions
 from dexsim.gap.rules import SEARCH
+from dexsim.gap.search.hypotheses import named
 from dexsim.gap.search.search import JointSearch, JointSelection, Member, Trial
 
 MODEL = """<mujoco><compiler angle="{angle}"/><option gravity="0 0 0" timestep="0.0005"/><worldbody>
@@ -140,6 +141,14 @@ def searched(**columns):
     runs = [driven(seed, **columns) for seed in range(3)]
     case = build(mujoco.MjModel.from_xml_string(model_text()), runs)[0]
     return JointSearch(case, [0, 1, 2], None, conditions(runs)).run()
+
+
+@pytest.mark.parametrize("stiffness, preload, gone", [(0.0, 0.0, True), (0.0, PRELOAD, False), (0.3, 0.0, False)])
+def test_a_preload_without_stiffness_is_a_spring_still(stiffness, preload, gone):
+    case = build(mujoco.MjModel.from_xml_string(model_text()), [driven(0)])[0]
+    spring = Member(EFFECTS["joint_spring"], EFFECTS["joint_spring"].variants(case.scales)[0])
+    trial = Trial((spring,), SimpleNamespace(params=named(spring), x=np.array([stiffness, preload])))
+    assert object.__new__(JointSelection)._shrunk(trial) == gone
 
 
 @pytest.mark.slow

@@ -233,6 +233,7 @@ class JointSpring(Effect):
     classes = ("static load", "friction or pull")
     motions = ("holds",)
     nests = ("coulomb_friction",)  # as it differs by direction: a preload without stiffness
+    also_sizes = ("preload",)
     from_poses = True
     model_columns = ("spring", "spring_preload")
 

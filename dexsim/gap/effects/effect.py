@@ -206,6 +206,7 @@ class Effect:
     slows: ClassVar[bool] = False  # holds back what is fast: what one such size is off by another makes up for
     # effects that are this one with a size of nothing, whatever else is like them
     nests: ClassVar[tuple[str, ...]] = ()
+    also_sizes: ClassVar[tuple[str, ...]] = ()  # parameters by which it is there though its first size is nothing
     simulated: ClassVar[bool] = True  # the plant has a law of it
     effort_only: ClassVar[bool] = False  # in the reading of the effort alone, the motion is unaffected
     couples: ClassVar[bool] = False  # another joint, `from_joint` of its parameters, has part in it

@@ -527,13 +527,14 @@ class JointHypotheses:
         at = dict(zip([p.key for p in trial.fit.params], trial.fit.x, strict=True))
         for m in trial.members:
             first = m.variant.params[0]
-            sizes = [
-                p for p in m.variant.params if p.key.startswith(first.key)
-            ]  # of a friction with load one direction may have none
+            # of a friction with load one direction may have none
+            sizes = [p for p in m.variant.params if p.key.startswith(first.key)]
+            others = [p for p in m.variant.params if p.key in m.effect.also_sizes]
             if (
                 first.mode == "set"
                 and first.start == first.low
                 and all(at[f"{m.id}.{p.key}"] <= p.low + 1e-3 * p.span for p in sizes)
+                and all(abs(at[f"{m.id}.{p.key}"] - p.start) <= 1e-3 * p.span for p in others)
             ):
                 return True
         return False
