@@ -171,6 +171,28 @@ def test_a_joint_whose_share_was_too_short_gets_what_the_others_left(spent, agai
         assert ends["b"] == pytest.approx(0.5 * (800 - spent))
 
 
+@pytest.mark.parametrize("limit, again", [(None, True), (1000.0, True), (150.0, False)])
+def test_what_took_longer_than_is_left_is_not_begun_anew(limit, again, monkeypatch):
+    """A joint that the others move otherwise is searched again only where that can end where the first search did: the
+    second answer takes the first one's place."""
+    clock = [0.0]
+    monkeypatch.setattr("dexsim.gap.compute.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("dexsim.gap.diagnosis.workers", lambda device, jobs: 2)
+    monkeypatch.setattr("dexsim.gap.diagnosis._unsettled", lambda found: True)
+    monkeypatch.setattr("dexsim.gap.diagnosis._other", lambda search, found: True)
+    monkeypatch.setattr("dexsim.gap.diagnosis._moved_by", lambda model, joints, found: [])
+    drives = object.__new__(Drives)
+    drives.w = SimpleNamespace(limit=TimeLimit(limit), settings=SimpleNamespace(device="cpu"), progress=None)
+    drives.mj_model, drives.unknown_controllers = None, set()
+    drives.cases = [SimpleNamespace(joint=j) for j in "abcd"]
+    drives._coupled_by, drives._begun = lambda trials: None, lambda k, tell: None
+    drives._search_of = lambda k, tell: (SimpleNamespace(case=drives.cases[k], took=0.0), f"second {k}")
+    answers = [(SimpleNamespace(case=c, took=40.0), f"first {k}") for k, c in enumerate(drives.cases)]
+    clock[0] = 60.0  # of 150 s, 120 for searches, 60 are left: 30 a joint, two at a time
+    drives._search_again(answers)
+    assert [x for _, x in answers] == [f"{'second' if again else 'first'} {k}" for k in range(4)]
+
+
 def test_touch_with_nothing_but_hints_within_its_noise_is_none():
     felt = TouchResult(
         [{"effect": "tactile_gain", "confidence": 0.3}], before=(0.03, 0.03, 0.03), after=(0.03, 0.03, 0.03), floor=0.03

@@ -4,7 +4,8 @@ through their steps here, joint by joint, judged on recordings kept out; its tou
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -266,6 +267,7 @@ class Drives(Steps):
 
     def _search_of(self, k: int, tell: Callable[[float], None]) -> tuple[JointSearch, Outcome | None]:
         """The search of one joint and its answer; None where nothing is long enough to be simulated."""
+        begun = time.monotonic()
         search, case = self._begun(k, tell), self.cases[k]
         if len(search.long.window) == 0:
             return search, None
@@ -274,6 +276,7 @@ class Drives(Steps):
         else:
             found = search.without_search()
         search.settle(found)
+        search.took = time.monotonic() - begun
         self._left -= 1
         self._judged_ahead(search, found)
         return search, found
@@ -315,6 +318,12 @@ class Drives(Steps):
         for k, answer in zip(cut, renewed, strict=True):
             answers[k] = answer
 
+    def _time_for(self, searches: Iterable[JointSearch]) -> bool:
+        """Whether what is left of the limit is as much as these searches took: they would begin anew, and in less time
+        end before where they did."""
+        took = [x.took for x in searches]
+        return min(1.0, workers(self.w.settings.device, len(took)) / len(took)) * self.w.limit.left() >= max(took)
+
     def _coupled_by(self, trials: Sequence[Trial]) -> None:
         """The cases once more, with the others' motion as these trials have it."""
         w = self.w
@@ -331,7 +340,7 @@ class Drives(Steps):
             and _unsettled(found)
         ]
         found = [x for _, x in answers if x is not None]
-        if len(unsettled) < 2 or len(found) < len(answers):
+        if len(unsettled) < 2 or len(found) < len(answers) or not self._time_for(answers[k][0] for k in unsettled):
             return
         self._coupled_by(_moved_by(self.mj_model, [search.case.joint for search, _ in answers], found))
         unsettled = [
@@ -361,7 +370,7 @@ class Drives(Steps):
             and not any(m.effect.couples for m in found.best.members)
         }
         near, several = {k: search.case for k, (search, _) in left.items()}, list(left.values())
-        by = compute.each(len(left), lambda i: None if w.limit.stopped else self._dragger(*several[i]))
+        by = compute.each(len(left), lambda i: None if w.limit.left() <= 0 else self._dragger(*several[i]))
         pulled = [(k, case) for k, case in zip(left, by, strict=True) if case is not None]
         for k, case in pulled:
             self.cases[k] = case
