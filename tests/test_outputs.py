@@ -3,10 +3,14 @@ whole."""
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 import mujoco
 import pytest
 
 from dexsim import outputs
+from dexsim.console import folders
 from dexsim.errors import UserError
 from dexsim.gap.inquiry import Diagnosis, empty
 from dexsim.gap.judge.handed_on import save_model
@@ -202,3 +206,16 @@ def test_a_note_of_strangers_moves_nothing(tmp_path):
         (out / outputs.WRITTEN).write_text(json.dumps({"files": {}, "pending": pending}))
         outputs.recover(out)
         assert (other / "x").read_text() == "mine" and (out / "mine").read_text() == "mine" and other.is_dir()
+
+
+def test_the_folder_is_tried_with_a_file_that_a_killed_process_cannot_leave(tmp_path, monkeypatch):
+    open_unnamed, seen = tempfile.TemporaryFile, []
+
+    def seen_meanwhile(*args, **kwargs):
+        file = open_unnamed(*args, **kwargs)
+        seen.append((Path(kwargs["dir"]), list(tmp_path.iterdir())))
+        return file
+
+    monkeypatch.setattr(folders.tempfile, "TemporaryFile", seen_meanwhile)
+    folders.make(tmp_path, "out=")
+    assert seen == [(tmp_path, [])]

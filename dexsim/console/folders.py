@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import tempfile
 from pathlib import Path
 
 from dexsim.errors import UserError
@@ -17,9 +17,9 @@ def make(folder: Path, setting: str, empty: bool = False) -> Path:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".writable.{os.getpid()}.tmp"  # several may try at once
-        probe.write_bytes(b"x")
-        probe.unlink()
+        # has no name where the system can do that: a process that is killed here leaves nothing behind
+        with tempfile.TemporaryFile(dir=folder, prefix=".writable.", suffix=".tmp") as probe:
+            probe.write(b"x")
         if empty and any(not (p.name.startswith(".writable.") and p.suffix == ".tmp") for p in folder.iterdir()):
             last = folder / "last.pt"  # a run that ended before it was saved has none
             go_on = f", or continue it with resume={last}" if last.is_file() else ""
