@@ -27,6 +27,7 @@ from dexsim.gap.plant.batch import Windows
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
 from dexsim.gap.report import files, next_recording
 from dexsim.gap.search import search as selecting
+from dexsim.gap.search import shaking
 from dexsim.gap.search.fit import Fitted
 from dexsim.gap.search.hypotheses import JointHypotheses, Member, Trial, thin
 from dexsim.gap.search.search import JointSearch
@@ -605,6 +606,48 @@ def test_friction_at_one_load_is_a_set():
                                plant=SimpleNamespace(run_of=np.zeros(4000, int)))  # fmt: skip
         assert inseparable("coulomb_friction", case, [0]) == alike, spread
         assert inseparable("lag", case, [0]) == []
+
+
+def test_what_stands_tells_of_no_load_under_which_it_slides():
+    load = np.where(np.arange(4000) % 2, 0.1, 1.0)  # two loads, and under the second it moves so fast:
+    for speed, alike in ((0.015, True), (0.03, False)):
+        case = SimpleNamespace(regimes={"speed": np.where(np.arange(4000) % 2, speed, 1.0), "_load": load},
+                               scales=SimpleNamespace(speed=1.0),
+                               plant=SimpleNamespace(run_of=np.zeros(4000, int)))  # fmt: skip
+        assert bool(inseparable("coulomb_friction", case, [0])) is alike, speed
+
+
+class Shook(shaking.Shaking):
+    """Windows of a second in which a joint swings from sample to sample by the sizes given, and not at all as it is
+    simulated."""
+
+    def __init__(self, sizes: tuple[float, ...]):
+        n, count = 100, len(sizes)
+        window = np.repeat(np.arange(count), n)
+        q = np.repeat(np.asarray(sizes, float), n) * (-1.0) ** np.arange(n * count)
+        w = SimpleNamespace(n=n * count, window=np.arange(count), sample_window=window, sample_row=np.arange(n * count))
+        plant = SimpleNamespace(t=0.01 * np.arange(n * count), q=q)
+        case = SimpleNamespace(plant=plant, quantum=1e-6)
+        none = SimpleNamespace(members=(), fit=SimpleNamespace(params=[], x=np.zeros(0)))
+        self.simulated = np.full((1, 3, count), 1e-9), np.zeros((1, count))
+        super().__init__(SimpleNamespace(short=w, case=case), none)
+
+    def _simulated(self, *_):
+        return self.simulated
+
+
+def test_a_joint_shakes_that_is_far_louder_than_at_its_quietest():
+    assert Shook((1.0, 4.0, 6.0, 9.0)).loud.tolist() == [False, False, True, True]
+
+
+def test_how_much_a_joint_shakes_counts_before_where_it_rests():
+    made = Shook((1.0, 1.0))
+    made.levels, made.means, made.usual, made.quiet = np.ones((3, 1)), np.zeros(1), 1.0, 1e-3
+    missed = []
+    for times, away in ((np.exp(np.sqrt(0.7 / 3)), 0.0), (1.0, 3.0), (np.exp(np.sqrt(1.4 / 3)), 0.0)):
+        made.simulated = np.full((1, 3, 1), times), np.full((1, 1), away)
+        missed.append(float(made.missed((), [], np.zeros((1, 0)))[0, 0]))
+    assert missed == sorted(missed) and missed[1] == pytest.approx(1.0)
 
 
 def test_repeats_that_differ_by_what_was_found_are_no_floor():

@@ -54,6 +54,18 @@ def left_by_a_plain_fit(of: Columns) -> float:
     return float(np.var(of.u - of.X @ least(of.X, of.u)) / np.var(of.torque))
 
 
+def test_a_joint_that_rings_is_not_pushed():
+    """It lies still, and then moves fast and shakes beside that, so many times as much as its motion does."""
+    t = np.arange(0.0, 20.0, 0.01)
+    slow = np.where(t < 10.0, 0.0, np.sin(2 * np.pi * 1.5 * (t - 10.0)))
+    moves = (t > 10.5) & (t < 19.5)
+    for times, ringing in ((2.0, False), (4.5, True)):
+        own = float(np.sqrt(np.mean(np.diff(slow[moves], 2) ** 2)))
+        shakes = own * np.sqrt(times**2 - 1) / 4.0 / np.sqrt(0.5) * np.sin(2 * np.pi * 49.0 * t + 0.3)
+        run = SimpleNamespace(t=t, q=(slow + np.where(moves, shakes, 0.0))[:, None])
+        assert logged_torque._by_ringing([(t, moves)], [run], 0, 10.0) is ringing, times
+
+
 def test_a_plain_fit_must_leave_much_for_a_push():
     for share, told in ((0.4, True), (0.22, False)):
         tried = [recorded(h * stretches(0.3), 0.01) for h in np.geomspace(0.5, 5.0, 60)]

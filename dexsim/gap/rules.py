@@ -1,9 +1,10 @@
 """The figures that decide: what each means, where its value came from, and which test fails if it is moved.
 
 What stays elsewhere decides no name, confidence or verdict by itself: sizes, bounds and starts of an effect (in its
-class), what a test of a signal goes by (at the top of its file in `read/`), figures of the numerics (steps, damping,
-ridges, filters, grids, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets,
-lengths of short lists, how many drafts are looked at closely: more of it takes longer).
+class), what a test of a signal goes by (at the top of its file in `read/`; whether a reading is rounded, in
+`plant/case.py`), figures of the numerics (steps, damping, ridges, filters' widths, grids, caps of a misfit, what a fit
+trims, bootstraps' draws and blocks, the rounding of 0), and how much is searched (windows, budgets, lengths of short
+lists, how many drafts are looked at closely, whose motion is refined: more of it takes longer).
 """
 
 from __future__ import annotations
@@ -220,6 +221,20 @@ class SearchRules:
         "degC: a smaller change of temperature tells nothing of heat",
         "by judgement: twice the resolution of a usual sensor",
         "test_a_small_change_of_temperature_tells_nothing",
+    )
+    loud: float = _rule(
+        5.0,
+        "x how much a joint shakes in its quietest stretch, and simulated without any effect: it shakes by itself",
+        "between 1.7, the most of joints with friction, play, delay or ripple, and 9.6, the least of one that rings",
+        "test_a_joint_shakes_that_is_far_louder_than_at_its_quietest",
+    )
+    resting: float = _rule(
+        1.0 / 9.0,
+        "weight of the square by which the mean position is missed, in usual misses, beside squares of the logarithm "
+        "by which the shaking is",
+        "an elasticity that rings is found within 4 % of its size from 1/9 to 4/9, a fifth off from 1/18 down, a tenth "
+        "from 1 up",
+        "test_how_much_a_joint_shakes_counts_before_where_it_rests",
     )
 
 
@@ -555,9 +570,16 @@ class JudgeRules:
     )
     turning: float = _rule(
         0.1,
-        "of the peak speed: from there on a joint moves, where braking is told from rest",
+        "of its large speed: from there on a joint moves, where braking is told from rest, a recording begins in "
+        "motion, or a torque is fitted while its joint moves",
         "by judgement",
         "test_regimes_of_a_motion",
+    )
+    slides: float = _rule(
+        0.02,
+        "of a joint's large speed: from there on it slides, where friction acts; slower it stands",
+        "the spread of a load while it slides is the same within a tenth from 0.01 to 0.04 on ten made-up cases",
+        "test_what_stands_tells_of_no_load_under_which_it_slides",
     )
     warmed: float = _rule(
         5.0,
@@ -993,6 +1015,12 @@ class TorqueRules:
         "by judgement: shortest at 100 Hz",
         "test_a_torque_is_fitted_where_enough_was_logged",
     )
+    shakes: float = _rule(
+        3.0,
+        "x what its slow motion alone shakes: a joint that shakes by as much rings, and nobody pushes it",
+        "between 2.4, the most of an arm without ringing, and 18, the least while it rings",
+        "test_a_joint_that_rings_is_not_pushed",
+    )
     room: float = _rule(
         1.1,
         "x the torque that drove a joint from rest: dry friction that is larger would have held it",
@@ -1092,6 +1120,17 @@ class Rules:
 
 RULES = Rules()
 SEARCH, JUDGE, TOUCH, TORQUE, BELIEF = RULES.search, RULES.judge, RULES.touch, RULES.torque, RULES.belief
+
+
+# x something: what is left of 1 is what decides
+RATIOS = ("search.enough", "search.unsettled", "torque.carries", "torque.worse", "torque.noise", "torque.alike")
+
+
+def moved(name: str, factor: float) -> float:
+    """A rule ("search.least") times `factor`; of one that is x something the logarithm is, so that it stays above 1."""
+    room, _, rule = name.partition(".")
+    value = getattr(getattr(RULES, room), rule)
+    return type(value)(value**factor if name in RATIOS else value * factor)
 
 
 def described() -> list[tuple[str, float, str, str, str]]:

@@ -22,7 +22,7 @@ from dexsim.gap.effects.drive import (
     TorqueLimit,
     TorqueSpeedLimit,
 )
-from dexsim.gap.effects.effect import SLOW, Effect, TouchEffect, Variant
+from dexsim.gap.effects.effect import Effect, TouchEffect, Variant
 from dexsim.gap.effects.friction import CoulombFriction, LoadFriction, Presliding, StribeckFriction, ViscousFriction
 from dexsim.gap.effects.signals import CommandDelay, CurrentSensor, Lag, PositionOffset, PositionScale
 from dexsim.gap.effects.touch import (
@@ -111,7 +111,7 @@ def at_one_load(case: Case, runs: Sequence[int]) -> bool:
     """Whether the load on the gear of a joint hardly changes while it slides, so that a friction that grows with it and
     one that does not are the same torque: the standard deviation of its size is less than `JUDGE.one_load` of its
     mean."""
-    slides = case.regimes["speed"] > SLOW * case.scales.speed
+    slides = case.regimes["speed"] > JUDGE.slides * case.scales.speed
     load = np.abs(case.regimes["_load"][slides & np.isin(case.plant.run_of, runs)])
     return bool(len(load)) and float(load.std()) < JUDGE.one_load * float(load.mean())
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import SLOW, Effect, FittedEffect, Variant, param, word
+from dexsim.gap.effects.effect import Effect, FittedEffect, Variant, param, word
 from dexsim.gap.plant.case import REFERENCE, Case
 from dexsim.gap.plant.columns import INDEX, Scales
 from dexsim.gap.rules import JUDGE, SEARCH
@@ -234,7 +234,7 @@ class Thermal(Effect):
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
         m = case.regimes
         warm = np.abs(m["temperature"] - REFERENCE) if "temperature" in m else m["time"]
-        moving = (m["speed"] > SLOW * case.scales.speed).astype(float)
+        moving = (m["speed"] > JUDGE.slides * case.scales.speed).astype(float)
         return warm * (moving if note.get("of") == "friction" else np.abs(m["_torque"]))
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:

@@ -85,9 +85,6 @@ def ranged(fit: Fit, lowest: float, highest: float) -> dict[str, float]:
     return {"value": value, "low": min(low, value), "high": max(high, value)}
 
 
-SLOW = 0.02  # of a joint's large speed: slower than this it stands
-
-
 @dataclass(frozen=True)
 class Variant:
     """One way an effect may be there: its parameters, starts [n][P], and constants set on the plant."""

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dexsim.gap.effects.effect import SLOW, ByTorque, Effect, FittedEffect, Variant, entry, param
+from dexsim.gap.effects.effect import ByTorque, Effect, FittedEffect, Variant, entry, param
 from dexsim.gap.plant.columns import Scales
-from dexsim.gap.rules import BELIEF
+from dexsim.gap.rules import BELIEF, JUDGE
 
 if TYPE_CHECKING:
     from dexsim.gap.plant.case import Case
@@ -39,7 +39,7 @@ class CoulombFriction(Effect):
         return [Variant((torque, asymmetry), tuple(starts))]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
-        return (case.regimes["speed"] > SLOW * case.scales.speed).astype(float)
+        return (case.regimes["speed"] > JUDGE.slides * case.scales.speed).astype(float)
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         out = {"torque": fit.entry("torque", fit.force, add=fit.case.scales.base_friction)}
@@ -105,7 +105,7 @@ class StribeckFriction(Effect):
         m, s = case.regimes, case.scales
         v = m["speed"]
         near = np.exp(-((v / max(values.get("v_s", 0.1 * s.speed), 1e-6)) ** 2))
-        return near * ((v > 0.2 * (SLOW * s.speed)) | (np.abs(m["_torque"]) > 0))
+        return near * ((v > 0.2 * (JUDGE.slides * s.speed)) | (np.abs(m["_torque"]) > 0))
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {"peak": fit.entry("peak", fit.force), "v_s": fit.entry("v_s", f"{fit.length}/s")}
@@ -149,7 +149,7 @@ class LoadFriction(Effect):
         return [by_motor, by_gear]
 
     def signal(self, case: Case, values: dict[str, float], note: dict) -> np.ndarray:
-        return np.abs(case.regimes["_load"]) * (case.regimes["speed"] > SLOW * case.scales.speed).astype(float)
+        return np.abs(case.regimes["_load"]) * (case.regimes["speed"] > JUDGE.slides * case.scales.speed).astype(float)
 
     def parameters(self, fit: FittedEffect) -> dict[str, Any]:
         return {k: fit.entry(k, "1") for k in ("fraction", "fraction_backdriven")}

@@ -15,7 +15,6 @@ from dexsim.actuator.columns import COLUMNS, FEATURES, INDEX
 from dexsim.actuator.reference import load_level, torque_along
 from dexsim.actuator.table import ServoTable
 from dexsim.gap.effects.catalogue import CATALOGUE, model_columns
-from dexsim.gap.effects.effect import SLOW
 from dexsim.gap.judge import kept_out
 from dexsim.gap.plant.case import Case
 from dexsim.gap.plant.columns import INDEX as PLANT_INDEX
@@ -65,7 +64,7 @@ def share_of_outside(case: Case, trial: Trial) -> float:
     share, back, power, unit = (
         row[PLANT_INDEX[f"gear_load_{n}"]] for n in ("friction", "friction_backdriven", "power", "unit")
     )
-    slides = case.regimes["speed"] > SLOW * case.scales.speed
+    slides = case.regimes["speed"] > JUDGE.slides * case.scales.speed
     load, speed = case.regimes["_load"][slides], case.regimes["_speed"][slides]
     by_load = np.where(load * speed < 0.0, back, share) * unit * (np.abs(load) / unit) ** power
     return float(by_load.sum() / max(np.abs(load).sum(), 1e-12))

@@ -174,8 +174,7 @@ def _alone(names: Sequence[str], time: np.ndarray, test: Sequence[int], train: S
 # -- errors -----------------------------------------------------------------------------------------------------------
 # Errors on what was kept out of the fit, the floor, when an effect acts, the verdict.
 
-UNDERWAY = 0.1  # of a joint's speed: a recording that begins with as much begins in motion, and its
-FIRST = 0.1  # s tell where and how fast: within
+FIRST = 0.1  # s of a recording that begins in motion tell where and how fast: within
 START_NOISE, START_SPEED = 10.0, 0.2  # x the noise, and of a joint's speed, of what the samples about its first say
 DRAWS = 400  # of a bootstrap
 
@@ -273,7 +272,7 @@ def _begun(case: Case, plants: np.ndarray, windows: Windows) -> tuple[np.ndarray
     say they did."""
     sigma, window, t = case.sigma, windows.sample_window, case.plant.t[windows.sample_row]
     first = np.flatnonzero(np.r_[True, np.diff(window) != 0]) if len(window) else np.zeros(0, int)
-    moving = np.abs(case.regimes["_speed"][windows.sample_row[first]]) > UNDERWAY * case.scales.speed
+    moving = np.abs(case.regimes["_speed"][windows.sample_row[first]]) > JUDGE.turning * case.scales.speed
     if not moving.any():
         return case.plant.simulate(plants, windows)
     size = np.array([START_NOISE * sigma, START_SPEED * case.scales.speed])

@@ -19,6 +19,7 @@ from dexsim.gap.plant.batch import JointPlant, Windows, nominal_row
 from dexsim.gap.plant.columns import DRAGGERS, INDEX, SERIES_INDEX, Scales, expand
 from dexsim.gap.plant.mechanics import JointConstants, along
 from dexsim.gap.read.runs import Run, local_polynomial
+from dexsim.gap.rules import SEARCH
 
 PHYSICAL = 0.0  # slope of the torque limit while braking of a drive that nothing is said of: full torque
 REFERENCE = 25.0  # degC: at which the figures of a data sheet hold
@@ -361,7 +362,7 @@ def _warmth(runs: Sequence[Run], j: int) -> float:
     if not logged:
         return 0.0
     heat = np.concatenate(logged)
-    return float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= 2.0 else 0.0
+    return float(max(np.ptp(heat), np.abs(heat - REFERENCE).max())) if np.ptp(heat) >= SEARCH.warmth else 0.0
 
 
 def _open_figures(table: ServoTable, joint: str) -> tuple[dict[str, tuple[float, float]], tuple[str, ...]]:

@@ -14,7 +14,7 @@ from dexsim.gap.effects.body import ExternalForce
 from dexsim.gap.effects.catalogue import EFFECTS
 from dexsim.gap.effects.effect import ByTorque
 from dexsim.gap.read.runs import Run
-from dexsim.gap.rules import BELIEF, JUDGE, TORQUE
+from dexsim.gap.rules import BELIEF, JUDGE, SEARCH, TORQUE
 from dexsim.gap.search import inverse_dynamics
 from dexsim.gap.search.inverse_dynamics import (
     BY_DIRECTION,
@@ -306,8 +306,7 @@ def findings(given: Sequence[tuple], unknown: Sequence[str], runs: list[Run], tr
 # missed. Where nothing agrees, the torque is no witness of this body at all.
 
 HALF, STARTS, STEPS = 0.5, 40, 12  # share of the blocks that are fitted, random beginnings, and steps from each
-MOVING = 0.1  # of the joint's large speed
-RINGS, SHAKES, LOUD = 0.2, 3.0, 5.0  # s; x what the slow motion shakes, and x what the quietest quarter does
+AROUND = 0.2  # s over which it is measured how much a joint shakes
 
 
 @dataclass
@@ -400,7 +399,7 @@ def _by_ringing(
         even = np.arange(run.t[0], run.t[-1], step)
         raw = np.interp(even, run.t, run.q[:, j])
         all_, slow = (_swing(x, step) for x in (raw, inverse_dynamics.low_pass(raw, cutoff, step)))
-        beyond = (all_ > SHAKES * slow) & (all_ > LOUD * np.quantile(all_, 0.25))
+        beyond = (all_ > TORQUE.shakes * slow) & (all_ > SEARCH.loud * np.quantile(all_, 0.25))
         pushed.append(on)
         rings.append(np.interp(t, even - run.t[0], beyond.astype(float)) > 0.5)
     on = np.concatenate(pushed)
@@ -408,8 +407,8 @@ def _by_ringing(
 
 
 def _swing(x: np.ndarray, step: float) -> np.ndarray:
-    """[n] rms of the second differences of x [n] within `RINGS` about each sample."""
-    count = max(int(RINGS / step), 3)
+    """[n] rms of the second differences of x [n] within `AROUND` about each sample."""
+    count = max(int(AROUND / step), 3)
     return np.sqrt(np.convolve(np.diff(x, 2, prepend=x[0], append=x[-1]) ** 2, np.ones(count) / count, "same"))
 
 
@@ -423,7 +422,7 @@ def _of_joint(
     that speaks."""
     names = [n for n in pieces[0].names if all(n in p.names for p in pieces)]
     X = [p.X[:, [p.names.index(n) for n in names]] for p in pieces]
-    fast = MOVING * float(np.percentile(np.abs(np.concatenate([p.v for p in pieces])), 95))
+    fast = JUDGE.turning * float(np.percentile(np.abs(np.concatenate([p.v for p in pieces])), 95))
     moves = [np.abs(p.v) > fast for p in pieces]
     mine = [k for k, x in enumerate(own) if x and moves[k].sum() > 20]
     if not mine or sum(int(moves[k].sum()) for k in mine) < 200:

@@ -25,10 +25,7 @@ from dexsim.gap.search.search import JointSearch
 
 APART = (1, 2, 3)  # samples between a reading and those that it is compared with
 SETTLES = 0.25  # s of a window before it is looked at: what was let go at a measured state swings in
-LOUD = 5.0  # x the quietest window, and what is simulated without any effect: it shakes
-FEWEST = 3  # windows that shake
 MOST_LOG, MOST_AWAY = 3.0, 5.0  # log ratio of what shakes, and x the usual miss of the mean: more counts as much
-WEIGHT = 1.0 / 9.0  # of the mean position's squared miss beside the logarithms
 RINGS = (0.1, 0.16, 0.22, 0.3, 0.4)  # damping ratios that are tried: a little more or less decides
 LIMITS: tuple[dict[str, float], ...] = (  # laws of the drive's limits, which end how far it swings
     {"braking_slope": -1.0, "limit_speed": 1.0},
@@ -74,11 +71,11 @@ class Shaking:
         self.levels, self.means = (x[0] for x in self._of(self.plant.q[self.w.sample_row][None]))
         least = max(search.case.quantum / np.sqrt(12), 1e-12)  # readings of a joint at rest do not differ at all
         self.quiet = max(min(float(self.levels[0].min()), quiet), least)
-        self.loud = self.levels[0] > LOUD * self.quiet
+        self.loud = self.levels[0] > SEARCH.loud * self.quiet
         if not self.loud.any():
             return
         levels, means = self._simulated(none.members, none.fit.params, none.fit.x[None])
-        self.loud &= self.levels[0] > LOUD * levels[0, 0]
+        self.loud &= self.levels[0] > SEARCH.loud * levels[0, 0]
         self.usual = max(1.5 * float(np.median(np.abs(means[0] - self.means))), self.quiet / 3)
 
     def _of(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -109,7 +106,7 @@ class Shaking:
         noise = 1.5 * self.quiet**2
         ratio = 0.5 * np.log((self.levels**2 + noise) / (levels**2 + 2 * noise))
         away = (means - self.means) / self.usual
-        return (np.clip(ratio, -MOST_LOG, MOST_LOG) ** 2).sum(1) + WEIGHT * np.minimum(away**2, MOST_AWAY**2)
+        return (np.clip(ratio, -MOST_LOG, MOST_LOG) ** 2).sum(1) + SEARCH.resting * np.minimum(away**2, MOST_AWAY**2)
 
     def of(self, trial: Trial) -> np.ndarray:
         """[W] by how much a fitted hypothesis misses each window."""
@@ -170,7 +167,7 @@ def answered(search: JointSearch, found: Outcome) -> Outcome:
     if followed or search.deadline.over():
         return found  # without an effect even ringing may be within the noise: it is what the noise was told by
     shaking = Shaking(search, found.none)
-    if shaking.loud.sum() < FEWEST:
+    if not shaking.loud.any():
         return found
     before = shaking.of(found.best)
     asked = [e for e in CATALOGUE if e.rings and (search.allowed is None or e.id in search.allowed)]
@@ -215,7 +212,7 @@ def shown(search: JointSearch, outcome: Outcome, runs: Sequence[int], span: dict
     if not fitted.loud.any():
         return False
     shaking = Shaking(search, outcome.none, runs, span, fitted.quiet)
-    if shaking.loud.sum() < FEWEST:
+    if not shaking.loud.any():
         return False
     before, after = (shaking.of(t).sum() for t in (outcome.none, outcome.best))
     return bool(after < (1 - SEARCH.least) * before)

@@ -15,7 +15,7 @@ from dexsim.gap.effects.effect import TouchEffect
 from dexsim.gap.effects.touch import TactileGain
 from dexsim.gap.plant.case import noise
 from dexsim.gap.read.runs import BLOCK
-from dexsim.gap.rules import TOUCH
+from dexsim.gap.rules import SEARCH, TOUCH
 from dexsim.gap.touch.plant import PARAMS, cell, neutral, readings, shear
 from dexsim.gap.touch.read import PadRun
 
@@ -358,7 +358,7 @@ class PadFit:
         out = {}
         for k, s in zip(fitted.keys, variance, strict=True):
             x = trial.values[k]
-            half = 1.645 * float(np.sqrt(s + ((TOUCH.law if k in OF_LAW else 0.015) * x) ** 2))
+            half = 1.645 * float(np.sqrt(s + ((TOUCH.law if k in OF_LAW else SEARCH.doubt) * x) ** 2))
             low, high = self._bounds(k)
             out[k] = (max(x - half, low), min(x + half, high))
         return {k: v for k, v in out.items() if k in keys}
