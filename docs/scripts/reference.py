@@ -1,6 +1,6 @@
 """Reference pages written from the code and the config files, so that they cannot go stale.
 
-    python docs/scripts/reference.py settings | columns | effects | audit | metadata | commands
+    python docs/scripts/reference.py settings | columns | effects | rules | audit | metadata | commands
 
 prints one as Markdown; `hooks.py` puts them into the site where a page says `<!-- GENERATED: name -->`.
 """
@@ -161,6 +161,19 @@ def effects() -> str:
     return f"## Joints\n\n{joints}\n## Touch and contact\n\n{touches}"
 
 
+def rules() -> str:
+    """The figures that the diagnosis decides by."""
+    from dexsim.gap.rules import RULES, described
+
+    head = ("figure", "value", "what it means", "where its value came from")
+    parts = []
+    for room in ("search", "judge", "touch", "torque", "belief"):
+        of = [r for r in described() if r[0].startswith(f"{room}.")]
+        rows = [(f"`{name}`", f"{value:.4g}", means, source) for name, value, means, source, _ in of]
+        parts.append(f"## {room.capitalize()}\n\n{type(getattr(RULES, room)).__doc__}\n\n{table(head, rows)}")
+    return "\n".join(parts)
+
+
 def audit() -> str:
     """Kinds of findings of the recording's audit."""
     from dexsim.recording.audit import KINDS
@@ -200,6 +213,7 @@ PAGES = {
     "settings": settings,
     "columns": columns,
     "effects": effects,
+    "rules": rules,
     "audit": audit,
     "metadata": metadata,
     "commands": commands,
