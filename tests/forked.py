@@ -1,71 +1,85 @@
-"""`python -m MODULE ARGUMENTS` in a fork of this process, which has the large libraries loaded: a new interpreter would
-spend seconds on importing them. dexsim's and the benchmarks' own files are imported anew."""
+"""Programs as forks of a server that has loaded the large libraries, once for all: an interpreter of its own spends six
+seconds of processor time on importing them. dexsim's and the benchmarks' own files are imported anew by each.
+
+For tests that are not about how a program is started from a shell.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import runpy
-import signal
 import subprocess
 import sys
 import tempfile
-import time
-import traceback
+from collections.abc import Callable
 from pathlib import Path
-
-# for what they load
-import mujoco_warp  # noqa: F401
-import rosbags.typesys  # noqa: F401
-import scipy.optimize  # noqa: F401
-import scipy.signal  # noqa: F401
-import scipy.stats  # noqa: F401
-import trimesh  # noqa: F401
-
-import dexsim.cli.play
-import dexsim.cli.train  # noqa: F401
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload([
+    "hydra", "mujoco", "mujoco_warp", "rosbags.typesys", "rsl_rl.models", "rsl_rl.runners", "scipy.optimize",
+    "scipy.signal", "scipy.spatial", "scipy.stats", "tensordict", "torch.distributed.run", "trimesh", "warp",
+])  # fmt: skip
+"""It begins with the first program, and ends with the tests."""
 
 
-def run(module: str, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
-    """Its status and what it printed. Raises TimeoutExpired after `timeout` s."""
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        sys.stdout.flush(), sys.stderr.flush()
-        pid = os.fork()
-        if pid == 0:
-            os._exit(_child(module, arguments, out.fileno(), err.fileno()))
-        end = time.monotonic() + timeout
-        while (done := os.waitpid(pid, os.WNOHANG))[0] == 0:
-            if time.monotonic() > end:
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-                raise subprocess.TimeoutExpired(module, timeout)
-            time.sleep(0.005)
-        texts = []
-        for file in (out, err):
-            file.seek(0)
-            texts.append(file.read().decode())
-    return subprocess.CompletedProcess([module, *arguments], os.waitstatus_to_exitcode(done[1]), *texts)
+class Forked:
+    """`work(*arguments)` in a process, in the folder `cwd`, with `env` beside the environment: as `subprocess.Popen`
+    with pipes and text=True. It leads a session of its own."""
+
+    def __init__(
+        self, work: Callable[..., Any], *arguments: object, cwd: Path = ROOT, env: dict[str, str] | None = None
+    ) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        self._texts = [Path(self._folder.name, name) for name in ("out", "err")]
+        env = dict(os.environ) | (env or {})
+        self._process = SERVER.Process(target=_child, args=(work, arguments, str(cwd), env, self._texts))
+        self._process.start()
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        return self._process.exitcode
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.exitcode
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """What it printed. Raises TimeoutExpired after `timeout` s."""
+        self._process.join(timeout)
+        if self._process.exitcode is None:
+            raise subprocess.TimeoutExpired(str(self._process), timeout)
+        out, err = (path.read_text() if path.exists() else "" for path in self._texts)
+        return out, err
 
 
-def _child(module: str, arguments: tuple[str, ...], out: int, err: int) -> int:
-    """Runs the module as a program; its exit status."""
-    os.dup2(out, 1), os.dup2(err, 2)
-    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
-    status = 0
+def run(module: str, *arguments: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
+    """`python -m module arguments` in the repository's folder. Raises TimeoutExpired after `timeout` s."""
+    program = Forked(_program, module, arguments)
     try:
-        os.chdir(ROOT)
-        for name in [n for n in sys.modules if n.partition(".")[0] in ("dexsim", "benchmarks")]:
-            del sys.modules[name]
-        sys.argv = [module, *arguments]
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
-    except SystemExit as ending:
-        if isinstance(ending.code, str):
-            print(ending.code, file=sys.stderr)
-        status = ending.code if isinstance(ending.code, int) else int(ending.code is not None)
-    except BaseException:
-        traceback.print_exc()
-        status = 1
-    finally:
-        sys.stdout.flush(), sys.stderr.flush()
-    return status
+        out, err = program.communicate(timeout)
+    except subprocess.TimeoutExpired:
+        os.killpg(program.pid, 9)
+        raise
+    return subprocess.CompletedProcess([module, *arguments], program.returncode, out, err)
+
+
+def _program(module: str, arguments: tuple[str, ...]) -> None:
+    sys.argv = [module, *arguments]
+    sys.path.insert(0, os.getcwd())
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+def _child(work: Callable[..., Any], arguments: tuple, cwd: str, env: dict[str, str], texts: list[Path]) -> None:
+    """multiprocessing prints an error that ends it, and knows what SystemExit means."""
+    os.setsid()
+    os.chdir(cwd)
+    os.environ.clear()
+    os.environ.update(env)
+    for number, path in enumerate(texts, 1):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(file, number)
+        os.close(file)
+    work(*arguments)

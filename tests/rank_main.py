@@ -1,4 +1,5 @@
-"""`dexsim train` on the dummy task, for torchrun in tests: rank_main.py CONFIGS MODE [key=value ...].
+"""`dexsim train` on the dummy task, for torchrun in tests: rank_main.py CONFIGS MODE [key=value ...]; `launched` does
+what torchrun does in a process that has torch loaded, and its ranks are forks of that.
 
 MODE: plain; report: each rank writes what it had and learned into out=; slow: steps take time;
 fail<k>: rank k meets an error at its 60th step; bug<k>: an exception there instead.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -21,6 +23,7 @@ from dexsim.errors import UserError
 from dexsim.learning.runner import Runner
 
 torch.set_num_threads(1)
+MODE = "plain"
 
 
 class RankEnv(dummy_task.DummyEnv):
@@ -65,8 +68,33 @@ class ReportingRunner(Runner):
         return done
 
 
-if __name__ == "__main__":
-    CONFIGS, MODE = Path(sys.argv[1]), sys.argv[2]
+def main(argv: list[str]) -> int:
+    """Exit status of a rank; its process's number stands in REPORT meanwhile."""
+    global MODE
+    configs, MODE = Path(argv[0]), argv[1]
+    folder = Path(os.environ["REPORT"])
+    folder.mkdir(exist_ok=True)
+    (folder / f"{os.environ['RANK']}.pid").write_text(str(os.getpid()))
     if MODE == "report":
         train.Runner = ReportingRunner
-    sys.exit(guard(lambda argv: commands.train(argv, CONFIGS, RankEnv), sys.argv[3:]))
+    return guard(lambda settings: commands.train(settings, configs, RankEnv), argv[2:])
+
+
+def one_rank(argv: list[str]) -> None:
+    """A rank that is a fork of torchrun: with the signals that a program begins with."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    sys.exit(main(argv))
+
+
+def launched(options: list[str], argv: list[str]) -> None:
+    """`torchrun options rank_main.py argv`, but that the ranks are forks."""
+    from torch.distributed import run
+
+    configured = run.config_from_args
+    run.config_from_args = lambda args: (configured(args)[0], one_rank, [argv])
+    run.main([*options, "--start-method=fork", __file__])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

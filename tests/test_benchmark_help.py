@@ -46,11 +46,15 @@ def test_help_of_what_writes_files(module):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["planted", "concealed"])
-def test_a_wrong_setting_is_one_line_and_status_2(name):
-    done = forked.run(f"benchmarks.{name}", "case=3")
+@pytest.mark.parametrize(
+    ("name", "setting", "said"),
+    [
+        ("planted", "case=3", "error: 'case=3' is not a setting"),
+        ("concealed", "case=3", "error: 'case=3' is not a setting"),
+        ("step", "steps=none", "error: steps=none"),
+    ],
+)
+def test_a_wrong_setting_is_one_line_and_status_2(name, setting, said):
+    done = forked.run(f"benchmarks.{name}", setting)
     assert done.returncode == 2
-    assert (
-        done.stderr.strip().startswith("error: 'case=3' is not a setting")
-        and len(done.stderr.strip().splitlines()) == 1
-    )
+    assert done.stderr.strip().startswith(said) and len(done.stderr.strip().splitlines()) == 1

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import forked
 import mujoco
@@ -25,8 +22,6 @@ from benchmarks.touch_alternatives import alternatives
 from benchmarks.touch_cost import cost_of
 from dexsim.errors import UserError
 from dexsim.paths import CONFIGS
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -142,10 +137,6 @@ def test_costs_follow_the_layout(touch_scene):
     assert 0.1 < cost_of(raw, "box", 16384).floor_us() < 100
 
 
-def run(*command: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, timeout=600)
-
-
 @pytest.mark.parametrize(
     "name, setting",
     [
@@ -166,11 +157,6 @@ def test_bad_settings_are_one_clear_line(name, setting):
     assert setting.split("=")[0].replace("device", "CUDA") in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_bad_setting_ends_with_code_2():
-    done = forked.run("benchmarks.step", "steps=none")
-    assert done.returncode == 2 and "Traceback" not in done.stderr and "steps=none" in done.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("command, keys", [
     (("benchmarks.engines", "worlds=8", "seconds=2"), ("physics_ratio", "env_ratio", "rows")),
@@ -183,7 +169,7 @@ def test_a_bad_setting_ends_with_code_2():
 ])  # fmt: skip
 def test_they_run_on_a_cpu_and_end_in_one_json_line(command, keys, tmp_path):
     writes = command[0] in ("benchmarks.physics", "benchmarks.minutes")
-    done = run(*command, *((f"out={tmp_path}",) if writes else ()))
+    done = forked.run(*command, *((f"out={tmp_path}",) if writes else ()))
     assert done.returncode == 0, done.stderr[-2000:]
     out = json.loads(done.stdout.splitlines()[-1])
     assert out["benchmark"] == command[0].split(".")[1] and "versions" in out and "device" in out

@@ -11,10 +11,13 @@ import sys
 import time
 from pathlib import Path
 
+import forked
 import pytest
+import rank_main
 import shell
 import torch
 
+from dexsim.console import ending
 from dexsim.errors import UserError
 from dexsim.learning import checkpoint
 from dexsim.learning.meter import Meter
@@ -29,28 +32,28 @@ def configs(tmp_path_factory):
     return shell.configs(tmp_path_factory.mktemp("ranks"))
 
 
-def torchrun(configs, folder, mode, *settings, ranks=2) -> subprocess.Popen:
+TORCHRUN = ("--standalone", "--nproc_per_node=2")
+
+
+def torchrun(configs, folder, mode, *settings) -> subprocess.Popen:
     """torchrun of rank_main.py in `folder`, in a process group of its own."""
     env = os.environ | {
         "OMP_NUM_THREADS": "1",
         "REPORT": str(folder / "report"),
         "PYTHONPATH": f"{shell.ROOT}:{MAIN.parent}",
     }
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        f"--nproc_per_node={ranks}",
-        str(MAIN),
-        str(configs),
-        mode,
-        *QUICK,
-        *settings,
-    ]
+    argv = [str(configs), mode, *QUICK, *settings]
+    command = [sys.executable, "-m", "torch.distributed.run", *TORCHRUN, str(MAIN), *argv]
     return subprocess.Popen(
         command, cwd=folder, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
+
+
+def forks(configs, folder, mode, *settings) -> forked.Forked:
+    """The same, but that torchrun and its ranks are forks: three times less to import."""
+    argv = [str(configs), mode, *QUICK, *settings]
+    env = {"OMP_NUM_THREADS": "1", "REPORT": str(folder / "report")}
+    return forked.Forked(rank_main.launched, list(TORCHRUN), argv, cwd=folder, env=env)
 
 
 def finish(process, seconds=100):
@@ -62,15 +65,6 @@ def finish(process, seconds=100):
         process.communicate()
         raise
     return process.returncode, out, err
-
-
-def rank_pid(process, rank) -> int:
-    """The process of one rank, among the children of torchrun."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    for pid in children:
-        if f"RANK={rank}" in Path(f"/proc/{pid}/environ").read_text().split("\0"):
-            return int(pid)
-    raise AssertionError(f"no rank {rank} among {children}")
 
 
 def wait_for(path, process, seconds=90):
@@ -150,6 +144,21 @@ def test_meter_sums_over_ranks():
     assert "Episode/a" in found
 
 
+def test_the_first_of_a_machine_says_what_all_find_wrong(monkeypatch, capsys):
+    """Others wait, since torchrun ends all once one has ended; where nobody has ended it, one speaks as well."""
+    waited = []
+    monkeypatch.setattr(ending.time, "sleep", waited.append)
+
+    def wrong(argv):
+        raise UserError(f"worlds={argv[0]}")
+
+    for rank, before in ((0, []), (1, [ending.FIRST_SPEAKS_S])):
+        for name, value in environment(rank, 2).items():
+            monkeypatch.setenv(name, value)
+        assert ending.guard(wrong, ["0"]) == 2 and waited == before
+        assert capsys.readouterr().err == "error: worlds=0\n"
+
+
 # --- two processes
 
 @pytest.fixture(scope="module")
@@ -180,7 +189,7 @@ def test_two_ranks_learn_one_policy(learned):
 @pytest.mark.slow
 def test_two_ranks_resume(configs, learned, tmp_path):
     last = learned[0] / "run" / "last.pt"
-    status, out, err = finish(torchrun(configs, tmp_path, "report", f"resume={last}", "iterations=5", "out=again"))
+    status, out, err = finish(forks(configs, tmp_path, "report", f"resume={last}", "iterations=5", "out=again"))
     assert status == 0, err
     c, d = (json.loads((tmp_path / "report" / f"{k}.json").read_text()) for k in (0, 1))
     assert c["from"] == d["from"] == 3 and c["steps"] == 5 * 24 * 4 * 2 and c["after"] == d["after"]
@@ -190,12 +199,11 @@ def test_two_ranks_resume(configs, learned, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("lost, by", [(1, 0), (0, 1)])
 def test_a_killed_rank_ends_the_run(configs, tmp_path, lost, by):
-    process = torchrun(configs, tmp_path, "slow", "iterations=100000", "out=run", "save_interval=1")
+    process = forks(configs, tmp_path, "slow", "iterations=100000", "out=run", "save_interval=1")
     wait_for(tmp_path / "run" / "model_2.pt", process)
-    os.kill(rank_pid(process, lost), signal.SIGKILL)
-    start = time.monotonic()
-    status, out, err = finish(process, 60)
-    assert status != 0 and time.monotonic() - start < 20  # most of it torchrun's own start and end on a busy machine
+    os.kill(int((tmp_path / "report" / f"{lost}.pid").read_text()), signal.SIGKILL)
+    status, out, err = finish(process)  # the others would wait for it for half an hour (COMPILE_LIMIT)
+    assert status != 0
     lines = [x for x in err.splitlines() if x.startswith("error:")]
     assert len(lines) == 1, err
     assert (
@@ -214,7 +222,7 @@ def test_ctrl_c_saves_once(configs, tmp_path):
     wait_for(tmp_path / "run" / "model_2.pt", process)
     # a terminal's Ctrl-C reaches torchrun and both ranks; torchrun passes it on again
     os.killpg(process.pid, signal.SIGINT)
-    status, out, err = finish(process, 60)
+    status, out, err = finish(process)
     assert status != 0 and out.count("stopping and saving") == 1 and out.count("saved run/last.pt") == 1, (out, err)
     done = int(out.split("stopped after ")[1].split()[0])
     assert checkpoint.load(tmp_path / "run" / "last.pt")["iteration"] == done >= 2
@@ -230,17 +238,16 @@ def test_ctrl_c_saves_once(configs, tmp_path):
     ],
 )
 def test_an_error_of_one_rank_is_said_once(configs, tmp_path, mode, said):
-    start = time.monotonic()
-    status, out, err = finish(torchrun(configs, tmp_path, mode, "iterations=100000", "out=run"), 60)
+    status, out, err = finish(forks(configs, tmp_path, mode, "iterations=100000", "out=run"))
     lines = [x for x in err.splitlines() if x.startswith("error:")]
     assert status != 0 and len(lines) == 1 and lines[0].startswith(said), err
     assert "run/last.pt" in lines[0] and checkpoint.load(tmp_path / "run" / "last.pt")["iteration"] >= 1
-    assert time.monotonic() - start < 50 and ("in step" in err) == (mode == "bug1")  # a traceback for our bugs only
+    assert ("in step" in err) == (mode == "bug1")  # a traceback for our bugs only
 
 
 @pytest.mark.slow
 def test_a_wrong_setting_is_said_once(configs, tmp_path):
-    status, out, err = finish(torchrun(configs, tmp_path, "plain", "wrlds=3"), 60)
+    status, out, err = finish(forks(configs, tmp_path, "plain", "wrlds=3"))
     assert (
         status != 0
         and len([x for x in err.splitlines() if x.startswith("error:")]) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import time
 from collections.abc import Callable
 
 from dexsim.errors import UserError
@@ -12,6 +13,8 @@ from dexsim.errors import UserError
 FULL = (errno.ENOSPC, errno.EDQUOT)
 PLACES = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.ELOOP)
 """Of paths that cannot be used, whoever named them."""
+FIRST_SPEAKS_S = 30.0
+"""s that a rank gives the first of its machine to say what both find wrong."""
 
 
 def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None = None) -> int:
@@ -24,7 +27,10 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
     try:
         return main(argv)
     except UserError as error:
-        return _say(error, 2) if not _silent() else 2
+        if _silent():
+            # torchrun ends all ranks as soon as one has ended: the first, too, before it has said anything
+            time.sleep(FIRST_SPEAKS_S)
+        return _say(error, 2)  # also of a rank that nobody has ended by now: the first has not found it
     except KeyboardInterrupt:
         return 130 if _silent() else _say("stopped by Ctrl-C before there was anything to save", 130, "")
     except BrokenPipeError:  # e.g. `dexsim train --help | head`
@@ -51,7 +57,7 @@ def guard(main: Callable[[list[str]], int], argv: list[str], about: str | None =
 
 def _silent() -> bool:
     """Whether another process says it: under torchrun every rank of a machine finds the same wrong setting, the first
-    speaks. What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
+    speaks, and torchrun ends the others. What goes wrong later reaches rank 0 (dexsim.learning.lifeline)."""
     return os.environ.get("WORLD_SIZE", "1") != "1" and os.environ.get("LOCAL_RANK", "0") != "0"
 
 
